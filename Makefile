@@ -1,0 +1,42 @@
+# Two commands set everything up: `make experiment EXP=ablation_ordinal` and `make test`. `make help` lists the rest.
+PYTHON ?= python3
+VENV   ?= .venv
+EXP    ?= ablation_ordinal
+ARGS   ?=
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+
+.PHONY: help setup experiment test test-slow lint format clean
+.DEFAULT_GOAL := help
+
+help:  ## list the targets
+	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+setup: $(READY)  ## make the environment (.venv) with the pinned packages
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"touchr1-jax needs Python >= 3.11, PYTHON={sys.executable} is {v[0]}.{v[1]}: set PYTHON=python3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade-strategy only-if-needed -c constraints.txt -e '.[dev]'
+	@touch $@
+
+experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
+	$(BIN)/python -m experiments $(EXP) $(ARGS)
+
+test: setup  ## pass the tests (under ten minutes on two cores)
+	$(BIN)/python -m pytest -q -n 2 $(ARGS)
+
+test-slow: setup  ## pass the tests that take minutes
+	$(BIN)/python -m pytest -q -m slow $(ARGS)
+
+lint: setup  ## check style, imports and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup  ## rewrite the sources in the house format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove the environment and caches, keep data/ and runs/
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -1,0 +1,1 @@
+"""The answer language, its tokenizers, its template and its parser."""

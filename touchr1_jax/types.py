@@ -1,0 +1,76 @@
+"""The data that moves through one rollout, as frozen pytrees: batch → prefix → rollout → parsed → reward → update.
+
+Dimensions, used in every name and shape of this package:
+  P prompts, G rollouts of one prompt, T completion tokens, L prefix tokens, V vocabulary, S tactile streams (stream s is
+  sensor s of the language), F frames, H W C image, A attributes, K levels of an attribute, D model width.
+"""
+
+from typing import Any
+
+import jax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+Params = Any  # a pytree of float arrays, as flax.linen returns it
+
+
+@struct.dataclass
+class TouchBatch:
+    """P contacts, each seen by all sensors; the JAX side of `sensors_io.schema.CLIP_ARRAYS`."""
+
+    frames: UInt8[Array, "P S F H W 3"]
+    force_n: Float[Array, "P S F 3"]
+    frame_index: Int[Array, "P S F"]
+    frame_mask: Bool[Array, "P S F"]
+    stream_mask: Bool[Array, "P S"]
+    view: UInt8[Array, "P Hv Wv 3"]
+    view_mask: Bool[Array, "P"]
+    label: Int[Array, "P A"]
+
+
+@struct.dataclass
+class Target:
+    """What one rollout is scored against; −1 marks an unknown label.
+
+    `asked` selects the attributes of the question, `streams` the sensors that were there to be reported on.
+    """
+
+    asked: Bool[Array, "A"]
+    label: Int[Array, "A"]
+    levels: Int[Array, "A"]
+    ordinal: Bool[Array, "A"]
+    streams: Bool[Array, "S"]
+
+
+@struct.dataclass
+class Parsed:
+    """One completion as the rewards see it; a level of −1 is ⊥, unparsable.
+
+    `perceive[s, a]` is what the answer says sensor s feels, `compare[a]` the cross-sensor summary, `conclude[a]` the
+    answer.  `formatted` means each of the six tags exactly once, in order, no empty body, only white space after the
+    last.  `truncated` means that no end token came.  `length` counts the tokens before the end token.
+    """
+
+    perceive: Int[Array, "S A"]
+    compare: Int[Array, "A"]
+    conclude: Int[Array, "A"]
+    formatted: Bool[Array, ""]
+    truncated: Bool[Array, ""]
+    length: Int[Array, ""]
+
+
+@struct.dataclass
+class Rollout:
+    """Sampled completions: token ids, the sampler's log-probabilities and which positions count.
+
+    `mask` covers every token up to and including the end token.
+    """
+
+    tokens: Int[Array, "*batch T"]
+    log_prob: Float[Array, "*batch T"]
+    mask: Bool[Array, "*batch T"]
+
+
+def tree_size(tree: Any) -> int:
+    """Number of elements of all arrays of a pytree."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
