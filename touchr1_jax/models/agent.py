@@ -1,0 +1,72 @@
+"""A policy together with its prompt layout and vocabulary: the pure functions that training and sampling call."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.models.policy import Features, Policy, Slots
+from touchr1_jax.types import Params, TouchBatch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Agent:
+    """Static context of every forward pass; parameters are always an argument.
+
+    Attributes:
+      policy: the Linen module.
+      slots: where a prompt keeps its tactile and view tokens.
+      banned: [V], ids that are never sampled (padding, placeholders).
+      end_ids: ids that end a completion.
+      pad_id: id that follows the end.
+    """
+
+    policy: Policy
+    slots: Slots
+    banned: np.ndarray
+    end_ids: tuple[int, ...]
+    pad_id: int
+
+    def encode(self, params: Params, batch: TouchBatch, *, blind: bool = False) -> Features:
+        """Encode a batch of contacts, [P, …]; a blind policy has no streams."""
+        method = Policy.encode_blind if blind else Policy.encode
+        return self.policy.apply({"params": params}, batch, method=method)
+
+    def encode_streams(self, params: Params, *stream: Array) -> Float[Array, "*n N D"]:
+        """Encode any batch of single streams; arguments as in `TactileViT`."""
+        return self.policy.apply({"params": params}, *stream, method=Policy.encode_streams)
+
+    def prefill(
+        self, params: Params, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"]
+    ) -> tuple[Float[Array, "V"], PrefixCache]:
+        """Encode one prompt."""
+        args = (features, ids, mask, self.slots, jnp.asarray(self.banned))
+        return self.policy.apply({"params": params}, *args, method=Policy.prefill)
+
+    def decode(
+        self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: tuple[LayerCache, ...]
+    ) -> tuple[Float[Array, "V"], tuple[LayerCache, ...]]:
+        """One token step of one rollout."""
+        args = (token, t, prefix, caches, jnp.asarray(self.banned))
+        return self.policy.apply({"params": params}, *args, method=Policy.decode)
+
+    def group_logits(
+        self, params: Params, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"], tokens: Int[Array, "G T"]
+    ) -> Float[Array, "G T V"]:
+        """Logits of every token of a group of completions of one prompt; the prompt is encoded once.
+
+        Values and gradients equal those of G separate forward passes over prompt and completion.
+        """
+        first, prefix = self.prefill(params, features, ids, mask)
+        banned = jnp.asarray(self.banned)
+        one = lambda o: self.policy.apply({"params": params}, o, first, prefix, banned, method=Policy.completion_logits)
+        return jax.vmap(one)(tokens)
+
+    def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
+        """Caches of one completion of at most `length` tokens."""
+        c = self.policy.config.decoder
+        zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim))
+        return tuple(LayerCache(zeros, zeros) for _ in range(c.num_layers))

@@ -1,0 +1,172 @@
+"""Decoder language model of the Qwen2.5 shape: grouped-query attention, RMSNorm, SwiGLU, multimodal rotary positions.
+
+Every method works on one sequence; the callers batch by `vmap`.  A group of G rollouts shares one prompt, so the keys of
+the prompt (`PrefixCache`) are an argument of their own that `vmap` over the group leaves unbatched.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DecoderConfig:
+    """Shape of the decoder; the defaults are the CPU-scale policy, the names are Qwen2.5's."""
+
+    vocab_size: int
+    hidden_size: int = 96
+    num_layers: int = 3
+    num_heads: int = 3
+    num_kv_heads: int = 1
+    head_dim: int = 32
+    intermediate_size: int = 256
+    mrope_section: tuple[int, int, int] = (4, 6, 6)
+    rope_theta: float = 1e4
+    tie_embedding: bool = True
+
+    def __post_init__(self) -> None:
+        if self.num_heads % self.num_kv_heads:
+            raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
+
+
+class LayerCache(NamedTuple):
+    """Keys and values of one layer, head-major: a time-major layout is several times slower to attend to."""
+
+    k: Float[Array, "KV T d"]
+    v: Float[Array, "KV T d"]
+
+
+class PrefixCache(NamedTuple):
+    """An encoded prompt: its keys and values, which of them may be seen, and the position that follows it."""
+
+    layers: tuple[LayerCache, ...]
+    mask: Bool[Array, "L"]
+    next_position: Int[Array, ""]
+
+
+class DecoderLayer(nn.Module):
+    """Pre-norm transformer layer, split in two so that each caller attends to the keys that it has."""
+
+    config: DecoderConfig
+
+    def setup(self) -> None:
+        c = self.config
+        self.norm_attention, self.norm_mlp = RMSNorm(), RMSNorm()
+        self.q_proj = nn.Dense(c.num_heads * c.head_dim)
+        self.k_proj = nn.Dense(c.num_kv_heads * c.head_dim)
+        self.v_proj = nn.Dense(c.num_kv_heads * c.head_dim)
+        self.o_proj = nn.Dense(c.hidden_size, use_bias=False)
+        self.mlp = GatedMLP(c.intermediate_size)
+
+    def project(self, x: Float[Array, "T D"], rotation: Rotation) -> tuple[Float[Array, "T KV R d"], LayerCache]:
+        """Queries of each token, and its keys and values head-major."""
+        c, t = self.config, x.shape[0]
+        y = self.norm_attention(x)
+        q = self.q_proj(y).reshape(t, c.num_kv_heads, c.num_heads // c.num_kv_heads, c.head_dim)
+        k = self.k_proj(y).reshape(t, c.num_kv_heads, c.head_dim)
+        v = self.v_proj(y).reshape(t, c.num_kv_heads, c.head_dim)
+        return rotate(q, rotation), LayerCache(rotate(k, rotation).swapaxes(0, 1), v.swapaxes(0, 1))
+
+    def finish(self, x: Float[Array, "T D"], attended: Float[Array, "T hd"]) -> Float[Array, "T D"]:
+        """Residual sums after attention and after the MLP."""
+        x = x + self.o_proj(attended)
+        return x + self.mlp(self.norm_mlp(x))
+
+
+class Decoder(nn.Module):
+    """Causal language model with an explicit cache: `prefill` a prompt, then `extend` it or `decode` token by token."""
+
+    config: DecoderConfig
+
+    def setup(self) -> None:
+        c = self.config
+        self.embedding = nn.Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
+        self.layers = [DecoderLayer(c) for _ in range(c.num_layers)]
+        self.norm = RMSNorm()
+        if not c.tie_embedding:
+            self.head = nn.Dense(c.vocab_size, use_bias=False)
+
+    def embed(self, tokens: Int[Array, "T"]) -> Float[Array, "T D"]:
+        """Rows of the embedding table."""
+        return self.embedding(tokens)
+
+    def logits(self, x: Float[Array, "T D"], banned: Bool[Array, "V"]) -> Float[Array, "T V"]:
+        """Scores of the next token in float32, with banned ids (placeholders, padding) out of reach for good."""
+        y = self.norm(x)
+        scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)
+        return jnp.where(banned, MASKED, scores.astype(jnp.float32))
+
+    def prefill(
+        self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"]
+    ) -> tuple[Float[Array, "D"], PrefixCache]:
+        """Encode a prompt once.
+
+        Args:
+          x: embedded prompt; its last token must be a real one.
+          positions: (time, row, column) of each token.
+          mask: which tokens exist; the others are never attended to.
+
+        Returns:
+          The hidden state of the last token and the cache that `extend` and `decode` read.
+        """
+        rotation = self._rotation(positions)
+        causal = jnp.tril(jnp.ones((x.shape[0], x.shape[0]), bool)) & mask
+        caches = []
+        for layer in self.layers:
+            q, cache = layer.project(x, rotation)
+            x = layer.finish(x, attend(q, [KeySource(cache.k, cache.v, causal)]))
+            caches.append(cache)
+        last = jnp.max(jnp.where(mask, positions, -1)) + 1
+        return x[-1], PrefixCache(tuple(caches), mask, last)
+
+    def extend(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T D"]:
+        """Hidden states of a completion under its prompt, all tokens at once (the learner's forward pass)."""
+        t = tokens.shape[0]
+        x = self.embed(tokens)
+        rotation = self._rotation(jnp.broadcast_to(prefix.next_position + jnp.arange(t), (3, t)))
+        causal = jnp.tril(jnp.ones((t, t), bool))
+        for layer, past in zip(self.layers, prefix.layers, strict=True):
+            q, own = layer.project(x, rotation)
+            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(own.k, own.v, causal)]))
+        return x
+
+    def decode(
+        self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: tuple[LayerCache, ...]
+    ) -> tuple[Float[Array, "D"], tuple[LayerCache, ...]]:
+        """Hidden state of completion token t, and the caches with its row written (the sampler's forward pass)."""
+        x = self.embed(token[None])
+        rotation = self._rotation(jnp.broadcast_to(prefix.next_position + t, (3, 1)))
+        written = []
+        for layer, past, cache in zip(self.layers, prefix.layers, caches, strict=True):
+            q, row = layer.project(x, rotation)
+            cache = LayerCache(_write_row(cache.k, row.k, t), _write_row(cache.v, row.v, t))
+            seen = jnp.arange(cache.k.shape[1]) <= t
+            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(cache.k, cache.v, seen)]))
+            written.append(cache)
+        return x[0], tuple(written)
+
+    def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
+        c = self.config
+        return mrope(positions, c.head_dim, c.mrope_section, c.rope_theta)
+
+
+@custom_vmap
+def _write_row(cache: Array, row: Array, t: Array) -> Array:
+    """cache[:, t] = row[:, 0]; stays a slice update in place under `vmap`, where jax's own rule makes a scatter."""
+    return jax.lax.dynamic_update_slice_in_dim(cache, row, t, axis=cache.ndim - 2)
+
+
+@_write_row.def_vmap
+def _write_row_batched(size: int, batched: list[bool], cache: Array, row: Array, t: Array) -> tuple[Array, bool]:
+    if batched[2]:
+        raise ValueError("all rows of a decoding batch are written at the same index t: do not batch t")
+    cache = cache if batched[0] else jnp.broadcast_to(cache, (size, *cache.shape))
+    row = row if batched[1] else jnp.broadcast_to(row, (size, *row.shape))
+    return _write_row(cache, row, t), True

@@ -1,0 +1,183 @@
+"""The policy: touch and vision encoders in front of the decoder, and the prompt that joins them.
+
+    features = encode(frames, force, view)            once per contact
+    logits, prefix = prefill(features, prompt ids)    once per prompt
+    logits = completion_logits(tokens, prefix)        per rollout, the learner
+    logits, cache = decode(token, t, prefix, cache)   per rollout and token, the sampler
+
+Every function but `encode` works on a single prompt or rollout and is batched by `vmap`.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.layers import RMSNorm
+from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache
+from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig, VisionTower
+from touchr1_jax.types import Params, TouchBatch
+
+
+@struct.dataclass
+class Features:
+    """What the decoder reads of one contact: tactile tokens with their frame indices, and view tokens.
+
+    `touch_time` is the integer frame index of each tactile token, never seconds: a cast of seconds per step to integers
+    would zero it and make a temporal control vacuous.
+    """
+
+    touch: Float[Array, "*n S N D"]
+    touch_time: Int[Array, "*n S N"]
+    stream_mask: Bool[Array, "*n S"]
+    view: Float[Array, "*n Nv D"]
+    view_mask: Bool[Array, "*n"]
+
+
+class Slots(NamedTuple):
+    """Where a prompt keeps its embedded tokens: positions on the L axis, as static NumPy integers."""
+
+    touch: np.ndarray  # [S, N]
+    view: np.ndarray  # [Nv]
+    stream_text: np.ndarray  # [L]: stream whose name a text token belongs to, −1 for other tokens
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyConfig:
+    """The three towers; `tactile.sensors` is the number S of streams."""
+
+    tactile: TactileViTConfig
+    vision: VisionConfig
+    decoder: DecoderConfig
+
+
+class Policy(nn.Module):
+    """Parameters and forward passes of the policy; see the module docstring for the order of the calls."""
+
+    config: PolicyConfig
+
+    def setup(self) -> None:
+        c = self.config
+        self.tactile = TactileViT(c.tactile)
+        self.tactile_norm = RMSNorm()
+        self.tactile_in = nn.Dense(2 * c.decoder.hidden_size)
+        self.tactile_out = nn.Dense(c.decoder.hidden_size)
+        self.vision = VisionTower(c.vision, c.decoder.hidden_size)
+        self.decoder = Decoder(c.decoder)
+
+    def encode_streams(self, frames, force_n, frame_index, frame_mask, sensor) -> Float[Array, "*n N D"]:
+        """Tactile tokens of any batch of streams, at the decoder's width; arguments as in `TactileViT`."""
+        x = self.tactile(frames, force_n, frame_index, frame_mask, sensor)
+        x = x.reshape(*x.shape[:-3], -1, x.shape[-1])
+        return self.tactile_out(nn.gelu(self.tactile_in(self.tactile_norm(x))))
+
+    def encode(self, batch: TouchBatch) -> Features:
+        """Encode all streams and the view of each contact of a batch."""
+        sensors = jnp.broadcast_to(jnp.arange(batch.frames.shape[1]), batch.frames.shape[:2])
+        touch = self.encode_streams(batch.frames, batch.force_n, batch.frame_index, batch.frame_mask, sensors)
+        return self._features(batch, touch)
+
+    def encode_blind(self, batch: TouchBatch) -> Features:
+        """The same contacts for a policy without touch: no stream is present, only the view is encoded."""
+        shape = (*self.token_time(batch.frame_index).shape, self.config.decoder.hidden_size)
+        return self._features(batch.replace(stream_mask=jnp.zeros_like(batch.stream_mask)), jnp.zeros(shape))
+
+    def _features(self, batch: TouchBatch, touch: Float[Array, "P S N D"]) -> Features:
+        return Features(
+            touch=touch,
+            touch_time=self.token_time(batch.frame_index),
+            stream_mask=batch.stream_mask,
+            view=self.vision(batch.view),
+            view_mask=batch.view_mask,
+        )
+
+    def token_time(self, frame_index: Int[Array, "*n F"]) -> Int[Array, "*n N"]:
+        """Frame index of each pooled token: that of the first frame of its time step."""
+        c = self.config.tactile
+        first = frame_index.reshape(*frame_index.shape[:-1], -1, c.frames_per_step)[..., 0]
+        return jnp.repeat(first, c.tokens_per_step, -1)
+
+    def prefill(
+        self, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"], slots: Slots, banned: Bool[Array, "V"]
+    ) -> tuple[Float[Array, "V"], PrefixCache]:
+        """Encode one prompt: the logits of the first completion token, and the cache of the prefix."""
+        x = self.decoder.embed(ids)
+        x = x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
+        mask = prompt_mask(features, mask, slots)
+        positions = prompt_positions(features.touch_time, mask, slots, self.config.vision.grid)
+        hidden, prefix = self.decoder.prefill(x, positions, mask)
+        return self.decoder.logits(hidden, banned), prefix
+
+    def completion_logits(
+        self, tokens: Int[Array, "T"], first: Float[Array, "V"], prefix: PrefixCache, banned: Bool[Array, "V"]
+    ) -> Float[Array, "T V"]:
+        """Logits that predict each completion token, the first from the prefix and the others from their predecessors."""
+        hidden = self.decoder.extend(tokens[:-1], prefix)
+        return jnp.concatenate([first[None], self.decoder.logits(hidden, banned)])
+
+    def decode(self, token, t, prefix: PrefixCache, caches: tuple[LayerCache, ...], banned: Bool[Array, "V"]):
+        """Logits of completion token t + 1 after token t, and the grown caches."""
+        hidden, caches = self.decoder.decode(token, t, prefix, caches)
+        return self.decoder.logits(hidden, banned), caches
+
+    def initialise(self, batch: TouchBatch, ids: Int[Array, "L"], mask: Bool[Array, "L"], slots: Slots) -> Array:
+        """Touch every parameter once; `init_policy` calls it."""
+        features = jax.tree.map(lambda x: x[0], self.encode(batch))
+        banned = jnp.zeros(self.config.decoder.vocab_size, bool)
+        first, prefix = self.prefill(features, ids, mask, slots, banned)
+        return self.completion_logits(ids, first, prefix, banned)
+
+
+def init_policy(policy: Policy, key: Array, batch: TouchBatch, ids: Array, mask: Array, slots: Slots) -> Params:
+    """Fresh parameters, float32, from one key and the shapes of a batch and a prompt."""
+    init = jax.jit(lambda k, b: policy.init(k, b, ids, mask, slots, method=Policy.initialise))
+    return init(key, jax.tree.map(lambda x: x[:1], batch))["params"]
+
+
+def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Bool[Array, "L"]:
+    """Which prompt tokens exist: real text, tokens and names of present streams, the view where there is one."""
+    mask = jnp.asarray(mask).at[slots.touch].set(features.stream_mask[:, None])
+    mask = mask.at[slots.view].set(features.view_mask)
+    named = features.stream_mask[np.maximum(slots.stream_text, 0)]
+    return mask & jnp.where(slots.stream_text >= 0, named, True)
+
+
+def prompt_positions(touch_time: Int[Array, "S N"], mask: Bool[Array, "L"], slots: Slots, grid: int) -> Int[Array, "3 L"]:
+    """(time, row, column) id of each prompt token, block by block as Qwen2.5-VL counts them.
+
+    A text token advances all three by one.  A view token keeps the time of its block and adds its row and column.  A
+    tactile token adds its frame index to the time of its block and its number within the step to the column.  A block
+    starts after the largest id before it, and tokens that do not exist advance nothing, so padding changes no position.
+    """
+    owner = np.full(mask.shape[0], -1)
+    owner[slots.view] = 0
+    owner[slots.touch] = 1 + np.arange(len(slots.touch))[:, None]
+    starts = np.flatnonzero(np.diff(owner, prepend=-2))
+    base, blocks = jnp.zeros((), jnp.int32), []
+    for begin, end in zip(starts, [*starts[1:], len(owner)], strict=True):
+        here = mask[begin:end]
+        if owner[begin] < 0:
+            index = jnp.cumsum(here) - 1
+            local = jnp.stack([index, index, index])
+        elif owner[begin] == 0:
+            cell = np.arange(end - begin)
+            local = jnp.stack([jnp.zeros_like(cell), cell // grid, cell % grid])
+        else:
+            time = touch_time[owner[begin] - 1]
+            column = np.concatenate([[0], np.cumsum(np.ones(end - begin - 1, int))])
+            local = jnp.stack([time, jnp.zeros_like(time), jnp.asarray(column) - _run_start(time)])
+        blocks.append(base + local)
+        base = base + jnp.max(jnp.where(here, local, -1), initial=-1) + 1
+    return jnp.concatenate(blocks, 1)
+
+
+def _run_start(time: Int[Array, "N"]) -> Int[Array, "N"]:
+    """Index of the first token with the same time, for tokens in order of time."""
+    fresh = jnp.concatenate([jnp.ones(1, bool), time[1:] != time[:-1]])
+    return jax.lax.cummax(jnp.where(fresh, jnp.arange(time.shape[0]), 0))

@@ -1,0 +1,163 @@
+"""Tactile encoder: a vision transformer over the frames of one tactile stream, pooled to a few tokens per time step.
+
+A stream of F frames becomes F/2 time steps.  Each step is cut into spatial patches, every patch becomes a token, and after
+the transformer each step is pooled by learned queries to `tokens_per_step` tokens that carry its integer frame index.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.layers import MASKED, RMSNorm
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TactileViTConfig:
+    """Shape of the tactile encoder.
+
+    A frame of H × W pixels is read by `stem_px` cells first, then by patches of `patch_cells` cells; `frames_per_step`
+    frames make one time step.  With the defaults 8 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
+    """
+
+    sensors: int
+    width: int = 128
+    num_layers: int = 4
+    num_heads: int = 4
+    mlp_ratio: int = 2
+    stem_px: int = 4
+    stem_width: int = 16
+    patch_cells: int = 7
+    frames_per_step: int = 2
+    tokens_per_step: int = 2
+    use_force: bool = True
+
+
+class TactileViT(nn.Module):
+    """f(frames, force) → tokens, for any leading batch shape."""
+
+    config: TactileViTConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        frames: Float[Array, "*n F H W 3"],
+        force_n: Float[Array, "*n F 3"],
+        frame_index: Int[Array, "*n F"],
+        frame_mask: Bool[Array, "*n F"],
+        sensor: Int[Array, "*n"],
+    ) -> Float[Array, "*n step token D"]:
+        """Encode streams.
+
+        Args:
+          frames: pixel values 0..255.
+          force_n: measured force of each frame, newton; a zero vector where it is unknown.
+          frame_index: position of each frame in its recording.
+          frame_mask: which frames exist.
+          sensor: index of the sensor that saw them.
+
+        Returns:
+          `tokens_per_step` tokens of each time step.
+        """
+        c = self.config
+        x = patch_tokens(frames, c)  # *n step patch D
+        steps = x.shape[-3]
+        step_mask = _group(frame_mask, c.frames_per_step).any(-1)
+        x = x + self.param("patch_position", nn.initializers.normal(0.02), (x.shape[-2], c.width))
+        x = x + nn.Embed(c.sensors, c.width, name="sensor")(sensor)[..., None, None, :]
+        time = _group(frame_index, c.frames_per_step)[..., 0]
+        x = x + nn.Dense(c.width, name="time")(sinusoid(time, 32))[..., None, :]
+        if c.use_force:
+            force = _group(force_features(force_n), c.frames_per_step)
+            force = nn.Dense(c.width, name="force_in")(force.reshape(*force.shape[:-2], -1))
+            x = x + nn.Dense(c.width, name="force_out")(nn.gelu(force))[..., None, :]
+        seen = jnp.repeat(step_mask, x.shape[-2], -1)
+        x = x.reshape(*x.shape[:-3], -1, c.width)
+        for i in range(c.num_layers):
+            x = EncoderLayer(c.width, c.num_heads, c.mlp_ratio, name=f"layer_{i}")(x, seen)
+        x = RMSNorm(name="norm")(x).reshape(*x.shape[:-2], steps, -1, c.width)
+        return QueryPool(c.tokens_per_step, name="pool")(x)
+
+
+def patch_tokens(frames: Float[Array, "*n F H W 3"], c: TactileViTConfig) -> Float[Array, "*n step patch D"]:
+    """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
+
+    The stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
+
+    Raises:
+      ValueError: when the frames do not divide into the configured patches or steps.
+    """
+    *lead, f, h, w, _ = frames.shape
+    cell = c.stem_px * c.patch_cells
+    if h % cell or w % cell or f % c.frames_per_step:
+        raise ValueError(
+            f"frames of {h}×{w} px and {f} per stream must divide into {cell} px patches and steps of "
+            f"{c.frames_per_step}; resize them or change the tactile_vit config"
+        )
+    rows, columns = h // cell, w // cell
+    # cut while the pixels are bytes: (row, cell row, pixel row, column, cell column, pixel column) → patch, cell, pixel
+    x = frames.reshape(*lead, f, rows, c.patch_cells, c.stem_px, columns, c.patch_cells, c.stem_px, 3)
+    n = len(lead)
+    x = x.transpose(*range(n), *(n + i for i in (0, 1, 4, 2, 5, 3, 6, 7)))
+    x = x.reshape(*lead, f, rows * columns, c.patch_cells**2, 3 * c.stem_px**2)
+    x = x.astype(jnp.float32) / 127.5 - 1.0
+    level = nn.Dense(c.stem_width, name="stem_level")(x)
+    change = nn.Dense(c.stem_width, use_bias=False, name="stem_change")(x)
+    x = nn.gelu(level + 4.0 * (change - change[..., :1, :, :, :]))
+    x = x.reshape(*lead, f // c.frames_per_step, c.frames_per_step, rows * columns, -1).swapaxes(-3, -2)
+    return nn.Dense(c.width, name="patch")(x.reshape(*x.shape[:-2], -1))
+
+
+class EncoderLayer(nn.Module):
+    """Pre-norm transformer layer with full attention over the tokens that exist."""
+
+    width: int
+    num_heads: int
+    mlp_ratio: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*n N D"], mask: Bool[Array, "*n N"]) -> Float[Array, "*n N D"]:
+        head = self.width // self.num_heads
+        qkv = nn.Dense(3 * self.width, name="qkv")(RMSNorm(name="norm_attention")(x))
+        q, k, v = jnp.split(qkv.reshape(*qkv.shape[:-1], 3 * self.num_heads, head), 3, -2)
+        scores = jnp.einsum("...qhd,...khd->...hqk", q, k) * head**-0.5
+        weights = nn.softmax(jnp.where(mask[..., None, None, :], scores, MASKED), -1)
+        mixed = jnp.einsum("...hqk,...khd->...qhd", weights, v)
+        x = x + nn.Dense(self.width, name="out")(mixed.reshape(x.shape))
+        y = nn.gelu(nn.Dense(self.mlp_ratio * self.width, name="up")(RMSNorm(name="norm_mlp")(x)))
+        return x + nn.Dense(self.width, name="down")(y)
+
+
+class QueryPool(nn.Module):
+    """Attention pooling of the patches of one time step by learned queries, softmax(Q kᵀ/√d) v."""
+
+    queries: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*n patch D"]) -> Float[Array, "*n query D"]:
+        width = x.shape[-1]
+        query = self.param("query", nn.initializers.normal(0.5), (self.queries, width))
+        k, v = jnp.split(nn.Dense(2 * width, name="kv")(x), 2, -1)
+        weights = nn.softmax(jnp.einsum("qd,...pd->...qp", query, k) * width**-0.5, -1)
+        return jnp.einsum("...qp,...pd->...qd", weights, v)
+
+
+def force_features(force_n: Float[Array, "*n 3"]) -> Float[Array, "*n 5"]:
+    """Force at the scale of a 20 N press: (f/10 N, log(1 + |f_z|/0.1 N) − 2, 1 where a force is known)."""
+    size = jnp.abs(force_n[..., 2:])
+    known = jnp.any(force_n != 0, -1, keepdims=True).astype(force_n.dtype)
+    return jnp.concatenate([force_n / 10.0, (jnp.log1p(size / 0.1) - 2.0) * known, known], -1)
+
+
+def sinusoid(index: Int[Array, "*n"], width: int) -> Float[Array, "*n width"]:
+    """Sine and cosine of an integer at geometric frequencies 1 … 1/1000 (Vaswani et al. 2017)."""
+    frequency = 1000.0 ** (-jnp.arange(width // 2) / (width // 2 - 1))
+    angle = index[..., None] * frequency
+    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
+
+
+def _group(x: Array, size: int) -> Array:
+    """Split the frame axis into (step, frame of the step): axis 1 from the end for masks, 2 for vectors."""
+    axis = x.ndim - 1 if x.dtype == bool or jnp.issubdtype(x.dtype, jnp.integer) else x.ndim - 2
+    return x.reshape(*x.shape[:axis], x.shape[axis] // size, size, *x.shape[axis + 1 :])

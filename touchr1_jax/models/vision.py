@@ -1,0 +1,54 @@
+"""Vision tower: a small transformer over the object's picture, merged 2 × 2 into tokens for the language model."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float, UInt8
+
+from touchr1_jax.models.layers import RMSNorm
+from touchr1_jax.models.tactile_vit import EncoderLayer
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VisionConfig:
+    """Shape of the vision tower; a 64 px view in 16 px patches gives 16 patches, merged to 4 tokens."""
+
+    image_px: int = 64
+    patch_px: int = 16
+    width: int = 64
+    num_layers: int = 1
+    num_heads: int = 2
+    mlp_ratio: int = 2
+
+    @property
+    def grid(self) -> int:
+        """Tokens along one side after the merger."""
+        return self.image_px // self.patch_px // 2
+
+
+class VisionTower(nn.Module):
+    """f(view) → grid² tokens of the language model's width, row by row."""
+
+    config: VisionConfig
+    out_width: int
+
+    @nn.compact
+    def __call__(self, view: UInt8[Array, "*n H W 3"]) -> Float[Array, "*n token D"]:
+        c = self.config
+        *lead, h, w, _ = view.shape
+        if (h, w) != (c.image_px, c.image_px):
+            raise ValueError(f"view is {h}×{w} px, the vision config says {c.image_px}²; resize it or change the config")
+        x = view.astype(jnp.float32) / 127.5 - 1.0
+        # windows of 2 × 2 patches are the outer blocks, so that the merger is a reshape
+        block = 2 * c.patch_px
+        x = x.reshape(*lead, c.grid, block, c.grid, block, 3)
+        x = jnp.moveaxis(x, -3, -4).reshape(*lead, c.grid**2, 2, c.patch_px, 2, c.patch_px, 3)
+        x = jnp.moveaxis(x, -3, -4).reshape(*lead, 4 * c.grid**2, -1)
+        x = nn.Dense(c.width, name="patch")(x)
+        x = x + self.param("position", nn.initializers.normal(0.02), (x.shape[-2], c.width))
+        for i in range(c.num_layers):
+            x = EncoderLayer(c.width, c.num_heads, c.mlp_ratio, name=f"layer_{i}")(x, jnp.ones(x.shape[:-1], bool))
+        x = RMSNorm(name="norm")(x).reshape(*lead, c.grid**2, 4 * c.width)
+        x = nn.gelu(nn.Dense(4 * c.width, name="merge_in")(x))
+        return nn.Dense(self.out_width, name="merge_out")(x)

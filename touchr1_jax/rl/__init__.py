@@ -1,0 +1,1 @@
+"""Group rollouts, advantages, divergences, losses, and the one jitted GRPO step that joins them."""

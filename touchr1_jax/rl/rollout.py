@@ -1,0 +1,100 @@
+"""Sample a group of completions per prompt from a shared, once-encoded prefix.
+
+The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix batched).
+The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.types import Rollout
+
+DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[Array, tuple[LayerCache, ...]]]
+"""(token [], t [], prefix, caches) → (logits [V] of token t + 1, caches), for one rollout."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SampleConfig:
+    """How completions are drawn: `group` of them per prompt, `length` tokens at most, greedily or at temperature 1."""
+
+    group: int
+    length: int
+    end_ids: tuple[int, ...]
+    pad_id: int
+    greedy: bool = False
+
+
+class _Loop(NamedTuple):
+    t: Int[Array, ""]
+    logits: Float[Array, "P G V"]
+    alive: Bool[Array, "P G"]
+    caches: tuple[LayerCache, ...]
+    tokens: Int[Array, "T P G"]
+    log_prob: Float[Array, "T P G"]
+    mask: Bool[Array, "T P G"]
+
+
+def sample(
+    decode: DecodeFn,
+    first: Float[Array, "P V"],
+    prefix: PrefixCache,
+    empty: tuple[LayerCache, ...],
+    key: Array,
+    config: SampleConfig,
+) -> Rollout:
+    """Draw `group` completions of each prompt, o_t ~ π(· | prefix, o_<t), stopping when all have ended.
+
+    Args:
+      decode: token step of one rollout.
+      first: logits of the first token of each prompt.
+      prefix: encoded prompts, batched over P.
+      empty: caches of one completion.
+      key: randomness; token t uses `fold_in(key, t)`.
+      config: group size, lengths, end and padding ids.
+
+    Returns:
+      A `Rollout` [P, G, T]; after the end token ids are `pad_id`, log-probabilities 0 and the mask false.
+    """
+    p, g, t_max = first.shape[0], config.group, config.length
+    step = jax.vmap(jax.vmap(decode, in_axes=(0, None, None, 0)), in_axes=(0, None, 0, 0))
+    ends = jnp.asarray(config.end_ids)
+
+    def body(loop: _Loop) -> _Loop:
+        token = _draw(loop.logits, jax.random.fold_in(key, loop.t), config.greedy)
+        log_prob = jnp.take_along_axis(jax.nn.log_softmax(loop.logits), token[..., None], -1)[..., 0]
+        token = jnp.where(loop.alive, token, config.pad_id)
+        logits, caches = step(token, loop.t, prefix, loop.caches)
+        return _Loop(
+            t=loop.t + 1,
+            logits=logits,
+            alive=loop.alive & ~jnp.isin(token, ends),
+            caches=caches,
+            tokens=loop.tokens.at[loop.t].set(token),
+            log_prob=loop.log_prob.at[loop.t].set(jnp.where(loop.alive, log_prob, 0.0)),
+            mask=loop.mask.at[loop.t].set(loop.alive),
+        )
+
+    start = _Loop(
+        t=jnp.zeros((), jnp.int32),
+        logits=jnp.broadcast_to(first[:, None], (p, g, first.shape[-1])),
+        alive=jnp.ones((p, g), bool),
+        caches=jax.tree.map(lambda c: jnp.broadcast_to(c, (p, g, *c.shape)), empty),
+        tokens=jnp.full((t_max, p, g), config.pad_id, jnp.int32),
+        log_prob=jnp.zeros((t_max, p, g)),
+        mask=jnp.zeros((t_max, p, g), bool),
+    )
+    end = jax.lax.while_loop(lambda s: (s.t < t_max) & jnp.any(s.alive), body, start)
+    by_rollout = lambda x: jnp.moveaxis(x, 0, -1)
+    return Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
+
+
+def _draw(logits: Float[Array, "P G V"], key: Array, greedy: bool) -> Int[Array, "P G"]:
+    """Gumbel-max sample, or the most likely token."""
+    noise = 0.0 if greedy else jax.random.gumbel(key, logits.shape)
+    return jnp.argmax(logits + noise, -1).astype(jnp.int32)

@@ -1,0 +1,38 @@
+"""The optimizers of the stages."""
+
+import dataclasses
+
+import optax
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OptimizerConfig:
+    """AdamW with linear warm-up and cosine decay to `final_share` of the peak.
+
+    `learning_rate` is the paper's; models trained from scratch multiply it by `lr_scale`, which every report prints.
+    """
+
+    learning_rate: float
+    lr_scale: float = 100.0
+    warmup_steps: int = 20
+    final_share: float = 0.05
+    weight_decay: float = 0.0
+    b2: float = 0.95
+    max_grad_norm: float = 1.0
+
+    @property
+    def peak(self) -> float:
+        """The learning rate that is used, learning_rate · lr_scale."""
+        return self.learning_rate * self.lr_scale
+
+
+def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
+    """Clip the global gradient norm, then AdamW on the schedule of `steps` steps."""
+    warmup = min(config.warmup_steps, steps // 2)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0.0, config.peak, warmup, max(steps, warmup + 1), end_value=config.peak * config.final_share
+    )
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adamw(schedule, b2=config.b2, weight_decay=config.weight_decay),
+    )
