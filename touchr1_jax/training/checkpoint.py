@@ -40,6 +40,10 @@ class Checkpoints:
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), data=ocp.args.JsonSave({"data": data}))
         self._manager.save(step, args=args)
 
+    def latest(self) -> int | None:
+        """Step of the newest checkpoint."""
+        return self._manager.latest_step()
+
     def restore(self, like: Any) -> Restored | None:
         """The newest checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none."""
         step = self._manager.latest_step()

@@ -6,6 +6,7 @@ so that its answers are as fallible as that sensor is.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -36,14 +37,14 @@ def stream_features(frames: UInt8[Array, "*n F H W 3"], force_n: Float[Array, "*
     """
     x = frames.astype(jnp.float32) / 255.0
     change = x - x[..., :1, :, :, :]
-    over = (-3, -2)
     *lead, h, w, c = x.shape
-    coarse = x.reshape(*lead, h // 4, 4, w // 4, 4, c).mean((-4, -2))
+    coarse = x.reshape(*lead, h // 4, 4, w * c).mean(-2).reshape(*lead, h // 4, w // 4, 4, c).mean(-2)
     fine_energy, coarse_energy = _gradient_energy(x), _gradient_energy(coarse)
+    centre = _pixel_mean(change)
     parts = [
-        change.mean(over),
-        jnp.log(jnp.abs(change).mean(over) + TINY),
-        jnp.log(change.std(over) + TINY),
+        centre,
+        jnp.log(_pixel_mean(jnp.abs(change)) + TINY),
+        jnp.log(jnp.sqrt(jnp.maximum(_pixel_mean(change**2) - centre**2, 0.0)) + TINY),
         fine_energy,
         coarse_energy,
         fine_energy - fine_energy[..., :1, :],
@@ -53,16 +54,43 @@ def stream_features(frames: UInt8[Array, "*n F H W 3"], force_n: Float[Array, "*
     return stacked.reshape(*stacked.shape[:-2], -1)
 
 
-def cross_fit(
-    features: Float[np.ndarray, "n D"], labels: Int[np.ndarray, "n"], groups: np.ndarray, levels: int, config: ProbeConfig
-) -> Int[np.ndarray, "n"]:
-    """Level that a probe trained on the other folds gives each row; folds are made of whole groups.
+def probe_log_probs(
+    features: Float[np.ndarray, "n D"],
+    labels: Int[np.ndarray, "n"],
+    weights: Float[np.ndarray, "fit n"],
+    levels: int,
+    config: ProbeConfig,
+) -> Float[np.ndarray, "fit n K"]:
+    """Log-probabilities of all rows under one multinomial probe per row of weights.
 
     Args:
       features: one row per example.
-      labels: 0 … levels − 1; rows below 0 are predicted but not trained on.
-      groups: identity whose rows stay together, such as the object.
-      levels: number of classes.
+      labels: 0 … levels − 1; a row below 0 must have weight 0.
+      weights: how much each example counts in each fit; 0 holds it out.
+      levels: number of classes K.
+      config: penalty and iterations.
+    """
+    fits = [
+        _fit_probe(jnp.asarray(features), jnp.maximum(labels, 0), jnp.asarray(w, jnp.float32), levels, config)
+        for w in weights
+    ]
+    return np.asarray(jax.nn.log_softmax(jnp.stack(fits)))
+
+
+def cross_fit(
+    features: Float[np.ndarray, "n D"],
+    labels: Int[np.ndarray, "n"],
+    groups: np.ndarray,
+    levels: int,
+    config: ProbeConfig,
+) -> Float[np.ndarray, "n K"]:
+    """Out-of-fold log-probabilities: each row is read by a probe that was trained on the other folds.
+
+    Args:
+      features: one row per example.
+      labels: 0 … levels − 1; rows below 0 are read but not trained on.
+      groups: identity whose rows stay together in a fold, such as the object.
+      levels: number of classes K.
       config: folds and fit.
 
     Raises:
@@ -72,13 +100,11 @@ def cross_fit(
     if len(names) < config.folds:
         raise ValueError(f"groups has {len(names)} members, fewer than folds = {config.folds}; lower folds")
     fold = np.random.default_rng(0).permutation(len(names))[group] % config.folds
-    weights = np.stack([(fold != k) & (labels >= 0) for k in range(config.folds)]).astype(np.float32)
-    rows, targets = jnp.asarray(features), jnp.maximum(jnp.asarray(labels), 0)
-    fit = jax.vmap(lambda w: _fit_probe(rows, targets, w, levels, config))
-    scores = jax.jit(fit)(jnp.asarray(weights))
-    return np.asarray(jnp.argmax(scores, -1))[fold, np.arange(len(fold))]
+    weights = np.stack([(fold != k) & (labels >= 0) for k in range(config.folds)])
+    return probe_log_probs(features, labels, weights, levels, config)[fold, np.arange(len(fold))]
 
 
+@functools.partial(jax.jit, static_argnames=("levels", "config"))
 def _fit_probe(
     x: Float[Array, "n D"], y: Int[Array, "n"], weight: Float[Array, "n"], levels: int, config: ProbeConfig
 ) -> Float[Array, "n K"]:
@@ -108,6 +134,12 @@ def _fit_probe(
 
 
 def _gradient_energy(x: Float[Array, "*n h w c"]) -> Float[Array, "*n c"]:
-    vertical = jnp.abs(jnp.diff(x, axis=-3)).mean((-3, -2))
-    horizontal = jnp.abs(jnp.diff(x, axis=-2)).mean((-3, -2))
+    vertical = _pixel_mean(jnp.abs(jnp.diff(x, axis=-3)))
+    horizontal = _pixel_mean(jnp.abs(jnp.diff(x, axis=-2)))
     return jnp.log(vertical + horizontal + TINY)
+
+
+def _pixel_mean(x: Float[Array, "*n h w c"]) -> Float[Array, "*n c"]:
+    """Mean over pixels; rows first, over long contiguous lines, because three channels alone do not vectorise."""
+    *lead, h, w, c = x.shape
+    return x.reshape(*lead, h, w * c).mean(-2).reshape(*lead, w, c).mean(-2)

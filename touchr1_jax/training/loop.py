@@ -34,7 +34,6 @@ def fit(
     *,
     checkpoints: Checkpoints,
     log: Callable[[int, dict[str, float]], None],
-    resumed: Callable[[int], None] = lambda step: None,
 ) -> Any:
     """Run `step` to `config.steps`, continuing from the newest checkpoint where there is one.
 
@@ -48,14 +47,12 @@ def fit(
       config: how long, and how often to save.
       checkpoints: where to save.
       log: receives (step, metrics) in order; steps count from 0.
-      resumed: told the step from which this call goes on, before any is taken.
     """
     restored = checkpoints.restore(state)
     start = 0
     if restored is not None:
         start, state = restored.step, restored.state
         batches.set_state(restored.data)
-    resumed(start)
     pending: tuple[int, dict[str, jax.Array]] | None = None
     for t in range(start, config.steps):
         state, metrics = step(state, next(batches))

@@ -1,0 +1,8 @@
+"""`python -m experiments`: run, continue and list experiments."""
+
+import sys
+
+from experiments.runner import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""Files that are whole or not there: JSON values of anything an experiment holds, published atomically."""
+
+import dataclasses
+import enum
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def jsonable(value: Any, where: str = "value") -> Any:
+    """The same value in JSON's own types: dataclasses and mappings become objects, tuples and arrays lists.
+
+    Raises:
+      ValueError: a number is not finite (JSON has no word for it), or an object's key is no string.
+      TypeError: a type that has no JSON form.
+    """
+    if isinstance(value, enum.Enum):
+        return jsonable(value.value, where)
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"{where} is {value}: must be finite to be written as JSON; leave undefined numbers out")
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {_key(key, where): jsonable(item, f"{where}.{key}") for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(item, f"{where}[{i}]") for i, item in enumerate(value)]
+    if hasattr(value, "__array__"):  # NumPy and JAX arrays and scalars alike
+        return jsonable(np.asarray(value).tolist(), where)
+    raise TypeError(f"{where} is a {type(value).__name__}: it has no JSON form; convert it to numbers, text or lists")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Publish a file atomically: write a temporary sibling, flush it to the disk, then put it in its place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Publish a UTF-8 text atomically."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Publish a value as indented JSON, atomically."""
+    write_text(path, json.dumps(jsonable(value), indent=2, ensure_ascii=False) + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def point_link(link: Path, target: str) -> None:
+    """Make `link` a symbolic link to `target`, replacing an older link atomically.
+
+    Raises:
+      FileExistsError: something that is no link is in the way.
+    """
+    if link.exists() and not link.is_symlink():
+        raise FileExistsError(f"{link} is no symbolic link, so it is not replaced; move it away")
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target)
+    os.replace(temporary, link)
+
+
+def _key(key: Any, where: str) -> str:
+    if not isinstance(key, str):
+        raise ValueError(f"{where} has the key {key!r}: keys must be strings in JSON; rename it")
+    return key

@@ -1,0 +1,120 @@
+"""From a configuration to the objects of one experiment: tokenizer, prompts, policy, parser, rewards."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rl.grpo import ScoreFn
+from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
+from touchr1_jax.text.parser import Parser, compile_parser
+from touchr1_jax.text.template import PromptLayout, build_layout, prompt_words
+from touchr1_jax.text.tokenizer import Tokenizer, word_level
+from touchr1_jax.types import Params, Parsed, Target, TouchBatch
+
+Weights = Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Sizes of the towers, about one million parameters by default; sensors and vocabulary come from the data."""
+
+    tactile: TactileViTConfig = TactileViTConfig(sensors=0)
+    vision: VisionConfig = VisionConfig()
+    decoder: DecoderConfig = DecoderConfig(vocab_size=0)
+    frames: int = 8
+    image_px: int = 112
+    completion_tokens: int = 24
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Assembly:
+    """Everything static that the stages share."""
+
+    model: ModelConfig
+    language: Language
+    tokenizer: Tokenizer
+    layout: PromptLayout
+    agent: Agent
+    parser: Parser
+
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """K of each attribute."""
+        return tuple(len(a.levels) for a in self.language.attributes)
+
+    def init(self, seed: int, batch: TouchBatch) -> Params:
+        """Fresh parameters."""
+        layout = self.layout
+        return init_policy(self.agent.policy, jax.random.key(seed), batch, layout.ids[0], layout.mask[0], self.agent.slots)
+
+    def score(self, weights: Weights, prior: Float[np.ndarray, "A K"]) -> ScoreFn:
+        """Total reward of one completion under the given weights."""
+        rewards = make_rewards(prior)
+
+        def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
+            parsed = self.parser(tokens)
+            reward, terms = total_reward(rewards, weights, parsed, target)
+            return reward, terms, parsed
+
+        return score
+
+    def target(
+        self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray
+    ) -> Target:
+        """Targets of single-attribute questions; labels of the attributes that are not asked are hidden."""
+        asked = self.layout.asked[attribute]
+        ordinal = np.array([a.ordinal for a in self.language.attributes])
+        return Target(
+            asked=jnp.asarray(asked),
+            label=jnp.asarray(np.where(asked, label, -1), jnp.int32),
+            levels=jnp.broadcast_to(jnp.asarray(self.levels, jnp.int32), asked.shape),
+            ordinal=jnp.broadcast_to(jnp.asarray(ordinal), asked.shape),
+            streams=jnp.asarray(streams),
+        )
+
+
+def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
+    """Put tokenizer, prompt layout, policy and parser together for a set of sensors.
+
+    Raises:
+      ValueError: a sensor that the language does not know.
+    """
+    known = {s.name: s for s in TOUCH_LANGUAGE.sensors}
+    unknown = [s for s in sensors if s not in known]
+    if unknown:
+        raise ValueError(f"sensors {unknown} are not in the language, which knows {', '.join(known)}; add them to it")
+    language = dataclasses.replace(TOUCH_LANGUAGE, sensors=tuple(known[s] for s in sensors))
+    tokenizer = word_level(language, prompt_words())
+    policy_config = PolicyConfig(
+        tactile=dataclasses.replace(model.tactile, sensors=len(sensors)),
+        vision=model.vision,
+        decoder=dataclasses.replace(model.decoder, vocab_size=tokenizer.vocab_size),
+    )
+    steps = model.frames // model.tactile.frames_per_step
+    layout = build_layout(
+        tokenizer,
+        language,
+        tactile_tokens=steps * model.tactile.tokens_per_step,
+        view_tokens=model.vision.grid**2,
+    )
+    agent = Agent(
+        policy=Policy(policy_config),
+        slots=Slots(layout.touch, layout.view, layout.stream_text),
+        banned=tokenizer.banned,
+        end_ids=tokenizer.end_ids,
+        pad_id=tokenizer.pad_id,
+    )
+    parser = compile_parser(language, tokenizer)
+    return Assembly(
+        model=model, language=language, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser
+    )

@@ -1,0 +1,92 @@
+"""The data of an experiment: made or imported once, cached by the hash of its configuration, split by object."""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from experiments.progress import Advance
+from sensors_io.pipeline import ClipConfig, clip_batches
+from sensors_io.records import RecordStore
+from sensors_io.scenes.protocol import SceneConfig
+from sensors_io.schema import ATTRIBUTES, CLIP_ARRAYS, LEVELS
+from touchr1_jax.types import TouchBatch
+
+Kind = Literal["generated", "physiclear", "records"]
+PARTS = ("sft", "grpo", "val", "test")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """Contacts on disk and what the stages need to know of them.
+
+    `parts` maps each of `PARTS` to contact indices; no object is in two of them.  `label` is int32 [contact, A].
+    """
+
+    store: RecordStore
+    clip: ClipConfig
+    parts: dict[str, np.ndarray]
+    label: np.ndarray
+    object_ids: np.ndarray
+    visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
+
+    def prior(self) -> np.ndarray:
+        """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0."""
+        train = self.label[np.concatenate([self.parts["sft"], self.parts["grpo"]])]
+        rows = np.zeros((len(ATTRIBUTES), max(LEVELS.values())), np.float32)
+        for a, name in enumerate(ATTRIBUTES):
+            known = train[train[:, a] >= 0, a]
+            rows[a, : LEVELS[name]] = np.bincount(known, minlength=LEVELS[name]) / max(len(known), 1)
+        return rows
+
+    def summary(self) -> dict[str, Any]:
+        """Counts for the report."""
+        counts = {f"{part}_contacts": len(rows) for part, rows in self.parts.items()}
+        counts |= {f"{part}_objects": len(set(self.object_ids[rows])) for part, rows in self.parts.items()}
+        test = self.parts["test"]
+        return counts | {
+            "source": self.store.meta.source,
+            "sensors": list(self.clip.sensors),
+            "frames_per_clip": self.clip.frames,
+            "image_px": self.clip.image_px,
+            "test_visual_lie_share": float(self.visual_lies[test].mean()),
+        }
+
+
+def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
+
+    Raises:
+      ValueError: a part without a contact.
+    """
+    train = store.contacts_of_split("train")
+    ids = np.array([store.contacts[i].object_id for i in train])
+    names = np.unique(ids)
+    held = np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))]
+    kept = np.isin(ids, held)
+    val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
+    parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
+    for name, rows in parts.items():
+        if not len(rows):
+            raise ValueError(
+                f"part {name!r} of the data set holds no contact: every part needs one; use more objects or "
+                f"another grpo_share (now {grpo_share})"
+            )
+    return parts
+
+
+def open_dataset(path: Path, clip: ClipConfig, grpo_share: float) -> Dataset:
+    """Open records and split them."""
+    store = RecordStore(path)
+    cards = [store.objects[key.object_id] for key in store.contacts]
+    return Dataset(
+        store=store,
+        clip=clip,
+        parts=split_parts(store, grpo_share),
+        label=np.stack([card.label_row() for card in cards]),
+        object_ids=np.array([card.object_id for card in cards]),
+        visual_lies=np.array([bool(card.visual_lies) for card in cards]),
+    )

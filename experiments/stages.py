@@ -1,0 +1,256 @@
+"""The stages that experiments are made of: evidence, SFT, encoding, GRPO, evaluation.
+
+Each is a function of its configuration and inputs; what it leaves behind lies in the run's directory, so that a stopped
+run goes on from its last checkpoint.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from experiments.assembly import Assembly, Weights
+from experiments.context import Context
+from experiments.dataset import Dataset
+from experiments.feeds import AnswerFeed, QuestionFeed, each, question_batch, touch_batch
+from sensors_io.pipeline import clip_batches
+from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.bench.metrics import Answers
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.greedy import make_answer
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step
+from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
+from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.sft import SFTState, make_sft_step
+from touchr1_jax.types import Params, Parsed
+
+EVAL_BATCH = 64
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SFTConfig:
+    """Stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 300
+    batch_size: int = 16
+    save_every: int = 100
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Probed:
+    """Fixed features of every contact's streams, float32 [contact, S, D], and of its force alone, [contact, D']."""
+
+    streams: np.ndarray
+    force: np.ndarray
+
+
+def probe_features(data: Dataset, context: Context) -> Probed:
+    """Summarise all contacts once; every seed shares it."""
+    rows = np.arange(len(data.store))
+    clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
+    streams, force = [], []
+    with context.progress("reading touch", len(rows)) as advance:
+        for clip in clips:
+            streams.append(np.asarray(stream_features(clip["frames"], clip["force_n"])))
+            force.append(clip["force_n"].reshape(len(clip["force_n"]), -1))
+            advance(len(clip["contact"]))
+    return Probed(streams=np.concatenate(streams), force=np.concatenate(force))
+
+
+def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
+    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts; other contacts and levels have −inf."""
+    rows = data.parts["sft"]
+    groups = data.object_ids[rows]
+    out = np.full((len(data.store), len(data.clip.sensors), len(ATTRIBUTES), max(LEVELS.values())), -np.inf, np.float32)
+    for s in range(len(data.clip.sensors)):
+        for a, name in enumerate(ATTRIBUTES):
+            out[rows, s, a, : LEVELS[name]] = cross_fit(
+                probed.streams[rows, s], data.label[rows, a], groups, LEVELS[name], config
+            )
+    return out
+
+
+def run_sft(
+    assembly: Assembly, data: Dataset, evidence: np.ndarray, config: SFTConfig, context: Context, *, seed: int, stage: str,
+    blind: bool = False,
+) -> Params:
+    """Train a policy from scratch on verified answers; a blind one never feels anything."""
+    feed = AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, seed=seed, blind=blind)
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
+    params = assembly.init(seed, touch_batch(next(iter(clips))))
+    state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
+    step = make_sft_step(assembly.agent, optimizer, blind=blind)
+    return _fit(step, state, feed, LoopConfig(steps=config.steps, save_every=config.save_every), context, stage).params
+
+
+def _fit(step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str) -> Any:
+    """`fit` with the run's checkpoints, log and progress bar."""
+    with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
+        start = checkpoints.latest() or 0
+        context.rewind(stage, start)
+        with context.progress(stage, loop.steps, start) as advance:
+
+            def log(t: int, metrics: dict[str, float]) -> None:
+                context.log(stage, t, **metrics)
+                advance()
+
+            return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
+
+
+def encode_contacts(
+    assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool = False
+) -> Features:
+    """Encode contacts once and keep the features on the host, in the order of `rows`."""
+    clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
+    encode = jax.jit(lambda p, b: assembly.agent.encode(p, b, blind=blind))
+    parts = []
+    with context.progress("encoding", len(rows)) as advance:
+        for clip in clips:
+            parts.append(jax.device_get(encode(params, touch_batch(clip))))
+            advance(len(clip["contact"]))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def noise_bank(
+    agent: Agent, params: Params, data: Dataset, *, seed: int, draws: int = 64, probe: int = 64
+) -> Float[Array, "K S N D"]:
+    """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
+
+    The statistics are those of `probe` SFT contacts.  Frame times are those of an undisturbed stream.
+    """
+    clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=probe, seed=seed, repeat=False)
+    clip = next(iter(clips))
+    pixels, force = clip["frames"].astype(np.float32), clip["force_n"]
+    pixel_stats = pixels.mean((0, 2, 3, 4)), pixels.std((0, 2, 3, 4))  # [S, 3]
+    force_stats = force.mean((0, 2)), force.std((0, 2))
+    s, f, h, w = pixels.shape[1:5]
+
+    @jax.jit
+    def draw(key: Array) -> Float[Array, "S N D"]:
+        pixel_key, force_key = jax.random.split(key)
+        noise = jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_stats[1][:, None, None, None] + pixel_stats[0][:, None, None, None]
+        push = jax.random.normal(force_key, (s, f, 3)) * force_stats[1][:, None] + force_stats[0][:, None]
+        index, mask = jnp.asarray(clip["frame_index"][0]), jnp.asarray(clip["frame_mask"][0])
+        return agent.encode_streams(params, jnp.clip(noise, 0, 255), push, index, mask, jnp.arange(s))
+
+    return jax.lax.map(draw, jax.random.split(jax.random.key(seed), draws))
+
+
+def run_grpo(
+    assembly: Assembly,
+    params: Params,
+    features: Features,
+    label: np.ndarray,
+    noise: Float[Array, "K S N D"],
+    weights: Weights,
+    prior: np.ndarray,
+    config: GRPOConfig,
+    loop: LoopConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+) -> Params:
+    """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
+    feed = QuestionFeed(assembly, features, label, batch_size=config.prompts, seed=seed)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.adamw(config.learning_rate * config.lr_scale, weight_decay=0.0)
+    )
+    decoder = {"decoder": params["decoder"]}
+    trained = jax.tree.map(jnp.copy, decoder)
+    state = GRPOState(
+        params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32), key=jax.random.key(seed)
+    )
+    step = make_grpo_step(assembly.agent, assembly.score(weights, prior), optimizer, config)
+    fixed = Fixed(reference=decoder, noise=noise)
+    end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage)
+    return {**params, **end.params}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluated:
+    """Greedy answers to every question about some contacts; question n is about contact `contact[n]`."""
+
+    contact: np.ndarray
+    attribute: np.ndarray
+    streams: np.ndarray
+    tokens: np.ndarray
+    parsed: Parsed
+    label: np.ndarray  # int32 [N, A], −1 where not asked
+    alone: np.ndarray | None  # int32 [N, S, A]
+
+    def answers(self, reward: np.ndarray) -> Answers:
+        """What the metrics read."""
+        return Answers(
+            conclude=self.parsed.conclude,
+            label=self.label,
+            formatted=self.parsed.formatted,
+            reward=reward,
+            streams=self.streams,
+            perceive=self.parsed.perceive,
+            alone=self.alone,
+        )
+
+
+def evaluate_policy(
+    assembly: Assembly, params: Params, features: Features, label: np.ndarray, prior: np.ndarray
+) -> Evaluated:
+    """Ask every labelled question about every contact, with all streams and with each stream alone."""
+    contact, attribute = np.nonzero(label >= 0)
+    present = features.stream_mask[contact]
+    ask = make_answer(assembly.agent, assembly.score({"format": 1.0}, prior), assembly.model.completion_tokens)
+    said = _ask(ask, assembly, params, features, label, contact, attribute, present)
+    s = present.shape[1]
+    alone = None
+    if present.any() and s > 1:
+        each_alone = [
+            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i)) for i in range(s)
+        ]
+        alone = np.stack([x.parsed.conclude for x in each_alone], 1)
+    return Evaluated(
+        contact=contact,
+        attribute=attribute,
+        streams=present,
+        tokens=said.tokens,
+        parsed=said.parsed,
+        label=np.where(assembly.layout.asked[attribute], label[contact], -1),
+        alone=alone,
+    )
+
+
+def _ask(ask, assembly, params, features, label, contact, attribute, streams):
+    """Greedy answers to all questions, in blocks of one size so that the program is compiled once."""
+    decoder, blocks = {"decoder": params["decoder"]}, []
+    for rows, real in each(len(contact), EVAL_BATCH):
+        batch = question_batch(assembly, features, label, contact[rows], attribute[rows], streams[rows])
+        blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(decoder, batch)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> np.ndarray:
+    """Total reward of each answer under the given weights, float32 [N]."""
+    rewards = make_rewards(prior)
+    target = assembly.target(done.attribute, done.label, done.streams)
+    score = jax.jit(jax.vmap(lambda p, t: total_reward(rewards, weights, p, t)[0]))
+    return np.asarray(score(jax.tree.map(jnp.asarray, done.parsed), target))
+
+
+def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
+    """Levels that a probe on the measured forces alone gives contacts, int [len(rows), A]: what the ramp gives away."""
+    train = np.isin(np.arange(len(data.store)), np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+    columns = []
+    for a, name in enumerate(ATTRIBUTES):
+        weight = (train & (data.label[:, a] >= 0))[None]
+        columns.append(probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)[0, rows].argmax(-1))
+    return np.stack(columns, 1)

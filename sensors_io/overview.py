@@ -1,0 +1,82 @@
+"""Tables of what a data set holds, for the command line."""
+
+import collections
+import dataclasses
+from collections.abc import Iterable
+
+import numpy as np
+from rich.table import Table
+
+from sensors_io.importers.physiclear import ImportReport
+from sensors_io.records import RecordStore
+from sensors_io.schema import ATTRIBUTES, MATERIALS, SPLITS, UNKNOWN, Flag, Sequence
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FlagCounts:
+    """Frames that carry each quality flag, and all frames, by sensor."""
+
+    flags: collections.Counter[tuple[str, Flag]] = dataclasses.field(default_factory=collections.Counter)
+    frames: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+
+    def add(self, sequences: Iterable[Sequence]) -> None:
+        """Count the frames of some sequences; a frame without a flag counts under `Flag.NONE`."""
+        for sequence in sequences:
+            self.frames[sequence.sensor] += len(sequence)
+            self.flags[sequence.sensor, Flag.NONE] += int(np.count_nonzero(sequence.flags == 0))
+            for flag in Flag:
+                self.flags[sequence.sensor, flag] += int(np.count_nonzero(sequence.flags & np.uint32(flag)))
+
+
+def summary_table(store: RecordStore) -> Table:
+    """Source, counts by sensor and by split."""
+    table = Table(title=str(store.path), show_header=False)
+    state = "complete" if store.complete else "incomplete"
+    rows: list[tuple[str, str]] = [
+        ("source", f"{store.meta.source} ({store.meta.licence}), config {store.meta.config_hash}, {state}"),
+        ("objects, contacts", f"{len(store.objects)}, {len(store)}"),
+    ]
+    seen = collections.Counter(sensor for i in range(len(store)) for sensor in store.sensors_of(i))
+    rows += [(s, f"{seen[s]} sequences, {store.frames.get(s, 0)} frames") for s in store.meta.sensors]
+    for split in SPLITS:
+        objects = sum(card.split == split for card in store.objects.values())
+        rows.append((split, f"{objects} objects, {len(store.contacts_of_split(split))} contacts"))
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def object_table(store: RecordStore) -> Table:
+    """One row per object: split, labels, contacts."""
+    table = Table("object", "split", *ATTRIBUTES, "contacts")
+    contacts = collections.Counter(key.object_id for key in store.contacts)
+    for name, card in store.objects.items():
+        levels = [card.labels.get(attribute, UNKNOWN) for attribute in ATTRIBUTES]
+        words = ["·" if level == UNKNOWN else str(level) for level in levels]
+        if levels[-1] != UNKNOWN:
+            words[-1] = MATERIALS[levels[-1]]
+        table.add_row(name, card.split, *words, str(contacts[name]))
+    return table
+
+
+def flag_table(counts: FlagCounts) -> Table:
+    """Frames by quality flag and sensor; a frame may carry several."""
+    sensors = list(counts.frames)
+    table = Table("frames", *sensors)
+    table.add_row("all", *(str(counts.frames[sensor]) for sensor in sensors), end_section=True)
+    for flag in (Flag.NONE, *Flag):
+        table.add_row(str(flag.name).lower(), *(str(counts.flags[sensor, flag]) for sensor in sensors))
+    return table
+
+
+def import_table(report: ImportReport) -> Table:
+    """What an import took in, then every file, object and label that it did not."""
+    table = Table("what", "count or reason", title="import")
+    table.add_row("videos imported", str(report.videos))
+    for split, count in report.objects.items():
+        table.add_row(f"objects in {split}", str(count))
+    table.add_row("skipped", str(len(report.skipped)))
+    table.add_row("labels missing", str(len(report.unlabelled)))
+    for skip in (*report.skipped, *report.unlabelled):
+        table.add_row(skip.name, skip.reason)
+    return table

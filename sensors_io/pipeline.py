@@ -1,0 +1,164 @@
+"""From stored contacts to training clips: which frames, at which size, in which order.
+
+Dimensions as in the schema: N frames of a sequence, F of a clip, S sensors, P clips of a batch.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import grain
+import numpy as np
+
+from sensors_io.records import RecordStore
+from sensors_io.schema import SENSORS, Clip, Flag, ObjectCard, SchemaError, Sequence
+from sensors_io.selection import choose_frames, field_images
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClipConfig:
+    """Shape of a clip and what may enter it.
+
+    Args:
+      frames: F, frames of each stream.
+      image_px: rows and columns of a tactile image.
+      view_px: rows and columns of the object's view.
+      sensors: the streams, in order.
+      rejected: a frame with one of these flags is left out where a sequence has others.
+    """
+
+    frames: int = 8
+    image_px: int = 112
+    view_px: int = 64
+    sensors: tuple[str, ...] = SENSORS
+    rejected: tuple[Flag, ...] = (Flag.STRAIN_LIMIT, Flag.NOT_CONVERGED, Flag.SATURATED)
+
+    def __post_init__(self) -> None:
+        for name in ("frames", "image_px", "view_px"):
+            if getattr(self, name) < 1:
+                raise SchemaError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
+        if not self.sensors or len(set(self.sensors)) != len(self.sensors):
+            raise SchemaError(f"sensors is {self.sensors}: at least one, each once; correct the list")
+
+
+def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipConfig) -> Clip:
+    """One training example from one contact: F chosen frames of each sensor, resized, with masks for what is missing.
+
+    The whole window is stretched to the square image.  A sequence without camera frames shows its fields instead, see
+    `field_images`.  A sensor that did not see the contact has zeros and `stream_mask` False.  `frame_index` is the
+    position of a frame in its sequence.  `force_n` is zero where it was not measured: a zero vector means unknown.
+
+    Args:
+      contact: the sequences of one contact by sensor; sensors outside `config.sensors` are ignored.
+      card: the touched object.
+
+    Raises:
+      SchemaError: the contact is empty or belongs to another object.
+    """
+    if not contact:
+        raise SchemaError("contact is {}: a clip needs at least one sequence; skip empty contacts")
+    key = next(iter(contact.values())).key
+    if key.object_id != card.object_id:
+        raise SchemaError(f"card is of object {card.object_id!r}: the contact is of {key.object_id!r}; pass its card")
+    size, view_size = (config.image_px, config.image_px), (config.view_px, config.view_px)
+    shape = (len(config.sensors), config.frames)
+    frames = np.zeros((*shape, *size, 3), np.uint8)
+    force_n = np.zeros((*shape, 3), np.float32)
+    frame_index, frame_mask = np.zeros(shape, np.int32), np.zeros(shape, np.bool_)
+    for s, sensor in enumerate(config.sensors):
+        if sensor not in contact:
+            continue
+        sequence = contact[sensor]
+        chosen = choose_frames(sequence, config.frames, config.rejected)
+        n = len(chosen)
+        frames[s, :n] = _images(sequence, chosen, size)
+        if sequence.force_n is not None:
+            force_n[s, :n] = sequence.force_n[chosen]
+        frame_index[s, :n], frame_mask[s, :n] = chosen, True
+    view = np.zeros((*view_size, 3), np.uint8) if card.view is None else _resize(card.view, view_size)
+    return Clip(
+        key=key,
+        frames=frames,
+        force_n=force_n,
+        frame_index=frame_index,
+        frame_mask=frame_mask,
+        stream_mask=np.array([sensor in contact for sensor in config.sensors]),
+        view=view,
+        view_mask=np.array(card.view is not None),
+        label=card.label_row(),
+    )
+
+
+def clip_batches(
+    store: RecordStore,
+    indices: Any,
+    config: ClipConfig,
+    *,
+    batch_size: int,
+    seed: int,
+    shuffle: bool = True,
+    repeat: bool = True,
+    drop_remainder: bool = False,
+    workers: int = 0,
+) -> grain.IterDataset:
+    """Batches of clips: dicts of the arrays of `CLIP_ARRAYS` with a leading P, and `contact`, their indices, int32 [P].
+
+    The order is a function of `seed` alone and differs from epoch to epoch; batches run across the ends of epochs.  An
+    iterator's `get_state` and `set_state` resume it exactly.
+
+    Args:
+      store: the data set.
+      indices: contacts to draw from, e.g. `store.contacts_of_split("train")`.
+      batch_size: P.
+      seed: seed of the order, 0 ≤ seed < 2³².
+      shuffle: False keeps the order of `indices`.
+      repeat: False ends after one epoch.
+      drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
+      workers: reading processes; 0 reads in a thread of this one.  States carry over between equal numbers of workers.
+
+    Raises:
+      SchemaError: no contact, or one that the store does not hold.
+    """
+    rows = [int(i) for i in indices]
+    if not rows:
+        raise SchemaError("indices is empty: a pipeline needs at least one contact; choose a split that has some")
+    if min(rows) < 0 or max(rows) >= len(store):
+        raise SchemaError(f"indices reach {min(rows)}..{max(rows)}: must lie in 0..{len(store) - 1}; use this store's")
+    dataset = grain.MapDataset.source(rows).seed(seed)
+    if shuffle:
+        dataset = dataset.shuffle()
+    if repeat:
+        dataset = dataset.repeat()
+    batches = dataset.map(_Reader(store, config)).batch(batch_size, drop_remainder=drop_remainder)
+    # one thread and two batches ahead: grain's default of 500 would hold gigabytes of frames
+    iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))
+    return iterable.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers)) if workers else iterable
+
+
+@dataclasses.dataclass(frozen=True)
+class _Reader:
+    """Contact index → arrays of its clip; a class, so that worker processes can be sent it."""
+
+    store: RecordStore
+    config: ClipConfig
+
+    def __call__(self, i: int) -> dict[str, np.ndarray]:
+        contact = self.store.contact(i, fields=False)
+        clip = make_clip(contact, self.store.objects[self.store.contacts[i].object_id], self.config)
+        return clip.arrays() | {"contact": np.array(i, np.int32)}
+
+
+def _images(sequence: Sequence, chosen: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Images of the chosen frames, uint8 [F, *size, 3]."""
+    if sequence.frames is not None:
+        return np.stack([_resize(sequence.frames[n], size) for n in chosen])
+    images = [cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR) for image in field_images(sequence, chosen)]
+    return np.clip(np.rint(images), 0, 255).astype(np.uint8)
+
+
+def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if image.shape[:2] == size:
+        return image
+    shrinks = image.shape[0] >= size[0] and image.shape[1] >= size[1]
+    return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)

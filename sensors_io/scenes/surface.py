@@ -1,0 +1,94 @@
+"""The height of an object's skin under a sensor, in JAX, exactly translatable and rotatable."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from sensors_io.scenes.objects import Solid
+
+
+@struct.dataclass
+class Skin:
+    """Shape of one object at one contact site, in the object's frame; the fields are those of `Solid`.
+
+    `site_mm` is the point of the relief and of the roughness that comes to lie at the apex.
+    """
+
+    curvature_per_mm: Float[Array, "2"]
+    turn_rad: Float[Array, ""]
+    feature_height_mm: Float[Array, ""]
+    feature_pitch_mm: Float[Array, ""]
+    feature_width: Float[Array, ""]
+    pattern: Int[Array, ""]
+    site_mm: Float[Array, "2"]
+    wave_numbers: Float[Array, "K 2"]
+    wave_amplitudes_mm: Float[Array, "K"]
+    wave_phases_rad: Float[Array, "K"]
+
+
+@struct.dataclass
+class Pose:
+    """Where the sensor stands over the site: offset, turn about the normal, tilt as a slope along x and y."""
+
+    offset_mm: Float[Array, "2"]
+    turn_rad: Float[Array, ""]
+    tilt: Float[Array, "2"]
+
+
+def make_skin(solid: Solid, site_mm: np.ndarray, curvature_factor: float) -> Skin:
+    """Skin of an object at a site; the body is more or less curved there by `curvature_factor`."""
+    f = np.float32
+    return Skin(
+        curvature_per_mm=f(curvature_factor) / np.array([solid.radius_1_mm, solid.radius_2_mm], np.float32),
+        turn_rad=f(solid.turn_rad),
+        feature_height_mm=f(solid.feature_height_mm),
+        feature_pitch_mm=f(solid.feature_pitch_mm),
+        feature_width=f(solid.feature_width),
+        pattern=np.int32(solid.pattern),
+        site_mm=site_mm.astype(np.float32),
+        wave_numbers=solid.wave_numbers,
+        wave_amplitudes_mm=solid.wave_amplitudes_mm,
+        wave_phases_rad=solid.wave_phases_rad,
+    )
+
+
+def gap(skin: Skin, pose: Pose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
+    """Distance of the undeformed skin from the flat gel on the grid [y, x] of `x_mm` × `x_mm`, least value 0.
+
+    z = A²/2R₁ + B²/2R₂ − height · pattern(A, B) + Σ a cos(k·r + φ) + tilt · r
+    """
+    turn = pose.turn_rad
+    x, y = x_mm[None, :] - pose.offset_mm[0], x_mm[:, None] - pose.offset_mm[1]
+    a, b = _turned(x, y, turn + skin.turn_rad)
+    body = (skin.curvature_per_mm[0] * a**2 + skin.curvature_per_mm[1] * b**2) / 2
+    relief = _relief(skin, a + skin.site_mm[0], b + skin.site_mm[1])
+    z = body - skin.feature_height_mm * relief + _roughness(skin, pose, x_mm) + pose.tilt[0] * x + pose.tilt[1] * y
+    return z - jnp.min(z)
+
+
+def _turned(x: Array, y: Array, angle: Array) -> tuple[Array, Array]:
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return c * x + s * y, c * y - s * x
+
+
+def _relief(skin: Skin, a: Array, b: Array) -> Array:
+    """The periodic features, between 0 and 1, in the order of `objects.PATTERNS`."""
+    u, v = a / skin.feature_pitch_mm, b / skin.feature_pitch_mm
+    du, dv = u - jnp.round(u), v - jnp.round(v)
+    width = 2 * skin.feature_width**2
+    bumps = jnp.exp(-(du**2 + dv**2) / width)
+    ridges = jnp.exp(-(du**2) / width)
+    plateaus = 0.5 + 0.5 * jnp.tanh(4 * jnp.cos(2 * jnp.pi * u) * jnp.cos(2 * jnp.pi * v))
+    return jnp.select([skin.pattern == 0, skin.pattern == 1], [bumps, ridges], plateaus)
+
+
+def _roughness(skin: Skin, pose: Pose, x_mm: Array) -> Array:
+    """Σ a cos(k·r + φ) as two matrix products: cos(k_y y + φ) cos(k_x x) − sin(k_y y + φ) sin(k_x x)."""
+    k_x, k_y = _turned(skin.wave_numbers[:, 0], skin.wave_numbers[:, 1], -pose.turn_rad)
+    phase = skin.wave_phases_rad + skin.wave_numbers @ skin.site_mm
+    phase = phase - k_x * pose.offset_mm[0] - k_y * pose.offset_mm[1]
+    along_x = x_mm[:, None] * k_x
+    along_y = x_mm[:, None] * k_y + phase
+    cosine = skin.wave_amplitudes_mm * jnp.cos(along_y) @ jnp.cos(along_x).T
+    return cosine - skin.wave_amplitudes_mm * jnp.sin(along_y) @ jnp.sin(along_x).T

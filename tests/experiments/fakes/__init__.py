@@ -1,0 +1,1 @@
+"""Experiments of no scientific interest, for the tests of the runner."""

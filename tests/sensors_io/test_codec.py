@@ -1,0 +1,139 @@
+"""Sequences and cards as bytes: exact where it is promised, within the stated error elsewhere, never silently wrong."""
+
+import dataclasses
+import json
+
+import hypothesis
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sensors_io import codec
+from sensors_io.schema import FRAME_ARRAYS, SENSORS, SchemaError
+from tests.sensors_io.fakes import card, sequence
+
+EXACT = [name for name in FRAME_ARRAYS if name not in codec.TOLERANCE]
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_sequence_comes_back(sensor):
+    before = sequence(3, sensor, length=7, moment_nmm=np.full((7, 3), -87.3, np.float32))
+    after = codec.decode_sequence(codec.encode_sequence(before))
+    for name in ("key", "sensor", "serial", "calibration", "camera", "contact_region_px", "mm_per_px"):
+        assert getattr(after, name) == getattr(before, name)
+    for name in EXACT:
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    for name, tolerance in codec.TOLERANCE.items():
+        if getattr(before, name) is None:
+            assert getattr(after, name) is None
+        else:
+            np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=0, atol=tolerance)
+
+
+def test_a_card_comes_back_exactly():
+    before = card(2, visual_lies=True, truth={"modulus_mpa": np.float64(0.25)}, name="a thing")
+    after = codec.decode_card(codec.encode_card(before))
+    np.testing.assert_array_equal(after.view, before.view)
+    np.testing.assert_array_equal(after.view_depth_mm, before.view_depth_mm)
+    plain = {"view": None, "view_depth_mm": None}
+    assert dataclasses.replace(after, **plain) == dataclasses.replace(before, **plain)
+
+
+@hypothesis.given(
+    shape=st.tuples(st.integers(1, 4), st.integers(1, 9), st.integers(1, 9)),
+    seed=st.integers(0, 2**31),
+    share=st.floats(0, 1),
+)
+def test_frames_and_masks_come_back_bit_for_bit(shape, seed, share):
+    rng = np.random.default_rng(seed)
+    n, h, w = shape
+    frames = rng.integers(0, 256, (n, h + 1, w, 3), dtype=np.uint8)
+    flags = rng.integers(0, 2**32, n, dtype=np.uint32)
+    times = rng.integers(-(2**62), 2**62, n)
+    before = sequence(
+        length=n, frames=frames, deformation_mm=None, depth_mm=np.zeros(shape, np.float32),
+        valid=rng.random(shape) < share, flags=flags, host_time_ns=times,
+    )  # fmt: skip
+    after = codec.decode_sequence(codec.encode_sequence(before))
+    for name in EXACT:
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
+@hypothesis.given(
+    hnp.arrays(np.float32, hnp.array_shapes(max_dims=3, max_side=6), elements=st.floats(-31.5, 31.5, width=32)),
+    st.floats(2.0**-60, 1),
+)
+def test_quantisation_is_within_half_a_step_and_idempotent(x, shrink):
+    x = x * np.float32(shrink)
+    counts, scale = codec.quantise("depth_mm", x, where="here")
+    back = counts * np.float32(scale)
+    assert back.dtype == np.float32
+    assert np.abs(back.astype(np.float64) - x).max() <= scale / 2 <= codec.TOLERANCE["depth_mm"]
+    again, again_scale = codec.quantise("depth_mm", back, where="here")
+    np.testing.assert_array_equal(again * np.float32(again_scale), back)
+    assert codec.quantise("depth_mm", -x, where="here")[1] == scale
+
+
+def test_storing_a_decoded_sequence_gives_the_same_bytes():
+    data = codec.encode_sequence(sequence(1))
+    assert codec.encode_sequence(codec.decode_sequence(data)) == data
+
+
+@pytest.mark.parametrize("name", codec.TOLERANCE)
+def test_the_largest_range_is_carried_and_the_next_is_refused(name):
+    limit = 32767 * 2.0 ** np.floor(np.log2(2 * codec.TOLERANCE[name]))
+    counts, scale = codec.quantise(name, np.array([-limit], np.float32), where="here")
+    assert counts[0] == -32767
+    assert scale / 2 <= codec.TOLERANCE[name]
+    with pytest.raises(SchemaError, match=f"here: {name} reaches .* int16 carries at most"):
+        codec.quantise(name, np.array([limit * 1.001], np.float32), where="here")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_is_refused(bad):
+    depth = np.zeros((12, 5, 6), np.float32)
+    depth[3, 2, 1] = bad
+    with pytest.raises(SchemaError, match=r"object_0/0/press/0/gelsight_mini: depth_mm .* not finite; put 0 there"):
+        codec.encode_sequence(sequence(depth_mm=depth))
+
+
+@pytest.mark.parametrize("camera", [{"gain": np.float32(1)}, {"gain": float("nan")}])
+def test_camera_settings_that_json_cannot_carry_are_refused(camera):
+    with pytest.raises(SchemaError, match="settings cannot be stored as JSON"):
+        codec.encode_sequence(sequence(camera=camera))
+
+
+@hypothesis.given(st.data())
+def test_every_flipped_bit_is_found(data):
+    entry = bytearray(codec.encode_sequence(sequence(length=2)))
+    position = data.draw(st.integers(0, len(entry) - 1))
+    entry[position] ^= 1 << data.draw(st.integers(0, 7))
+    with pytest.raises(codec.CorruptRecordsError):
+        codec.decode_sequence(bytes(entry))
+
+
+def test_a_cut_entry_and_a_wrong_kind_are_found():
+    entry = codec.encode_sequence(sequence())
+    for cut in (0, 3, 11, 100, len(entry) - 1):
+        with pytest.raises(codec.CorruptRecordsError):
+            codec.decode_sequence(entry[:cut])
+    with pytest.raises(codec.CorruptRecordsError, match="is of kind 'sequence', not 'object'"):
+        codec.decode_card(entry)
+
+
+def test_fields_can_be_left_out_only_beside_frames():
+    slim = codec.decode_sequence(codec.encode_sequence(sequence()), fields=False)
+    assert all(getattr(slim, name) is None for name in codec.FIELDS)
+    assert slim.frames is not None
+    assert slim.force_n is not None
+    assert codec.decode_sequence(codec.encode_sequence(sequence(sensor="tac3d")), fields=False).depth_mm is not None
+
+
+def test_the_layout_describes_itself():
+    entry = codec.encode_sequence(sequence())
+    length = int.from_bytes(entry[8:12], "little")
+    header = json.loads(entry[12 : 12 + length])
+    assert header["plain"]["key"]["object_id"] == "object_0"
+    assert [a["name"] for a in header["arrays"]][:2] == ["frames", "deformation_mm"]
+    assert bytes(sequence().frames[0, 0, 0]) == entry[12 + length :][:3]

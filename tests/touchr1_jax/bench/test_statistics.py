@@ -1,0 +1,127 @@
+"""Intervals and tests by hand values, and their coverage where no hand value exists."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from touchr1_jax.bench import statistics
+from touchr1_jax.bench.statistics import clustered_bootstrap
+
+
+def test_bootstrap_of_two_clusters_is_exact():
+    # Resamples are {aa, ab, bb} with probabilities ¼, ½, ¼, so the outer quantiles are the cluster means.
+    interval = clustered_bootstrap(np.array([0.0, 0.0, 1.0]), np.array(["a", "a", "b"]))
+    assert (interval.mean, interval.low, interval.high) == (pytest.approx(1 / 3), 0.0, 1.0)
+
+
+def test_repeating_every_value_of_an_object_does_not_narrow_the_interval():
+    values = np.random.default_rng(0).random(30)
+    once = clustered_bootstrap(values, np.arange(30), seed=1)
+    tenfold = clustered_bootstrap(np.repeat(values, 10), np.repeat(np.arange(30), 10), seed=1)
+    assert (once.low, once.high) == pytest.approx((tenfold.low, tenfold.high))
+
+
+def test_bootstrap_agrees_with_a_plain_loop():
+    rng = np.random.default_rng(3)
+    clusters = rng.integers(0, 8, 40)
+    strata = rng.integers(0, 2, 40)
+    values = rng.random(40)
+    got = clustered_bootstrap(values, clusters, strata=strata, resamples=4000, seed=0)
+    means = []
+    for _ in range(4000):
+        index = np.concatenate([np.nonzero(clusters == c)[0] for c in rng.choice(np.unique(clusters), 8)])
+        means.append(np.mean([values[index][strata[index] == s].mean() for s in np.unique(strata[index])]))
+    assert (got.low, got.high) == pytest.approx(np.quantile(means, (0.025, 0.975)), abs=0.02)
+    assert got.mean == pytest.approx(np.mean([values[strata == s].mean() for s in (0, 1)]))
+
+
+def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for trial in range(200):
+        effect = rng.normal(size=40)
+        values = np.repeat(effect, 5) + 0.3 * rng.normal(size=200)
+        interval = clustered_bootstrap(values, np.repeat(np.arange(40), 5), resamples=500, seed=trial)
+        hits += interval.low <= 0 <= interval.high
+    assert 0.88 <= hits / 200 <= 0.99
+
+
+def test_paired_difference_is_tighter_than_its_parts():
+    rng = np.random.default_rng(0)
+    hard = rng.random(50)
+    a, b = hard + 0.1, hard
+    interval = clustered_bootstrap(a - b, np.arange(50))
+    assert interval.excludes_zero
+    assert interval.low == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("values", "clusters", "message"),
+    [
+        ([1.0, 2.0], ["a"], "lengths"),
+        ([1.0, np.nan], ["a", "b"], r"values\[1\] is nan"),
+        ([1.0, 2.0], ["a", "a"], "two"),
+    ],
+)
+def test_bootstrap_names_what_is_wrong(values, clusters, message):
+    with pytest.raises(ValueError, match=message):
+        clustered_bootstrap(np.array(values), np.array(clusters))
+
+
+def test_student_interval_by_hand():
+    interval = statistics.student_interval(np.array([1.0, 2.0, 3.0, 4.0, 5.0]))
+    assert interval.mean == 3.0
+    assert interval.high - 3.0 == pytest.approx(2.776445 * np.sqrt(2.5 / 5), rel=1e-6)
+    with pytest.raises(ValueError, match="seeds"):
+        statistics.student_interval(np.array([1.0]))
+
+
+def test_interquartile_mean_drops_a_quarter_at_either_end():
+    assert statistics.interquartile_mean(np.array([[100.0, 1.0], [3.0, -50.0]])) == 2.0
+    scores = np.random.default_rng(0).random(23)
+    assert statistics.interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores, 0.25))
+
+
+def test_stratified_bootstrap_resamples_inside_each_task():
+    scores = np.tile([1.0, 2.0, 3.0, 4.0], (5, 1))  # no spread over runs: nothing to resample
+    interval = statistics.stratified_bootstrap_iqm(scores)
+    assert (interval.low, interval.mean, interval.high) == (2.5, 2.5, 2.5)
+    spread = statistics.stratified_bootstrap_iqm(scores + np.arange(5)[:, None])
+    assert spread.low < spread.mean < spread.high
+
+
+def test_probability_of_improvement_by_hand():
+    better, than = np.array([[1.0], [3.0]]), np.array([[2.0], [1.0]])
+    assert statistics.probability_of_improvement(better, than) == pytest.approx((0 + 0.5 + 1 + 1) / 4)
+    assert statistics.probability_of_improvement(than, than) == 0.5
+    with pytest.raises(ValueError, match="tasks"):
+        statistics.probability_of_improvement(np.ones((2, 1)), np.ones((2, 2)))
+
+
+def test_sign_flip_test_by_hand():
+    assert statistics.sign_flip_test(np.ones(5)) == 2 / 32
+    assert statistics.sign_flip_test(np.array([1.0, -1.0])) == 1.0
+    assert statistics.sign_flip_test(np.array([1.0, 2.0, -1.0])) == 6 / 8  # |sum| is 4 twice, 2 four times, 0 twice
+    with pytest.raises(ValueError, match="empty"):
+        statistics.sign_flip_test(np.array([]))
+
+
+def test_sampled_sign_flips_agree_with_a_t_test():
+    differences = np.random.default_rng(0).normal(0.4, 1, 40)
+    assert statistics.sign_flip_test(differences) == pytest.approx(stats.ttest_1samp(differences, 0).pvalue, abs=0.01)
+    assert statistics.sign_flip_test(np.ones(40)) == pytest.approx(1 / 20_001)
+
+
+@given(st.lists(st.floats(-5, 5), min_size=1, max_size=8))
+def test_sign_flip_p_value_is_symmetric_and_bounded(differences):
+    d = np.array(differences)
+    p = statistics.sign_flip_test(d)
+    assert min(1.0, 2.0 ** (1 - len(d))) <= p <= 1
+    assert p == statistics.sign_flip_test(-d)
+
+
+def test_holm_by_hand():
+    assert statistics.holm(np.array([0.04, 0.01, 0.03])).tolist() == pytest.approx([0.06, 0.03, 0.06])
+    assert statistics.holm(np.array([0.6, 0.9])).tolist() == [1.0, 1.0]

@@ -1,0 +1,282 @@
+"""The metrics of every table: what each one means, and the small functions that compute it.
+
+Dimensions: N questions (contacts), A attributes, S sensors, M scored values.  An answer of −1 is ⊥, unparsable.  A
+label of −1 means *not scored*: the attribute was not asked, or nobody annotated it; such entries count nowhere.
+
+Every function returns `Scores`: the single values whose mean is the metric and the question each value comes from, so
+that an interval can resample whole objects.  Shares are percentages, 0–100.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+BOTTOM = -1
+"""⊥ among answers; among labels: not scored."""
+
+PREFIX: Mapping[str, str] = {"hardness": "h", "roughness": "r", "protrusion": "p", "material": "mat"}
+"""What the metric names of an attribute start with."""
+
+ORDINAL = ("hardness", "roughness", "protrusion")
+"""The attributes of `acc`, `omae` and `middle_rate`."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Metric:
+    """How one metric is named, read and printed; `format` is a format specification such as ".1f".
+
+    `beside` marks the metrics that only explain others and stand in a second table.
+    """
+
+    title: str
+    unit: str
+    better: Literal["higher", "lower", "none"]
+    format: str
+    meaning: str
+    beside: bool = False
+
+
+def _share(title: str, better: Literal["higher", "none"], meaning: str, beside: bool = False) -> Metric:
+    return Metric(title=title, unit="%", better=better, format=".1f", meaning=meaning, beside=beside)
+
+
+METRICS: Mapping[str, Metric] = {
+    "acc": _share("Acc", "higher", "mean of H-, R- and P-Acc"),
+    "h_acc": _share("H-Acc", "higher", "hardness answers that are right; unparsable is wrong"),
+    "r_acc": _share("R-Acc", "higher", "roughness answers that are right; unparsable is wrong"),
+    "p_acc": _share("P-Acc", "higher", "protrusion answers that are right; unparsable is wrong"),
+    "mat_acc": _share("Mat-Acc", "higher", "material answers that are right, nine ways; unparsable is wrong"),
+    "h_bacc": _share(
+        "H-bAcc", "higher", "balanced hardness accuracy: mean over the levels of the accuracy on each", beside=True
+    ),
+    "r_bacc": _share(
+        "R-bAcc", "higher", "balanced roughness accuracy: mean over the levels of the accuracy on each", beside=True
+    ),
+    "p_bacc": _share(
+        "P-bAcc", "higher", "balanced protrusion accuracy: mean over the levels of the accuracy on each", beside=True
+    ),
+    "mat_bacc": _share("Mat-bAcc", "higher", "balanced material accuracy: mean over the materials", beside=True),
+    "omae": Metric(
+        title="OMAE",
+        unit="levels",
+        better="lower",
+        format=".3f",
+        meaning="mean distance in levels over hardness, roughness and protrusion answers; unparsable counts K−1",
+    ),
+    "csc": _share("CSC", "higher", "pairs of sensors whose conclusions, each given one sensor alone, are both right"),
+    "csc_agree": _share(
+        "CSC-agree", "none", "pairs of sensors whose conclusions agree, right or not; a constant gets 100", beside=True
+    ),
+    "csc_slot": _share(
+        "CSC-slot", "none", "pairs of perceive slots of one answer that name the same level", beside=True
+    ),
+    "parse_rate": _share("Parsed", "higher", "answers that are formatted and whose asked conclusions parse"),
+    "middle_rate": _share("Middle", "none", "ordinal answers that name the middle level", beside=True),
+    "reward": Metric(
+        title="Reward", unit="", better="higher", format=".3f", meaning="mean total reward of the greedy answers"
+    ),
+}
+"""Every metric name that a results file may hold."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scores:
+    """The values behind one metric: the metric is the mean over strata of the mean value inside each stratum.
+
+    Args:
+      values: float [M].
+      items: int [M], the question (0..N−1) that each value belongs to.
+      strata: int [M], zeros for a plain mean; the class for balanced accuracy, the attribute for `acc`.
+    """
+
+    values: np.ndarray
+    items: np.ndarray
+    strata: np.ndarray
+
+    def mean(self) -> float:
+        """The metric.
+
+        Raises:
+          ValueError: nothing was scored.
+        """
+        if not len(self.values):
+            raise ValueError("values is empty: a metric needs one scored answer at least; give labels that are not −1")
+        return float(np.mean([self.values[self.strata == s].mean() for s in np.unique(self.strata)]))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Answers:
+    """Everything a policy said about N questions, as arrays.
+
+    Args:
+      conclude: int [N, A], the answers given all sensors.
+      label: int [N, A], −1 where not scored.
+      formatted: bool [N].
+      reward: float [N], total reward of each answer.
+      streams: bool [N, S], the sensors that were there.
+      perceive: int [N, S, A], what the answer says each sensor feels.
+      alone: int [N, S, A], the answers given sensor s alone, or `None` where that was not run.
+    """
+
+    conclude: np.ndarray
+    label: np.ndarray
+    formatted: np.ndarray
+    reward: np.ndarray
+    streams: np.ndarray
+    perceive: np.ndarray
+    alone: np.ndarray | None = None
+
+
+def accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
+    """Exact match: 100·mean 1[ŷ = y], ⊥ wrong.
+
+    Args:
+      answer, label: int [N].
+    """
+    _same_shape(answer=answer, label=label)
+    scored = label != BOTTOM
+    return _scores(100.0 * (answer == label), scored)
+
+
+def balanced_accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
+    """Mean over the levels that occur among the labels of the accuracy on each; a constant gets 100 over their number.
+
+    Args:
+      answer, label: int [N].
+    """
+    plain = accuracy(answer, label)
+    return dataclasses.replace(plain, strata=label[plain.items])
+
+
+def mean_accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
+    """Mean over attributes of their accuracies, each attribute weighing the same.
+
+    Args:
+      answer, label: int [N, A].
+    """
+    _same_shape(answer=answer, label=label)
+    attribute = np.broadcast_to(np.arange(label.shape[1]), label.shape)
+    return _scores(100.0 * (answer == label), label != BOTTOM, attribute)
+
+
+def ordinal_mae(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Scores:
+    """OMAE, mean |ŷ − y| in levels with ⊥ counting K − 1; on the same answers OMAE ≥ 1 − Acc/100.
+
+    Args:
+      answer, label: int [N, A].
+      levels: int [A], the K of each attribute.
+    """
+    _same_shape(answer=answer, label=label)
+    distance = np.where(answer == BOTTOM, levels - 1, np.abs(answer - label))
+    return _scores(distance.astype(float), label != BOTTOM)
+
+
+def cross_sensor_consistency(alone: np.ndarray, label: np.ndarray, streams: np.ndarray) -> Scores:
+    """CSC, 100·mean over question, attribute and sensor pair (a, b) of 1[ŷ_a = ŷ_b = y].
+
+    Args:
+      alone: int [N, S, A], the conclusion given sensor s alone.
+      label: int [N, A].
+      streams: bool [N, S]; pairs with an absent sensor do not count.
+    """
+    return _over_pairs(alone == label[:, None], alone, label, streams)
+
+
+def cross_sensor_agreement(alone: np.ndarray, label: np.ndarray, streams: np.ndarray) -> Scores:
+    """Plain agreement, 100·mean of 1[ŷ_a = ŷ_b ≠ ⊥] over the pairs of CSC; on `perceive` slots this is CSC-slot.
+
+    It bounds CSC from above and a constant answer gets 100, so it is no goal by itself.
+
+    Args:
+      alone: int [N, S, A]; label: int [N, A]; streams: bool [N, S], as for CSC.
+    """
+    return _over_pairs(alone != BOTTOM, alone, label, streams)
+
+
+def parse_rate(formatted: np.ndarray, answer: np.ndarray, label: np.ndarray) -> Scores:
+    """100·mean 1[formatted and no scored conclusion is ⊥].
+
+    Args:
+      formatted: bool [N].
+      answer, label: int [N, A].
+    """
+    _same_shape(answer=answer, label=label)
+    parsed = formatted & ((answer != BOTTOM) | (label == BOTTOM)).all(axis=1)
+    return _scores(100.0 * parsed, np.ones(len(parsed), bool))
+
+
+def middle_rate(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Scores:
+    """100·mean 1[ŷ = (K − 1)/2] over the scored ordinal questions; ⊥ counts as not the middle.
+
+    Args:
+      answer, label: int [N, A].
+      levels: int [A], odd: only then there is a middle level.
+    """
+    _same_shape(answer=answer, label=label)
+    if np.any(levels % 2 == 0):
+        raise ValueError(
+            f"levels is {levels.tolist()}: an even number of levels has no middle; leave such attributes out"
+        )
+    return _scores(100.0 * (answer == (levels - 1) // 2), label != BOTTOM)
+
+
+def evaluate(answers: Answers, attributes: tuple[str, ...], levels: tuple[int, ...]) -> dict[str, Scores]:
+    """All metrics that the answers define, keyed as `METRICS`.
+
+    A metric without a single value is left out: an attribute that nobody asked, CSC with fewer than two sensors or
+    without single-sensor answers.
+
+    Args:
+      attributes: the names of the A axis, all in `PREFIX`.
+      levels: the number of levels of each.
+    """
+    unknown = [a for a in attributes if a not in PREFIX]
+    if unknown:
+        raise ValueError(f"attributes holds {unknown}: metrics exist for {', '.join(PREFIX)}; add them to PREFIX")
+    ordinal = [i for i, a in enumerate(attributes) if a in ORDINAL]
+    said, label, levels_a = answers.conclude[:, ordinal], answers.label[:, ordinal], np.asarray(levels)[ordinal]
+    table = {
+        "acc": mean_accuracy(said, label),
+        "omae": ordinal_mae(said, label, levels_a),
+        "middle_rate": middle_rate(said, label, levels_a),
+        "parse_rate": parse_rate(answers.formatted, answers.conclude, answers.label),
+        "reward": _scores(np.asarray(answers.reward, float), np.ones(len(answers.reward), bool)),
+        "csc_slot": cross_sensor_agreement(answers.perceive, answers.label, answers.streams),
+    }
+    for i, attribute in enumerate(attributes):
+        table[f"{PREFIX[attribute]}_acc"] = accuracy(answers.conclude[:, i], answers.label[:, i])
+        table[f"{PREFIX[attribute]}_bacc"] = balanced_accuracy(answers.conclude[:, i], answers.label[:, i])
+    if answers.alone is not None:
+        table["csc"] = cross_sensor_consistency(answers.alone, answers.label, answers.streams)
+        table["csc_agree"] = cross_sensor_agreement(answers.alone, answers.label, answers.streams)
+    return {name: table[name] for name in METRICS if name in table and len(table[name].values)}
+
+
+def _over_pairs(good: np.ndarray, alone: np.ndarray, label: np.ndarray, streams: np.ndarray) -> Scores:
+    """Score every (question, attribute, pair) by 1[good_a and good_b and ŷ_a = ŷ_b]."""
+    n, sensors, attributes = alone.shape
+    if label.shape != (n, attributes) or streams.shape != (n, sensors):
+        raise ValueError(
+            f"alone is {list(alone.shape)}, label {list(label.shape)}, streams {list(streams.shape)}: "
+            "they must be [N, S, A], [N, A] and [N, S]; align the arrays"
+        )
+    pairs = np.array(list(itertools.combinations(range(sensors), 2)), int).reshape(-1, 2)
+    a, b = pairs[:, 0], pairs[:, 1]
+    same = good[:, a] & good[:, b] & (alone[:, a] == alone[:, b])
+    counts = (streams[:, a] & streams[:, b])[:, :, None] & (label != BOTTOM)[:, None, :]
+    return _scores(100.0 * same, counts)
+
+
+def _scores(values: np.ndarray, scored: np.ndarray, strata: np.ndarray | None = None) -> Scores:
+    """Keep the scored entries of an array [N, ...] and remember the question each comes from."""
+    strata = np.zeros(values.shape, int) if strata is None else strata
+    return Scores(values=values[scored], items=np.nonzero(scored)[0], strata=strata[scored])
+
+
+def _same_shape(**arrays: np.ndarray) -> None:
+    shapes = {name: array.shape for name, array in arrays.items()}
+    if len(set(shapes.values())) > 1:
+        raise ValueError(f"shapes are {shapes}: they must be equal; align the arrays")

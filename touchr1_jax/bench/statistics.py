@@ -1,0 +1,187 @@
+"""Intervals and tests for metrics: over objects by clustered bootstrap, over training seeds by t and sign flips.
+
+Two questions, two kinds of interval.  *Would it hold on other objects?*  Resample the objects.  *Would it hold for
+other training runs?*  Compare the per-seed means, paired by seed.  All intervals are two-sided.
+"""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+from scipy import special
+
+EXACT_LIMIT = 16
+"""Up to this many differences the sign-flip test enumerates all 2^n sign patterns."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A point estimate and its confidence interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def excludes_zero(self) -> bool:
+        """Whether 0 lies outside the interval."""
+        return self.low > 0 or self.high < 0
+
+
+def clustered_bootstrap(
+    values: np.ndarray,
+    clusters: np.ndarray,
+    *,
+    strata: np.ndarray | None = None,
+    resamples: int = 10_000,
+    seed: int = 0,
+    level: float = 0.95,
+) -> Interval:
+    """Percentile interval of a mean when values of one object are not independent: whole objects are resampled.
+
+    With C clusters, draw w ~ Multinomial(C, 1/C) and take θ* = mean_s (Σ_c w_c Σ_cs) / (Σ_c w_c n_cs), where Σ_cs and
+    n_cs are the sum and the number of the values of cluster c in stratum s; a stratum that a resample misses is left
+    out of that resample's mean.  The interval spans the (1 ∓ level)/2 quantiles of θ*.  The difference of two policies
+    on the same answers is `clustered_bootstrap(a - b, ...)`.
+
+    Args:
+      values: float [M], finite.
+      clusters: [M], the object of each value.
+      strata: int [M], see `metrics.Scores`; `None` for the plain mean.
+
+    Raises:
+      ValueError: lengths differ, a value is not finite, or fewer than two clusters.
+
+    Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), §3.8 (resampling clusters), §5.3.
+    """
+    strata = np.zeros(len(values), int) if strata is None else strata
+    _check_values(values, clusters, strata)
+    cluster_ids, cluster = np.unique(clusters, return_inverse=True)
+    stratum_ids, stratum = np.unique(strata, return_inverse=True)
+    if len(cluster_ids) < 2:
+        raise ValueError(f"clusters holds {len(cluster_ids)}: an interval over objects needs two; score more objects")
+    sums = np.zeros((len(cluster_ids), len(stratum_ids)))
+    counts = np.zeros_like(sums)
+    np.add.at(sums, (cluster, stratum), values)
+    np.add.at(counts, (cluster, stratum), 1.0)
+    weights = np.random.default_rng(seed).multinomial(
+        len(cluster_ids), np.full(len(cluster_ids), 1 / len(cluster_ids)), size=resamples
+    )
+    seen = weights @ counts
+    means = np.where(seen > 0, weights @ sums / np.maximum(seen, 1), np.nan)
+    low, high = np.quantile(np.nanmean(means, axis=1), _tails(level))
+    return Interval(mean=float(np.mean(sums.sum(0) / counts.sum(0))), low=float(low), high=float(high))
+
+
+def student_interval(values: np.ndarray, *, level: float = 0.95) -> Interval:
+    """x̄ ± t_{n−1, (1+level)/2} · s/√n over n independent training runs; give paired differences to compare two arms.
+
+    Args:
+      values: float [n], n ≥ 2.  At n = 5 the factor is 2.776.
+
+    Source: Student, The probable error of a mean, Biometrika 6 (1908).
+    """
+    n = len(values)
+    if n < 2:
+        raise ValueError(f"values holds {n}: an interval over seeds needs two at least; train more seeds")
+    half = float(special.stdtrit(n - 1, (1 + level) / 2)) * float(np.std(values, ddof=1)) / math.sqrt(n)
+    mean = float(np.mean(values))
+    return Interval(mean=mean, low=mean - half, high=mean + half)
+
+
+def interquartile_mean(scores: np.ndarray) -> float:
+    """IQM: the mean of the scores left after dropping ⌊n/4⌋ at either end.
+
+    Args:
+      scores: float, any shape, pooled over runs and tasks.
+
+    Source: Agarwal et al., Deep RL at the Edge of the Statistical Precipice (2021), §4.3; rounding as in `rliable`.
+    """
+    ordered = np.sort(scores, axis=None)
+    cut = ordered.size // 4
+    return float(ordered[cut : ordered.size - cut].mean())
+
+
+def stratified_bootstrap_iqm(
+    scores: np.ndarray, *, resamples: int = 2_000, seed: int = 0, level: float = 0.95
+) -> Interval:
+    """Percentile interval of the IQM when the runs of each task are resampled on their own.
+
+    Args:
+      scores: float [runs, tasks]; the tasks are the strata.
+
+    Source: Agarwal et al. (2021), §4.1 (stratified bootstrap).
+    """
+    runs, tasks = scores.shape
+    pick = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
+    ordered = np.sort(scores[pick, np.arange(tasks)].reshape(resamples, -1), axis=1)
+    cut = ordered.shape[1] // 4
+    low, high = np.quantile(ordered[:, cut : ordered.shape[1] - cut].mean(axis=1), _tails(level))
+    return Interval(mean=interquartile_mean(scores), low=float(low), high=float(high))
+
+
+def probability_of_improvement(better: np.ndarray, than: np.ndarray) -> float:
+    """Mean over tasks of P(X > Y) + ½ P(X = Y), X a run of one policy and Y a run of the other.
+
+    Args:
+      better, than: float [runs, tasks] and [runs', tasks], higher is better (negate errors).
+
+    Source: Agarwal et al. (2021), §4.3; the Mann–Whitney statistic over n·n′.
+    """
+    if better.shape[1:] != than.shape[1:]:
+        raise ValueError(f"shapes are {better.shape} and {than.shape}: the tasks must be the same; align the columns")
+    x, y = better[:, None], than[None]
+    return float(np.mean((x > y) + 0.5 * (x == y)))
+
+
+def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: int = 0) -> float:
+    """Two-sided p-value of "the paired differences are symmetric about 0".
+
+    p = share of sign patterns ε ∈ {−1, 1}^n with |mean(ε·d)| ≥ |mean(d)|, all 2^n of them up to n = 16, else a random
+    sample with (1 + hits)/(1 + resamples).  It cannot fall below 2^{1−n}: five seeds reach .0625 at best.
+
+    Args:
+      differences: float [n].
+
+    Source: Fisher, The Design of Experiments (1935), §21; Phipson and Smyth (2010) for the +1.
+    """
+    n = len(differences)
+    if n < 1:
+        raise ValueError("differences is empty: a test needs one pair at least; compare more seeds")
+    exact = n <= EXACT_LIMIT
+    if exact:
+        signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
+    else:
+        signs = np.random.default_rng(seed).choice((1.0, -1.0), size=(resamples, n))
+    observed = abs(differences.sum())
+    hits = int(np.sum(np.abs(signs @ differences) >= observed - 1e-12 * (1 + observed)))
+    return hits / len(signs) if exact else (1 + hits) / (1 + resamples)
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """Holm's step-down adjustment: p̃_(i) = max_{j ≤ i} min(1, (m − j + 1)·p_(j)), in the order given.
+
+    Args:
+      p_values: float [m].
+
+    Source: Holm, A simple sequentially rejective multiple test procedure (1979).
+    """
+    order = np.argsort(p_values, kind="stable")
+    scaled = np.minimum(1.0, p_values[order] * np.arange(len(p_values), 0, -1))
+    adjusted = np.empty(len(p_values))
+    adjusted[order] = np.maximum.accumulate(scaled)
+    return adjusted
+
+
+def _tails(level: float) -> tuple[float, float]:
+    return (1 - level) / 2, (1 + level) / 2
+
+
+def _check_values(values: np.ndarray, clusters: np.ndarray, strata: np.ndarray) -> None:
+    if not len(values) == len(clusters) == len(strata):
+        lengths = f"{len(values)}, {len(clusters)} and {len(strata)}"
+        raise ValueError(f"values, clusters and strata have lengths {lengths}: they must be equal; align the arrays")
+    if not np.all(np.isfinite(values)):
+        first = int(np.argmin(np.isfinite(values)))
+        raise ValueError(f"values[{first}] is {values[first]}: values must be finite; leave undefined ones out")

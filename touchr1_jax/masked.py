@@ -1,0 +1,72 @@
+"""Statistics over the selected elements of an array; the one place where they are divided, so no stray epsilons.
+
+In all of them `mask` (boolean) broadcasts against `x` and `axis` is as in NumPy.  What is not selected has no
+influence, not even when it is NaN or infinite.  Gradients are finite: 0 where nothing is selected or nothing varies.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Shaped
+
+Axis = int | tuple[int, ...] | None
+
+
+def count(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+    """Number of selected elements, float32."""
+    selected = jnp.broadcast_to(mask, jnp.broadcast_shapes(x.shape, mask.shape))
+    return jnp.sum(selected, axis=axis, keepdims=keepdims, dtype=jnp.float32)
+
+
+def total(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+    """Sum of the selected elements, Σ m x."""
+    return jnp.sum(jnp.where(mask, x, 0), axis=axis, keepdims=keepdims)
+
+
+def mean(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+    """Mean of the selected elements, Σ m x / max(Σ m, 1): 0 where none is selected."""
+    size = count(x, mask, axis, keepdims=keepdims)
+    return total(x, mask, axis, keepdims=keepdims) / jnp.maximum(size, 1)
+
+
+def var(
+    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
+) -> Array:
+    """Variance of the selected elements, Σ m (x − mean)² / max(Σ m − ddof, 1); `ddof` 0 is the population's."""
+    size = count(x, mask, axis, keepdims=keepdims)
+    centred = jnp.where(mask, x, 0) - mean(x, mask, axis, keepdims=True)
+    return total(centred**2, mask, axis, keepdims=keepdims) / jnp.maximum(size - ddof, 1)
+
+
+def std(
+    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
+) -> Array:
+    """Standard deviation of the selected elements, √var, with gradient 0 where the variance is 0."""
+    variance = var(x, mask, axis, ddof=ddof, keepdims=keepdims)
+    varies = variance > 0
+    return jnp.where(varies, jnp.sqrt(jnp.where(varies, variance, 1)), 0)
+
+
+def whiten(
+    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, epsilon: float, ddof: int = 0
+) -> Array:
+    """Standardised elements, (x − mean) / (std + ε), and 0 where not selected.
+
+    Args:
+      epsilon: keeps the quotient finite; in the units of x.
+    """
+    centred = jnp.where(mask, x, 0) - mean(x, mask, axis, keepdims=True)
+    return jnp.where(mask, centred / (std(x, mask, axis, ddof=ddof, keepdims=True) + epsilon), 0)
+
+
+def maximum(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, empty: float) -> Array:
+    """Largest selected element; `empty` where none is selected."""
+    return _extreme(jnp.max, -jnp.inf, x, mask, axis, empty)
+
+
+def minimum(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, empty: float) -> Array:
+    """Smallest selected element; `empty` where none is selected."""
+    return _extreme(jnp.min, jnp.inf, x, mask, axis, empty)
+
+
+def _extreme(reduce, neutral: float, x: Array, mask: Array, axis: Axis, empty: float) -> Array:
+    some = count(x, mask, axis) > 0
+    return jnp.where(some, reduce(jnp.where(mask, x, neutral), axis=axis), empty)

@@ -1,0 +1,55 @@
+"""Accuracy with ordinal credit under which every constant answer earns the same."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from touchr1_jax import masked
+from touchr1_jax.rewards.accuracy import credit
+from touchr1_jax.rewards.base import Reward
+from touchr1_jax.types import Parsed, Target
+
+PRIOR_TOLERANCE = 1e-3
+"""How far the probabilities of an attribute may be from summing to 1."""
+
+
+def accuracy_debiased(prior: np.ndarray) -> Reward:
+    """Make R = R_acc(ŷ, y) − (r̄(ŷ) − mean_k r̄(k)) with r̄(k) = Σ_y p(y) R_acc(k, y).
+
+    Ordinal credit favours the middle level: on uniform labels a constant "middle" earns .60, a constant end .467.  Here
+    every constant earns mean_k r̄(k).  Unparsable answers keep their credit.  A departure from the paper.
+
+    Args:
+      prior: float [A, K], how often each level of an attribute is the label in training; 0 past an attribute's levels.
+
+    Raises:
+      ValueError: a prior that is not [A, K], negative, or whose rows do not sum to 1.
+    """
+    prior = np.asarray(prior, np.float32)
+    if prior.ndim != 2:
+        raise ValueError(f"prior has shape {prior.shape}: must be [A, K]; give one row per attribute")
+    for a, row in enumerate(prior):
+        if not (np.all(row >= 0) and abs(row.sum() - 1) <= PRIOR_TOLERANCE):
+            raise ValueError(
+                f"prior[{a}] is {row.tolist()}: must be ≥ 0 and sum to 1; count the training labels, "
+                "and give an attribute without labels a uniform row"
+            )
+
+    def value(parsed: Parsed, target: Target) -> Float[Array, ""]:
+        answer = parsed.conclude
+        expected, exists = constant_earnings(prior, target)
+        own = jnp.take_along_axis(expected, jnp.maximum(answer, 0)[:, None], axis=1)[:, 0]
+        bias = jnp.where((answer < 0) | (target.label < 0), 0.0, own - masked.mean(expected, exists, axis=1))
+        earned = credit(answer, target.label, target.levels, target.ordinal)
+        return masked.mean(earned - bias, target.asked)
+
+    return Reward(value)
+
+
+def constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Array]:
+    """r̄(k), what the constant answer k earns on average, and which levels k an attribute has, both [A, K]."""
+    level = jnp.arange(prior.shape[1])
+    levels, ordinal = target.levels[:, None, None], target.ordinal[:, None, None]
+    table = credit(level[:, None], level, levels, ordinal)  # [A, K answered, K true]
+    exists = level < target.levels[:, None]
+    return jnp.sum(table * prior[:, None, :], axis=-1), exists
