@@ -22,7 +22,7 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 SHARED = "#4d5560"
 """Colour of whatever belongs to no single arm."""
 
-MARKERS = "DsXP^v*"
+MARKERS = "Ds^vXph"
 
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps and values of one logged scalar of one stage."""
@@ -94,10 +94,9 @@ def accuracy_against_middle(
     with mpl.rc_context(_LOOK):
         figure = Figure(figsize=(6.6, 3.7), layout="constrained")
         axes = figure.add_subplot()
-        drawn = [
-            _draw_point(axes, name, row, colour.get(name, SHARED), "o" if name in arms else MARKERS[i % len(MARKERS)])
-            for i, (name, row) in enumerate([*arms.items(), *baselines.items()])
-        ]
+        drawn = [_draw_point(axes, name, row, colour[name], "o") for name, row in arms.items()]
+        for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS), strict=False):
+            drawn.append(_draw_point(axes, name, row, SHARED, marker))
         axes.set(xlabel=f"{METRICS['middle_rate'].meaning} (%)", ylabel=f"{METRICS['acc'].title} (%)")
         axes.margins(0.08)
         if not any(drawn):

@@ -217,7 +217,7 @@ def _figures(results: Results) -> Html:
     times = [row(name, str(len(s)), f"{sum(s) / len(s):,.1f}", f"{sum(s):,.1f}", head=1) for name, s in seconds.items()]
     data = [row(name, _plain(value), head=1) for name, value in results.data.items()]
     parts = [
-        tag("div", tag("h3", "Data"), table(["", ""], data)) if data else Html(""),
+        tag("div", tag("h3", "Data"), table(["Quantity", "value"], data)) if data else Html(""),
         tag("div", tag("h3", "Wall time"), table(["Stage", "runs", "mean (s)", "all (s)"], times))
         if times
         else Html(""),

@@ -20,12 +20,13 @@ def rollouts(examples: Sequence[RolloutExample], colour: Mapping[str, str]) -> H
 
 
 def strip_png(frames: np.ndarray) -> bytes:
-    """The frames of one sensor side by side, as a PNG.
+    """The frames of one sensor side by side with two white pixels between them, as a PNG.
 
     Args:
       frames: uint8 [F, H, W, 3], RGB.
     """
-    return _png(np.concatenate(list(frames), axis=1))
+    apart = np.pad(frames, ((0, 0), (0, 0), (1, 1), (0, 0)), constant_values=255)
+    return _png(np.concatenate(list(apart), axis=1))
 
 
 def highlighted(trace: str, slots: Sequence[Slot]) -> Html:

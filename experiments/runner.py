@@ -51,6 +51,16 @@ class Experiment(Generic[C]):
     run: Callable[[C, Context], Results]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if "default" in self.scales:
+            raise ValueError(f"scales of {self.name} holds 'default': that name means `config`; rename the scale")
+        for scale, config in self.configs().items():
+            if not dataclasses.is_dataclass(config) or type(config) is not type(self.config):
+                raise ValueError(
+                    f"scale {scale!r} of {self.name} is {config!r}: every scale must be an instance of one dataclass; "
+                    "make it with dataclasses.replace from the default"
+                )
+
     def configs(self) -> dict[str, C]:
         """Every scale's configuration."""
         return {"default": self.config, **self.scales}
@@ -80,9 +90,13 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
     if name not in questions:
         close = difflib.get_close_matches(name, questions)
         hint = f" Did you mean {' or '.join(close)}?" if close else ""
-        Console(stderr=True).print(f"There is no experiment {name!r}.{hint}\n{listing(questions)}", markup=False)
+        _complain(f"There is no experiment {name!r}.{hint}\n{listing(questions)}")
         return 2
     module = importlib.import_module(f"{package}.{name}")
+    if module.EXPERIMENT.name != name:
+        raise ValueError(
+            f"{package}.{name} names its experiment {module.EXPERIMENT.name!r}: must be {name!r}; rename it"
+        )
     command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
     return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
 
@@ -145,7 +159,7 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
             _announce(console, directory, resumed)
             _run(experiment, command.config, Context(directory, command.cache_dir, console), about)
     except runs.RunInUse as error:
-        Console(stderr=True).print(str(error), markup=False)
+        _complain(str(error))
         return 1
     except Stopped as stopped:
         again = shlex.join(part for part in shlex.split(typed) if part != "--fresh")
@@ -216,3 +230,7 @@ def _first_line(text: str | None) -> str:
 
 def _print(*texts: str) -> None:
     Console(soft_wrap=True, highlight=False).print(*texts, sep="\n", markup=False)
+
+
+def _complain(text: str) -> None:
+    Console(stderr=True, soft_wrap=True, highlight=False).print(text, markup=False)

@@ -33,7 +33,7 @@ class RunInUse(RuntimeError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Revision:
-    """The commit of the code, `unknown` outside a checkout; `dirty`: files that git does not ignore differed from it."""
+    """The commit of the code, `unknown` outside a checkout; `dirty`: unignored files differed from it."""
 
     commit: str
     dirty: bool

@@ -5,6 +5,7 @@ run goes on from its last checkpoint.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -25,7 +26,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.greedy import make_answer
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step
+from touchr1_jax.rl.grpo import Fixed, GRPOState, ScoreFn, make_grpo_step
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig, fit
@@ -86,12 +87,18 @@ def run_sft(
 ) -> Params:
     """Train a policy from scratch on verified answers; a blind one never feels anything."""
     feed = AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, seed=seed, blind=blind)
-    optimizer = make_optimizer(config.optimizer, config.steps)
+    optimizer, step = sft_program(assembly.agent, config, blind)
     clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
     params = assembly.init(seed, touch_batch(next(iter(clips))))
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
-    step = make_sft_step(assembly.agent, optimizer, blind=blind)
     return _fit(step, state, feed, LoopConfig(steps=config.steps, save_every=config.save_every), context, stage).params
+
+
+@functools.cache
+def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds."""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    return optimizer, make_sft_step(agent, optimizer, blind=blind)
 
 
 def _fit(step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str) -> Any:
@@ -113,13 +120,19 @@ def encode_contacts(
 ) -> Features:
     """Encode contacts once and keep the features on the host, in the order of `rows`."""
     clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
-    encode = jax.jit(lambda p, b: assembly.agent.encode(p, b, blind=blind))
+    encode = encode_program(assembly.agent, blind)
     parts = []
     with context.progress("encoding", len(rows)) as advance:
         for clip in clips:
             parts.append(jax.device_get(encode(params, touch_batch(clip))))
             advance(len(clip["contact"]))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@functools.cache
+def encode_program(agent: Agent, blind: bool) -> Any:
+    """Compiled encoder, made once."""
+    return jax.jit(lambda p, b: agent.encode(p, b, blind=blind))
 
 
 def noise_bank(
@@ -153,8 +166,7 @@ def run_grpo(
     features: Features,
     label: np.ndarray,
     noise: Float[Array, "K S N D"],
-    weights: Weights,
-    prior: np.ndarray,
+    score: ScoreFn,
     config: GRPOConfig,
     loop: LoopConfig,
     context: Context,
@@ -164,18 +176,25 @@ def run_grpo(
 ) -> Params:
     """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
     feed = QuestionFeed(assembly, features, label, batch_size=config.prompts, seed=seed)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.adamw(config.learning_rate * config.lr_scale, weight_decay=0.0)
-    )
+    optimizer, step = grpo_program(assembly.agent, score, config)
     decoder = {"decoder": params["decoder"]}
     trained = jax.tree.map(jnp.copy, decoder)
     state = GRPOState(
         params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32), key=jax.random.key(seed)
     )
-    step = make_grpo_step(assembly.agent, assembly.score(weights, prior), optimizer, config)
     fixed = Fixed(reference=decoder, noise=noise)
     end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage)
     return {**params, **end.params}
+
+
+@functools.cache
+def grpo_program(agent: Agent, score: ScoreFn, config: GRPOConfig) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds of an arm."""
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adamw(config.learning_rate * config.lr_scale, weight_decay=0.0),
+    )
+    return optimizer, make_grpo_step(agent, score, optimizer, config)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -203,13 +222,11 @@ class Evaluated:
         )
 
 
-def evaluate_policy(
-    assembly: Assembly, params: Params, features: Features, label: np.ndarray, prior: np.ndarray
-) -> Evaluated:
+def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
     """Ask every labelled question about every contact, with all streams and with each stream alone."""
     contact, attribute = np.nonzero(label >= 0)
     present = features.stream_mask[contact]
-    ask = make_answer(assembly.agent, assembly.score({"format": 1.0}, prior), assembly.model.completion_tokens)
+    ask = answer_program(assembly)
     said = _ask(ask, assembly, params, features, label, contact, attribute, present)
     s = present.shape[1]
     alone = None
@@ -227,6 +244,12 @@ def evaluate_policy(
         label=np.where(assembly.layout.asked[attribute], label[contact], -1),
         alone=alone,
     )
+
+
+@functools.cache
+def answer_program(assembly: Assembly) -> Any:
+    """Compiled greedy answerer, made once."""
+    return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
 
 
 def _ask(ask, assembly, params, features, label, contact, attribute, streams):

@@ -136,7 +136,7 @@ def _complain(error: Exception) -> None:
 
 @contextlib.contextmanager
 def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar with rate and time left on stderr; nothing of it stays where stderr is no terminal."""
+    """A bar with rate and time left on stderr; nothing where stderr is no terminal."""
     columns = (
         rich.progress.TextColumn("{task.description}"),
         rich.progress.BarColumn(),
@@ -144,7 +144,7 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
         rich.progress.TextColumn("{task.fields[rate]}"),
         rich.progress.TimeRemainingColumn(),
     )
-    with rich.progress.Progress(*columns, console=ERR, transient=not ERR.is_terminal) as bar:
+    with rich.progress.Progress(*columns, console=ERR, disable=not ERR.is_terminal) as bar:
         task = bar.add_task(what, total=None, rate="")
 
         def show(done: int, total: int) -> None:

@@ -111,8 +111,8 @@ def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float
     top = float(np.abs(x).max(initial=0.0))
     if not math.isfinite(top):
         raise SchemaError(f"{where}: {name} holds a value that is not finite; put 0 there and clear `valid`")
-    mantissa, exponent = math.frexp(top / _TOP)
-    scale = max(math.ldexp(1.0, exponent - (mantissa == 0.5)), _LEAST_SCALE)
+    mantissa, exponent = math.frexp(max(top / _TOP, _LEAST_SCALE))
+    scale = math.ldexp(1.0, exponent - (mantissa == 0.5))
     if scale > 2 * TOLERANCE[name]:
         limit = _TOP * 2.0 ** math.floor(math.log2(2 * TOLERANCE[name]))
         raise SchemaError(

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import absl.flags
 import cv2
 import grain
 import numpy as np
@@ -133,7 +134,11 @@ def clip_batches(
     batches = dataset.map(_Reader(store, config)).batch(batch_size, drop_remainder=drop_remainder)
     # one thread and two batches ahead: grain's default of 500 would hold gigabytes of frames
     iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))
-    return iterable.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers)) if workers else iterable
+    if not workers:
+        return iterable
+    if not absl.flags.FLAGS.is_parsed():
+        absl.flags.FLAGS.mark_as_parsed()  # grain's workers read flags that only absl programs parse
+    return iterable.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,9 +22,10 @@ def choose_frames(sequence: Sequence, count: int, rejected: Seq[Flag]) -> np.nda
         argmin Σ_k |v_{n_k} − l_k|   over   n_1 < n_2 < … < n_F
 
     v is the measured normal load −Fz in a press, so that the frames cover the ramp from 0 to its maximum.  Elsewhere it
-    is the cumulative salience Σ_{m≤n} c_m, c_m the mean absolute change of frame m against the first one, so that
-    frames lie denser the more is seen of the contact.  (In a slide at set force the levels of the load would all fall
-    into the first touch.)  The most pressed frame, of largest load or else of largest change, is always among them.
+    is the cumulative salience Σ_{m≤n} c_m, c_m the mean absolute change of frame m against the first one less that of
+    the quietest frame, so that frames lie denser the more is seen of the contact.  (In a slide at set force the levels
+    of the load would all fall into the first touch.)  The most pressed frame, of largest load or else of largest
+    change, is always among them.
 
     Args:
       sequence: N frames.
@@ -47,7 +48,8 @@ def choose_frames(sequence: Sequence, count: int, rejected: Seq[Flag]) -> np.nda
         value = peak = load
     else:
         change = _change(sequence, usable)
-        value, peak = np.cumsum(change), change if load is None else load
+        floor = np.partition(change, 1)[1]  # noise: the change of the quietest frame beside the first
+        value, peak = np.cumsum(np.maximum(change - floor, 0)), change if load is None else load
     if np.ptp(value) == 0:
         value = np.arange(usable.size)
     chosen = nearest_increasing(value, np.linspace(value.min(), value.max(), count))
@@ -60,7 +62,7 @@ def choose_frames(sequence: Sequence, count: int, rejected: Seq[Flag]) -> np.nda
 def nearest_increasing(value: np.ndarray, level: np.ndarray) -> np.ndarray:
     """The strictly increasing positions whose values lie nearest to the levels in sum, by dynamic programming.
 
-        B_k(n) = |v_n − l_k| + min_{m<n} B_{k−1}(m),   position k = the last argmin, traced back;  O(F N)
+        B_k(n) = |v_n − l_k| + min_{m<n} B_{k−1}(m),   positions traced back from argmin B_F;  O(F N)
 
     Args:
       value: v, float [N].

@@ -5,12 +5,12 @@ object looks like.  An honest object looks like what it is, so the view tells as
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 
 from sensors_io.scenes.objects import PROTRUSION, ROUGHNESS
-from sensors_io.schema import MATERIALS
 
 VIEW_MM = 45.0
 """Side of the view."""
@@ -19,68 +19,101 @@ CAMERA_MM = 300.0
 """From the camera to the table."""
 
 
+Texture = Callable[[int, np.random.Generator], np.ndarray]
+"""Draws a texture of about unit amplitude on [px, px]."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Look:
-    """How a material looks: ranges of hue, saturation and value (0..1), gloss, and the share of its texture in the value.
+    """How a material looks: ranges of hue, saturation and value (0..1), gloss, texture and its share in the value.
 
-    `texture` names the drawing: plain, brushed, weave, mottle, pebble or grain.  `clear` is the share of background
-    that shines through.
+    `clear` is the share of the background that shines through.
     """
 
     hue: tuple[float, float]
     saturation: tuple[float, float]
     value: tuple[float, float]
     gloss: float
-    texture: str
+    texture: Texture
     contrast: float
     clear: float = 0.0
 
 
-LOOKS = {
-    "plastic": Look(hue=(0, 1), saturation=(0.6, 0.95), value=(0.6, 0.95), gloss=0.5, texture="plain", contrast=0.02),
-    "metal": Look(
-        hue=(0.52, 0.66), saturation=(0.0, 0.1), value=(0.5, 0.75), gloss=0.9, texture="brushed", contrast=0.12
+def _smooth_noise(px: int, scale_64: float, rng: np.random.Generator) -> np.ndarray:
+    """Unit-variance noise with a correlation length of `scale_64` pixels of a 64-pixel view."""
+    noise = cv2.GaussianBlur(rng.standard_normal((px, px)), (0, 0), scale_64 * px / 64)
+    return noise / noise.std()
+
+
+def _plain(px: int, rng: np.random.Generator) -> np.ndarray:
+    return _smooth_noise(px, 6, rng)
+
+
+def _mottle(px: int, rng: np.random.Generator) -> np.ndarray:
+    return np.tanh(1.5 * _smooth_noise(px, 3, rng)) + 0.3 * _smooth_noise(px, 1, rng)
+
+
+def _pebble(px: int, rng: np.random.Generator) -> np.ndarray:
+    return 1 - 2.2 * np.exp(-(_smooth_noise(px, 1.6, rng) ** 2) / 0.15)
+
+
+def _brushed(px: int, rng: np.random.Generator) -> np.ndarray:
+    streaks = cv2.resize(rng.standard_normal((px, 3)), (px, px), interpolation=cv2.INTER_LINEAR)
+    return streaks if rng.random() < 0.5 else streaks.T
+
+
+def _weave(px: int, rng: np.random.Generator) -> np.ndarray:
+    a, b = _turned_pixels(px, rng)
+    pitch = rng.uniform(3.2, 5)
+    return 0.7 * np.sign(np.sin(np.pi * a / pitch) * np.sin(np.pi * b / pitch)) + 0.3 * _smooth_noise(px, 1, rng)
+
+
+def _grain(px: int, rng: np.random.Generator) -> np.ndarray:
+    a, _ = _turned_pixels(px, rng)
+    rings = np.sin(2 * np.pi * (a + 4 * _smooth_noise(px, 9, rng)) / rng.uniform(5, 9))
+    return rings + 0.3 * _smooth_noise(px, 1, rng)
+
+
+def _turned_pixels(px: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates along two random perpendicular axes, in pixels of a 64-pixel view."""
+    turn, i = rng.uniform(0, np.pi), np.arange(px) * (64 / px)
+    c, s = np.cos(turn), np.sin(turn)
+    return c * i[None, :] + s * i[:, None], c * i[:, None] - s * i[None, :]
+
+
+LOOKS = (
+    Look(hue=(0, 1), saturation=(0.6, 0.95), value=(0.6, 0.95), gloss=0.5, texture=_plain, contrast=0.02),
+    Look(hue=(0.52, 0.66), saturation=(0, 0.1), value=(0.5, 0.75), gloss=0.9, texture=_brushed, contrast=0.12),
+    Look(hue=(0, 1), saturation=(0.25, 0.65), value=(0.35, 0.8), gloss=0.0, texture=_weave, contrast=0.3),
+    Look(hue=(0, 0.28), saturation=(0.55, 0.9), value=(0.55, 0.9), gloss=0.25, texture=_mottle, contrast=0.3),
+    Look(hue=(0.08, 0.16), saturation=(0.02, 0.2), value=(0.85, 0.98), gloss=0.03, texture=_mottle, contrast=0.05),
+    Look(
+        hue=(0.42, 0.58), saturation=(0.1, 0.3), value=(0.75, 0.95), gloss=1, texture=_plain, contrast=0.01, clear=0.6
     ),
-    "fabric": Look(hue=(0, 1), saturation=(0.25, 0.65), value=(0.35, 0.8), gloss=0.0, texture="weave", contrast=0.3),
-    "food": Look(
-        hue=(0.0, 0.28), saturation=(0.55, 0.9), value=(0.55, 0.9), gloss=0.25, texture="mottle", contrast=0.3
-    ),
-    "paper": Look(
-        hue=(0.08, 0.16), saturation=(0.02, 0.2), value=(0.85, 0.98), gloss=0.03, texture="mottle", contrast=0.05
-    ),
-    "glass": Look(
-        hue=(0.42, 0.58),
-        saturation=(0.1, 0.3),
-        value=(0.75, 0.95),
-        gloss=1.0,
-        texture="plain",
-        contrast=0.01,
-        clear=0.6,
-    ),
-    "leather": Look(
-        hue=(0.02, 0.08), saturation=(0.4, 0.7), value=(0.15, 0.45), gloss=0.2, texture="pebble", contrast=0.35
-    ),
-    "wood": Look(hue=(0.06, 0.11), saturation=(0.4, 0.65), value=(0.45, 0.75), gloss=0.08, texture="grain", contrast=0.35),
-    "other": Look(hue=(0, 1), saturation=(0.0, 0.5), value=(0.2, 0.9), gloss=0.2, texture="mottle", contrast=0.18),
-}
+    Look(hue=(0.02, 0.08), saturation=(0.4, 0.7), value=(0.15, 0.45), gloss=0.2, texture=_pebble, contrast=0.35),
+    Look(hue=(0.06, 0.11), saturation=(0.4, 0.65), value=(0.45, 0.75), gloss=0.08, texture=_grain, contrast=0.35),
+    Look(hue=(0, 1), saturation=(0, 0.5), value=(0.2, 0.9), gloss=0.2, texture=_mottle, contrast=0.18),
+)
+"""In the order of `MATERIALS`: plastic, metal, fabric, food, paper, glass, leather, wood, other."""
 
 
 def view(material: int, px: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Picture and depth map of an object that looks like `material`, seen from above.
 
     Args:
-      material: index into `MATERIALS`.
+      material: index into `schema.MATERIALS`.
       px: side of the view.
       rng: draws outline, colour, texture and the relief that is typical of the material.
 
     Returns:
       RGB uint8 [px, px, 3] and the distance from the camera, mm, float32 [px, px].
     """
-    look = LOOKS[MATERIALS[material]]
+    look = LOOKS[material]
     x = ((np.arange(px) + 0.5) / px - 0.5) * VIEW_MM
     height, inside = _shape(material, x[None, :], x[:, None], rng)
     albedo = _albedo(look, px, rng)
-    table = _hsv(rng.random(), rng.uniform(0, 0.15), rng.uniform(0.3, 0.75)) * (1 + 0.03 * _smooth_noise(px, 3, rng))[..., None]
+    table = _hsv(rng.random(), rng.uniform(0, 0.15), rng.uniform(0.3, 0.75))
+    table = table * (1 + 0.03 * _smooth_noise(px, 3, rng))[..., None]
     body = look.clear * table + (1 - look.clear) * albedo
     lit = _light(body, height, look.gloss, rng)
     cover = inside[..., None]
@@ -91,7 +124,7 @@ def view(material: int, px: int, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 def _shape(material: int, x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Height above the table, mm, and soft cover 0..1 of a domed superellipse with the relief typical of the material."""
+    """Height, mm, and soft cover 0..1 of a domed superellipse with the relief typical of the material."""
     turn, power = rng.uniform(0, np.pi), rng.uniform(2, 5)
     a = np.cos(turn) * x + np.sin(turn) * y
     b = np.cos(turn) * y - np.sin(turn) * x
@@ -109,30 +142,7 @@ def _shape(material: int, x: np.ndarray, y: np.ndarray, rng: np.random.Generator
 def _albedo(look: Look, px: int, rng: np.random.Generator) -> np.ndarray:
     """Colour without light, [px, px, 3]."""
     colour = _hsv(rng.uniform(*look.hue), rng.uniform(*look.saturation), rng.uniform(*look.value))
-    return colour * (1 + look.contrast * _texture(look.texture, px, rng))[..., None]
-
-
-def _texture(name: str, px: int, rng: np.random.Generator) -> np.ndarray:
-    """Texture of about unit amplitude, [px, px]."""
-    turn = rng.uniform(0, np.pi)
-    i = np.arange(px) * (64 / px)
-    a = np.cos(turn) * i[None, :] + np.sin(turn) * i[:, None]
-    b = np.cos(turn) * i[:, None] - np.sin(turn) * i[None, :]
-    if name == "plain":
-        return _smooth_noise(px, 6, rng)
-    if name == "brushed":
-        streaks = cv2.resize(rng.standard_normal((px, 3)), (px, px), interpolation=cv2.INTER_LINEAR)
-        return streaks if turn < np.pi / 2 else streaks.T
-    if name == "weave":
-        pitch = rng.uniform(3.2, 5)
-        return np.sign(np.sin(np.pi * a / pitch) * np.sin(np.pi * b / pitch)) * 0.7 + 0.3 * _smooth_noise(px, 1, rng)
-    if name == "mottle":
-        return np.tanh(1.5 * _smooth_noise(px, 3, rng)) + 0.3 * _smooth_noise(px, 1, rng)
-    if name == "pebble":
-        return 1 - 2.2 * np.exp(-(_smooth_noise(px, 1.6, rng) ** 2) / 0.15)
-    if name == "grain":
-        return np.sin(2 * np.pi * (a + 4 * _smooth_noise(px, 9, rng)) / rng.uniform(5, 9)) + 0.3 * _smooth_noise(px, 1, rng)
-    raise ValueError(f"texture is {name!r}: must be plain, brushed, weave, mottle, pebble or grain; correct the look")
+    return colour * (1 + look.contrast * look.texture(px, rng))[..., None]
 
 
 def _light(albedo: np.ndarray, height: np.ndarray, gloss: float, rng: np.random.Generator) -> np.ndarray:
@@ -142,7 +152,8 @@ def _light(albedo: np.ndarray, height: np.ndarray, gloss: float, rng: np.random.
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     azimuth = rng.uniform(0, 2 * np.pi)
     lamp = np.array([0.55 * np.cos(azimuth), 0.55 * np.sin(azimuth), 0.835])
-    halfway = (lamp + [0, 0, 1]) / np.linalg.norm(lamp + [0, 0, 1])
+    halfway = lamp + np.array([0.0, 0.0, 1.0])
+    halfway /= np.linalg.norm(halfway)
     diffuse = 0.35 + 0.7 * np.clip(normal @ lamp, 0, 1)
     shine = 0.9 * gloss * np.clip(normal @ halfway, 0, 1) ** (8 + 60 * gloss)
     return albedo * diffuse[..., None] + shine[..., None]
@@ -150,12 +161,6 @@ def _light(albedo: np.ndarray, height: np.ndarray, gloss: float, rng: np.random.
 
 def _shadow(inside: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(inside, (0, 0), inside.shape[0] / 20)
-
-
-def _smooth_noise(px: int, scale_64: float, rng: np.random.Generator) -> np.ndarray:
-    """Unit-variance noise with a correlation length of `scale_64` pixels of a 64-pixel view."""
-    noise = cv2.GaussianBlur(rng.standard_normal((px, px)), (0, 0), scale_64 * px / 64)
-    return noise / noise.std()
 
 
 def _hsv(hue: float, saturation: float, value: float) -> np.ndarray:

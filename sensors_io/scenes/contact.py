@@ -1,14 +1,12 @@
 """Frictionless normal contact at a prescribed force, by spectral projected gradients in float32.
 
-The unknown is the pressure p ≥ 0 on an [N, N] grid with Σ p dA = F.  With the compliance G of layer and object in series
-and the gap g₀ of the undeformed bodies, the complementarity conditions are
+The unknown is the pressure p ≥ 0 on an [N, N] grid with Σ p dA = F.  With the compliance G of layer and object in
+series and the gap g₀ of the undeformed bodies, the complementarity conditions are
 
     w = G ∗ p + g₀,   w = δ where p > 0,   w ≥ δ where p = 0,
 
 those of the convex quadratic ½ pᵀGp + pᵀg₀.
 """
-
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +71,7 @@ def winkler_pressure(gap: Float[Array, "N N"], total: Float[Array, ""], stiffnes
     return _rescale(rise, total)
 
 
-@functools.partial(jax.jit, static_argnames=("max_iterations",))
+@jax.jit
 def solve(
     gap_mm: Float[Array, "N N"],
     force_n: Float[Array, ""],
@@ -87,7 +85,7 @@ def solve(
 
         p ← P(p − τ d),   d = g where p > 0 or g < 0,   g = w − mean over p > 0 of w,
 
-    P clips at 0 and rescales to the force; τ alternates the two Barzilai–Borwein lengths.  One convolution per iteration.
+    P clips at 0 and rescales to the force; τ alternates the two Barzilai–Borwein lengths.  One convolution a step.
     Stops on  (Σ p|g| / Σ p + 0.1 max over p = 0 of −g) / δ < tolerance,  or at the cap with `converged` false and the
     best iterate seen.  No output is ever NaN for finite input; map with `jax.lax.map`, which stops per scene.
 

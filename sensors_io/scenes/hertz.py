@@ -1,6 +1,7 @@
 """Closed forms of frictionless contact with a half-space: what the contact solver must reproduce in its limit.
 
-E* = E / (1 − ν²) is the plane-strain modulus, MPa; lengths mm, forces N.  Source: Johnson, Contact Mechanics (1985), ch. 4.
+E* = E / (1 − ν²) is the plane-strain modulus, MPa; lengths mm, forces N.
+Source: Johnson, Contact Mechanics (1985), ch. 4.
 """
 
 import dataclasses

@@ -39,7 +39,8 @@ class DepthResponse:
     """Displacement at one depth per unit surface load, mm/MPa, each array shaped as the wave numbers.
 
     For pressure p and tractions τ_l along and τ_t across the wave vector:
-    u_z = normal_pressure p − i normal_shear τ_l,  u_l = i lateral_pressure p + lateral_shear τ_l,  u_t = transverse τ_t.
+    u_z = normal_pressure p − i normal_shear τ_l,  u_l = i lateral_pressure p + lateral_shear τ_l,
+    u_t = transverse τ_t.
     """
 
     normal_pressure: np.ndarray
@@ -149,7 +150,7 @@ def _displacement(q: np.ndarray, layer: Layer, z: float) -> tuple[np.ndarray, np
 
 
 def _boundary(q: np.ndarray, layer: Layer) -> np.ndarray:
-    """The four conditions [n, 4, 4]; stresses in units of 2μq, their dilatation part in closed form (finite at ν = ½)."""
+    """The four conditions [n, 4, 4]; stresses in units of 2μq, dilatation in closed form (finite at ν = ½)."""
     nu = layer.poisson
     half = (1 + 3 - 4 * nu) / 2
     t = q * layer.thickness_mm

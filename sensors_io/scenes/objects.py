@@ -152,7 +152,7 @@ def rough_waves(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane waves of a self-affine surface: power spectrum flat above 2 mm wavelength, ∝ q^{−2(1+H)} below it.
 
-    Wave numbers are stratified in log q between 2π/4 mm and the shortest wave, so the sum has exactly the rms asked for.
+    Wave numbers are stratified in log q between 2π/4 mm and the shortest wave, so the sum has the rms asked for.
 
     Returns:
       wave vectors [K, 2] rad/mm (x, y), amplitudes [K] mm, phases [K] rad.

@@ -1,6 +1,6 @@
 """What the camera behind the gel sees: one renderer per optical principle, all free of shadows.
 
-A renderer turns the deformed gel, sampled on the image grid, and the light of the unit into linear RGB [H, W, 3] in 0..1.
+A renderer turns the deformed gel, sampled on the image grid, and the light of the unit into RGB [H, W, 3] in 0..1.
 Patterns are warped backwards: the picture at r shows the pattern at r − v, v = u − (u·∇)u, the second-order inverse of
 r = r₀ + u(r₀), u the apparent motion.
 """

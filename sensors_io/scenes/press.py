@@ -40,8 +40,10 @@ class Press:
 
 @struct.dataclass
 class Noise:
-    """Unit normal noise of one press: of pixels (`None` without a camera), of the field nodes' five channels, of the zero
-    plane's offset and two slopes; and which nodes are lost.  Drawn on the host, twice as fast as in the program.
+    """Unit normal noise of one press, drawn on the host, where it is faster, and which field nodes are lost.
+
+    `pixels` is `None` without a camera; `nodes` is that of the fields' five channels, `plane` that of the depth field's
+    zero plane: offset and two slopes.
     """
 
     pixels: Float[Array, "F H W 3"] | None
@@ -71,12 +73,10 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Grid:
-    """Numerical settings: pixels of contact grid and picture, solver tolerance and cap."""
+    """Sides of the contact grid and of the picture, in pixels."""
 
     contact_grid: int
     image_px: int
-    tolerance: float
-    max_iterations: int
 
 
 @struct.dataclass
@@ -129,15 +129,24 @@ def draw_noise(rng: np.random.Generator, frames: int, sensor: SensorModel, image
     cells = (FIELD_GRID, FIELD_GRID)
     shape = (frames, image_px, image_px, 3)
     return Noise(
-        pixels=rng.standard_normal(shape, np.float32) if sensor.render is not None else None,
-        nodes=rng.standard_normal((frames, 5, *cells), np.float32),
-        plane=rng.standard_normal((frames, 3), np.float32),
-        lost=rng.random((frames, *cells), np.float32) < LOST_NODE_SHARE,
+        pixels=jnp.asarray(rng.standard_normal(shape, np.float32)) if sensor.render is not None else None,
+        nodes=jnp.asarray(rng.standard_normal((frames, 5, *cells), np.float32)),
+        plane=jnp.asarray(rng.standard_normal((frames, 3), np.float32)),
+        lost=jnp.asarray(rng.random((frames, *cells), np.float32) < LOST_NODE_SHARE),
     )
 
 
 @functools.partial(jax.jit, static_argnames=("sensor", "grid"))
-def record(press: Press, unit: Unit, kernels: Kernels, noise: Noise, sensor: SensorModel, grid: Grid) -> Recording:
+def record(
+    press: Press,
+    unit: Unit,
+    kernels: Kernels,
+    noise: Noise,
+    sensor: SensorModel,
+    grid: Grid,
+    tolerance: float = contact.TOLERANCE,
+    max_iterations: int = contact.MAX_ITERATIONS,
+) -> Recording:
     """Press, measure and photograph.
 
     Args:
@@ -146,7 +155,9 @@ def record(press: Press, unit: Unit, kernels: Kernels, noise: Noise, sensor: Sen
       kernels: `make_kernels(sensor, grid)`.
       noise: `draw_noise`.
       sensor: the sensor type.
-      grid: numerical settings.
+      grid: sizes.
+      tolerance: of the contact solver.
+      max_iterations: its cap, past which `converged` is false.
     """
     spacing = sensor.window_mm / grid.contact_grid
     x = (jnp.arange(grid.contact_grid, dtype=jnp.float32) + 0.5) * spacing - sensor.window_mm / 2
@@ -154,7 +165,7 @@ def record(press: Press, unit: Unit, kernels: Kernels, noise: Noise, sensor: Sen
     gel, body = kernels.gel / unit.modulus_factor, kernels.body / press.modulus_mpa
 
     def solve(force: Array) -> contact.Contact:
-        return contact.solve(gap, force, gel, body, spacing, grid.tolerance, grid.max_iterations)
+        return contact.solve(gap, force, gel, body, spacing, tolerance, max_iterations)
 
     solved = jax.lax.map(solve, press.force_n)
     plane = _marker_plane(solved, kernels, unit, sensor)
@@ -208,7 +219,8 @@ def _photograph(
             marker_depth_mm=up(plane[2]),
             window_mm=sensor.window_mm,
         )
-        light = unit.light.replace(exposure=unit.light.exposure * (1 + press.exposure_drift * progress))
+        exposure = unit.light.exposure * (1 + press.exposure_drift * progress)
+        light = dataclasses.replace(unit.light, exposure=exposure)
         return optics.expose(render(gel, light), pixels, sensor.read_noise, sensor.shot_noise)
 
     return jax.lax.map(one, (depth, plane, progress, noise.pixels))
@@ -217,7 +229,7 @@ def _photograph(
 def _measure(
     plane: Array, unit: Unit, kernels: Kernels, noise: Noise, sensor: SensorModel
 ) -> tuple[Array, Array, Array]:
-    """Deformation, shear and depth as the sensor reports them: calibration gains, drifting zero plane, noise, lost nodes.
+    """Deformation, shear and depth as the sensor reports them: with its gains, drifting zero, noise and lost nodes.
 
     No tangential load acts, so the shear field holds noise alone.
     """

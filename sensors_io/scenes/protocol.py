@@ -8,21 +8,18 @@ import collections
 import concurrent.futures
 import dataclasses
 import functools
-import hashlib
 import itertools
-import json
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sensors_io.scenes import appearance, objects, optics, surface
+from sensors_io.scenes.config import GENERATOR, SceneConfig, require, stream
 from sensors_io.scenes.press import Grid, Press, Recording, Unit, draw_noise, make_kernels, record
 from sensors_io.scenes.sensors import MODELS, SensorModel
 from sensors_io.schema import ContactKey, Flag, ObjectCard, Sequence
-
-GENERATOR = 1
-"""Version of the generator: part of the hash, raised whenever the same config would give other records."""
 
 UNITS = 3
 """Physical units of every sensor type."""
@@ -33,63 +30,6 @@ LOAD = 1
 _STRAIN_LIMIT = 0.3  # of the gel's thickness, past which small strain is off by more than the label noise
 _WORKERS = 2
 _LOOKAHEAD = 3  # contacts in flight
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SceneConfig:
-    """What to generate.
-
-    `split_shares` are the shares of objects in train, val and test.  Forces are `frames` geometric levels between
-    `min_force_n` and `max_force_n`; the ramp misses its targets by `force_jitter` (relative), the force sensor has a gain
-    error and noise on each axis.  `solver_tolerance` and `solver_max_iterations` are those of the contact solver.
-    """
-
-    objects: int = 600
-    sites: int = 3
-    frames: int = 8
-    image_px: int = 112
-    contact_grid: int = 64
-    view_px: int = 64
-    visual_lie_share: float = 0.3
-    min_force_n: float = 0.2
-    max_force_n: float = 20.0
-    force_jitter: float = 0.03
-    force_gain_error: float = 0.01
-    force_noise_n: float = 0.03
-    ramp_s: float = 3.0
-    split_shares: tuple[float, float, float] = (0.7, 0.1, 0.2)
-    solver_tolerance: float = 1e-3
-    solver_max_iterations: int = 200
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name, least in (("objects", 3), ("sites", 1), ("frames", 1), ("contact_grid", 24), ("image_px", 16), ("view_px", 16)):
-            value = getattr(self, name)
-            _require(value >= least, name, value, f"must be ≥ {least}")
-        _require(self.contact_grid % 2 == 0, "contact_grid", self.contact_grid, "must be even")
-        _require(0 <= self.visual_lie_share <= 1, "visual_lie_share", self.visual_lie_share, "must lie in [0, 1]")
-        ok = 0 < self.min_force_n <= self.max_force_n
-        _require(ok, "min_force_n", self.min_force_n, f"must lie in (0, max_force_n = {self.max_force_n}]")
-        _require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
-        ok = min(self.split_shares) >= 0 and abs(sum(self.split_shares) - 1) < 1e-6
-        _require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
-        _require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")
-
-    @property
-    def contact_count(self) -> int:
-        """Contacts of the data set; each gives one sequence per sensor."""
-        return self.objects * self.sites
-
-    @property
-    def shortest_wave_mm(self) -> float:
-        """Shortest wave of the roughness: 2.5 pixels of the coarsest contact grid."""
-        return max(0.8, 2.5 * max(m.window_mm for m in MODELS) / self.contact_grid)
-
-
-def config_hash(config: SceneConfig) -> str:
-    """Hash of everything that decides the records: the config and the version of the generator."""
-    payload = json.dumps({"generator": GENERATOR, **dataclasses.asdict(config)}, sort_keys=True)
-    return hashlib.sha256(payload.encode()).hexdigest()[:16]
 
 
 def object_cards(config: SceneConfig) -> list[ObjectCard]:
@@ -107,7 +47,7 @@ def contacts(config: SceneConfig, start: int = 0) -> Iterator[list[Sequence]]:
     Raises:
       ValueError: a start outside the data set.
     """
-    _require(0 <= start <= config.contact_count, "start", start, f"must lie in [0, {config.contact_count}]")
+    require(0 <= start <= config.contact_count, "start", start, f"must lie in [0, {config.contact_count}]")
     return _in_order(config, start)
 
 
@@ -139,7 +79,7 @@ def _in_order(config: SceneConfig, start: int) -> Iterator[list[Sequence]]:
 def _site(config: SceneConfig, index: int) -> tuple[objects.Solid, surface.Skin, np.ndarray, float]:
     """What all sensors share in a contact: object, skin, site (mm from the object's centre), direction."""
     solid = _solid(config, index // config.sites)
-    rng = _rng(config, "contact", index)
+    rng = stream(config.seed, "contact", index)
     site = rng.uniform(-8, 8, 2)
     turn = rng.uniform(0, 2 * np.pi)
     return solid, surface.make_skin(solid, site, float(np.exp(0.15 * rng.standard_normal()))), site, turn
@@ -149,20 +89,21 @@ def _press(config: SceneConfig, index: int, order: int) -> Sequence:
     """Contact `index` by sensor number `order`."""
     solid, skin, site, turn = _site(config, index)
     sensor = MODELS[order]
-    rng = _rng(config, "press", index, order)
+    rng = stream(config.seed, "press", index, order)
     serial = int(rng.integers(UNITS))
     force, measured, target = _ramp(config, rng)
     press = Press(
         skin=skin,
         pose=_pose(turn, rng),
-        modulus_mpa=np.float32(solid.modulus_mpa),
-        force_n=force,
-        exposure_drift=np.float32(0.01 * rng.standard_normal()),
+        modulus_mpa=_f32(solid.modulus_mpa),
+        force_n=_f32(force),
+        exposure_drift=_f32(0.01 * rng.standard_normal()),
     )
-    grid = _grid(config)
+    grid = Grid(contact_grid=config.contact_grid, image_px=config.image_px)
     unit = _session(_unit(config.seed, order, serial), rng)
     noise = draw_noise(rng, config.frames, sensor, config.image_px)
-    made = jax.device_get(record(press, unit, make_kernels(sensor, grid), noise, sensor, grid))
+    limits = (config.solver_tolerance, config.solver_max_iterations)
+    made = jax.device_get(record(press, unit, make_kernels(sensor, grid), noise, sensor, grid, *limits))
     time_ns = _times(config, index, order, sensor, target)
     markers = sensor.marker_depth_mm is not None
     return Sequence(
@@ -203,47 +144,49 @@ def _ramp(config: SceneConfig, rng: np.random.Generator) -> tuple[np.ndarray, np
     crosstalk = 0.01 * rng.standard_normal(2)
     noise = config.force_noise_n * rng.standard_normal((config.frames, 3))
     measured = np.stack([crosstalk[0] * force, crosstalk[1] * force, -gain * force], -1) + noise
-    return force.astype(np.float32), measured.astype(np.float32), target.astype(np.float32)
+    return force, measured.astype(np.float32), target.astype(np.float32)
 
 
 def _pose(turn: float, rng: np.random.Generator) -> surface.Pose:
     """The site's direction with this sensor's error of placement: 0.3 mm, 2°, tilt 0.3°."""
     return surface.Pose(
-        offset_mm=rng.normal(0, 0.3, 2).astype(np.float32),
-        turn_rad=np.float32(turn + rng.normal(0, np.deg2rad(2))),
-        tilt=rng.normal(0, np.deg2rad(0.3), 2).astype(np.float32),
+        offset_mm=_f32(rng.normal(0, 0.3, 2)),
+        turn_rad=_f32(turn + rng.normal(0, np.deg2rad(2))),
+        tilt=_f32(rng.normal(0, np.deg2rad(0.3), 2)),
     )
 
 
 @functools.lru_cache(maxsize=64)
 def _unit(seed: int, order: int, serial: int) -> Unit:
     """One physical unit: gel 5 % off its model, its own lamps, print and calibration."""
-    rng = np.random.default_rng([seed, _STREAMS["unit"], order, serial])
+    rng = stream(seed, "unit", order, serial)
     sensor = MODELS[order]
     dense = sensor.render is optics.speckle
-    texture = optics.speckle_texture(rng, 288, 5.0) if dense else np.zeros((2, 2), np.float32)
+    texture = optics.speckle_texture(rng, 288, 5.0) if dense else np.zeros((2, 2))
     light = optics.Light(
-        exposure=np.float32(np.exp(0.05 * rng.standard_normal())),
-        led_gain=np.exp(0.06 * rng.standard_normal(3)).astype(np.float32),
-        pattern_shift_mm=rng.uniform(-0.5, 0.5, 2).astype(np.float32),
-        texture=texture,
+        exposure=_f32(np.exp(0.05 * rng.standard_normal())),
+        led_gain=_f32(np.exp(0.06 * rng.standard_normal(3))),
+        pattern_shift_mm=_f32(rng.uniform(-0.5, 0.5, 2)),
+        texture=_f32(texture),
     )
     return Unit(
-        modulus_factor=np.float32(np.exp(0.05 * rng.standard_normal())),
+        modulus_factor=_f32(np.exp(0.05 * rng.standard_normal())),
         light=light,
-        lateral_gain=np.float32(1 + 0.02 * rng.standard_normal()),
-        depth_gain=np.float32(1 + 0.03 * rng.standard_normal()),
+        lateral_gain=_f32(1 + 0.02 * rng.standard_normal()),
+        depth_gain=_f32(1 + 0.03 * rng.standard_normal()),
     )
 
 
 def _session(unit: Unit, rng: np.random.Generator) -> Unit:
     """The unit on the day of this press: exposure 3 % off."""
-    exposure = np.float32(unit.light.exposure * np.exp(0.03 * rng.standard_normal()))
-    return unit.replace(light=unit.light.replace(exposure=exposure))
+    exposure = unit.light.exposure * float(np.exp(0.03 * rng.standard_normal()))
+    return dataclasses.replace(unit, light=dataclasses.replace(unit.light, exposure=exposure))
 
 
 def _times(config: SceneConfig, index: int, order: int, sensor: SensorModel, target: np.ndarray) -> np.ndarray:
-    """Host stamps: the sensors press one after another, 10 s apart, force rises linearly, frames come on the camera's clock."""
+    """Host stamps: the sensors press one after another, 10 s apart; force rises linearly; frames come on the camera's
+    clock, each on a tick of its own.
+    """
     begin_ms = 10_000.0 * (index * len(MODELS) + order)
     ideal = target.astype(np.float64) / config.max_force_n * config.ramp_s * 1000 / sensor.frame_period_ms
     tick = np.maximum.accumulate(np.round(ideal) - np.arange(len(ideal))) + np.arange(len(ideal))
@@ -253,24 +196,17 @@ def _times(config: SceneConfig, index: int, order: int, sensor: SensorModel, tar
 def _region(config: SceneConfig, sensor: SensorModel, site: np.ndarray) -> tuple[int, int, int, int]:
     """The sensing window on the view, clipped to it: x, y, width, height."""
     scale = config.view_px / appearance.VIEW_MM
-    low = np.round(np.clip(config.view_px / 2 + (site - sensor.window_mm / 2) * scale, 0, config.view_px - 1)).astype(int)
+    low = np.round(np.clip(config.view_px / 2 + (site - sensor.window_mm / 2) * scale, 0, config.view_px - 1)).astype(
+        int
+    )
     side = max(1, round(sensor.window_mm * scale))
     width, height = np.minimum(side, config.view_px - low)
     return int(low[0]), int(low[1]), int(width), int(height)
 
 
-def _grid(config: SceneConfig) -> Grid:
-    return Grid(
-        contact_grid=config.contact_grid,
-        image_px=config.image_px,
-        tolerance=config.solver_tolerance,
-        max_iterations=config.solver_max_iterations,
-    )
-
-
 def _card(config: SceneConfig, index: int, split: str) -> ObjectCard:
     solid = _solid(config, index)
-    picture, depth = appearance.view(solid.looks_like, config.view_px, _rng(config, "view", index))
+    picture, depth = appearance.view(solid.looks_like, config.view_px, stream(config.seed, "view", index))
     return ObjectCard(
         object_id=_object_id(index),
         split=split,
@@ -288,7 +224,7 @@ def _splits(config: SceneConfig) -> list[str]:
     train, val, _ = config.split_shares
     edges = np.round(np.cumsum([train, val]) * config.objects).astype(int)
     names = np.array(["test"] * config.objects, dtype=object)
-    order = _rng(config, "split").permutation(config.objects)
+    order = stream(config.seed, "split").permutation(config.objects)
     names[order[: edges[0]]] = "train"
     names[order[edges[0] : edges[1]]] = "val"
     return list(names)
@@ -296,20 +232,12 @@ def _splits(config: SceneConfig) -> list[str]:
 
 @functools.lru_cache(maxsize=32)
 def _solid(config: SceneConfig, index: int) -> objects.Solid:
-    return objects.sample(_rng(config, "object", index), config.visual_lie_share, config.shortest_wave_mm)
+    return objects.sample(stream(config.seed, "object", index), config.visual_lie_share, config.shortest_wave_mm)
 
 
-_STREAMS = {"object": 1, "view": 2, "split": 3, "unit": 4, "contact": 5, "press": 6}
-
-
-def _rng(config: SceneConfig, stream: str, *index: int) -> np.random.Generator:
-    return np.random.default_rng([config.seed, _STREAMS[stream], *index])
+def _f32(value: float | np.ndarray) -> jax.Array:
+    return jnp.asarray(value, jnp.float32)
 
 
 def _object_id(index: int) -> str:
     return f"g{index:06d}"
-
-
-def _require(ok: bool, field: str, value: object, constraint: str) -> None:
-    if not ok:
-        raise ValueError(f"{field} is {value!r}: {constraint}; change {field}")

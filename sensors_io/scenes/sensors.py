@@ -21,8 +21,8 @@ BODY = Layer(modulus_mpa=1.0, poisson=0.4, thickness_mm=20.0)
 class SensorModel:
     """One sensor type.
 
-    `render` is `None` for a sensor that exposes no camera.  `marker_depth_mm` is the depth of the marker plane below the
-    surface, `None` without markers: lateral displacement is then not observable.  Noise is per node of the field grid.
+    `render` is `None` for a sensor that exposes no camera.  `marker_depth_mm` is the depth of the marker plane below
+    the surface, `None` without markers: lateral displacement is then not observable.  Noise is per field node.
     """
 
     name: str
@@ -84,4 +84,6 @@ DMTAC_X = SensorModel(
 
 MODELS = (GELSIGHT_MINI, XENSE, TAC3D, DMTAC_X)
 if tuple(m.name for m in MODELS) != SENSORS:
-    raise ImportError(f"sensor models {[m.name for m in MODELS]} must follow schema.SENSORS {list(SENSORS)}; reorder them")
+    raise ImportError(
+        f"sensor models {[m.name for m in MODELS]} must follow schema.SENSORS {list(SENSORS)}; reorder them"
+    )

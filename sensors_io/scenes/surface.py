@@ -38,18 +38,21 @@ class Pose:
 
 def make_skin(solid: Solid, site_mm: np.ndarray, curvature_factor: float) -> Skin:
     """Skin of an object at a site; the body is more or less curved there by `curvature_factor`."""
-    f = np.float32
+
+    def f(value: float | np.ndarray) -> Array:
+        return jnp.asarray(value, jnp.float32)
+
     return Skin(
-        curvature_per_mm=f(curvature_factor) / np.array([solid.radius_1_mm, solid.radius_2_mm], np.float32),
+        curvature_per_mm=f(np.array([curvature_factor / solid.radius_1_mm, curvature_factor / solid.radius_2_mm])),
         turn_rad=f(solid.turn_rad),
         feature_height_mm=f(solid.feature_height_mm),
         feature_pitch_mm=f(solid.feature_pitch_mm),
         feature_width=f(solid.feature_width),
-        pattern=np.int32(solid.pattern),
-        site_mm=site_mm.astype(np.float32),
-        wave_numbers=solid.wave_numbers,
-        wave_amplitudes_mm=solid.wave_amplitudes_mm,
-        wave_phases_rad=solid.wave_phases_rad,
+        pattern=jnp.asarray(solid.pattern, jnp.int32),
+        site_mm=f(site_mm),
+        wave_numbers=f(solid.wave_numbers),
+        wave_amplitudes_mm=f(solid.wave_amplitudes_mm),
+        wave_phases_rad=f(solid.wave_phases_rad),
     )
 
 
@@ -62,7 +65,8 @@ def gap(skin: Skin, pose: Pose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
     x, y = x_mm[None, :] - pose.offset_mm[0], x_mm[:, None] - pose.offset_mm[1]
     a, b = _turned(x, y, turn + skin.turn_rad)
     body = (skin.curvature_per_mm[0] * a**2 + skin.curvature_per_mm[1] * b**2) / 2
-    relief = _relief(skin, a + skin.site_mm[0], b + skin.site_mm[1])
+    site_a, site_b = _turned(skin.site_mm[0], skin.site_mm[1], skin.turn_rad)
+    relief = _relief(skin, a + site_a, b + site_b)
     z = body - skin.feature_height_mm * relief + _roughness(skin, pose, x_mm) + pose.tilt[0] * x + pose.tilt[1] * y
     return z - jnp.min(z)
 

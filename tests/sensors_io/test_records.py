@@ -103,7 +103,7 @@ class TestBadInput:
             ([fakes.sequence(0, trial=1)] * 2, "each once"),
             ([fakes.sequence(0)], "stored already"),
             ([fakes.sequence(1)], "object 'object_1' has no card"),
-            ([dataclasses.replace(fakes.sequence(0, trial=1), sensor="digit")], "each once, of gelsight_mini"),
+            ([dataclasses.replace(fakes.sequence(0, trial=1), sensor="digit")], "each once, out of gelsight_mini"),
             ([fakes.sequence(0, trial=1, length=0)], "no frames"),
         ],
         ids=["empty", "keys", "twice", "stored", "card", "sensor", "length"],
@@ -123,11 +123,15 @@ class TestInterrupted:
         return [[fakes.sequence(0, s, trial=i) for s in ("gelsight_mini", "tac3d")] for i in range(start, 7)]
 
     def test_an_exception_publishes_what_is_written_and_marks_it_incomplete(self, tmp_path):
-        with pytest.raises(RuntimeError, match="stop"), RecordWriter(tmp_path, meta=fakes.META) as writer:
-            writer.write_object(fakes.card(0))
-            for contact in self.contacts()[:2]:
-                writer.write_contact(contact)
-            raise RuntimeError("stop")
+        def stop_after_two():
+            with RecordWriter(tmp_path, meta=fakes.META) as writer:
+                writer.write_object(fakes.card(0))
+                for contact in self.contacts()[:2]:
+                    writer.write_contact(contact)
+                raise RuntimeError("stop")
+
+        with pytest.raises(RuntimeError, match="stop"):
+            stop_after_two()
         with pytest.raises(records.IncompleteRecordsError, match="2 contacts and its writing has not ended"):
             RecordStore(tmp_path)
         assert len(RecordStore(tmp_path, allow_incomplete=True)) == 2
@@ -184,7 +188,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
     def test_records_are_not_overwritten_mixed_or_shared(self, tmp_path):
         fakes.write(tmp_path, 2)
-        with pytest.raises(records.RecordsExistError, match="holds records already; delete it, .* or resume"):
+        with pytest.raises(records.RecordsExistError, match=r"holds records already; delete it, .* or resume"):
             RecordWriter(tmp_path, meta=fakes.META)
         other = records.RecordsMeta(source="fake", licence="none", config_hash="beef", sensors=SENSORS)
         with pytest.raises(records.RecordsExistError, match="was made by config 'c0ffee', not 'beef'"):
@@ -214,7 +218,7 @@ class TestDamage:
     @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": "touchr1-records", "version": 1}'])
     def test_a_damaged_index(self, path, text):
         (path / "index.json").write_text(text)
-        with pytest.raises(records.CorruptRecordsError, match="index.json is damaged"):
+        with pytest.raises(records.CorruptRecordsError, match=r"index.json is damaged"):
             RecordStore(path)
 
     def test_another_version(self, path):
@@ -225,7 +229,7 @@ class TestDamage:
 
     def test_a_missing_shard(self, path):
         shards(path)[1].unlink()
-        with pytest.raises(records.CorruptRecordsError, match="contacts-00001.arrayrecord is missing: copy it again"):
+        with pytest.raises(records.CorruptRecordsError, match=r"contacts-00001.arrayrecord is missing: copy it again"):
             RecordStore(path)
 
     @pytest.mark.parametrize("keep", [0, 100, -1])
@@ -241,11 +245,8 @@ class TestDamage:
         data[len(data) // 4] ^= 255
         shard.write_bytes(data)
         store = RecordStore(path)
-        with pytest.raises(
-            records.CorruptRecordsError, match="contacts-00000.arrayrecord, entry .* copy the file again"
-        ):
-            for i in range(2):
-                store.contact(i)
+        with pytest.raises(records.CorruptRecordsError, match=r"contacts-00000.arrayrecord, entry .* copy the file"):
+            [store.contact(i) for i in range(2)]
         store.contact(2)  # the other shard is untouched
 
     def test_an_entry_whose_checksum_does_not_hold(self, path):

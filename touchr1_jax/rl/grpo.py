@@ -75,7 +75,7 @@ def make_grpo_step(
         params = optax.apply_updates(state.params, updates)
         metrics = parts | {f"reward_{name}": jnp.mean(value) for name, value in terms.items()}
         metrics |= rollout_metrics(rollout, reward, flat, parsed, batch.target)
-        metrics |= {"grad_norm": optax.global_norm(grads)}
+        metrics |= {"grad_norm": optax.tree.norm(grads)}
         return GRPOState(params=params, opt_state=opt_state, step=state.step + 1, key=state.key), metrics
 
     return jax.jit(step, donate_argnums=0)

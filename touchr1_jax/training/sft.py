@@ -48,7 +48,7 @@ def make_sft_step(
         (value, right), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
-        metrics = {"loss": value, "token_accuracy": right, "grad_norm": optax.global_norm(grads)}
+        metrics = {"loss": value, "token_accuracy": right, "grad_norm": optax.tree.norm(grads)}
         return SFTState(params=params, opt_state=opt_state, step=state.step + 1), metrics
 
     return jax.jit(step, donate_argnums=0)

@@ -1,0 +1,85 @@
+"""What to generate, the hash of it, and the streams of randomness."""
+
+import dataclasses
+import hashlib
+import json
+
+import numpy as np
+
+from sensors_io.scenes.sensors import MODELS
+
+GENERATOR = 1
+"""Version of the generator: part of the hash, raised whenever the same config would give other records."""
+
+_STREAMS = {"object": 1, "view": 2, "split": 3, "unit": 4, "contact": 5, "press": 6}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """What to generate.
+
+    `split_shares` are the shares of objects in train, val and test.  Forces are `frames` geometric levels between
+    `min_force_n` and `max_force_n`; the ramp misses its targets by `force_jitter` (relative), the force sensor has a
+    relative gain error per press and noise on each axis.  The last two numbers but the seed are the contact solver's.
+    """
+
+    objects: int = 600
+    sites: int = 3
+    frames: int = 8
+    image_px: int = 112
+    contact_grid: int = 64
+    view_px: int = 64
+    visual_lie_share: float = 0.3
+    min_force_n: float = 0.2
+    max_force_n: float = 20.0
+    force_jitter: float = 0.03
+    force_gain_error: float = 0.01
+    force_noise_n: float = 0.03
+    ramp_s: float = 3.0
+    split_shares: tuple[float, float, float] = (0.7, 0.1, 0.2)
+    solver_tolerance: float = 1e-3
+    solver_max_iterations: int = 200
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require(self.objects >= 1, "objects", self.objects, "must be ≥ 1")
+        require(self.sites >= 1, "sites", self.sites, "must be ≥ 1")
+        require(self.frames >= 1, "frames", self.frames, "must be ≥ 1")
+        require(self.image_px >= 16, "image_px", self.image_px, "must be ≥ 16")
+        require(self.view_px >= 16, "view_px", self.view_px, "must be ≥ 16")
+        require(self.contact_grid >= 24, "contact_grid", self.contact_grid, "must be ≥ 24 to resolve a contact")
+        require(self.contact_grid % 2 == 0, "contact_grid", self.contact_grid, "must be even")
+        require(0 <= self.visual_lie_share <= 1, "visual_lie_share", self.visual_lie_share, "must lie in [0, 1]")
+        ok = 0 < self.min_force_n <= self.max_force_n
+        require(ok, "min_force_n", self.min_force_n, f"must lie in (0, max_force_n = {self.max_force_n}]")
+        require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
+        ok = min(self.split_shares) >= 0 and abs(sum(self.split_shares) - 1) < 1e-6
+        require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
+        require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")
+
+    @property
+    def contact_count(self) -> int:
+        """Contacts of the data set; each gives one sequence per sensor."""
+        return self.objects * self.sites
+
+    @property
+    def shortest_wave_mm(self) -> float:
+        """Shortest wave of the roughness: 2.5 pixels of the coarsest contact grid."""
+        return max(0.8, 2.5 * max(m.window_mm for m in MODELS) / self.contact_grid)
+
+
+def config_hash(config: SceneConfig) -> str:
+    """Hash of everything that decides the records: the config and the version of the generator."""
+    payload = json.dumps({"generator": GENERATOR, **dataclasses.asdict(config)}, sort_keys=True)
+    return hashlib.sha256(payload.encode()).hexdigest()[:16]
+
+
+def stream(seed: int, name: str, *index: int) -> np.random.Generator:
+    """Randomness of one thing, independent of that of all others and of the order in which they are made."""
+    return np.random.default_rng([seed, _STREAMS[name], *index])
+
+
+def require(ok: bool, field: str, value: object, constraint: str) -> None:
+    """Raise a `ValueError` that names the field, the value and the constraint unless `ok`."""
+    if not ok:
+        raise ValueError(f"{field} is {value!r}: {constraint}; change {field}")

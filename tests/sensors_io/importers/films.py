@@ -1,0 +1,45 @@
+"""Tiny videos and a labels.json in the layout of PhysiCLeAR."""
+
+import json
+
+import cv2
+import numpy as np
+
+
+def film(path, frames=12, size=(24, 32), rate=25.0):
+    """A Motion-JPEG video whose frame n is a grey of 20 + 10 n (mod 220), with a red corner."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, size[::-1])
+    for n in range(frames):
+        image = np.full((*size, 3), 20 + 10 * n % 220, np.uint8)
+        image[:8, :8] = (0, 0, 255)
+        writer.write(image)
+    writer.release()
+    return path
+
+
+def entry(name, /, videos=2, **changes):
+    values = {
+        "object": name,
+        "name": f"a {name}",
+        "split": "train",
+        "hardness": 1,
+        "roughness": 0,
+        "bumps": 2,
+        "material": "rubber",
+        "videos": [f"{name}_{k}.avi" for k in range(videos)],
+    }
+    return values | changes
+
+
+def folder(path, *entries):
+    """A source folder; every listed video is written."""
+    (path / "videos").mkdir(parents=True)
+    labels(path, *entries)
+    for item in entries:
+        for name in item["videos"]:
+            film(path / "videos" / name)
+    return path
+
+
+def labels(path, *entries):
+    (path / "labels.json").write_text(json.dumps({"levels": {}, "objects": list(entries)}))

@@ -1,0 +1,55 @@
+"""The held-out split: by object, independent of order, balanced, and never the last of a level."""
+
+import collections
+
+import hypothesis
+import numpy as np
+from hypothesis import strategies as st
+
+from sensors_io.importers.holdout import hold_out
+from sensors_io.schema import ATTRIBUTES, LEVELS
+from tests.sensors_io.fakes import card
+
+
+def cards(count, seed=0, split="train"):
+    rng = np.random.default_rng(seed)
+    return [
+        card(
+            n, split=split, labels={a: int(rng.integers(LEVELS[a])) for a in ATTRIBUTES}, view=None, view_depth_mm=None
+        )
+        for n in range(count)
+    ]
+
+
+def levels(cards, split):
+    return collections.Counter((a, c.labels[a]) for c in cards if c.split == split for a in ATTRIBUTES)
+
+
+@hypothesis.given(st.integers(0, 40), st.integers(0, 99), st.floats(0, 0.99))
+def test_every_level_stays_in_train_and_nothing_else_moves(count, seed, share):
+    before = [*cards(count, seed), card(90, split="val"), card(91, split="unlabelled", labels={})]
+    after = hold_out(before, share)
+    assert [c.object_id for c in after] == [c.object_id for c in before]
+    assert [c.split for c in after[-2:]] == ["val", "unlabelled"]
+    assert set(levels(after, "train")) == set(levels(before, "train"))
+    assert sum(c.split == "test" for c in after) <= round(share * count)
+
+
+def test_the_choice_does_not_depend_on_the_order():
+    before = cards(40)
+    chosen = {c.object_id for c in hold_out(before, 0.2) if c.split == "test"}
+    assert chosen == {c.object_id for c in hold_out(before[::-1], 0.2) if c.split == "test"}
+    assert len(chosen) == 8
+
+
+def test_the_levels_are_shared_out_evenly():
+    after = hold_out(cards(100), 0.2)
+    train, test = levels(after, "train"), levels(after, "test")
+    for (attribute, level), count in test.items():
+        if attribute != "material":
+            assert abs(count / (count + train[attribute, level]) - 0.2) < 0.05
+
+
+def test_only_fully_labelled_objects_are_held_out():
+    before = [card(n, labels={"hardness": 1}) for n in range(9)]
+    assert all(a.split == b.split for a, b in zip(hold_out(before, 0.5), before, strict=True))

@@ -1,0 +1,194 @@
+"""The PhysiCLeAR importer: what comes in, and a named error or a listed skip for everything that does not."""
+
+import dataclasses
+import os
+import pathlib
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.physiclear import (
+    ImportSourceError,
+    PhysiclearConfig,
+    Skip,
+    import_physiclear,
+    read_labels,
+)
+from sensors_io.records import RecordsExistError, RecordStore
+from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
+from tests.sensors_io.importers.films import entry, film, folder, labels
+
+KEEP = PhysiclearConfig(height=0, max_frames=0, test_share=0)
+
+
+def test_videos_become_records(tmp_path):
+    source = folder(
+        tmp_path / "in",
+        entry("ball"),
+        entry("cup", split="val", material="glass", videos=1) | {"videos": ["cup_7.avi"]},
+        entry("fig", split="unlabelled", hardness=None, roughness=None, bumps=None, material=None, name=None),
+    )
+    seen = []
+    report = import_physiclear(source, tmp_path / "out", config=KEEP, progress=lambda *now: seen.append(now))
+    assert report.videos == 5
+    assert report.skipped == report.unlabelled == ()
+    assert dict(report.objects) == {"train": 1, "val": 1, "test": 0, "unlabelled": 1}
+    assert seen == [(n, 5) for n in range(1, 6)]
+    store = RecordStore(tmp_path / "out")
+    assert store.meta.notes["report"]["videos"] == 5
+    assert store.meta.sensors == ("gelsight_mini",)
+    assert [(k.object_id, k.trial) for k in store.contacts] == [
+        ("ball", 0),
+        ("ball", 1),
+        ("cup", 7),
+        ("fig", 0),
+        ("fig", 1),
+    ]
+    ball = store.objects["ball"]
+    assert dict(ball.labels) == {"hardness": 1, "roughness": 0, "protrusion": 2, "material": MATERIALS.index("other")}
+    assert store.objects["fig"].label_row().tolist() == [UNKNOWN] * 4
+    sequence = store.contact(0)["gelsight_mini"]
+    assert (sequence.key.motion, sequence.key.site) == ("free", 0)
+    assert sequence.frames.shape == (12, 24, 32, 3)
+    assert sequence.force_n is None
+    np.testing.assert_array_equal(sequence.host_time_ns, np.arange(12) * 40_000_000)
+    assert sequence.camera == {"file": "ball_0.avi", "rate_hz": 25.0, "size_px": [24, 32], "frames": 12}
+
+
+def test_the_options_thin_and_shrink(tmp_path):
+    source = folder(tmp_path / "in", entry("ball", videos=1))
+    import_physiclear(
+        source, tmp_path / "out", config=PhysiclearConfig(height=12, stride=2, max_frames=3, test_share=0)
+    )
+    sequence = RecordStore(tmp_path / "out").contact(0)["gelsight_mini"]
+    assert sequence.frames.shape == (3, 12, 16, 3)
+    np.testing.assert_array_equal(sequence.host_time_ns, np.array([0, 4, 10]) * 40_000_000)
+
+
+def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
+    source = folder(
+        tmp_path / "in",
+        entry("ball", videos=3),
+        entry("cup", hardness=None),
+        entry("jar", videos=1),
+        entry("lid", videos=1) | {"videos": ["cover_0.avi"]},
+    )
+    videos = source / "videos"
+    (videos / "ball_0.avi").write_bytes(b"broken")
+    (videos / "ball_2.avi").unlink()
+    (videos / "jar_0.avi").write_bytes(b"")
+    film(videos / "stray_0.avi")
+    report = import_physiclear(source, tmp_path / "out", config=KEEP)
+    assert report.videos == 3
+    assert set(report.skipped) == {
+        Skip(name="ball_0.avi", reason="does not open as a video"),
+        Skip(name="ball_2.avi", reason="is listed and absent"),
+        Skip(name="jar_0.avi", reason="does not open as a video"),
+        Skip(name="cover_0.avi", reason="is not named lid_<trial>"),
+        Skip(name="stray_0.avi", reason="is not listed in labels.json"),
+        Skip(name="jar", reason="object without a readable video"),
+        Skip(name="lid", reason="object without a readable video"),
+    }
+    assert report.unlabelled == (Skip(name="cup", reason="hardness is not annotated"),)
+    store = RecordStore(tmp_path / "out")
+    assert set(store.objects) == {"ball", "cup"}
+    assert len(store) == 3
+    assert len(store.meta.notes["report"]["skipped"]) == 7
+
+
+def test_an_interrupted_import_goes_on(tmp_path):
+    source = folder(tmp_path / "in", entry("ball", videos=3), entry("cup", videos=2))
+    whole = import_physiclear(source, tmp_path / "whole", config=KEEP)
+
+    def stop(done, total):
+        if done == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_physiclear(source, tmp_path / "parts", config=KEEP, progress=stop)
+    assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole
+    assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole  # a finished one is kept
+    assert RecordStore(tmp_path / "parts").contacts == RecordStore(tmp_path / "whole").contacts
+    with pytest.raises(RecordsExistError, match="was made by config"):
+        import_physiclear(source, tmp_path / "parts", config=dataclasses.replace(KEEP, stride=2))
+
+
+class TestNamedErrors:
+    def run(self, source):
+        return import_physiclear(source, source.parent / "out", config=KEEP)
+
+    def test_no_labels(self, tmp_path):
+        with pytest.raises(ImportSourceError, match=r"labels.json is missing: give the directory that holds"):
+            self.run(tmp_path / "in")
+
+    def test_an_empty_folder(self, tmp_path):
+        (tmp_path / "in" / "videos").mkdir(parents=True)
+        labels(tmp_path / "in", entry("ball"))
+        with pytest.raises(ImportSourceError, match="videos is missing or empty: put the videos there"):
+            self.run(tmp_path / "in")
+
+    def test_no_readable_video(self, tmp_path):
+        source = folder(tmp_path / "in", entry("ball", videos=1))
+        (source / "videos" / "ball_0.avi").write_bytes(b"broken")
+        with pytest.raises(ImportSourceError, match=r"no video can be read; the first: .*ball_0.avi.*does not open"):
+            self.run(source)
+        assert not (tmp_path / "out" / "index.json").exists()
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"hardness": 3}, r"labels\[hardness\] is 3: must lie in 0..2"),
+            ({"material": "cheese"}, "material 'cheese' must be one of plastic"),
+            ({"split": "dev"}, "split is 'dev'"),
+            ({"object": "a ball"}, "object_id is 'a ball'"),
+            ({"videos": ["../ball_0.avi"]}, "must be a file name without a directory"),
+            ({"hardness": "soft"}, "invalid literal"),
+        ],
+    )
+    def test_labels_out_of_range(self, tmp_path, change, message):
+        labels(tmp_path, entry("ball") | change)
+        with pytest.raises(ImportSourceError, match=message):
+            read_labels(tmp_path / "labels.json")
+
+    def test_missing_keys_and_no_json(self, tmp_path):
+        item = entry("ball")
+        del item["bumps"]
+        labels(tmp_path, item)
+        with pytest.raises(ImportSourceError, match="'bumps'"):
+            read_labels(tmp_path / "labels.json")
+        (tmp_path / "labels.json").write_text("{")
+        with pytest.raises(ImportSourceError, match="correct the entry"):
+            read_labels(tmp_path / "labels.json")
+
+    @pytest.mark.parametrize(
+        ("items", "message"),
+        [
+            ([entry("ball"), entry("ball", videos=0)], "object 'ball' appears twice"),
+            ([entry("ball"), entry("cup") | {"videos": ["ball_0.avi"]}], "video 'ball_0.avi' appears twice; splits"),
+        ],
+    )
+    def test_splits_cannot_share_an_object_or_a_video(self, tmp_path, items, message):
+        labels(tmp_path, *items)
+        with pytest.raises(ImportSourceError, match=message):
+            read_labels(tmp_path / "labels.json")
+
+    @pytest.mark.parametrize("bad", [{"stride": 0}, {"height": -1}, {"max_frames": -1}, {"test_share": 1.0}])
+    def test_bad_options(self, bad):
+        with pytest.raises(ImportSourceError, match=f"{next(iter(bad))} is "):
+            PhysiclearConfig(**bad)
+
+
+@pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")
+def test_the_real_recordings(tmp_path):
+    source = pathlib.Path(os.environ["TOUCHR1_PHYSICLEAR"])
+    report = import_physiclear(source, tmp_path / "out", config=PhysiclearConfig(height=60, max_frames=8))
+    assert report.videos == 437
+    assert report.skipped == report.unlabelled == ()
+    store = RecordStore(tmp_path / "out")
+    objects = {split: {k.object_id for k in map(store.contacts.__getitem__, store.contacts_of_split(split))}
+               for split in ("train", "val", "test", "unlabelled")}  # fmt: skip
+    assert {split: len(ids) for split, ids in objects.items()} == {"train": 48, "val": 7, "test": 12, "unlabelled": 13}
+    assert len(set.union(*objects.values())) == 80
+    for attribute in ATTRIBUTES[:3]:
+        for split in ("train", "test"):
+            assert {store.objects[name].labels[attribute] for name in objects[split]} == {0, 1, 2}

@@ -1,0 +1,91 @@
+"""Videos are read whole or refused by name."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.importers.video import VideoError, read_video
+from tests.sensors_io.importers.films import film
+
+WHOLE = {"height": 0, "stride": 1, "max_frames": 0}
+
+
+def test_every_frame_is_kept_in_rgb(tmp_path):
+    video = read_video(film(tmp_path / "a.avi", 12), **WHOLE)
+    assert video.frames.shape == (12, 24, 32, 3)
+    assert video.frames.dtype == np.uint8
+    assert video.index.tolist() == list(range(12))
+    assert (video.rate_hz, video.size_px, video.total) == (25, (24, 32), 12)
+    np.testing.assert_allclose(video.frames[:, 20, 20].mean(axis=1), 20 + 10 * np.arange(12), atol=3)
+    red, green, blue = video.frames[5, 2, 2].astype(int)
+    assert red > 200 > 80 > max(green, blue)
+
+
+@pytest.mark.parametrize(
+    ("options", "index"),
+    [
+        ({"stride": 5}, [0, 5, 10]),
+        ({"max_frames": 4}, [0, 4, 7, 11]),
+        ({"stride": 2, "max_frames": 3}, [0, 4, 10]),
+        ({"max_frames": 1}, [0]),
+        ({"max_frames": 99}, list(range(12))),
+    ],
+)
+def test_frames_are_thinned_as_asked(tmp_path, options, index):
+    film(tmp_path / "a.avi", 12)
+    every = read_video(tmp_path / "a.avi", **WHOLE)
+    video = read_video(tmp_path / "a.avi", **WHOLE | options)
+    assert video.index.tolist() == index
+    np.testing.assert_array_equal(video.frames, every.frames[index])
+
+
+def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
+    film(tmp_path / "a.avi", 3)
+    every, small = read_video(tmp_path / "a.avi", **WHOLE), read_video(tmp_path / "a.avi", **WHOLE | {"height": 12})
+    assert small.frames.shape == (3, 12, 16, 3)
+    assert small.size_px == (24, 32)
+    np.testing.assert_allclose(small.frames, every.frames.reshape(3, 12, 2, 16, 2, 3).mean(axis=(2, 4)), atol=0.51)
+
+
+def test_broken_files_are_named(tmp_path):
+    for name, data in (("empty", b""), ("text", b"no video at all" * 99)):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(VideoError, match="does not open as a video"):
+            read_video(tmp_path / name, **WHOLE)
+    with pytest.raises(VideoError, match="does not open as a video"):
+        read_video(tmp_path / "absent.avi", **WHOLE)
+
+
+def test_a_film_cut_short_is_named(tmp_path):
+    data = film(tmp_path / "a.avi", 40).read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    with pytest.raises(VideoError, match=r"is cut off: \d+ of 40 frames|holds no frame|does not open"):
+        read_video(tmp_path / "cut.avi", **WHOLE)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({cv2.CAP_PROP_FPS: 0.0}, "states a frame rate of 0.0"),
+        ({cv2.CAP_PROP_FPS: float("nan")}, "states a frame rate of nan"),
+        ({cv2.CAP_PROP_FRAME_COUNT: 13.0}, "is cut off: 12 of 13 frames"),
+    ],
+)
+def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, message):
+    film(tmp_path / "a.avi", 12)
+
+    opened = cv2.VideoCapture
+
+    class Capture:  # not a subclass: OpenCV's own class does not survive being one
+        def __init__(self, name):
+            self.capture = opened(name)
+
+        def __getattr__(self, name):
+            return getattr(self.capture, name)
+
+        def get(self, what):
+            return stated.get(what, self.capture.get(what))
+
+    monkeypatch.setattr(cv2, "VideoCapture", Capture)
+    with pytest.raises(VideoError, match=message):
+        read_video(tmp_path / "a.avi", **WHOLE)

@@ -1,0 +1,227 @@
+"""The contact solver against closed forms, against a float64 reference by another method, and where it may fail."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import contact
+from sensors_io.scenes.hertz import Hertz, half_space_spectrum
+from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
+from sensors_io.scenes.objects import rough_waves
+from sensors_io.scenes.reference import convolve, solve_reference
+
+N, M, WINDOW_MM = 48, 72, 16.0
+SPACING = WINDOW_MM / N
+X = (np.arange(N) + 0.5) * SPACING - WINDOW_MM / 2
+R2 = X[None] ** 2 + X[:, None] ** 2
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+BODY = Layer(modulus_mpa=1.0, poisson=0.4, thickness_mm=20.0)
+
+
+def _spectrum(layer: Layer, points: int = M, spacing: float = SPACING) -> np.ndarray:
+    return normal_compliance(np.hypot(*wave_numbers(points, spacing)), layer)
+
+
+def _rough(rms_mm: float, seed: int = 0) -> np.ndarray:
+    k, a, phase = rough_waves(np.random.default_rng(seed), rms_mm, 2.5 * SPACING)
+    angle = k[:, 0, None, None] * X[None] + k[:, 1, None, None] * X[:, None] + phase[:, None, None]
+    return np.sum(a[:, None, None] * np.cos(angle), 0)
+
+
+def _dots(pitch: float = 4.0) -> np.ndarray:
+    f = X / pitch - np.round(X / pitch)
+    return 1 - np.exp(-(f[None] ** 2 + f[:, None] ** 2) / 0.08) + R2 / 80
+
+
+def _solve(gap: np.ndarray, force: float, gel: np.ndarray, body: np.ndarray | float = 0.0, **kwargs) -> contact.Contact:
+    gel32 = jnp.asarray(gel, jnp.float32)
+    body32 = jnp.broadcast_to(jnp.asarray(body, jnp.float32), gel32.shape)
+    return jax.device_get(contact.solve(jnp.asarray(gap, jnp.float32), force, gel32, body32, SPACING, **kwargs))
+
+
+def _check_finite(solved: contact.Contact) -> None:
+    for leaf in jax.tree.leaves(solved):
+        assert np.all(np.isfinite(leaf))
+    assert np.all(solved.pressure_mpa >= 0)
+
+
+# Hertz ---------------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def _hertz_presses(points: int = 64, radius: float = 8.0, modulus: float = 0.4) -> list[tuple[Hertz, contact.Contact]]:
+    spacing = WINDOW_MM / points
+    x = (np.arange(points) + 0.5) * spacing - WINDOW_MM / 2
+    gap = jnp.asarray((x[None] ** 2 + x[:, None] ** 2) / (2 * radius), jnp.float32)
+    kernel = jnp.asarray(half_space_spectrum(points, spacing, modulus), jnp.float32)
+    presses = []
+    for force in (0.2, 1.0, 5.0):
+        solved = contact.solve(gap, force, kernel, jnp.zeros_like(kernel), spacing, 1e-5)
+        presses.append((Hertz(radius_mm=radius, plane_modulus_mpa=modulus, force_n=force), jax.device_get(solved)))
+    return presses
+
+
+def test_half_space_reproduces_hertz() -> None:
+    for hertz, solved in _hertz_presses():
+        assert solved.converged
+        np.testing.assert_allclose(solved.approach_mm, hertz.approach_mm, rtol=0.01)
+        np.testing.assert_allclose(solved.pressure_mpa.max(), hertz.peak_pressure_mpa, rtol=0.04)
+        points = solved.pressure_mpa.shape[0]
+        x = (np.arange(points) + 0.5) * WINDOW_MM / points - WINDOW_MM / 2
+        u = hertz.displacement_mm(np.hypot(x[None], x[:, None]))
+        np.testing.assert_allclose(solved.displacement_mm, u, atol=0.02 * u.max())
+
+
+def test_force_grows_with_depth_to_the_power_three_halves() -> None:
+    force = [h.force_n for h, _ in _hertz_presses()]
+    depth = [float(c.approach_mm) for _, c in _hertz_presses()]
+    assert np.polyfit(np.log(depth), np.log(force), 1)[0] == pytest.approx(1.5, abs=0.01)
+
+
+def test_hertz_closed_form_balances_its_force_and_is_continuous() -> None:
+    hertz = Hertz(radius_mm=5.0, plane_modulus_mpa=0.4, force_n=3.0)
+    r = np.linspace(0, hertz.contact_radius_mm, 20001)
+    assert np.trapezoid(2 * np.pi * r * hertz.pressure_mpa(r), r) == pytest.approx(3.0, rel=1e-4)
+    a = hertz.contact_radius_mm
+    inside, outside = hertz.displacement_mm(np.array([a * (1 - 1e-9), a * (1 + 1e-9)]))
+    assert inside == pytest.approx(outside, rel=1e-6)
+    far = hertz.displacement_mm(np.array([1e3]))[0]
+    assert far == pytest.approx(3.0 / (np.pi * 0.4 * 1e3), rel=1e-4)
+
+
+def test_finite_thickness_stiffens_the_gel() -> None:
+    gel = Layer(modulus_mpa=0.2, poisson=0.48, thickness_mm=4.0)
+    for force, ratio in ((0.1, 0.77), (1.0, 0.59), (20.0, 0.33)):
+        hertz = Hertz(radius_mm=8.0, plane_modulus_mpa=0.2 / (1 - 0.48**2), force_n=force)
+        solved = _solve(R2 / 16, force, _spectrum(gel))
+        assert solved.approach_mm / hertz.approach_mm == pytest.approx(ratio, abs=0.03)
+
+
+# Reference -----------------------------------------------------------------------------------------------------------
+
+SCENES = {
+    "stiff sphere": (R2 / 16, 1e3, 5.0),
+    "soft sphere": (R2 / 16, 0.1, 5.0),
+    "rough sphere": (R2 / 30 + _rough(0.05), 20.0, 2.0),
+    "soft rough": (R2 / 60 + _rough(0.1, 1), 0.4, 20.0),
+    "dots": (_dots(), 5.0, 8.0),
+    "flat rough": (_rough(0.02, 2), 1e3, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_agrees_with_the_float64_reference(name: str) -> None:
+    gap, modulus, force = SCENES[name]
+    gel, body = _spectrum(GEL), _spectrum(BODY) / modulus
+    reference = solve_reference(gap, force, gel + body, SPACING)
+    u = convolve(reference.pressure_mpa, gel)
+    for tolerance, u_error, p_error in ((1e-3, 1e-2, 0.05), (2e-5, 2e-4, 1e-3)):
+        solved = _solve(gap, force, gel, body, tolerance=tolerance)
+        assert solved.converged
+        assert np.linalg.norm(solved.displacement_mm - u) < u_error * np.linalg.norm(u)
+        p = reference.pressure_mpa
+        assert np.linalg.norm(solved.pressure_mpa - p) < p_error * np.linalg.norm(p)
+        assert solved.approach_mm == pytest.approx(reference.approach_mm, rel=u_error)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_force_balance_and_complementarity(name: str) -> None:
+    gap, modulus, force = SCENES[name]
+    gel, body = _spectrum(GEL), _spectrum(BODY) / modulus
+    solved = _solve(gap, force, gel, body)
+    p = solved.pressure_mpa.astype(np.float64)
+    assert p.sum() * SPACING**2 == pytest.approx(force, rel=1e-5)
+    assert np.all(p >= 0)
+    w = convolve(p, gel + body) + gap - gap.min()
+    assert np.sum(p * np.abs(w - solved.approach_mm)) / p.sum() < 1.1e-3 * solved.approach_mm
+    assert np.all(w[p == 0] - solved.approach_mm > -1.1e-2 * solved.approach_mm)
+
+
+def test_an_offset_of_the_gap_changes_nothing() -> None:
+    gap, modulus, force = SCENES["rough sphere"]
+    plain = _solve(gap, force, _spectrum(GEL), _spectrum(BODY) / modulus)
+    lifted = _solve(gap + 7.0, force, _spectrum(GEL), _spectrum(BODY) / modulus)
+    np.testing.assert_allclose(lifted.displacement_mm, plain.displacement_mm, atol=2e-3 * plain.displacement_mm.max())
+
+
+def test_the_reference_refuses_to_return_unconverged() -> None:
+    with pytest.raises(RuntimeError, match="raise the cap"):
+        solve_reference(R2 / 16, 1.0, _spectrum(GEL), SPACING, max_iterations=2)
+
+
+# Failure cases -------------------------------------------------------------------------------------------------------
+
+
+def _needle_beside_shoulder() -> np.ndarray:
+    gap = np.full((N, N), 5.0)
+    gap[:, : N // 2 - 4] = 0.6
+    gap[N // 2 - 1 : N // 2 + 1, N // 2 + 4 : N // 2 + 6] = 0.0
+    return gap
+
+
+def _pin(radius: float = 0.5) -> np.ndarray:
+    r = np.sqrt(R2)
+    return np.where(r < radius, radius - np.sqrt(np.maximum(radius**2 - R2, 0)), radius + 3 * (r - radius))
+
+
+HARD_CASES = {
+    "few pixels at 1 mN": (R2 / 4, 1e-3, GEL),
+    "needle beside a shoulder": (_needle_beside_shoulder(), 2.0, GEL),
+    "nearly full contact": (_rough(0.03, 3), 15.0, GEL),
+    "full pad": (np.zeros((N, N)), 5.0, GEL),
+    "white noise": (0.1 * np.random.default_rng(0).standard_normal((N, N)), 5.0, GEL),
+    "nearly incompressible": (R2 / 16, 5.0, Layer(modulus_mpa=0.3, poisson=0.4999, thickness_mm=4.0)),
+    "thin gel": (R2 / 16, 5.0, Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=0.3)),
+    "tilt": (R2 / 60 + 0.2 * X[None], 5.0, GEL),
+    "very soft gel": (R2 / 16, 1.0, Layer(modulus_mpa=0.01, poisson=0.48, thickness_mm=4.0)),
+    "pin": (_pin(), 5.0, GEL),
+}
+
+
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_hard_cases_give_no_nan_and_an_honest_flag(name: str) -> None:
+    gap, force, gel = HARD_CASES[name]
+    compliance = _spectrum(gel)
+    solved = _solve(gap, force, compliance)
+    _check_finite(solved)
+    p = solved.pressure_mpa.astype(np.float64)
+    assert p.sum() * SPACING**2 == pytest.approx(force, rel=1e-4)
+    w = convolve(p, compliance) + gap - gap.min()
+    g = w - w[p > 0].mean()
+    residual = (np.sum(p * np.abs(g)) / p.sum() + 0.1 * max(0.0, np.max(-g[p == 0], initial=0))) / w[p > 0].mean()
+    assert bool(solved.converged) == (solved.residual < contact.TOLERANCE)
+    assert residual == pytest.approx(float(solved.residual), rel=0.1, abs=1e-4)
+
+
+def test_the_cap_clears_converged() -> None:
+    gap, modulus, force = SCENES["soft rough"]
+    solved = _solve(gap, force, _spectrum(GEL), _spectrum(BODY) / modulus, max_iterations=2)
+    _check_finite(solved)
+    assert not solved.converged
+    assert solved.iterations == 2
+    assert solved.residual >= contact.TOLERANCE
+
+
+def test_a_pin_leaves_small_strain() -> None:
+    gap, force, gel = HARD_CASES["pin"]
+    assert _solve(gap, force, _spectrum(gel)).displacement_mm.max() / gel.thickness_mm > 0.3
+
+
+def test_mapped_equals_single() -> None:
+    gap, modulus, _ = SCENES["dots"]
+    gel, body = (jnp.asarray(a, jnp.float32) for a in (_spectrum(GEL), _spectrum(BODY) / modulus))
+    forces = jnp.array([0.5, 8.0])
+    z = jnp.asarray(gap, jnp.float32)
+    mapped = jax.jit(lambda f: jax.lax.map(lambda one: contact.solve(z, one, gel, body, SPACING), f))(forces)
+    single = _solve(gap, 8.0, gel, body)
+    np.testing.assert_allclose(mapped.displacement_mm[1], single.displacement_mm, atol=2e-3)
+
+
+def test_winkler_start_carries_the_force() -> None:
+    p = contact.winkler_pressure(jnp.asarray(R2 / 16, jnp.float32), jnp.float32(9.0), jnp.float32(0.1))
+    assert float(p.sum()) == pytest.approx(9.0, rel=1e-5)
+    level = np.asarray(p / 0.1 + R2 / 16)[np.asarray(p) > 0]
+    np.testing.assert_allclose(level, level.mean(), rtol=1e-3)

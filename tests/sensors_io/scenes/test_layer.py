@@ -1,0 +1,115 @@
+"""The bonded layer: two independent solutions agree, limits are those of the literature."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sensors_io.scenes.layer import Layer, depth_response, normal_compliance, shear_compliance, wave_numbers
+
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+Q = np.geomspace(1e-3, 50, 60)
+
+layers = st.builds(
+    Layer,
+    modulus_mpa=st.floats(0.01, 10),
+    poisson=st.floats(0.0, 0.499),
+    thickness_mm=st.floats(0.3, 30),
+)
+
+
+def _literal(q: np.ndarray, layer: Layer) -> np.ndarray:
+    kappa, s = 3 - 4 * layer.poisson, q * layer.thickness_mm
+    ratio = (kappa * np.sinh(2 * s) - 2 * s) / (kappa * np.cosh(2 * s) + 2 * s**2 + (1 + kappa**2) / 2)
+    return (1 - layer.poisson) / (layer.shear_modulus_mpa * q) * ratio
+
+
+def test_closed_form_equals_the_boundary_value_problem() -> None:
+    np.testing.assert_allclose(depth_response(Q, GEL, 0.0).normal_pressure, normal_compliance(Q, GEL), rtol=1e-10)
+
+
+@settings(max_examples=40, deadline=None)
+@given(layer=layers)
+def test_closed_form_equals_the_literal_formula(layer: Layer) -> None:
+    q = np.geomspace(0.1, 50, 20) / layer.thickness_mm
+    np.testing.assert_allclose(normal_compliance(q, layer), _literal(q, layer), rtol=1e-9)
+    np.testing.assert_allclose(depth_response(q, layer, 0.0).normal_pressure, _literal(q, layer), rtol=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(layer=layers)
+def test_reciprocity(layer: Layer) -> None:
+    response = depth_response(Q, layer, 0.0)
+    scale = np.abs(response.normal_shear).max()
+    np.testing.assert_allclose(response.lateral_pressure, response.normal_shear, atol=1e-10 * scale, rtol=0)
+
+
+def test_shear_across_the_wave_vector() -> None:
+    np.testing.assert_allclose(depth_response(Q, GEL, 0.0).transverse, shear_compliance(Q, GEL), rtol=1e-12)
+
+
+def test_long_waves_compress_the_layer_uniformly() -> None:
+    mu, nu, h = GEL.shear_modulus_mpa, GEL.poisson, GEL.thickness_mm
+    expected = h * (1 - 2 * nu) / (2 * mu * (1 - nu))
+    np.testing.assert_allclose(normal_compliance(np.array([0.0, 1e-9, 1e-6]), GEL), expected, rtol=1e-9)
+    at_zero = depth_response(np.zeros(1), GEL, 1.0)
+    np.testing.assert_allclose(at_zero.normal_pressure, expected * (h - 1) / h)
+    np.testing.assert_allclose(at_zero.lateral_shear, (h - 1) / mu)
+
+
+def test_short_waves_see_a_half_space() -> None:
+    plane_modulus = GEL.modulus_mpa / (1 - GEL.poisson**2)
+    q = np.array([20.0, 1e2, 1e4])
+    np.testing.assert_allclose(normal_compliance(q, GEL), 2 / (plane_modulus * q), rtol=1e-10)
+
+
+def test_no_overflow_in_float32_range() -> None:
+    q = np.array([0.0, 1e-12, 44 / 4, 200.0, 1e6])
+    assert np.all(np.isfinite(normal_compliance(q, GEL).astype(np.float32)))
+    for field in vars(depth_response(q, GEL, 0.5)).values():
+        assert np.all(np.isfinite(field))
+
+
+@pytest.mark.parametrize("poisson", [0.49, 0.4999, 0.499999, 0.5])
+def test_nearly_incompressible_layers_are_finite_and_positive(poisson: float) -> None:
+    layer = Layer(modulus_mpa=0.3, poisson=poisson, thickness_mm=4.0)
+    g = normal_compliance(Q, layer)
+    assert np.all(g > 0)
+    assert normal_compliance(np.zeros(1), layer) >= 0
+    np.testing.assert_allclose(depth_response(Q, layer, 0.0).normal_pressure[20:], g[20:], rtol=1e-8)
+
+
+def test_incompressible_displacement_is_divergence_free() -> None:
+    layer, step, depth = Layer(modulus_mpa=0.3, poisson=0.5, thickness_mm=4.0), 1e-5, 1.0
+    q = np.array([0.1, 0.5, 2.0])
+    below, above = depth_response(q, layer, depth + step), depth_response(q, layer, depth - step)
+    slope = (below.normal_pressure - above.normal_pressure) / (2 * step)
+    np.testing.assert_allclose(slope, q * depth_response(q, layer, depth).lateral_pressure, rtol=1e-6)
+
+
+def test_the_base_is_bonded() -> None:
+    for field in vars(depth_response(Q, GEL, GEL.thickness_mm)).values():
+        np.testing.assert_allclose(field, 0, atol=1e-9)
+
+
+def test_wave_numbers_match_the_half_plane_of_rfft2() -> None:
+    q_y, q_x = wave_numbers(96, 0.25)
+    assert np.broadcast_shapes(q_y.shape, q_x.shape) == np.fft.rfft2(np.zeros((96, 96))).shape
+
+
+@pytest.mark.parametrize(
+    ("field", "changes"),
+    [
+        ("modulus_mpa", {"modulus_mpa": 0.0}),
+        ("poisson", {"poisson": 0.51}),
+        ("thickness_mm", {"thickness_mm": -1.0}),
+    ],
+)
+def test_impossible_layers_are_refused(field: str, changes: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=field):
+        Layer(**{"modulus_mpa": 0.3, "poisson": 0.48, "thickness_mm": 4.0, **changes})
+
+
+def test_markers_outside_the_layer_are_refused() -> None:
+    with pytest.raises(ValueError, match="depth_mm is 5.0: must lie in"):
+        depth_response(Q, GEL, 5.0)

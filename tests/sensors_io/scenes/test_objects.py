@@ -1,0 +1,139 @@
+"""Procedural objects: labels follow the thresholds, materials inform without deciding, skins move rigidly."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sensors_io.scenes import appearance, objects, surface
+from sensors_io.schema import MATERIALS
+
+NEAR_GAP = 0.999  # values come this close to the edge of the gap around a threshold
+
+
+def _sample(count: int, lie_share: float = 0.3) -> list[objects.Solid]:
+    return [objects.sample(np.random.default_rng(i), lie_share, 0.8) for i in range(count)]
+
+
+@pytest.mark.parametrize("name", objects.PROPERTIES)
+@given(latent=st.floats(-6, 6))
+def test_level_follows_the_thresholds(name: str, latent: float) -> None:
+    prop = objects.PROPERTIES[name]
+    value = prop.value(latent)
+    assert prop.extremes[0] <= value <= prop.extremes[1]
+    assert prop.level(value) == sum(value >= t for t in prop.thresholds)
+    for threshold in prop.thresholds:
+        assert abs(np.log(value / threshold)) >= NEAR_GAP * np.log(objects.GAP) / 2
+
+
+@pytest.mark.parametrize("name", objects.PROPERTIES)
+def test_values_grow_with_the_latent_on_both_sides_of_each_threshold(name: str) -> None:
+    prop = objects.PROPERTIES[name]
+    values = np.array([prop.value(x) for x in np.linspace(-3, 3, 400)])
+    assert np.all(np.diff(values) > 0)
+    for threshold in prop.thresholds:
+        near = np.log(values / threshold)
+        assert np.any((near > 0) & (near < 0.25))
+        assert np.any((near < 0) & (near > -0.25))
+
+
+@pytest.mark.parametrize("name", objects.PROPERTIES)
+def test_material_informs_but_does_not_decide(name: str) -> None:
+    odds = objects.level_odds(objects.PROPERTIES[name])
+    np.testing.assert_allclose(odds.sum(1), 1)
+    assert 0.50 <= odds.max(1).mean() <= 0.58  # what a guesser gets that knows the material alone
+    assert np.all((odds.mean(0) > 0.28) & (odds.mean(0) < 0.38))
+    assert odds.min() > 0.005  # the ranges of all materials overlap
+
+
+def test_frequencies_follow_the_odds() -> None:
+    solids = _sample(3000)
+    for name, prop in objects.PROPERTIES.items():
+        levels = np.array([s.labels()[name] for s in solids])
+        np.testing.assert_allclose(np.bincount(levels) / 3000, objects.level_odds(prop).mean(0), atol=0.035)
+
+
+def test_truth_explains_the_labels() -> None:
+    for solid in _sample(50):
+        truth, labels = solid.truth(), solid.labels()
+        assert labels["hardness"] == sum(truth["modulus_mpa"] >= t for t in objects.HARDNESS_MPA)
+        assert labels["roughness"] == sum(truth["rms_mm"] >= t for t in objects.ROUGHNESS_MM)
+        assert labels["protrusion"] == sum(truth["feature_height_mm"] >= t for t in objects.PROTRUSION_MM)
+        assert labels["material"] == solid.material
+
+
+def test_lies_are_told_at_their_rate_and_contradict() -> None:
+    solids = _sample(2000)
+    lies = [s for s in solids if s.looks_like != s.material]
+    assert len(lies) / 2000 == pytest.approx(0.3, abs=0.04)
+    for solid in lies:
+        own, shown = objects.typical_levels(solid.material), objects.typical_levels(solid.looks_like)
+        assert sum(a != b for a, b in zip(own, shown, strict=True)) >= 2
+    assert all(objects.lie_materials(m) for m in range(len(MATERIALS)))
+    assert not [s for s in _sample(200, 0.0) if s.looks_like != s.material]
+
+
+def test_roughness_has_the_rms_and_the_band_asked_for() -> None:
+    k, a, phase = objects.rough_waves(np.random.default_rng(0), 0.05, 0.8)
+    wavelength = 2 * np.pi / np.linalg.norm(k, axis=1)
+    assert wavelength.min() > 0.799
+    assert wavelength.max() < 4.001
+    x = np.linspace(0, 200, 400)
+    z = np.sum(a[:, None] * np.cos(k[:, :1] * x + k[:, 1:] * 0.7 * x + phase[:, None]), 0)
+    assert z.std() == pytest.approx(0.05, rel=0.15)
+    assert np.sqrt(np.sum(a**2) / 2) == pytest.approx(0.05, rel=1e-5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(dx=st.integers(-8, 8), dy=st.integers(-8, 8), seed=st.integers(0, 50))
+def test_skins_move_rigidly(dx: int, dy: int, seed: int) -> None:
+    spacing, n = 0.25, 48
+    skin = surface.make_skin(objects.sample(np.random.default_rng(seed), 0.3, 0.8), np.array([1.0, -2.0]), 1.0)
+    x = (jnp.arange(n) + 0.5) * spacing - n * spacing / 2
+
+    def gap(offset: tuple[float, float]) -> np.ndarray:
+        pose = surface.Pose(offset_mm=jnp.array(offset), turn_rad=jnp.array(0.4), tilt=jnp.zeros(2))
+        return np.asarray(surface.gap(skin, pose, x))
+
+    here, there = gap((0.0, 0.0)), gap((dx * spacing, dy * spacing))
+    rows, columns = slice(max(0, -dy), n - max(0, dy)), slice(max(0, -dx), n - max(0, dx))
+    moved = there[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
+    difference = moved - here[rows, columns]
+    np.testing.assert_allclose(difference, difference.mean(), atol=2e-4)
+    assert there.min() == 0
+
+
+def test_a_quarter_turn_of_the_sensor_turns_the_gap() -> None:
+    skin = surface.make_skin(objects.sample(np.random.default_rng(3), 0.3, 0.8), np.zeros(2), 1.2)
+    x = (jnp.arange(40) + 0.5) * 0.3 - 6.0
+
+    def gap(turn: float) -> np.ndarray:
+        return np.asarray(surface.gap(skin, surface.Pose(offset_mm=jnp.zeros(2), turn_rad=turn, tilt=jnp.zeros(2)), x))
+
+    np.testing.assert_allclose(gap(0.3 + np.pi / 2), np.rot90(gap(0.3), -1), atol=2e-4)
+
+
+def test_roughness_and_relief_show_in_the_gap() -> None:
+    x = (jnp.arange(64) + 0.5) * 0.25 - 8.0
+    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
+    for seed in range(5):
+        solid = objects.sample(np.random.default_rng(seed), 0.0, 0.8)
+        skin = surface.make_skin(solid, np.zeros(2), 1.0)
+        smooth = skin.replace(wave_amplitudes_mm=jnp.zeros_like(skin.wave_amplitudes_mm))
+        roughness = np.asarray(surface.gap(skin, pose, x) - surface.gap(smooth, pose, x))
+        assert roughness.std() == pytest.approx(solid.rms_mm, rel=0.35)
+        bare = smooth.replace(feature_height_mm=jnp.array(0.0))
+        relief = np.asarray(surface.gap(bare, pose, x) - surface.gap(smooth, pose, x))
+        assert np.ptp(relief) == pytest.approx(solid.feature_height_mm, rel=0.2)
+
+
+@pytest.mark.parametrize("material", range(len(MATERIALS)))
+def test_views_depend_on_the_apparent_material_alone(material: int) -> None:
+    picture, depth = appearance.view(material, 48, np.random.default_rng(5))
+    again, _ = appearance.view(material, 48, np.random.default_rng(5))
+    np.testing.assert_array_equal(picture, again)
+    assert picture.shape == (48, 48, 3)
+    assert depth.dtype == np.float32
+    assert picture.std() > 5
+    assert 280 < depth.min() < 295 < depth.max() < 303

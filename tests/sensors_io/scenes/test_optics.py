@@ -1,0 +1,85 @@
+"""Renderers: patterns move as the gel does, light answers to slope, nothing leaves its range."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import optics
+
+PX, WINDOW_MM = 80, 16.0
+X = (np.arange(PX) + 0.5) * WINDOW_MM / PX - WINDOW_MM / 2
+ZERO = np.zeros((PX, PX))
+RENDERERS = {"photometric": optics.photometric, "dots": optics.dots, "speckle": optics.speckle}
+
+
+def _gel(depth=ZERO, x=ZERO, y=ZERO, marker_depth=ZERO) -> optics.DeformedGel:
+    f = [jnp.asarray(a, jnp.float32) for a in (depth, x, y, marker_depth)]
+    return optics.DeformedGel(
+        depth_mm=f[0], marker_x_mm=f[1], marker_y_mm=f[2], marker_depth_mm=f[3], window_mm=WINDOW_MM
+    )
+
+
+def _light(shift: tuple[float, float] = (0.0, 0.0)) -> optics.Light:
+    texture = optics.speckle_texture(np.random.default_rng(0), 192, 5.0)
+    return optics.Light(
+        exposure=jnp.array(1.0), led_gain=jnp.ones(3), pattern_shift_mm=jnp.array(shift), texture=jnp.asarray(texture)
+    )
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_pictures_stay_in_range(name: str) -> None:
+    bump = np.exp(-(X[None] ** 2 + X[:, None] ** 2) / 4)
+    image = RENDERERS[name](_gel(2 * bump, 0.3 * bump, -0.3 * bump, 2 * bump), _light())
+    assert image.shape == (PX, PX, 3)
+    assert np.all(np.isfinite(image))
+    assert float(image.min()) >= 0
+    pixels = optics.expose(image, jnp.full(image.shape, 50.0), 0.01, 0.01)
+    assert pixels.dtype == jnp.uint8
+
+
+@pytest.mark.parametrize("render", [optics.dots, optics.speckle])
+def test_a_uniform_displacement_moves_the_pattern_along(render) -> None:
+    moved = render(_gel(x=ZERO + 0.4, y=ZERO - 0.2), _light())
+    np.testing.assert_allclose(moved, render(_gel(), _light((0.4, -0.2))), atol=1e-4)
+
+
+def test_dots_follow_a_stretched_gel() -> None:
+    stretch = 0.1
+    image = np.asarray(optics.dots(_gel(x=stretch * X[None] + ZERO, y=stretch * X[:, None] + ZERO), _light()))
+    row = image[PX // 2 - 1].mean(-1)
+    minima = [i for i in range(2, PX - 2) if row[i] == row[i - 2 : i + 3].min() and row[i] < 0.6 * row.max()]
+    pitch = np.polyfit(np.arange(len(minima)), X[minima], 1)[0]
+    assert pitch == pytest.approx(1.4 * (1 + stretch), rel=0.03)
+
+
+def test_indentation_magnifies_the_pattern() -> None:
+    depth = 1.0
+    magnified = optics.speckle(_gel(marker_depth=ZERO + depth), _light())
+    factor = depth / optics.CAMERA_DISTANCE_MM
+    stretched = optics.speckle(_gel(x=factor * X[None] + ZERO, y=factor * X[:, None] + ZERO), _light())
+    np.testing.assert_allclose(magnified, stretched, atol=1e-4)
+
+
+def test_opposite_slopes_shine_in_different_colours() -> None:
+    flat = np.asarray(optics.photometric(_gel(), _light()))
+    ramp = {s: np.asarray(optics.photometric(_gel(depth=s * 0.2 * (X[:, None] + ZERO)), _light())) for s in (1, -1)}
+    red = {s: (ramp[s] - flat)[PX // 2, PX // 2, 0] for s in ramp}
+    assert red[1] > 0.1
+    assert red[-1] < -0.1
+    blue = {s: (ramp[s] - flat)[PX // 2, PX // 2, 2] for s in ramp}
+    assert blue[1] < 0 < blue[-1]
+
+
+def test_flat_mini_gel_has_the_background_of_the_real_one() -> None:
+    image = 255 * np.asarray(optics.photometric(_gel(), _light()))
+    centre, top, bottom = image[PX // 2, PX // 2], image[4, PX // 2], image[-5, PX // 2]
+    assert centre[0] > 1.4 * top[0]  # red in the middle
+    assert top[2] > bottom[2]  # blue from above
+    assert np.all((image > 20) & (image < 180))
+
+
+def test_cubic_matrix_keeps_constants_and_lines() -> None:
+    matrix = np.asarray(optics.cubic_matrix(112, 64))
+    np.testing.assert_allclose(matrix.sum(1), 1, atol=1e-5)
+    line = (np.arange(64) + 0.5) / 64
+    np.testing.assert_allclose((matrix @ line)[4:-4], ((np.arange(112) + 0.5) / 112)[4:-4], atol=1e-5)

@@ -1,0 +1,216 @@
+"""The generated data set: valid, deterministic, resumable, honest about itself, and worth learning from."""
+
+import dataclasses
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards
+from sensors_io.scenes import press as press_module
+from sensors_io.scenes.protocol import make_contact
+from sensors_io.scenes.sensors import MODELS
+from sensors_io.schema import SENSORS, Flag, Sequence
+
+SMALL = SceneConfig(objects=130, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
+
+
+@pytest.fixture(scope="module")
+def some() -> list[list[Sequence]]:
+    """Every other contact of the small set: one per object."""
+    return [make_contact(SMALL, index) for index in range(0, SMALL.contact_count, SMALL.sites)]
+
+
+def _arrays(sequence: Sequence) -> dict[str, np.ndarray]:
+    return {k: v for k, v in vars(sequence).items() if isinstance(v, np.ndarray)}
+
+
+def _assert_same(a: list[Sequence], b: list[Sequence]) -> None:
+    for left, right in zip(a, b, strict=True):
+        assert left.key == right.key
+        assert _arrays(left).keys() == _arrays(right).keys()
+        for name, array in _arrays(left).items():
+            np.testing.assert_array_equal(array, _arrays(right)[name], err_msg=name)
+
+
+def test_generation_resumes_anywhere_with_the_same_values(some: list[list[Sequence]]) -> None:
+    whole = list(itertools.islice(contacts(SMALL), 5))
+    tail = list(itertools.islice(contacts(SMALL, start=2), 3))
+    for a, b in zip(whole[2:], tail, strict=True):
+        _assert_same(a, b)
+    for index in (0, 2, 4):
+        _assert_same(whole[index], some[index // 2])
+
+
+def test_generation_ends_and_refuses_a_start_outside() -> None:
+    assert len(list(contacts(SMALL, start=SMALL.contact_count - 2))) == 2
+    assert list(contacts(SMALL, start=SMALL.contact_count)) == []
+    with pytest.raises(ValueError, match=r"start is 261: must lie in \[0, 260\]"):
+        contacts(SMALL, start=261)
+
+
+def test_each_contact_holds_the_four_sensors_in_order(some: list[list[Sequence]]) -> None:
+    for contact in some[:5]:
+        assert tuple(s.sensor for s in contact) == SENSORS
+        assert len({s.key for s in contact}) == 1
+        for sequence in contact:
+            assert len(sequence) == SMALL.frames
+            assert np.all(np.diff(sequence.host_time_ns) > 0)
+            camera = sequence.sensor != "tac3d"
+            assert (sequence.frames is not None) == camera
+            assert (sequence.mm_per_px is not None) == camera
+            assert (sequence.shear_mm is None) == (sequence.sensor == "gelsight_mini")
+            assert sequence.depth_mm is not None
+            assert sequence.depth_mm.shape == (SMALL.frames, 20, 20)
+            assert sequence.contact_region_px is not None
+            x, y, width, height = sequence.contact_region_px
+            assert 0 <= x < x + width <= SMALL.view_px
+            assert 0 <= y < y + height <= SMALL.view_px
+
+
+def test_measured_force_presses_down_with_the_stated_error(some: list[list[Sequence]]) -> None:
+    force = np.array([[s.force_n for s in contact] for contact in some])
+    target = np.array([[s.target_force_n for s in contact] for contact in some])
+    assert np.all(force[..., 2] < 0)
+    relative = -force[..., 2] / target - 1
+    assert relative[..., -1].std() == pytest.approx(np.hypot(SMALL.force_jitter, SMALL.force_gain_error), rel=0.25)
+    assert abs(relative.mean()) < 0.01
+    np.testing.assert_allclose(target[0, 0], np.geomspace(1, 20, 3), rtol=1e-6)
+
+
+def test_fields_carry_noise_and_markers_spread(some: list[list[Sequence]]) -> None:
+    x = np.linspace(-1, 1, 20)
+    for order in (1, 2, 3):
+        model = MODELS[order]
+        shear = np.concatenate([c[order].shear_mm[c[order].valid] for c in some])
+        assert shear.std() == pytest.approx(model.lateral_noise_mm, rel=0.05)
+        spread = [np.mean(c[order].deformation_mm[-1, ..., 0] * x) for c in some]
+        assert np.mean(np.array(spread) > 0) > 0.95  # an almost incompressible layer flows outwards
+    lost = np.mean([~s.valid for c in some for s in c])
+    assert lost == pytest.approx(press_module.LOST_NODE_SHARE, rel=0.3)
+
+
+def test_flags_say_what_happened(some: list[list[Sequence]]) -> None:
+    flags = np.array([[s.flags for s in c] for c in some])
+    assert not np.any(flags & Flag.NOT_CONVERGED)
+    strain = (flags & Flag.STRAIN_LIMIT) > 0
+    border = (flags & Flag.BORDER_CONTACT) > 0
+    for flag in (strain, border):
+        share = flag.mean((0, 1))
+        assert share[0] < share[-1]
+    deepest = np.array([[s.depth_mm.max((1, 2)) for s in c] for c in some])
+    limit = 0.3 * np.array([m.gel.thickness_mm for m in MODELS])[:, None]
+    assert np.all(strain[deepest > 1.35 * limit])
+    assert not np.any(strain[deepest < 0.6 * limit])
+
+
+def test_the_cap_raises_the_flag() -> None:
+    capped = dataclasses.replace(SMALL, solver_max_iterations=1)
+    flags = np.concatenate([s.flags for s in make_contact(capped, 4)])
+    assert np.any(flags & Flag.NOT_CONVERGED)
+
+
+def test_one_compilation_per_sensor(some: list[list[Sequence]]) -> None:
+    before = press_module.record._cache_size()
+    make_contact(SMALL, 7)
+    assert press_module.record._cache_size() == before
+
+
+def test_labels_of_the_cards_match_the_truth() -> None:
+    cards = object_cards(SMALL)
+    assert [c.object_id for c in cards] == [f"g{i:06d}" for i in range(SMALL.objects)]
+    for card in cards:
+        assert card.labels["hardness"] == (card.truth["modulus_mpa"] >= 0.5) + (card.truth["modulus_mpa"] >= 5.0)
+        assert card.view is not None
+        assert card.view.shape == (32, 32, 3)
+        assert card.annotator == "generator"
+    lies = np.mean([c.visual_lies for c in cards])
+    assert lies == pytest.approx(SMALL.visual_lie_share, abs=0.12)
+
+
+def test_splits_are_exact_and_follow_the_seed() -> None:
+    splits = [c.split for c in object_cards(SMALL)]
+    assert [splits.count(s) for s in ("train", "val", "test")] == [91, 13, 26]
+    assert splits == [c.split for c in object_cards(SMALL)]
+    assert splits != [c.split for c in object_cards(dataclasses.replace(SMALL, seed=1))]
+
+
+def test_objects_do_not_depend_on_how_many_there_are() -> None:
+    few, many = (object_cards(dataclasses.replace(SMALL, objects=n)) for n in (5, 9))
+    for a, b in zip(few, many[:5], strict=True):
+        assert a.truth == b.truth
+        np.testing.assert_array_equal(a.view, b.view)
+
+
+def test_hash_tells_configs_apart() -> None:
+    changes = ({}, {"seed": 1}, {"image_px": 64}, {"split_shares": (0.6, 0.2, 0.2)}, {"solver_tolerance": 1e-4})
+    hashes = [config_hash(dataclasses.replace(SMALL, **change)) for change in changes]
+    assert len(set(hashes)) == len(changes)
+    assert hashes[0] == config_hash(dataclasses.replace(SMALL))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("objects", 0),
+        ("sites", 0),
+        ("frames", 0),
+        ("contact_grid", 20),
+        ("contact_grid", 41),
+        ("image_px", 8),
+        ("visual_lie_share", 1.2),
+        ("min_force_n", 0.0),
+        ("min_force_n", 30.0),
+        ("split_shares", (0.5, 0.2, 0.2)),
+        ("solver_tolerance", 0.0),
+        ("force_jitter", 0.5),
+    ],
+)
+def test_bad_configs_are_refused_by_name(field: str, value: object) -> None:
+    with pytest.raises(ValueError, match=f"{field} is .*must"):
+        dataclasses.replace(SMALL, **{field: value})
+
+
+def test_padding_is_two_thicknesses_and_smooth() -> None:
+    for model in MODELS:
+        size = press_module.padded_size(64, model.window_mm, model.gel.thickness_mm)
+        assert (size - 64) * model.window_mm / 64 >= 2 * model.gel.thickness_mm
+        assert size <= 110
+        assert all(p in (2, 3, 5) for p in _primes(size))
+
+
+def test_float32_recordings_are_finite(some: list[list[Sequence]]) -> None:
+    for leaf in jax.tree.leaves([[s.depth_mm, s.deformation_mm, s.shear_mm, s.force_n] for c in some for s in c]):
+        assert np.all(np.isfinite(leaf))
+
+
+def test_touch_tells_hardness_and_force_alone_does_not(some: list[list[Sequence]]) -> None:
+    labels = np.array([c.labels["hardness"] for c in object_cards(SMALL)])
+    force = np.array([c[2].force_n[:, 2] for c in some])
+    depth = np.array([np.maximum(c[2].depth_mm, 1e-3) for c in some])
+    touch = np.concatenate([np.log(depth.max((2, 3))), np.log(depth.mean((2, 3)))], 1)
+    assert _leave_one_out(touch, labels) > 0.58
+    assert _leave_one_out(force, labels) < 0.46
+
+
+def _leave_one_out(features: np.ndarray, labels: np.ndarray) -> float:
+    """Accuracy of linear discriminants with pooled covariance, each object judged by all others."""
+    hits = 0
+    for i in range(len(labels)):
+        rest = np.arange(len(labels)) != i
+        x, y = features[rest], labels[rest]
+        means = np.array([x[y == k].mean(0) for k in range(3)])
+        within = np.cov((x - means[y]).T) + 1e-4 * np.eye(x.shape[1])
+        apart = features[i] - means
+        hits += int(np.argmin(np.einsum("kd,de,ke->k", apart, np.linalg.inv(within), apart)) == labels[i])
+    return hits / len(labels)
+
+
+def _primes(n: int) -> list[int]:
+    found = []
+    for p in range(2, n + 1):
+        while n % p == 0:
+            found.append(p)
+            n //= p
+    return found

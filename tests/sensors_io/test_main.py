@@ -1,0 +1,108 @@
+"""The command line: tables for people, exit status 1 and one line for known errors."""
+
+import io
+
+import pytest
+import rich.console
+
+from sensors_io import __main__ as cli
+from sensors_io.records import RecordWriter
+from tests.sensors_io import fakes
+from tests.sensors_io.importers.films import entry, folder
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """Run a command; returns its status, its output and its messages."""
+
+    def call(*args):
+        out, err = io.StringIO(), io.StringIO()
+        monkeypatch.setattr(cli, "OUT", rich.console.Console(file=out, width=200))
+        monkeypatch.setattr(cli, "ERR", rich.console.Console(file=err, width=200))
+        return cli.main([str(arg) for arg in args]), out.getvalue(), err.getvalue()
+
+    return call
+
+
+def test_import_reports_what_it_skipped(run, tmp_path):
+    source = folder(tmp_path / "in", entry("ball", videos=2))
+    (source / "videos" / "ball_1.avi").write_bytes(b"broken")
+    status, out, _ = run(
+        "import", "physiclear", source, "--out", tmp_path / "out", "--test-share", "0", "--stride", "3"
+    )
+    assert status == 0
+    assert "does not open as a video" in out
+    status, out, _ = run("list", tmp_path / "out")
+    assert status == 0
+    assert "ball" in out
+    assert "1 sequences, 4 frames" in out
+
+
+def test_check_counts_flags_and_verifies(run, tmp_path):
+    fakes.write(tmp_path, 4, per_shard=2)
+    status, out, err = run("check", tmp_path)
+    assert (status, err.strip()) == (0, "")
+    assert "4 sequences, 48 frames" in out
+    assert "strain_limit" in out
+    shard = tmp_path / "contacts-00001.arrayrecord"
+    data = bytearray(shard.read_bytes())
+    data[len(data) // 4] ^= 255
+    shard.write_bytes(data)
+    status, _, err = run("check", tmp_path)
+    assert status == 1
+    assert "CorruptRecordsError" in err
+    assert "contacts-00001.arrayrecord" in err
+
+
+def test_check_says_that_records_are_incomplete(run, tmp_path):
+    with RecordWriter(tmp_path, meta=fakes.META) as writer:
+        writer.publish()
+        status, _, err = run("check", tmp_path)
+    assert status == 1
+    assert err.strip().startswith("IncompleteRecordsError: ")
+
+
+def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):
+    asked = []
+
+    def generate(config, out, *, progress):
+        asked.append((config.objects, config.frames))
+        progress(1, 2)
+        fakes.write(out, 2)
+
+    monkeypatch.setattr(cli, "generate_records", generate)
+    status, out, _ = run("generate", "--objects", "7", "--frames", "5", "--out", tmp_path / "r")
+    assert status == 0
+    assert asked == [(7, 5)]
+    assert "2 sequences" in out
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["list", "nowhere"], "MissingIndexError: nowhere has no index.json"),
+        (["import", "physiclear", "nowhere", "--out", "out"], "ImportSourceError: nowhere/labels.json is missing"),
+    ],
+)
+def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(*args)
+    assert (status, out) == (1, "")
+    assert err.startswith(message)
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_a_wrong_command_is_told_the_right_ones(run, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run("lst")
+    assert stopped.value.code == 2
+
+
+def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "generate_records", stop)
+    status, _, err = run("generate", "--out", tmp_path / "r")
+    assert status == 130
+    assert "run the same command again" in err

@@ -1,0 +1,168 @@
+"""Clips and their batches: shapes and masks by hand, order by seed, resumed = uninterrupted."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.pipeline import ClipConfig, clip_batches, make_clip
+from sensors_io.records import RecordStore
+from sensors_io.schema import CLIP_ARRAYS, SENSORS, UNKNOWN, Flag, SchemaError
+from tests.sensors_io import fakes
+
+SMALL = ClipConfig(frames=4, image_px=8, view_px=6)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return RecordStore(fakes.write(tmp_path_factory.mktemp("records") / "r", 7))
+
+
+def contact(n=0, sensors=SENSORS, **changes):
+    return {sensor: fakes.sequence(n, sensor, **changes) for sensor in sensors}
+
+
+def same(a, b):
+    assert a.keys() == b.keys()
+    for name in a:
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+class TestMakeClip:
+    def test_it_holds_what_the_schema_says(self):
+        clip = make_clip(contact(1), fakes.card(1), SMALL)
+        assert clip.frames.shape == (4, 4, 8, 8, 3)
+        assert clip.stream_mask.all()
+        assert clip.frame_mask.all()
+        assert clip.view_mask
+        np.testing.assert_array_equal(clip.view, 10)
+        np.testing.assert_array_equal(clip.label, [1, 2, 0, 1])
+        for s, sensor in enumerate(SENSORS):
+            force = fakes.sequence(1, sensor).force_n
+            np.testing.assert_array_equal(clip.force_n[s], force[clip.frame_index[s]])
+            assert clip.force_n[s, -1, 2] == -20
+            assert clip.frame_index[s].tolist() == [0, 4, 7, 11]
+
+    def test_images_are_area_means_of_the_frames(self):
+        made = contact(0)
+        clip = make_clip(made, fakes.card(0), SMALL)
+        want = cv2.resize(made["xense"].frames[11], (8, 8), interpolation=cv2.INTER_AREA)
+        np.testing.assert_array_equal(clip.frames[1, -1], want)
+        block = make_clip(contact(0), fakes.card(0), ClipConfig(frames=1, image_px=4, view_px=6))
+        frame = made["xense"].frames[block.frame_index[1, 0]].reshape(4, 4, 4, 5, 3)
+        np.testing.assert_allclose(block.frames[1, 0], frame.mean(axis=(1, 3)), atol=0.51)
+
+    def test_a_sensor_without_camera_shows_its_fields(self):
+        clip = make_clip(contact(0, valid=None), fakes.card(0), SMALL)
+        depth = clip.frames[2, :, 3, 3, 2].astype(int)
+        assert (np.diff(depth) > 0).all()
+        assert 128 <= depth[0] < 140
+        assert clip.frames[2, -1, ..., 2].max() == round(128 + 1.2 * 127 / 1.5)
+
+    def test_a_missing_sensor_is_masked(self):
+        clip = make_clip(contact(0, ("dmtac_x",)), fakes.card(0), SMALL)
+        assert clip.stream_mask.tolist() == [False, False, False, True]
+        assert not clip.frame_mask[:3].any()
+        assert not clip.frames[:3].any()
+        assert clip.frames[3].any()
+
+    def test_sensors_of_the_config_set_the_streams(self):
+        clip = make_clip(
+            contact(0), fakes.card(0), ClipConfig(frames=4, image_px=8, sensors=("xense", "gelsight_mini"))
+        )
+        both = make_clip(contact(0), fakes.card(0), SMALL)
+        np.testing.assert_array_equal(clip.frames, both.frames[[1, 0]])
+
+    def test_short_sequences_are_padded(self):
+        clip = make_clip(contact(0, length=3), fakes.card(0), SMALL)
+        assert clip.frame_mask.tolist() == [[True] * 3 + [False]] * 4
+        assert clip.frame_index.tolist() == [[0, 1, 2, 0]] * 4
+        assert not clip.frames[:, 3].any()
+
+    def test_rejected_frames_do_not_enter(self):
+        flags = np.zeros(12, np.uint32)
+        flags[8:] = int(Flag.NOT_CONVERGED)
+        assert make_clip(contact(0, flags=flags), fakes.card(0), SMALL).frame_index.max() == 7
+
+    def test_what_is_unknown_is_zero_or_masked(self):
+        card = fakes.card(0, view=None, view_depth_mm=None, labels={"hardness": 2})
+        clip = make_clip(contact(0, force_n=None), card, SMALL)
+        assert not clip.force_n.any()
+        assert not clip.view_mask
+        assert not clip.view.any()
+        assert clip.label.tolist() == [2, UNKNOWN, UNKNOWN, UNKNOWN]
+
+    def test_bad_input_is_named(self):
+        with pytest.raises(SchemaError, match=r"contact is \{\}"):
+            make_clip({}, fakes.card(0), SMALL)
+        with pytest.raises(SchemaError, match="card is of object 'object_1': the contact is of 'object_0'"):
+            make_clip(contact(0), fakes.card(1), SMALL)
+        with pytest.raises(SchemaError, match="frames is 0: must be ≥ 1"):
+            ClipConfig(frames=0)
+        with pytest.raises(SchemaError, match="each once"):
+            ClipConfig(sensors=("xense", "xense"))
+
+
+class TestClipBatches:
+    def batches(self, store, **changes):
+        return clip_batches(store, range(len(store)), SMALL, **{"batch_size": 3, "seed": 5} | changes)
+
+    def test_a_batch_stacks_clips(self, store):
+        batch = next(iter(self.batches(store)))
+        assert set(batch) == {*CLIP_ARRAYS, "contact"}
+        for name, spec in CLIP_ARRAYS.items():
+            assert batch[name].dtype == spec.dtype
+            assert batch[name].shape[0] == 3
+        assert batch["contact"].dtype == np.int32
+        for row, i in enumerate(batch["contact"]):
+            clip = make_clip(store.contact(i), store.objects[store.contacts[i].object_id], SMALL)
+            same(clip.arrays(), {name: batch[name][row] for name in CLIP_ARRAYS})
+
+    def test_the_order_is_a_function_of_the_seed(self, store):
+        def order(seed):
+            iterator = iter(self.batches(store, seed=seed))
+            return np.concatenate([next(iterator)["contact"] for _ in range(7)])
+
+        np.testing.assert_array_equal(order(1), order(1))
+        assert (order(1) != order(2)).any()
+        epochs = order(1).reshape(3, 7)
+        np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(7), (3, 1)))
+        assert (epochs[0] != epochs[1]).any()
+
+    @pytest.mark.parametrize("stop", [0, 1, 2, 3, 6, 7])
+    def test_resumed_equals_uninterrupted(self, store, stop):
+        whole = iter(self.batches(store))
+        want = [next(whole) for _ in range(9)]
+        first = iter(self.batches(store))
+        for _ in range(stop):
+            next(first)
+        state = first.get_state()
+        next(first)  # what is read after the state was taken does not matter
+        second = iter(self.batches(store))
+        second.set_state(state)
+        for batch in want[stop:]:
+            same(next(second), batch)
+
+    def test_one_epoch_ends_with_a_smaller_batch_or_without_it(self, store):
+        kept = [b["contact"].tolist() for b in self.batches(store, shuffle=False, repeat=False)]
+        assert kept == [[0, 1, 2], [3, 4, 5], [6]]
+        dropped = list(self.batches(store, shuffle=False, repeat=False, drop_remainder=True))
+        assert [len(b["contact"]) for b in dropped] == [3, 3]
+
+    def test_only_the_given_contacts_are_read(self, store):
+        batches = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, shuffle=False, repeat=False)
+        assert [b["contact"].tolist() for b in batches] == [[5, 1]]
+
+    def test_worker_processes_change_nothing_but_speed(self, store):
+        iterator = iter(self.batches(store, workers=2))
+        alone = iter(self.batches(store))
+        try:
+            for _ in range(3):
+                same(next(iterator), next(alone))
+        finally:
+            iterator.close()
+
+    def test_bad_indices_are_named(self, store):
+        with pytest.raises(SchemaError, match="indices is empty: a pipeline needs at least one contact"):
+            clip_batches(store, [], SMALL, batch_size=2, seed=0)
+        with pytest.raises(SchemaError, match=r"indices reach 0\.\.7: must lie in 0\.\.6"):
+            clip_batches(store, [0, 7], SMALL, batch_size=2, seed=0)

@@ -1,0 +1,121 @@
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax.rewards.examples import constant, make_parsed, make_target
+from touchr1_jax.rewards import Reward, make_rewards, total_reward
+from touchr1_jax.types import Parsed, Target
+
+PRIOR = np.array([[1 / 3] * 3 + [0] * 6, [1 / 3] * 3 + [0] * 6, [1 / 9] * 9])
+REWARDS = make_rewards(PRIOR)
+WEIGHTS = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
+
+
+def total(weights, parsed, target, rewards=REWARDS):
+    value, parts = total_reward(rewards, weights, parsed, target)
+    np.testing.assert_allclose(value, sum(parts.values()), rtol=1e-6)
+    assert parts.keys() == weights.keys()
+    return float(value), {name: float(part) for name, part in parts.items()}
+
+
+def test_weighted_sum():
+    parsed = make_parsed(conclude=(1, 0, 0), compare=(1, 0, 0), perceive=(0, 1, 2), formatted=True)
+    value, parts = total(WEIGHTS, parsed, make_target(label=(0, 0, 0)))
+    assert parts == pytest.approx({"accuracy": 0.6 * 0.4, "consistency": 0.3 * 2 / 3, "format": 0.1})
+    assert value == pytest.approx(0.54)
+
+
+@pytest.mark.parametrize("target", [make_target(streams=(0, 1, 0)), make_target(asked=(0, 0, 1))])
+def test_undefined_term_is_dropped_and_the_others_grow(target):
+    value, parts = total(WEIGHTS, constant(0), target)
+    assert value == pytest.approx(1)
+    assert parts == pytest.approx({"accuracy": 6 / 7, "consistency": 0, "format": 1 / 7})
+
+
+def test_nothing_applies():
+    assert total({"consistency": 1.0}, constant(0), make_target(streams=(1, 0, 0))) == (0, {"consistency": 0})
+
+
+def test_the_sum_of_the_weights_is_kept():
+    for target in (make_target(), make_target(streams=(1, 0, 0))):
+        assert total({name: 3 * w for name, w in WEIGHTS.items()}, constant(0), target)[0] == pytest.approx(3)
+
+
+def test_listing_levels_and_repeating_tags_loses():
+    honest = total(WEIGHTS, constant(1), make_target(label=(0, 0, 0)))[0]
+    gamed = make_parsed(conclude=(-1, -1, -1), compare=(-1, -1, -1), perceive=-1, formatted=False)
+    assert total(WEIGHTS, gamed, make_target(label=(0, 0, 0)))[0] == pytest.approx(-0.06)
+    assert honest > 0.5
+
+
+@pytest.mark.parametrize("weights", [WEIGHTS, dict.fromkeys(REWARDS, 1.0)])
+def test_jit_and_vmap_change_nothing(weights):
+    rng = np.random.default_rng(0)
+    draw = lambda *shape: jnp.array(rng.integers(-1, 3, shape))
+    n = 32
+    parsed = Parsed(
+        perceive=draw(n, 3, 3),
+        compare=draw(n, 3),
+        conclude=draw(n, 3),
+        formatted=draw(n) > 0,
+        truncated=draw(n) > 0,
+        length=draw(n),
+    )
+    targets = Target(
+        asked=draw(n, 3) > 0,
+        label=draw(n, 3),
+        levels=jnp.tile(jnp.array([3, 3, 9]), (n, 1)),
+        ordinal=jnp.tile(jnp.array([True, True, False]), (n, 1)),
+        streams=draw(n, 3) > 0,
+    )
+    score = lambda p, t: total_reward(REWARDS, weights, p, t)
+    batched = jax.jit(jax.vmap(score))(parsed, targets)
+    pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
+    one_by_one = [score(pick(parsed, i), pick(targets, i)) for i in range(n)]
+    chex.assert_trees_all_close(batched, jax.tree.map(lambda *rows: jnp.stack(rows), *one_by_one), atol=1e-6)
+    chex.assert_tree_all_finite(batched)
+
+
+@pytest.mark.parametrize("name", REWARDS)
+def test_every_reward_is_a_scalar(name):
+    parsed, target = constant(0), make_target()
+    assert jax.eval_shape(REWARDS[name].value, parsed, target) == jax.ShapeDtypeStruct((), jnp.float32)
+    assert jax.eval_shape(REWARDS[name].applies, target) == jax.ShapeDtypeStruct((), jnp.bool_)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ({"acuracy": 1.0}, r"no reward is called 'acuracy'; choose from accuracy, accuracy_debiased, consistency"),
+        ({"accuracy": -1.0}, r"weights\[accuracy\] is -1\.0: must be finite and ≥ 0"),
+        ({"accuracy": float("nan")}, r"weights\[accuracy\] is nan: must be finite"),
+        ({"accuracy": 0.0}, r"at least one must be above 0"),
+        ({}, r"weights is \{\}: at least one"),
+    ],
+)
+def test_bad_weights_are_named(weights, message):
+    with pytest.raises(ValueError, match=message):
+        total(weights, constant(0), make_target())
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (Reward(lambda p, t: p.conclude * 1.0), r"reward 'mine': value has type float32\[3\], must be float\[\]"),
+        (Reward(lambda p, t: p.formatted), r"reward 'mine': value has type bool\[\], must be float\[\]"),
+        (Reward(lambda p, t: p.length), r"reward 'mine': value has type int32\[\], must be float\[\]"),
+        (
+            Reward(lambda p, t: jnp.ones(()), lambda t: t.asked),
+            r"reward 'mine': applies has type bool\[3\], must be bool",
+        ),
+        (
+            Reward(lambda p, t: jnp.ones(()), lambda t: 1.0),
+            r"reward 'mine': applies has type float32\[\], must be bool",
+        ),
+    ],
+)
+def test_bad_rewards_fail_when_traced(reward, message):
+    with pytest.raises(TypeError, match=message):
+        jax.eval_shape(lambda p, t: total_reward({"mine": reward}, {"mine": 1.0}, p, t), constant(0), make_target())
