@@ -88,7 +88,7 @@ class RecordWriter:
             self._lock.close()
             raise
         self._keys = {key for key, _ in self._index.contacts}
-        self._cards: list[ObjectCard] = []
+        self._cards: dict[str, bytes] = {}
         self._pending: list[tuple[ContactKey, dict[str, int]]] = []
         self._frames: dict[str, int] = {}
         self._shard: ShardWriter | None = None
@@ -101,7 +101,7 @@ class RecordWriter:
     @property
     def objects_done(self) -> frozenset[str]:
         """Objects whose card is written."""
-        return frozenset(self._index.objects) | {card.object_id for card in self._cards}
+        return frozenset(self._index.objects) | self._cards.keys()
 
     def __contains__(self, key: ContactKey) -> bool:
         return key in self._keys
@@ -118,7 +118,7 @@ class RecordWriter:
         """
         if card.object_id in self.objects_done:
             raise SchemaError(f"object_id is {card.object_id!r}: an object is stored once; drop the second card")
-        self._cards.append(card)
+        self._cards[card.object_id] = encode_card(card)
 
     def write_contact(self, sequences: Seq[Sequence]) -> None:
         """Store one contact: its sequences by different sensors.
@@ -145,11 +145,11 @@ class RecordWriter:
         index = self._index
         if self._cards:
             cards = ShardWriter(self._root, f"objects-{len(index.object_shards):05d}")
-            for card in self._cards:
-                cards.write(encode_card(card))
+            for card in self._cards.values():
+                cards.write(card)
             index.object_shards.append(cards.publish())
-            index.objects += [card.object_id for card in self._cards]
-            self._cards = []
+            index.objects += self._cards
+            self._cards = {}
         if self._shard is not None:
             index.contact_shards.append(self._shard.publish())
             index.contacts += self._pending

@@ -1,5 +1,7 @@
-"""Shape checking for the whole suite: every jaxtyping annotation of `touchr1_jax` is enforced while tests run."""
+"""Shape checking for the whole suite: every jaxtyping annotation of a function of `touchr1_jax` holds while tests run."""
 
 import jaxtyping
 
-jaxtyping.install_import_hook("touchr1_jax", "tests.typecheck.functions")
+from tests.typecheck import functions
+
+jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions.__name__}")

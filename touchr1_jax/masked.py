@@ -5,30 +5,32 @@ influence, not even when it is NaN or infinite.  Gradients are finite: 0 where n
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Shaped
 
+AnyArray = Array | np.ndarray
 Axis = int | tuple[int, ...] | None
 
 
-def count(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+def count(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
     """Number of selected elements, float32."""
     selected = jnp.broadcast_to(mask, jnp.broadcast_shapes(x.shape, mask.shape))
     return jnp.sum(selected, axis=axis, keepdims=keepdims, dtype=jnp.float32)
 
 
-def total(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+def total(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
     """Sum of the selected elements, Σ m x."""
     return jnp.sum(jnp.where(mask, x, 0), axis=axis, keepdims=keepdims)
 
 
-def mean(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+def mean(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
     """Mean of the selected elements, Σ m x / max(Σ m, 1): 0 where none is selected."""
     size = count(x, mask, axis, keepdims=keepdims)
     return total(x, mask, axis, keepdims=keepdims) / jnp.maximum(size, 1)
 
 
 def var(
-    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
+    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
 ) -> Array:
     """Variance of the selected elements, Σ m (x − mean)² / max(Σ m − ddof, 1); `ddof` 0 is the population's."""
     size = count(x, mask, axis, keepdims=keepdims)
@@ -37,7 +39,7 @@ def var(
 
 
 def std(
-    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
+    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
 ) -> Array:
     """Standard deviation of the selected elements, √var, with gradient 0 where the variance is 0."""
     variance = var(x, mask, axis, ddof=ddof, keepdims=keepdims)
@@ -46,7 +48,7 @@ def std(
 
 
 def whiten(
-    x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, epsilon: float, ddof: int = 0
+    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, epsilon: float, ddof: int = 0
 ) -> Array:
     """Standardised elements, (x − mean) / (std + ε), and 0 where not selected.
 
@@ -57,16 +59,16 @@ def whiten(
     return jnp.where(mask, centred / (std(x, mask, axis, ddof=ddof, keepdims=True) + epsilon), 0)
 
 
-def maximum(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, empty: float) -> Array:
+def maximum(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, empty: float) -> Array:
     """Largest selected element; `empty` where none is selected."""
     return _extreme(jnp.max, -jnp.inf, x, mask, axis, empty)
 
 
-def minimum(x: Shaped[Array, "*n"], mask: Bool[Array, "*m"], axis: Axis = None, *, empty: float) -> Array:
+def minimum(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, empty: float) -> Array:
     """Smallest selected element; `empty` where none is selected."""
     return _extreme(jnp.min, jnp.inf, x, mask, axis, empty)
 
 
-def _extreme(reduce, neutral: float, x: Array, mask: Array, axis: Axis, empty: float) -> Array:
+def _extreme(reduce, neutral: float, x: AnyArray, mask: AnyArray, axis: Axis, empty: float) -> Array:
     some = count(x, mask, axis) > 0
     return jnp.where(some, reduce(jnp.where(mask, x, neutral), axis=axis), empty)

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ LOAD = 1
 """Phase of every frame of a press: loading."""
 
 _STRAIN_LIMIT = 0.3  # of the gel's thickness, past which small strain is off by more than the label noise
+_FORCE_LEAD_NS = 2_000_000  # the force sensor is read 2 ms before the picture arrives
 _WORKERS = 2
 _LOOKAHEAD = 3  # contacts in flight
 
@@ -99,13 +101,8 @@ def _press(config: SceneConfig, index: int, order: int) -> Sequence:
         force_n=_f32(force),
         exposure_drift=_f32(0.01 * rng.standard_normal()),
     )
-    grid = Grid(contact_grid=config.contact_grid, image_px=config.image_px)
     unit = _session(_unit(config.seed, order, serial), rng)
-    noise = draw_noise(rng, config.frames, sensor, config.image_px)
-    limits = (config.solver_tolerance, config.solver_max_iterations)
-    made = jax.device_get(record(press, unit, make_kernels(sensor, grid), noise, sensor, grid, *limits))
     time_ns = _times(config, index, order, sensor, target)
-    markers = sensor.marker_depth_mm is not None
     return Sequence(
         key=ContactKey(object_id=_object_id(index // config.sites), site=index % config.sites, motion="press", trial=0),
         sensor=sensor.name,
@@ -113,18 +110,32 @@ def _press(config: SceneConfig, index: int, order: int) -> Sequence:
         calibration=f"generated-{GENERATOR}",
         contact_region_px=_region(config, sensor, site),
         mm_per_px=sensor.window_mm / config.image_px if sensor.render is not None else None,
-        frames=made.frames,
-        deformation_mm=made.deformation_mm if markers else None,
-        shear_mm=made.shear_mm if markers else None,
-        depth_mm=made.depth_mm,
-        valid=made.valid,
         force_n=measured,
         target_force_n=target,
         host_time_ns=time_ns,
-        force_time_ns=time_ns - 2_000_000,
+        force_time_ns=time_ns - _FORCE_LEAD_NS,
         phase=np.full(config.frames, LOAD, np.uint8),
-        flags=_flags(made),
+        **_measured(config, sensor, press, unit, rng),
     )
+
+
+def _measured(
+    config: SceneConfig, sensor: SensorModel, press: Press, unit: Unit, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Pictures, fields and flags of a press, as the arrays of a `Sequence`."""
+    grid = Grid(contact_grid=config.contact_grid, image_px=config.image_px)
+    noise = draw_noise(rng, config.frames, sensor, config.image_px)
+    limits = (config.solver_tolerance, config.solver_max_iterations)
+    made = jax.device_get(record(press, unit, make_kernels(sensor, grid), noise, sensor, grid, *limits))
+    markers = sensor.marker_depth_mm is not None
+    return {
+        "frames": made.frames,
+        "deformation_mm": made.deformation_mm if markers else None,
+        "shear_mm": made.shear_mm if markers else None,
+        "depth_mm": made.depth_mm,
+        "valid": made.valid,
+        "flags": _flags(made),
+    }
 
 
 def _flags(made: Recording) -> np.ndarray:

@@ -116,6 +116,8 @@ class TestBadInput:
     def test_an_object_is_stored_once(self, writer):
         with pytest.raises(SchemaError, match="object_id is 'object_0'"):
             writer.write_object(fakes.card(0))
+        with pytest.raises(SchemaError, match="object_9: its settings cannot be stored as JSON"):
+            writer.write_object(fakes.card(9, truth={"modulus_mpa": float("nan")}))
 
 
 class TestInterrupted:

@@ -90,7 +90,7 @@ def test_masks_broadcast():
 def test_booleans_and_integers():
     assert masked.mean(jnp.array([True, True, False]), jnp.array([True, True, True])) == pytest.approx(2 / 3)
     assert masked.mean(jnp.array([1, 2, 9]), jnp.array([True, True, False])) == 1.5
-    assert masked.maximum(jnp.array([1, 2, 9]), jnp.array([True, True, False]), empty=0) == 2
+    assert masked.maximum(jnp.array([1, 2, 9]), jnp.array([True, True, False]), empty=0.0) == 2
 
 
 @pytest.mark.parametrize("name", [n for n in STATISTICS if n != "count"])

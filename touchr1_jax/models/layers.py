@@ -81,7 +81,7 @@ class KeySource(NamedTuple):
     mask: Bool[Array, "..."]
 
 
-def attend(q: Float[Array, "T KV R d"], sources: Sequence[KeySource]) -> Float[Array, "T heads*d"]:
+def attend(q: Float[Array, "T KV R d"], sources: Sequence[KeySource]) -> Float[Array, "T KV*R*d"]:
     """Grouped-query attention of one sequence over the union of several key blocks, softmax(q kᵀ/√d) v.
 
     The blocks stay apart, so that keys shared by a group of rollouts are stored and multiplied once under `vmap`.

@@ -97,7 +97,7 @@ class Decoder(nn.Module):
         """Rows of the embedding table."""
         return self.embedding(tokens)
 
-    def logits(self, x: Float[Array, "T D"], banned: Bool[Array, "V"]) -> Float[Array, "T V"]:
+    def logits(self, x: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the next token in float32, with banned ids (placeholders, padding) out of reach for good."""
         y = self.norm(x)
         scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)

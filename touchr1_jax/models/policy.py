@@ -134,9 +134,17 @@ class Policy(nn.Module):
         return self.completion_logits(ids, first, prefix, banned)
 
 
-def init_policy(policy: Policy, key: Array, batch: TouchBatch, ids: Array, mask: Array, slots: Slots) -> Params:
+def init_policy(
+    policy: Policy,
+    key: Array,
+    batch: TouchBatch,
+    ids: Int[np.ndarray, "L"],
+    mask: Bool[np.ndarray, "L"],
+    slots: Slots,
+) -> Params:
     """Fresh parameters, float32, from one key and the shapes of a batch and a prompt."""
-    init = jax.jit(lambda k, b: policy.init(k, b, ids, mask, slots, method=Policy.initialise))
+    prompt = jnp.asarray(ids), jnp.asarray(mask)
+    init = jax.jit(lambda k, b: policy.init(k, b, *prompt, slots, method=Policy.initialise))
     return init(key, jax.tree.map(lambda x: x[:1], batch))["params"]
 
 

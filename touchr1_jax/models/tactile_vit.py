@@ -8,7 +8,7 @@ import dataclasses
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Real
 
 from touchr1_jax.models.layers import MASKED, RMSNorm
 
@@ -42,7 +42,7 @@ class TactileViT(nn.Module):
     @nn.compact
     def __call__(
         self,
-        frames: Float[Array, "*n F H W 3"],
+        frames: Real[Array, "*n F H W 3"],
         force_n: Float[Array, "*n F 3"],
         frame_index: Int[Array, "*n F"],
         frame_mask: Bool[Array, "*n F"],
@@ -80,7 +80,7 @@ class TactileViT(nn.Module):
         return QueryPool(c.tokens_per_step, name="pool")(x)
 
 
-def patch_tokens(frames: Float[Array, "*n F H W 3"], c: TactileViTConfig) -> Float[Array, "*n step patch D"]:
+def patch_tokens(frames: Real[Array, "*n F H W 3"], c: TactileViTConfig) -> Float[Array, "*n step patch D"]:
     """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
 
     The stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.

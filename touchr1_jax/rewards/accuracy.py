@@ -11,9 +11,9 @@ UNPARSABLE = -0.1
 
 
 def credit(
-    answer: Int[Array, "*n"], label: Int[Array, "*n"], levels: Int[Array, "*n"], ordinal: Bool[Array, "*n"]
-) -> Float[Array, "*n"]:
-    """Credit of one answer, with d = |ŷ − y|.
+    answer: Int[Array, "*#n"], label: Int[Array, "*#n"], levels: Int[Array, "*#n"], ordinal: Bool[Array, "*#n"]
+) -> Float[Array, "*#n"]:
+    """Credit of each answer, with d = |ŷ − y|; the arguments broadcast.
 
     Ordinal: 1 at d = 0, 0.4 at d = 1, 0 at d ≥ 2, −0.1 where unparsable.  Categorical: 1 if right, else 0.  Source:
     Touch-R1 (arXiv 2605.27154).  Departure: an attribute of two levels would earn 0.4 for the opposite answer and gets

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
 from touchr1_jax.rewards.accuracy import credit
@@ -37,7 +37,7 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
 
     def value(parsed: Parsed, target: Target) -> Float[Array, ""]:
         answer = parsed.conclude
-        expected, exists = constant_earnings(prior, target)
+        expected, exists = _constant_earnings(prior, target)
         own = jnp.take_along_axis(expected, jnp.maximum(answer, 0)[:, None], axis=1)[:, 0]
         bias = jnp.where((answer < 0) | (target.label < 0), 0.0, own - masked.mean(expected, exists, axis=1))
         earned = credit(answer, target.label, target.levels, target.ordinal)
@@ -46,7 +46,7 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
     return Reward(value)
 
 
-def constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Array]:
+def _constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:
     """r̄(k), what the constant answer k earns on average, and which levels k an attribute has, both [A, K]."""
     level = jnp.arange(prior.shape[1])
     levels, ordinal = target.levels[:, None, None], target.ordinal[:, None, None]

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -71,7 +71,7 @@ def _check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) 
         raise ValueError(f"weights is {dict(weights)}: at least one must be above 0; give a reward some weight")
 
 
-def _scalar(name: str, part: str, value: Array, kind: type) -> Array:
+def _scalar(name: str, part: str, value: Any, kind: type) -> Any:
     """The value itself, if it is a scalar of that kind."""
     shape, dtype = jnp.shape(value), jnp.result_type(value)
     if shape != () or not jnp.issubdtype(dtype, kind):

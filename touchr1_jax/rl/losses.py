@@ -30,8 +30,8 @@ def clipped_surrogate(
 
 
 def grounding_kl(
-    log_p: Float[Array, "T V"], log_masked: Float[Array, "T V"], *, stop_masked: bool, cap: float | None
-) -> Float[Array, "T"]:
+    log_p: Float[Array, "*n V"], log_masked: Float[Array, "*n V"], *, stop_masked: bool, cap: float | None
+) -> Float[Array, "*n"]:
     """Tactile grounding of each token, KL(π(· | touch) ‖ π(· | one stream replaced by noise)), exact over the vocabulary.
 
     Args:

@@ -220,7 +220,7 @@ class _Classes:
         after, more = self._byte_next[byte][state], self._byte_list[byte][state]
         joined = np.where(events == 0, more, events)
         for q in np.flatnonzero((events != 0) & (more != 0)):
-            joined[q] = self._lists.joined(events[q], more[q])
+            joined[q] = self._lists.joined(int(events[q]), int(more[q]))
         key = self._key((after, joined))
         if key not in self._index:
             self._index[key] = len(self.rows)

@@ -41,7 +41,7 @@ class Parser:
     sensor_of: np.ndarray  # int32 [events], the sensor that an event names, −1 for none
     levels_of: np.ndarray  # int32 [events, A], bit k where an event names level k of an attribute
 
-    def __call__(self, tokens: Int[Array, "T"]) -> Parsed:
+    def __call__(self, tokens: Int[Array, "*T"]) -> Parsed:
         """What one completion says; tokens from the first end token on do not matter.
 
         Raises:

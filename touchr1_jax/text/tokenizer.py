@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import SupportsIndex
 
 import numpy as np
 import tokenizers
@@ -67,7 +68,7 @@ class Tokenizer:
         """Ids of a text, without special tokens."""
         return self.encoder(text)
 
-    def decode(self, ids: Iterable[int]) -> str:
+    def decode(self, ids: Iterable[SupportsIndex]) -> str:
         """The text of ids; special tokens add nothing."""
         return b"".join(self.pieces[i] for i in ids).decode("utf-8", errors="replace")
 

@@ -111,5 +111,5 @@ def test_impossible_layers_are_refused(field: str, changes: dict[str, float]) ->
 
 
 def test_markers_outside_the_layer_are_refused() -> None:
-    with pytest.raises(ValueError, match="depth_mm is 5.0: must lie in"):
+    with pytest.raises(ValueError, match=r"depth_mm is 5\.0: must lie in"):
         depth_response(Q, GEL, 5.0)

@@ -1,3 +1,4 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,7 +32,7 @@ def test_disagreement_is_measured_in_the_range_of_levels(levels, earned):
 
 
 def test_mean_over_the_asked_ordinal_attributes():
-    parsed = constant(1).replace(compare=np.array([1, 0, 8]))
+    parsed = constant(1).replace(compare=jnp.array([1, 0, 8]))
     assert consistency(parsed, make_target(asked=(1, 1, 1))) == pytest.approx((1 + 0.5) / 2)
 
 

@@ -7,7 +7,9 @@ from touchr1_jax.rewards.exact import exact
 @pytest.mark.parametrize(("answer", "earned"), [(1, 1), (0, 0), (2, 0), (-1, -0.1)])
 @pytest.mark.parametrize("attribute", [0, 2])
 def test_right_or_not(answer, earned, attribute):
-    at = lambda value: tuple(value if a == attribute else 0 for a in range(3))
+    def at(value):
+        return tuple(value if a == attribute else 0 for a in range(3))
+
     assert exact(make_parsed(at(answer)), make_target(asked=at(1), label=at(1))) == pytest.approx(earned)
 
 

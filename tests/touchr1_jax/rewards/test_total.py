@@ -53,8 +53,11 @@ def test_listing_levels_and_repeating_tags_loses():
 @pytest.mark.parametrize("weights", [WEIGHTS, dict.fromkeys(REWARDS, 1.0)])
 def test_jit_and_vmap_change_nothing(weights):
     rng = np.random.default_rng(0)
-    draw = lambda *shape: jnp.array(rng.integers(-1, 3, shape))
     n = 32
+
+    def draw(*shape):
+        return jnp.array(rng.integers(-1, 3, shape))
+
     parsed = Parsed(
         perceive=draw(n, 3, 3),
         compare=draw(n, 3),
@@ -70,10 +73,12 @@ def test_jit_and_vmap_change_nothing(weights):
         ordinal=jnp.tile(jnp.array([True, True, False]), (n, 1)),
         streams=draw(n, 3) > 0,
     )
-    score = lambda p, t: total_reward(REWARDS, weights, p, t)
+
+    def score(p, t):
+        return total_reward(REWARDS, weights, p, t)
+
     batched = jax.jit(jax.vmap(score))(parsed, targets)
-    pick = lambda tree, i: jax.tree.map(lambda x: x[i], tree)
-    one_by_one = [score(pick(parsed, i), pick(targets, i)) for i in range(n)]
+    one_by_one = [score(*jax.tree.map(lambda x, i=i: x[i], (parsed, targets))) for i in range(n)]
     chex.assert_trees_all_close(batched, jax.tree.map(lambda *rows: jnp.stack(rows), *one_by_one), atol=1e-6)
     chex.assert_tree_all_finite(batched)
 

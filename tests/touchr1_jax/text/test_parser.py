@@ -102,6 +102,7 @@ def test_level_words_match_whole_and_alone(body, level):
         pytest.param(f"let me feel {GOOD}", ([0, 1, 2, 0], 1, 2, True), id="free text before"),
         pytest.param(GOOD.replace("> <", "> so <"), ([0, 1, 2, 0], 1, 2, True), id="free text between"),
         pytest.param(GOOD + " \n\t", ([0, 1, 2, 0], 1, 2, True), id="white space after"),
+        pytest.param(GOOD + " \x1c", ([0, 1, 2, 0], 1, 2, False), id="only ASCII white space is white"),
         pytest.param(GOOD + " .", ([0, 1, 2, 0], 1, 2, False), id="text after"),
         pytest.param(GOOD + "<", ([0, 1, 2, 0], 1, 2, False), id="half a tag after"),
         pytest.param(GOOD + GOOD, ([-1] * 4, -1, -1, False), id="all tags repeated"),
@@ -162,10 +163,9 @@ def test_tokens_after_the_end_do_not_matter():
     tokenizer = word_level(TOUCH_LANGUAGE)
     parser = jax.jit(compile_parser(TOUCH_LANGUAGE, tokenizer))
     ids = [*tokenizer.encode(GOOD), *tokenizer.end_ids]
-    for length in (len(ids), len(ids) + 7):
-        for filler in range(tokenizer.vocab_size):
-            padded = jnp.array(ids + [filler] * (length - len(ids)))
-            chex.assert_trees_all_equal(parser(padded), parser(jnp.array(ids)))
+    expected = parser(jnp.array(ids))
+    for filler in range(tokenizer.vocab_size):
+        chex.assert_trees_all_equal(parser(jnp.array(ids + [filler] * 7)), expected)
 
 
 def test_how_a_text_is_cut_into_tokens_does_not_matter():
@@ -182,7 +182,7 @@ def test_jit_and_vmap_change_nothing():
     tokenizer = make_tokenizer("straddling", TOUCH_LANGUAGE)
     parser = compile_parser(TOUCH_LANGUAGE, tokenizer)
     rng = np.random.default_rng(0)
-    tokens = jnp.array(rng.integers(0, tokenizer.vocab_size, (6, 30)), jnp.int32)
+    tokens = jnp.array(rng.integers(0, tokenizer.vocab_size, (3, 30)), jnp.int32)
     batched = jax.jit(jax.vmap(parser))(tokens)
     one_by_one = [parser(row) for row in tokens]
     chex.assert_trees_all_equal(batched, jax.tree.map(lambda *rows: jnp.stack(rows), *one_by_one))

@@ -15,7 +15,9 @@ HARDNESS = np.array([True, False, False, False])
 
 
 def answer(asked=HARDNESS, streams=(1, 1, 1, 1), perceive=(0, 0, 1, 0), compare=0, conclude=0) -> str:
-    full = lambda levels: np.broadcast_to(np.asarray(levels)[..., None], (*np.shape(levels), 4))
+    def full(levels):
+        return np.broadcast_to(np.asarray(levels)[..., None], (*np.shape(levels), 4))
+
     slots = {"perceive": full(perceive), "compare": full(compare), "conclude": full(conclude)}
     return answer_text(TOUCH_LANGUAGE, asked=np.asarray(asked), streams=np.asarray(streams), **slots)
 

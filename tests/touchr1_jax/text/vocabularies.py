@@ -133,10 +133,12 @@ def spell(pieces: list[bytes] | tuple[bytes, ...], text: str, seed: int = 0) -> 
 @st.composite
 def answers(draw: st.DrawFn, language: Language) -> str:
     """Well-formed answers with a few things inserted, deleted or moved."""
-    level = st.sampled_from([f" {p}" for p in level_phrases(language)])
-    sensor = st.sampled_from([f" {p}" for p in sensor_phrases(language)])
-    report = st.builds(str.__add__, sensor, level)
     noise = st.sampled_from(NOISE)
+    gap = st.sampled_from((" ", " ", " ", "  ", " \n", "-", "")) if draw(st.booleans()) else st.just(" ")
+    tail = st.one_of(st.just(""), st.just(""), noise) if draw(st.booleans()) else st.just("")
+    level = st.builds("{}{}{}".format, gap, st.sampled_from(level_phrases(language)), tail)
+    sensor = st.builds("{}{}".format, gap, st.sampled_from(sensor_phrases(language)))
+    report = st.builds(str.__add__, sensor, level)
     parts: list[str] = []
     for i, tag in enumerate(tags(language)):
         parts.append(tag if i == 0 else f" {tag}")
