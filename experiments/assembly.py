@@ -55,7 +55,9 @@ class Assembly:
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """Fresh parameters."""
         layout = self.layout
-        return init_policy(self.agent.policy, jax.random.key(seed), batch, layout.ids[0], layout.mask[0], self.agent.slots)
+        return init_policy(
+            self.agent.policy, jax.random.key(seed), batch, layout.ids[0], layout.mask[0], self.agent.slots
+        )
 
     def score(self, weights: Weights, prior: Float[np.ndarray, "A K"]) -> ScoreFn:
         """Total reward of one completion under the given weights."""
@@ -68,9 +70,7 @@ class Assembly:
 
         return score
 
-    def target(
-        self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray
-    ) -> Target:
+    def target(self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray) -> Target:
         """Targets of single-attribute questions; labels of the attributes that are not asked are hidden."""
         asked = self.layout.asked[attribute]
         ordinal = np.array([a.ordinal for a in self.language.attributes])
@@ -115,6 +115,4 @@ def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
         pad_id=tokenizer.pad_id,
     )
     parser = compile_parser(language, tokenizer)
-    return Assembly(
-        model=model, language=language, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser
-    )
+    return Assembly(model=model, language=language, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser)

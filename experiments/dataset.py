@@ -1,21 +1,15 @@
-"""The data of an experiment: made or imported once, cached by the hash of its configuration, split by object."""
+"""The data of an experiment: contacts on disk, split by object into the parts that the stages use."""
 
 import dataclasses
-import hashlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from experiments.progress import Advance
-from sensors_io.pipeline import ClipConfig, clip_batches
+from sensors_io.pipeline import ClipConfig
 from sensors_io.records import RecordStore
-from sensors_io.scenes.protocol import SceneConfig
-from sensors_io.schema import ATTRIBUTES, CLIP_ARRAYS, LEVELS
-from touchr1_jax.types import TouchBatch
+from sensors_io.schema import ATTRIBUTES, LEVELS
 
-Kind = Literal["generated", "physiclear", "records"]
 PARTS = ("sft", "grpo", "val", "test")
 
 
@@ -32,6 +26,7 @@ class Dataset:
     label: np.ndarray
     object_ids: np.ndarray
     visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
+    has_force: bool
 
     def prior(self) -> np.ndarray:
         """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0."""
@@ -81,6 +76,7 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
 def open_dataset(path: Path, clip: ClipConfig, grpo_share: float) -> Dataset:
     """Open records and split them."""
     store = RecordStore(path)
+    clip = dataclasses.replace(clip, sensors=store.meta.sensors)
     cards = [store.objects[key.object_id] for key in store.contacts]
     return Dataset(
         store=store,
@@ -89,4 +85,5 @@ def open_dataset(path: Path, clip: ClipConfig, grpo_share: float) -> Dataset:
         label=np.stack([card.label_row() for card in cards]),
         object_ids=np.array([card.object_id for card in cards]),
         visual_lies=np.array([bool(card.visual_lies) for card in cards]),
+        has_force=any(sequence.force_n is not None for sequence in store.contact(0).values()),
     )

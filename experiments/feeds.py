@@ -4,10 +4,13 @@ A feed wraps a Grain iterator and counts what it has drawn; its own randomness i
 `set_state` resumes it exactly.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any, Self
 
 import grain
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments.assembly import Assembly
@@ -54,11 +57,11 @@ class Feed:
 
 def touch_batch(clip: dict[str, np.ndarray]) -> TouchBatch:
     """The arrays of a clip batch as the JAX batch type."""
-    return TouchBatch(**{name: clip[name] for name in CLIP_ARRAYS})
+    return TouchBatch(**{name: jnp.asarray(clip[name]) for name in CLIP_ARRAYS})
 
 
 def random_streams(present: np.ndarray, full_share: float, rng: np.random.Generator) -> np.ndarray:
-    """Which present sensors each question may feel: all with probability `full_share`, else a random non-empty subset.
+    """Which present sensors a question may feel: all with probability `full_share`, else a random non-empty subset.
 
     Args:
       present: bool [n, S].
@@ -76,12 +79,19 @@ def random_streams(present: np.ndarray, full_share: float, rng: np.random.Genera
 class AnswerFeed(Feed):
     """SFT batches: each contact with one question per attribute and the verified answer to it.
 
-    `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level most
-    likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the label.
+    `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
+    most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the label.
     """
 
     def __init__(
-        self, assembly: Assembly, data: Dataset, evidence: np.ndarray, *, batch_size: int, seed: int, blind: bool = False
+        self,
+        assembly: Assembly,
+        data: Dataset,
+        evidence: np.ndarray,
+        *,
+        batch_size: int,
+        seed: int,
+        blind: bool = False,
     ) -> None:
         clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=batch_size, seed=seed)
         super().__init__(clips, seed)
@@ -94,19 +104,23 @@ class AnswerFeed(Feed):
         streams = np.zeros_like(present) if self._blind else random_streams(present, 0.5, rng)
         streams = streams.reshape(p, a, -1)
         pairs = [
-            self._answer(element["contact"][i], q, element["label"][i], streams[i, q]) for i in range(p) for q in range(a)
+            self._answer(element["contact"][i], q, element["label"][i], streams[i, q])
+            for i in range(p)
+            for q in range(a)
         ]
         tokens, masks = (np.stack(x).reshape(p, a, -1) for x in zip(*pairs, strict=True))
         return SFTBatch(
             touch=touch_batch(element),
-            ids=np.broadcast_to(layout.ids, (p, *layout.ids.shape)),
-            mask=np.broadcast_to(layout.mask, (p, *layout.mask.shape)),
-            streams=streams,
-            tokens=tokens,
-            token_mask=masks,
+            ids=jnp.broadcast_to(layout.ids, (p, *layout.ids.shape)),
+            mask=jnp.broadcast_to(layout.mask, (p, *layout.mask.shape)),
+            streams=jnp.asarray(streams),
+            tokens=jnp.asarray(tokens),
+            token_mask=jnp.asarray(masks),
         )
 
-    def _answer(self, contact: int, question: int, label: np.ndarray, streams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _answer(
+        self, contact: int, question: int, label: np.ndarray, streams: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         assembly, asked = self._assembly, self._assembly.layout.asked[question]
         length = assembly.model.completion_tokens
         if np.any(label[asked] < 0):  # nobody annotated it: the question has no answer and no loss
@@ -146,7 +160,7 @@ class QuestionFeed(Feed):
     def make(self, element: np.ndarray, rng: np.random.Generator) -> GRPOBatch:
         """Gather the features of one batch of questions."""
         contact, attribute = self._contact[element], self._attribute[element]
-        streams = random_streams(self._features.stream_mask[contact], self._full_share, rng)
+        streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
         return question_batch(self._assembly, self._features, self._label, contact, attribute, streams)
 
 
@@ -161,16 +175,16 @@ def question_batch(
     """One question per row: row i asks attribute[i] about contact[i], felt by streams[i]."""
     chosen = take(features, contact)
     return GRPOBatch(
-        features=chosen.replace(stream_mask=chosen.stream_mask & streams),
-        ids=assembly.layout.ids[attribute],
-        mask=assembly.layout.mask[attribute],
+        features=dataclasses.replace(chosen, stream_mask=chosen.stream_mask & jnp.asarray(streams)),
+        ids=jnp.asarray(assembly.layout.ids[attribute]),
+        mask=jnp.asarray(assembly.layout.mask[attribute]),
         target=assembly.target(attribute, label[contact], streams),
     )
 
 
 def take(features: Features, rows: np.ndarray) -> Features:
     """Rows of encoded contacts kept on the host."""
-    return Features(**{name: getattr(features, name)[rows] for name in Features.__dataclass_fields__})
+    return jax.tree.map(lambda x: jnp.asarray(x[rows]), features)
 
 
 def each(total: int, size: int) -> Iterator[tuple[np.ndarray, int]]:

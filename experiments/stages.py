@@ -69,7 +69,7 @@ def probe_features(data: Dataset, context: Context) -> Probed:
 
 
 def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
-    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts; other contacts and levels have −inf."""
+    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts, −inf for all others."""
     rows = data.parts["sft"]
     groups = data.object_ids[rows]
     out = np.full((len(data.store), len(data.clip.sensors), len(ATTRIBUTES), max(LEVELS.values())), -np.inf, np.float32)
@@ -82,7 +82,14 @@ def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float
 
 
 def run_sft(
-    assembly: Assembly, data: Dataset, evidence: np.ndarray, config: SFTConfig, context: Context, *, seed: int, stage: str,
+    assembly: Assembly,
+    data: Dataset,
+    evidence: np.ndarray,
+    config: SFTConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
     blind: bool = False,
 ) -> Params:
     """Train a policy from scratch on verified answers; a blind one never feels anything."""
@@ -152,7 +159,10 @@ def noise_bank(
     @jax.jit
     def draw(key: Array) -> Float[Array, "S N D"]:
         pixel_key, force_key = jax.random.split(key)
-        noise = jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_stats[1][:, None, None, None] + pixel_stats[0][:, None, None, None]
+        noise = (
+            jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_stats[1][:, None, None, None]
+            + pixel_stats[0][:, None, None, None]
+        )
         push = jax.random.normal(force_key, (s, f, 3)) * force_stats[1][:, None] + force_stats[0][:, None]
         index, mask = jnp.asarray(clip["frame_index"][0]), jnp.asarray(clip["frame_mask"][0])
         return agent.encode_streams(params, jnp.clip(noise, 0, 255), push, index, mask, jnp.arange(s))
@@ -212,12 +222,12 @@ class Evaluated:
     def answers(self, reward: np.ndarray) -> Answers:
         """What the metrics read."""
         return Answers(
-            conclude=self.parsed.conclude,
+            conclude=np.asarray(self.parsed.conclude),
             label=self.label,
-            formatted=self.parsed.formatted,
+            formatted=np.asarray(self.parsed.formatted),
             reward=reward,
             streams=self.streams,
-            perceive=self.parsed.perceive,
+            perceive=np.asarray(self.parsed.perceive),
             alone=self.alone,
         )
 
@@ -225,14 +235,15 @@ class Evaluated:
 def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
     """Ask every labelled question about every contact, with all streams and with each stream alone."""
     contact, attribute = np.nonzero(label >= 0)
-    present = features.stream_mask[contact]
+    present = np.asarray(features.stream_mask)[contact]
     ask = answer_program(assembly)
     said = _ask(ask, assembly, params, features, label, contact, attribute, present)
     s = present.shape[1]
     alone = None
     if present.any() and s > 1:
         each_alone = [
-            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i)) for i in range(s)
+            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
+            for i in range(s)
         ]
         alone = np.stack([x.parsed.conclude for x in each_alone], 1)
     return Evaluated(
@@ -261,12 +272,19 @@ def _ask(ask, assembly, params, features, label, contact, attribute, streams):
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
 
 
-def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> np.ndarray:
-    """Total reward of each answer under the given weights, float32 [N]."""
+def reward_terms(
+    assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray
+) -> dict[str, Float[np.ndarray, "N"]]:
+    """What each weighted reward adds to the total of each answer."""
     rewards = make_rewards(prior)
     target = assembly.target(done.attribute, done.label, done.streams)
-    score = jax.jit(jax.vmap(lambda p, t: total_reward(rewards, weights, p, t)[0]))
-    return np.asarray(score(jax.tree.map(jnp.asarray, done.parsed), target))
+    score = jax.jit(jax.vmap(lambda p, t: total_reward(rewards, weights, p, t)[1]))
+    return jax.device_get(score(jax.tree.map(jnp.asarray, done.parsed), target))
+
+
+def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
+    """Total reward of each answer under the given weights."""
+    return sum(reward_terms(assembly, done, weights, prior).values(), start=np.zeros(len(done.contact), np.float32))
 
 
 def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
@@ -275,5 +293,7 @@ def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeCon
     columns = []
     for a, name in enumerate(ATTRIBUTES):
         weight = (train & (data.label[:, a] >= 0))[None]
-        columns.append(probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)[0, rows].argmax(-1))
+        columns.append(
+            probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)[0, rows].argmax(-1)
+        )
     return np.stack(columns, 1)

@@ -1,8 +1,8 @@
 """The data that moves through one rollout, as frozen pytrees: batch → prefix → rollout → parsed → reward → update.
 
 Dimensions, used in every name and shape of this package:
-  P prompts, G rollouts of one prompt, T completion tokens, L prefix tokens, V vocabulary, S tactile streams (stream s is
-  sensor s of the language), F frames, H W C image, A attributes, K levels of an attribute, D model width.
+  P prompts, G rollouts of one prompt, T completion tokens, L prefix tokens, V vocabulary, S tactile streams (stream s
+  is sensor s of the language), F frames, H W C image, A attributes, K levels of an attribute, D model width.
 """
 
 from typing import Any

@@ -55,6 +55,18 @@ def make_agent(config: PolicyConfig = CONFIG, slots: Slots = SLOTS) -> Agent:
 AGENT = make_agent()
 
 
+SHALLOW = make_agent(
+    dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFIG.decoder, num_layers=1))
+)
+"""One decoder layer, for programs that are slow to compile."""
+
+
+def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
+    """Parameters of the decoder of `SHALLOW`: those of `params` without the second layer."""
+    decoder = params(seed, loud=loud)["decoder"]
+    return {"decoder": {name: value for name, value in decoder.items() if name != "layers_1"}}
+
+
 @functools.cache
 def params(seed: int = 0, *, loud: float = 0.4) -> Params:
     """Parameters drawn from N(0, loud²), scales from N(1, loud²), so that attention is not uniform and no bias trivial.
@@ -68,7 +80,8 @@ def params(seed: int = 0, *, loud: float = 0.4) -> Params:
         centre = 1.0 if path[-1].key == "scale" else 0.0
         return jnp.asarray(rng.normal(centre, loud, leaf.shape), leaf.dtype)
 
-    return jax.tree_util.tree_map_with_path(draw, shapes)
+    with jax.ensure_compile_time_eval():  # the cache must not keep a tracer of whoever asks first
+        return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 def initialise(key: jax.Array) -> Params:

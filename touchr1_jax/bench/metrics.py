@@ -78,6 +78,13 @@ METRICS: Mapping[str, Metric] = {
     "reward": Metric(
         title="Reward", unit="", better="higher", format=".3f", meaning="mean total reward of the greedy answers"
     ),
+    "reward_trained": Metric(
+        title="Reward (own)",
+        unit="",
+        better="higher",
+        format=".4f",
+        meaning="mean total reward of the greedy answers under the weights that the arm was trained on",
+    ),
 }
 """Every metric name that a results file may hold."""
 

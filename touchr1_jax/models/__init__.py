@@ -1,1 +1,1 @@
-"""Flax Linen modules of the policy: tactile encoder, vision tower, decoder language model, and the policy that joins them."""
+"""Flax Linen modules: tactile encoder, vision tower, decoder language model, and the policy that joins them."""

@@ -1,6 +1,8 @@
 """A policy together with its prompt layout and vocabulary: the pure functions that training and sampling call."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,28 +35,31 @@ class Agent:
     def encode(self, params: Params, batch: TouchBatch, *, blind: bool = False) -> Features:
         """Encode a batch of contacts, [P, …]; a blind policy has no streams."""
         method = Policy.encode_blind if blind else Policy.encode
-        return self.policy.apply({"params": params}, batch, method=method)
+        return self._apply(params, method, batch)
 
     def encode_streams(self, params: Params, *stream: Array) -> Float[Array, "*n N D"]:
         """Encode any batch of single streams; arguments as in `TactileViT`."""
-        return self.policy.apply({"params": params}, *stream, method=Policy.encode_streams)
+        return self._apply(params, Policy.encode_streams, *stream)
 
     def prefill(
         self, params: Params, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"]
     ) -> tuple[Float[Array, "V"], PrefixCache]:
         """Encode one prompt."""
-        args = (features, ids, mask, self.slots, jnp.asarray(self.banned))
-        return self.policy.apply({"params": params}, *args, method=Policy.prefill)
+        return self._apply(params, Policy.prefill, features, ids, mask, self.slots, jnp.asarray(self.banned))
 
     def decode(
         self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: tuple[LayerCache, ...]
     ) -> tuple[Float[Array, "V"], tuple[LayerCache, ...]]:
         """One token step of one rollout."""
-        args = (token, t, prefix, caches, jnp.asarray(self.banned))
-        return self.policy.apply({"params": params}, *args, method=Policy.decode)
+        return self._apply(params, Policy.decode, token, t, prefix, caches, jnp.asarray(self.banned))
 
     def group_logits(
-        self, params: Params, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"], tokens: Int[Array, "G T"]
+        self,
+        params: Params,
+        features: Features,
+        ids: Int[Array, "L"],
+        mask: Bool[Array, "L"],
+        tokens: Int[Array, "G T"],
     ) -> Float[Array, "G T V"]:
         """Logits of every token of a group of completions of one prompt; the prompt is encoded once.
 
@@ -62,11 +67,13 @@ class Agent:
         """
         first, prefix = self.prefill(params, features, ids, mask)
         banned = jnp.asarray(self.banned)
-        one = lambda o: self.policy.apply({"params": params}, o, first, prefix, banned, method=Policy.completion_logits)
-        return jax.vmap(one)(tokens)
+        return jax.vmap(lambda o: self._apply(params, Policy.completion_logits, o, first, prefix, banned))(tokens)
 
     def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
         """Caches of one completion of at most `length` tokens."""
         c = self.policy.config.decoder
         zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim))
         return tuple(LayerCache(zeros, zeros) for _ in range(c.num_layers))
+
+    def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:
+        return self.policy.apply({"params": params}, *args, method=method)

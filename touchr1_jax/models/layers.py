@@ -1,4 +1,4 @@
-"""Layers that every tower shares: RMS normalisation, gated MLP, rotary positions, attention over several key sources."""
+"""Layers that the towers share: RMS normalisation, gated MLP, rotary positions, attention over several key blocks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -93,9 +93,7 @@ def attend(q: Float[Array, "T KV R d"], sources: Sequence[KeySource]) -> Float[A
     ]
     top = jnp.max(jnp.stack([jnp.max(s, -1) for s in scores]), 0)[..., None]
     weights = [jnp.exp(s - jax.lax.stop_gradient(top)) for s in scores]
-    total = sum(jnp.sum(w, -1) for w in weights)  # [KV, R, T]
-    mixed = sum(
-        jnp.einsum("krtn,knd->tkrd", w.astype(q.dtype), s.v) for w, s in zip(weights, sources, strict=True)
-    )
+    total = sum((jnp.sum(w, -1) for w in weights), start=jnp.zeros(()))  # [KV, R, T]
+    mixed = sum(jnp.einsum("krtn,knd->tkrd", w.astype(q.dtype), s.v) for w, s in zip(weights, sources, strict=True))
     normed = mixed / total.transpose(2, 0, 1)[..., None].astype(q.dtype)
     return normed.reshape(q.shape[0], -1)

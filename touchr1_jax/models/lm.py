@@ -1,7 +1,7 @@
 """Decoder language model of the Qwen2.5 shape: grouped-query attention, RMSNorm, SwiGLU, multimodal rotary positions.
 
-Every method works on one sequence; the callers batch by `vmap`.  A group of G rollouts shares one prompt, so the keys of
-the prompt (`PrefixCache`) are an argument of their own that `vmap` over the group leaves unbatched.
+Every method works on one sequence; the callers batch by `vmap`.  A group of G rollouts shares one prompt, so the keys
+of the prompt (`PrefixCache`) are an argument of their own that `vmap` over the group leaves unbatched.
 """
 
 import dataclasses

@@ -86,7 +86,9 @@ class Policy(nn.Module):
     def encode_blind(self, batch: TouchBatch) -> Features:
         """The same contacts for a policy without touch: no stream is present, only the view is encoded."""
         shape = (*self.token_time(batch.frame_index).shape, self.config.decoder.hidden_size)
-        return self._features(batch.replace(stream_mask=jnp.zeros_like(batch.stream_mask)), jnp.zeros(shape))
+        return self._features(
+            dataclasses.replace(batch, stream_mask=jnp.zeros_like(batch.stream_mask)), jnp.zeros(shape)
+        )
 
     def _features(self, batch: TouchBatch, touch: Float[Array, "P S N D"]) -> Features:
         return Features(
@@ -117,7 +119,7 @@ class Policy(nn.Module):
     def completion_logits(
         self, tokens: Int[Array, "T"], first: Float[Array, "V"], prefix: PrefixCache, banned: Bool[Array, "V"]
     ) -> Float[Array, "T V"]:
-        """Logits that predict each completion token, the first from the prefix and the others from their predecessors."""
+        """Logits that predict each completion token, the first from the prefix, the others from what precedes them."""
         hidden = self.decoder.extend(tokens[:-1], prefix)
         return jnp.concatenate([first[None], self.decoder.logits(hidden, banned)])
 
@@ -156,7 +158,9 @@ def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Boo
     return mask & jnp.where(slots.stream_text >= 0, named, True)
 
 
-def prompt_positions(touch_time: Int[Array, "S N"], mask: Bool[Array, "L"], slots: Slots, grid: int) -> Int[Array, "3 L"]:
+def prompt_positions(
+    touch_time: Int[Array, "S N"], mask: Bool[Array, "L"], slots: Slots, grid: int
+) -> Int[Array, "3 L"]:
     """(time, row, column) id of each prompt token, block by block as Qwen2.5-VL counts them.
 
     A text token advances all three by one.  A view token keeps the time of its block and adds its row and column.  A

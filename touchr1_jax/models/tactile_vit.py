@@ -1,7 +1,7 @@
 """Tactile encoder: a vision transformer over the frames of one tactile stream, pooled to a few tokens per time step.
 
-A stream of F frames becomes F/2 time steps.  Each step is cut into spatial patches, every patch becomes a token, and after
-the transformer each step is pooled by learned queries to `tokens_per_step` tokens that carry its integer frame index.
+A stream of F frames becomes F/2 time steps.  Each step is cut into spatial patches, every patch becomes a token, and
+after the transformer each step is pooled by learned queries to `tokens_per_step` tokens that carry its frame index.
 """
 
 import dataclasses
@@ -104,9 +104,28 @@ def patch_tokens(frames: Real[Array, "*n F H W 3"], c: TactileViTConfig) -> Floa
     x = x.astype(jnp.float32) / 127.5 - 1.0
     level = nn.Dense(c.stem_width, name="stem_level")(x)
     change = nn.Dense(c.stem_width, use_bias=False, name="stem_change")(x)
-    x = nn.gelu(level + 4.0 * (change - change[..., :1, :, :, :]))
-    x = x.reshape(*lead, f // c.frames_per_step, c.frames_per_step, rows * columns, -1).swapaxes(-3, -2)
-    return nn.Dense(c.width, name="patch")(x.reshape(*x.shape[:-2], -1))
+    change = change - change[..., :1, :, :, :]
+    texture = log_energy(level - level.mean(-2, keepdims=True))
+    moved = log_energy(change)
+    energy = jnp.concatenate([texture, texture - texture[..., :1, :, :], moved, change.mean(-2)], -1)
+    x = nn.gelu(level + 4.0 * change).reshape(*lead, f, rows * columns, -1)
+    embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
+    return embed(x, "patch") + embed(energy, "energy")
+
+
+def log_energy(x: Float[Array, "*n cell channel"]) -> Float[Array, "*n channel"]:
+    """Mean size of a filter's response over a patch, on a scale of about unit spread, (log(mean |x| + 1e-3) + 3)/1.5.
+
+    Texture and pressure act by orders of magnitude: their logarithm is what a linear layer can use.
+    """
+    return (jnp.log(jnp.abs(x).mean(-2) + 1e-3) + 3.0) / 1.5
+
+
+def _steps(x: Float[Array, "*n F patch C"], frames_per_step: int) -> Float[Array, "*n step patch frames*C"]:
+    """Join the frames of each time step along the channels."""
+    *lead, f, patches, _ = x.shape
+    x = x.reshape(*lead, f // frames_per_step, frames_per_step, patches, -1).swapaxes(-3, -2)
+    return x.reshape(*x.shape[:-2], -1)
 
 
 class EncoderLayer(nn.Module):

@@ -38,7 +38,9 @@ class VisionTower(nn.Module):
         c = self.config
         *lead, h, w, _ = view.shape
         if (h, w) != (c.image_px, c.image_px):
-            raise ValueError(f"view is {h}×{w} px, the vision config says {c.image_px}²; resize it or change the config")
+            raise ValueError(
+                f"view is {h}×{w} px, the vision config says {c.image_px}²; resize it or change the config"
+            )
         x = view.astype(jnp.float32) / 127.5 - 1.0
         # windows of 2 × 2 patches are the outer blocks, so that the merger is a reshape
         block = 2 * c.patch_px

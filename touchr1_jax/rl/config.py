@@ -9,8 +9,8 @@ from touchr1_jax.rl.kl import KLEstimator
 class GRPOConfig:
     """The algorithm; `paper()` is the published objective with our values for what it leaves open.
 
-    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.  `lr_scale` multiplies the paper's
-    learning rate for models trained from scratch, which stand still at 1e-6.
+    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.  `lr_scale` multiplies the
+    paper's learning rate for models trained from scratch, which stand still at 1e-6.
     """
 
     prompts: int = 8
@@ -47,3 +47,15 @@ class GRPOConfig:
         """Departures that keep the objective bounded: masked branch held fixed, G_tg capped at 1 nat a token, exact KL,
         zero-variance groups left out of the policy-gradient mean."""
         return GRPOConfig(kl="exact", grounding_stop_masked=True, grounding_cap_nat=1.0, drop_degenerate=True)
+
+
+def preset_name(config: GRPOConfig) -> str:
+    """Name of the preset and the settings that differ from it, as reports print it."""
+    presets = {"paper": GRPOConfig.paper(), "stable": GRPOConfig.stable()}
+    fields = [f.name for f in dataclasses.fields(GRPOConfig)]
+    changes = {
+        name: [f"{f}={getattr(config, f)}" for f in fields if getattr(config, f) != getattr(preset, f)]
+        for name, preset in presets.items()
+    }
+    nearest = min(changes, key=lambda name: len(changes[name]))
+    return " ".join([nearest, *([f"with {', '.join(changes[nearest])}"] if changes[nearest] else [])])

@@ -100,8 +100,6 @@ def mask_one_stream(features: Features, noise: Float[Array, "K S N D"], key: Arr
     return jnp.where(any_stream, replaced, features.touch)
 
 
-
-
 def prompt_weights(counts: Bool[Array, "P"]) -> Float[Array, "P"]:
     """Weight of each prompt in a mean over the prompts that count; all 0 when none does."""
     return counts / jnp.maximum(jnp.sum(counts), 1)

@@ -32,7 +32,7 @@ def clipped_surrogate(
 def grounding_kl(
     log_p: Float[Array, "*n V"], log_masked: Float[Array, "*n V"], *, stop_masked: bool, cap: float | None
 ) -> Float[Array, "*n"]:
-    """Tactile grounding of each token, KL(π(· | touch) ‖ π(· | one stream replaced by noise)), exact over the vocabulary.
+    """Tactile grounding of each token, KL(π(· | touch) ‖ π(· | one stream made noise)), exact over the vocabulary.
 
     Args:
       log_p: log-probabilities under the true touch.

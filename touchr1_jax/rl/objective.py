@@ -3,6 +3,7 @@
 Per prompt the policy, the reference and the perturbed policy each encode their prefix once and score the whole group.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -101,8 +102,6 @@ def perturbed_kl(config: GRPOConfig, scored, params: Params, experience: Experie
     """Tactile grounding at each token; skipped, not computed and multiplied by 0, when γ is 0."""
     if config.gamma == 0.0:
         return jnp.zeros(log_p.shape[:-1])
-    features = experience.batch.features.replace(touch=experience.masked_touch)
+    features = dataclasses.replace(experience.batch.features, touch=experience.masked_touch)
     log_masked = scored(params, features)
-    return grounding_kl(
-        log_p, log_masked, stop_masked=config.grounding_stop_masked, cap=config.grounding_cap_nat
-    )
+    return grounding_kl(log_p, log_masked, stop_masked=config.grounding_stop_masked, cap=config.grounding_cap_nat)

@@ -1,7 +1,7 @@
 """Sample a group of completions per prompt from a shared, once-encoded prefix.
 
-The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix batched).
-The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended.
+The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix
+batched).  The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended.
 """
 
 import dataclasses

@@ -16,7 +16,7 @@ _PHRASE = re.compile(r"[a-z0-9_]+(?:[ \-][a-z0-9_]+)*")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Attribute:
-    """A property that can be asked for: `levels[k]` are the words and phrases that name level k, the first one canonical."""
+    """A property that can be asked for: `levels[k]` are the phrases that name level k, the canonical one first."""
 
     name: str
     levels: tuple[tuple[str, ...], ...]
@@ -60,7 +60,7 @@ class Language:
                 _check_phrase(f"sensor {sensor.name}", phrase)
                 if names.setdefault(phrase, sensor.name) != sensor.name:
                     raise ValueError(
-                        f"sensor phrase {phrase!r} names both {names[phrase]} and {sensor.name}; drop it from one of them"
+                        f"sensor phrase {phrase!r} names {names[phrase]} and {sensor.name}; drop it from one of them"
                     )
 
     def attribute_index(self, name: str) -> int:

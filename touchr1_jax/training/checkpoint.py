@@ -52,5 +52,3 @@ class Checkpoints:
         args = ocp.args.Composite(state=ocp.args.StandardRestore(like), data=ocp.args.JsonRestore())
         found = self._manager.restore(step, args=args)
         return Restored(step, found.state, found.data["data"])
-
-

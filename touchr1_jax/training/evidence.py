@@ -108,7 +108,7 @@ def cross_fit(
 def _fit_probe(
     x: Float[Array, "n D"], y: Int[Array, "n"], weight: Float[Array, "n"], levels: int, config: ProbeConfig
 ) -> Float[Array, "n K"]:
-    """Scores of all rows under W, b that minimise Σ w CE / Σ w + penalty/2 ‖W‖², features standardised by the weighted rows."""
+    """Scores of all rows under the W, b that minimise Σ w CE / Σ w + penalty/2 ‖W‖², on standardised features."""
     total = jnp.sum(weight)
     centre = weight @ x / total
     spread = jnp.sqrt(weight @ (x - centre) ** 2 / total)

@@ -3,6 +3,7 @@
 Every contact is encoded once and answers Q questions, so the encoder's cost is shared.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -61,7 +62,7 @@ def sft_loss(
     features = agent.encode(params, batch.touch, blind=blind)
 
     def answer(features, ids, mask, streams, tokens):
-        seen = features.replace(stream_mask=features.stream_mask & streams)
+        seen = dataclasses.replace(features, stream_mask=features.stream_mask & streams)
         return agent.group_logits(params, seen, ids, mask, tokens[None])[0]
 
     per_question = jax.vmap(answer, in_axes=(None, 0, 0, 0, 0))

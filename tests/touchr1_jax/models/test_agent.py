@@ -41,22 +41,21 @@ def full_mask(features, mask) -> np.ndarray:
     return mask
 
 
-def naive_group(params, features, ids, mask, tokens):
-    """Logits [G, T, V] of one prompt, each rollout as one full sequence."""
-    mask = full_mask(features, mask)
-    positions = naive.prompt_positions(mask, np.asarray(features.touch_time), tiny.CONFIG.vision.grid, BLOCKS)
+def naive_logits(params, batch, touch, view, tokens):
+    """Logits [P, G, T, V] with every rollout as one full sequence; `touch` and `view` may be traced."""
+    return jnp.stack([naive_group(params, batch, i, touch[i], view[i], tokens[i]) for i in range(P)])
+
+
+def naive_group(params, batch, i, touch, view, tokens):
+    """The same for prompt i."""
+    features = jax.tree.map(lambda x: np.asarray(x)[i], batch.features)
+    mask = full_mask(features, np.asarray(batch.mask)[i])
+    positions = naive.prompt_positions(mask, features.touch_time, tiny.CONFIG.vision.grid, BLOCKS)
     last = positions[:, mask].max()
     positions = np.concatenate([positions, np.tile(last + 1 + np.arange(T), (3, 1))], 1)
     table = params["decoder"]["embedding"]["embedding"]
-    prompt = table[ids].at[tiny.LAYOUT.touch].set(features.touch).at[tiny.LAYOUT.view].set(features.view)
-    one = [naive.logits(params["decoder"], prompt, o, positions, mask, tiny.CONFIG.decoder) for o in tokens]
-    return jnp.stack(one)
-
-
-def naive_logits(params, batch, tokens):
-    """The same for all prompts."""
-    rows = [jax.tree.map(lambda x, i=i: x[i], (batch.features, batch.ids, batch.mask)) for i in range(P)]
-    return jnp.stack([naive_group(params, f, ids, mask, o) for (f, ids, mask), o in zip(rows, tokens, strict=True)])
+    prompt = table[batch.ids[i]].at[tiny.LAYOUT.touch].set(touch).at[tiny.LAYOUT.view].set(view)
+    return jax.vmap(lambda o: naive.logits(params["decoder"], prompt, o, positions, mask, tiny.CONFIG.decoder))(tokens)
 
 
 def close(ours, theirs, tolerance: float = 1e-5) -> None:
@@ -71,7 +70,7 @@ def close(ours, theirs, tolerance: float = 1e-5) -> None:
 def test_shared_prefix_gives_the_values_of_full_sequences(batch):
     tokens, params = tiny.completions(0, P, G, T), tiny.params()
     ours = group_logits(params, batch.features, batch.ids, batch.mask, tokens)[..., writable]
-    theirs = naive_logits(params, batch, tokens)[..., writable]
+    theirs = naive_logits(params, batch, batch.features.touch, batch.features.view, tokens)[..., writable]
     assert float(jnp.std(theirs)) > 1  # else agreement would mean little
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5 * float(jnp.abs(theirs).max()))
 
@@ -86,8 +85,7 @@ def test_shared_prefix_gives_the_gradients_of_full_sequences(batch):
         return jnp.sum(cotangent * group_logits(params, features, batch.ids, batch.mask, tokens)[..., writable])
 
     def theirs(params, touch, view):
-        features = batch.features.replace(touch=touch, view=view)
-        return jnp.sum(cotangent * naive_logits(params, batch.replace(features=features), tokens)[..., writable])
+        return jnp.sum(cotangent * naive_logits(params, batch, touch, view, tokens)[..., writable])
 
     at = decoder, batch.features.touch, batch.features.view
     close(jax.grad(ours, (0, 1, 2))(*at), jax.jit(jax.grad(theirs, (0, 1, 2)))(*at))

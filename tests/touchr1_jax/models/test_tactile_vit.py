@@ -1,0 +1,129 @@
+"""The tactile encoder: which pixels and frames reach which token."""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax import tiny
+from touchr1_jax.models.tactile_vit import QueryPool, TactileViTConfig, force_features, patch_tokens, sinusoid
+
+CONFIG = dataclasses.replace(tiny.CONFIG.tactile, patch_cells=2, stem_px=2)  # patches of 4 px
+F, H, W = 4, 8, 12
+
+
+class Patches(nn.Module):
+    """`patch_tokens` as a module."""
+
+    config: TactileViTConfig = CONFIG
+
+    @nn.compact
+    def __call__(self, frames):
+        return patch_tokens(frames, self.config)
+
+
+@pytest.fixture(scope="module")
+def patches():
+    """Jitted frames [F, H, W, 3] → tokens [step, patch, D]."""
+    module = Patches()
+    frames = jnp.zeros((F, H, W, 3))
+    params = module.init(jax.random.key(0), frames)
+    return jax.jit(lambda x: module.apply(params, x))
+
+
+def test_a_patch_sees_its_own_pixels_and_no_others(patches):
+    """Patch p of a step lies in row p // 3, column p % 3 of the 4 px grid, in the two frames of its step."""
+    rng = np.random.default_rng(0)
+    frames = rng.uniform(0, 255, (F, H, W, 3)).astype(np.float32)
+    before = patches(frames)
+    for f, y, x in [(2, 0, 0), (3, 3, 3), (2, 5, 11), (3, 7, 4)]:
+        touched = frames.copy()
+        touched[f, y, x] += 50
+        changed = np.any(np.asarray(patches(touched) != before), -1)
+        expected = np.zeros((2, 6), bool)
+        expected[f // 2, y // 4 * 3 + x // 4] = True
+        np.testing.assert_array_equal(changed, expected)
+
+
+def test_the_first_frame_is_what_changes_are_measured_from(patches):
+    frames = np.random.default_rng(1).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
+    touched = frames.copy()
+    touched[0, 1, 1] += 50
+    changed = np.any(np.asarray(patches(touched) != patches(frames)), -1)
+    np.testing.assert_array_equal(changed, [[True] + [False] * 5] * 2)  # its patch, in every step
+
+
+@pytest.mark.parametrize("shape", [(4, 8, 10, 3), (4, 6, 12, 3), (3, 8, 12, 3)])
+def test_frames_must_divide(shape):
+    with pytest.raises(ValueError, match="must divide into 4 px patches and steps of 2; resize them"):
+        Patches().init(jax.random.key(0), jnp.zeros(shape))
+
+
+encode = jax.jit(lambda p, b: tiny.AGENT.encode_streams(p, b.frames, b.force_n, b.frame_index, b.frame_mask, jnp.arange(2)[None]))
+
+
+def test_every_input_reaches_the_tokens():
+    """Frames, force, frame indices, frame mask: a silently omitted one would not show in any loss."""
+    batch, params = tiny.touch_batch(0), tiny.params()
+    before = encode(params, batch)
+    assert before.shape == (1, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)
+    mask = batch.frame_mask.copy()
+    mask[0, 0, 2:] = False
+    changes = {
+        "frames": 255 - batch.frames,
+        "force_n": -batch.force_n,
+        "frame_index": batch.frame_index + 7,
+        "frame_mask": mask,
+    }
+    for name, value in changes.items():
+        assert float(jnp.abs(encode(params, batch.replace(**{name: value})) - before).max()) > 1e-3, name
+
+
+def test_sensors_have_embeddings_of_their_own():
+    batch, params = tiny.touch_batch(0), tiny.params()
+    same = jax.tree.map(lambda x: x.copy(), batch)
+    same.frames[:, 1], same.force_n[:, 1], same.frame_index[:, 1] = batch.frames[:, 0], batch.force_n[:, 0], batch.frame_index[:, 0]
+    tokens = encode(params, same)
+    assert float(jnp.abs(tokens[:, 0] - tokens[:, 1]).max()) > 1e-3
+
+
+def test_permuted_frames_change_the_tokens():
+    """The shuffle control is not vacuous: time order alone, with the same frame indices, must show."""
+    batch, params = tiny.touch_batch(0), tiny.params()
+    order = [2, 0, 3, 1]
+    shuffled = batch.replace(frames=batch.frames[:, :, order], force_n=batch.force_n[:, :, order])
+    before, after = encode(params, batch), encode(params, shuffled)
+    assert float(jnp.abs(after - before).max()) > 0.05 * float(jnp.std(before))
+
+
+def test_force_can_be_switched_off():
+    config = dataclasses.replace(tiny.CONFIG, tactile=dataclasses.replace(tiny.CONFIG.tactile, use_force=False))
+    batch = tiny.touch_batch(0)
+    agent, params = tiny.make_agent(config), tiny.params()
+    blind = {**params, "tactile": {k: v for k, v in params["tactile"].items() if not k.startswith("force")}}
+    run = jax.jit(lambda b: agent.encode(blind, b).touch)
+    np.testing.assert_array_equal(run(batch), run(batch.replace(force_n=-3 * batch.force_n)))
+
+
+def test_force_features_by_hand():
+    force = jnp.array([[0.0, 0, 0], [1.0, -2, -20]])
+    np.testing.assert_allclose(
+        force_features(force), [[0, 0, 0, 0, 0], [0.1, -0.2, -2, np.log(201) - 2, 1]], rtol=1e-6, atol=1e-7
+    )
+
+
+def test_sinusoid_tells_frame_indices_apart():
+    rows = np.asarray(sinusoid(jnp.arange(90), 32))
+    distance = np.linalg.norm(rows[:, None] - rows, axis=-1) + np.eye(90)
+    assert distance.min() > 0.1
+
+
+def test_pool_by_hand():
+    """One query, two patches: softmax of q·k/√D over the patches, then their values."""
+    params = {"query": jnp.array([[2.0]]), "kv": {"kernel": jnp.array([[1.0, 10.0]]), "bias": jnp.zeros(2)}}
+    out = QueryPool(1).apply({"params": params}, jnp.array([[0.0], [1.0]]))
+    p = 1 / (1 + np.exp(-2))
+    np.testing.assert_allclose(out, [[10 * p]], rtol=1e-6)

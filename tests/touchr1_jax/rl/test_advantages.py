@@ -1,0 +1,64 @@
+"""Advantages by hand; rounding must not make signal out of equal rewards."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from touchr1_jax.rl.advantages import degenerate, group_advantage
+
+
+def test_advantages_by_hand():
+    """Mean ½, population σ ½."""
+    np.testing.assert_allclose(
+        group_advantage(jnp.array([1.0, 0, 0, 1]), epsilon=0.0), [1, -1, -1, 1], rtol=1e-6
+    )
+    # rewards 1, .4, 0, −.1: mean .325, σ² = mean of .675², .075², .325², .425²
+    spread = np.sqrt((0.675**2 + 0.075**2 + 0.325**2 + 0.425**2) / 4)
+    expected = np.array([0.675, 0.075, -0.325, -0.425]) / (spread + 1e-4)
+    np.testing.assert_allclose(group_advantage(jnp.array([1, 0.4, 0, -0.1])), expected, rtol=1e-5)
+
+
+def test_without_sigma_by_hand():
+    """Dr. GRPO."""
+    ours = group_advantage(jnp.array([1.0, 0.4, 0, -0.1]), normalise=False)
+    np.testing.assert_allclose(ours, [0.675, 0.075, -0.325, -0.425], rtol=1e-6)
+
+
+def test_epsilon_is_added_to_sigma():
+    np.testing.assert_allclose(group_advantage(jnp.array([1.0, 0.0]), epsilon=0.5), [0.5, -0.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("value", [1.0, 0.4, 0.0, -0.1])
+@pytest.mark.parametrize("group", [2, 3, 5, 7, 8, 16])
+@pytest.mark.parametrize("normalise", [True, False])
+def test_equal_rewards_give_exactly_zero(value, group, normalise):
+    """The mean of G times 0.4 is not 0.4 in float32: σ alone would amplify the difference."""
+    reward = jnp.full((3, group), 0.6 * value + 0.3 + 0.1, jnp.float32)
+    for rewards in (reward, jnp.full((3, group), value, jnp.float32)):
+        assert not group_advantage(rewards, epsilon=0.0 if normalise else 1e-4, normalise=normalise).any()
+        assert degenerate(rewards).all()
+
+
+def test_rewards_of_equal_value_but_unequal_rounding_are_degenerate():
+    reward = jnp.array([0.6 + 0.3 + 0.1, 1.0, 0.1 + 0.2 + 0.7, np.float32(1) + np.float32(2e-7)], jnp.float32)
+    assert degenerate(reward)
+    assert not group_advantage(reward).any()
+
+
+def test_groups_are_normalised_apart():
+    reward = jnp.array([[1.0, 0, 0, 1], [0.4, 0.4, 0.4, 0.4], [10, 0, 10, 0]])
+    ours = group_advantage(reward)
+    np.testing.assert_array_equal(degenerate(reward), [False, True, False])
+    np.testing.assert_allclose(ours[0], group_advantage(reward[0]), rtol=1e-6)
+    assert not ours[1].any()
+
+
+@given(st.lists(st.sampled_from([1.0, 0.4, 0.0, -0.1]), min_size=2, max_size=8).filter(lambda r: len(set(r)) > 1))
+@settings(max_examples=50, deadline=None)
+def test_sum_is_zero_and_order_follows_the_reward(rewards):
+    rewards = (rewards * 8)[:8]  # one shape, one compilation
+    advantage = np.asarray(group_advantage(jnp.array(rewards)))
+    assert abs(advantage.sum()) < 1e-4
+    np.testing.assert_array_equal(np.sign(np.subtract.outer(rewards, rewards)), np.sign(np.subtract.outer(advantage, advantage)))

@@ -1,0 +1,26 @@
+"""Presets as they are published and reported."""
+
+import pytest
+
+from touchr1_jax.rl.config import GRPOConfig
+
+
+def test_paper_preset():
+    c = GRPOConfig.paper()
+    assert (c.group, c.beta, c.learning_rate, c.kl) == (8, 1e-3, 1e-6, "k3")
+    assert (c.gamma, c.clip_low, c.clip_high, c.epsilon) == (0.01, 0.2, 0.2, 1e-4)
+    assert c.normalise
+    assert not c.drop_degenerate
+    assert not c.grounding_stop_masked
+    assert c.grounding_cap_nat is None
+
+
+def test_stable_preset():
+    c = GRPOConfig.stable()
+    assert (c.kl, c.grounding_stop_masked, c.grounding_cap_nat, c.drop_degenerate) == ("exact", True, 1.0, True)
+    assert c.gamma == 0.01
+
+
+def test_micro_batches_must_divide():
+    with pytest.raises(ValueError, match="micro_prompts 3 must divide prompts 8; choose a divisor"):
+        GRPOConfig(micro_prompts=3)
