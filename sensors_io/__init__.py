@@ -1,1 +1,1 @@
-"""Tactile sensors in, lossless records and training clips out: devices, importers, generated scenes, Grain pipelines."""
+"""Tactile sensors in, lossless records and clips out: devices, importers, generated scenes, Grain pipelines."""

@@ -1,4 +1,4 @@
-"""Shape checking for the whole suite: every jaxtyping annotation of a function of `touchr1_jax` holds while tests run."""
+"""Shape checking for the whole suite: the shapes that functions of `touchr1_jax` annotate hold while tests run."""
 
 import jaxtyping
 

@@ -55,9 +55,7 @@ def make_agent(config: PolicyConfig = CONFIG, slots: Slots = SLOTS) -> Agent:
 AGENT = make_agent()
 
 
-SHALLOW = make_agent(
-    dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFIG.decoder, num_layers=1))
-)
+SHALLOW = make_agent(dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFIG.decoder, num_layers=1)))
 """One decoder layer, for programs that are slow to compile."""
 
 

@@ -30,7 +30,7 @@ class Features:
     """What the decoder reads of one contact: tactile tokens with their frame indices, and view tokens.
 
     `touch_time` is the integer frame index of each tactile token, never seconds: a cast of seconds per step to integers
-    would zero it and make a temporal control vacuous.
+    would zero it and make a temporal control vacuous.  It is −1 where a time step has no frame: no such token exists.
     """
 
     touch: Float[Array, "*n S N D"]
@@ -85,7 +85,7 @@ class Policy(nn.Module):
 
     def encode_blind(self, batch: TouchBatch) -> Features:
         """The same contacts for a policy without touch: no stream is present, only the view is encoded."""
-        shape = (*self.token_time(batch.frame_index).shape, self.config.decoder.hidden_size)
+        shape = (*self.token_time(batch.frame_index, batch.frame_mask).shape, self.config.decoder.hidden_size)
         return self._features(
             dataclasses.replace(batch, stream_mask=jnp.zeros_like(batch.stream_mask)), jnp.zeros(shape)
         )
@@ -93,16 +93,18 @@ class Policy(nn.Module):
     def _features(self, batch: TouchBatch, touch: Float[Array, "P S N D"]) -> Features:
         return Features(
             touch=touch,
-            touch_time=self.token_time(batch.frame_index),
+            touch_time=self.token_time(batch.frame_index, batch.frame_mask),
             stream_mask=batch.stream_mask,
             view=self.vision(batch.view),
             view_mask=batch.view_mask,
         )
 
-    def token_time(self, frame_index: Int[Array, "*n F"]) -> Int[Array, "*n N"]:
-        """Frame index of each pooled token: that of the first frame of its time step."""
+    def token_time(self, frame_index: Int[Array, "*n F"], frame_mask: Bool[Array, "*n F"]) -> Int[Array, "*n N"]:
+        """Frame index of each pooled token: that of the first frame of its time step, −1 where the step has none."""
         c = self.config.tactile
-        first = frame_index.reshape(*frame_index.shape[:-1], -1, c.frames_per_step)[..., 0]
+        by_step = lambda x: x.reshape(*x.shape[:-1], -1, c.frames_per_step)
+        index, exists = by_step(jnp.where(frame_mask, frame_index, -1)), by_step(frame_mask)
+        first = jnp.take_along_axis(index, jnp.argmax(exists, -1, keepdims=True), -1)[..., 0]
         return jnp.repeat(first, c.tokens_per_step, -1)
 
     def prefill(
@@ -151,8 +153,9 @@ def init_policy(
 
 
 def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Bool[Array, "L"]:
-    """Which prompt tokens exist: real text, tokens and names of present streams, the view where there is one."""
-    mask = jnp.asarray(mask).at[slots.touch].set(features.stream_mask[:, None])
+    """Which prompt tokens exist: real text, names of present streams, tokens of their recorded steps, any view."""
+    felt = features.stream_mask[:, None] & (features.touch_time >= 0)
+    mask = jnp.asarray(mask).at[slots.touch].set(felt)
     mask = mask.at[slots.view].set(features.view_mask)
     named = features.stream_mask[np.maximum(slots.stream_text, 0)]
     return mask & jnp.where(slots.stream_text >= 0, named, True)

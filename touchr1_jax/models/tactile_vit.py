@@ -61,6 +61,8 @@ class TactileViT(nn.Module):
           `tokens_per_step` tokens of each time step.
         """
         c = self.config
+        frames = jnp.where(frame_mask[..., None, None, None], frames, 0)  # padding must hold nothing
+        force_n = jnp.where(frame_mask[..., None], force_n, 0.0)
         x = patch_tokens(frames, c)  # *n step patch D
         steps = x.shape[-3]
         step_mask = _group(frame_mask, c.frames_per_step).any(-1)
@@ -100,15 +102,15 @@ def patch_tokens(frames: Real[Array, "*n F H W 3"], c: TactileViTConfig) -> Floa
     x = frames.reshape(*lead, f, rows, c.patch_cells, c.stem_px, columns, c.patch_cells, c.stem_px, 3)
     n = len(lead)
     x = x.transpose(*range(n), *(n + i for i in (0, 1, 4, 2, 5, 3, 6, 7)))
-    x = x.reshape(*lead, f, rows * columns, c.patch_cells**2, 3 * c.stem_px**2)
-    x = x.astype(jnp.float32) / 127.5 - 1.0
-    level = nn.Dense(c.stem_width, name="stem_level")(x)
-    change = nn.Dense(c.stem_width, use_bias=False, name="stem_change")(x)
+    x = x.reshape(-1, 3 * c.stem_px**2).astype(jnp.float32) / 127.5 - 1.0
+    # one long matrix: XLA's CPU gradient of a dense layer over many leading axes is seven times slower
+    x = nn.Dense(2 * c.stem_width, name="stem")(x)
+    level, change = jnp.split(x.reshape(*lead, f, rows * columns, c.patch_cells**2, -1), 2, -1)
     change = change - change[..., :1, :, :, :]
     texture = log_energy(level - level.mean(-2, keepdims=True))
     moved = log_energy(change)
     energy = jnp.concatenate([texture, texture - texture[..., :1, :, :], moved, change.mean(-2)], -1)
-    x = nn.gelu(level + 4.0 * change).reshape(*lead, f, rows * columns, -1)
+    x = nn.relu(level + 4.0 * change).reshape(*lead, f, rows * columns, -1)
     embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
     return embed(x, "patch") + embed(energy, "energy")
 
@@ -121,7 +123,7 @@ def log_energy(x: Float[Array, "*n cell channel"]) -> Float[Array, "*n channel"]
     return (jnp.log(jnp.abs(x).mean(-2) + 1e-3) + 3.0) / 1.5
 
 
-def _steps(x: Float[Array, "*n F patch C"], frames_per_step: int) -> Float[Array, "*n step patch frames*C"]:
+def _steps(x: Float[Array, "*n F patch C"], frames_per_step: int) -> Float[Array, "*n step patch wide"]:
     """Join the frames of each time step along the channels."""
     *lead, f, patches, _ = x.shape
     x = x.reshape(*lead, f // frames_per_step, frames_per_step, patches, -1).swapaxes(-3, -2)

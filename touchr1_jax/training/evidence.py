@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, UInt8
+from jaxtyping import Array, Float, Int, Shaped, UInt8
 
 from touchr1_jax.models.tactile_vit import force_features
 
 TINY = 1e-4  # keeps log(energy) of a constant image finite; energies are in units of full scale
+ROUNDING = 1e-5  # a spread below this share of the mean is that of a constant feature in float32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -57,7 +58,7 @@ def stream_features(frames: UInt8[Array, "*n F H W 3"], force_n: Float[Array, "*
 def probe_log_probs(
     features: Float[np.ndarray, "n D"],
     labels: Int[np.ndarray, "n"],
-    weights: Float[np.ndarray, "fit n"],
+    weights: Shaped[np.ndarray, "fit n"],
     levels: int,
     config: ProbeConfig,
 ) -> Float[np.ndarray, "fit n K"]:
@@ -112,7 +113,8 @@ def _fit_probe(
     total = jnp.sum(weight)
     centre = weight @ x / total
     spread = jnp.sqrt(weight @ (x - centre) ** 2 / total)
-    z = (x - centre) / jnp.where(spread > 0, spread, 1.0)
+    varies = spread > ROUNDING * jnp.abs(centre)
+    z = jnp.where(varies, (x - centre) / jnp.where(varies, spread, 1.0), 0.0)
 
     def loss(parameters):
         matrix, bias = parameters

@@ -60,7 +60,7 @@ def logits(
 
 
 def prompt_positions(mask: np.ndarray, touch_time: np.ndarray, grid: int, blocks: list[tuple]) -> np.ndarray:
-    """(time, row, column) of a prompt by counting in Python; `blocks` are ("text" | "view" | stream, length), in order."""
+    """(time, row, column) of a prompt, counted in Python; `blocks` are ("text" | "view" | stream, length) in order."""
     rows, base, at = [], 0, 0
     for kind, length in blocks:
         block, inside, column = [], 0, 0

@@ -1,4 +1,4 @@
-"""A group that shares its prefix computes what separate full sequences would; the sampler sees what the learner sees."""
+"""A group that shares its prefix computes what separate full sequences would; sampler and learner see the same."""
 
 import dataclasses
 
@@ -14,7 +14,14 @@ from touchr1_jax.rl.losses import clipped_surrogate, token_log_probs
 from touchr1_jax.rl.rollout import SampleConfig
 
 P, G, T = 2, 3, 6
-BLOCKS = [("view", tiny.NV), ("text", 1), (0, tiny.N), ("text", 1), (1, tiny.N), ("text", tiny.L - tiny.NV - 2 * tiny.N - 2)]
+BLOCKS = [
+    ("view", tiny.NV),
+    ("text", 1),
+    (0, tiny.N),
+    ("text", 1),
+    (1, tiny.N),
+    ("text", tiny.L - tiny.NV - 2 * tiny.N - 2),
+]
 DRAW = SampleConfig(group=G, length=T, end_ids=tiny.AGENT.end_ids, pad_id=tiny.AGENT.pad_id)
 writable = tiny.WRITABLE
 
@@ -102,9 +109,7 @@ def test_learner_sees_the_log_probabilities_of_the_sampler(batch, rollout):
     logits = group_logits(tiny.params(), batch.features, batch.ids, batch.mask, rollout.tokens)
     learner = token_log_probs(jax.nn.log_softmax(logits), rollout.tokens)
     assert rollout.mask.sum() > P * G  # more than first tokens
-    np.testing.assert_allclose(
-        jnp.where(rollout.mask, learner, 0), rollout.log_prob, rtol=1e-5, atol=1e-5
-    )
+    np.testing.assert_allclose(jnp.where(rollout.mask, learner, 0), rollout.log_prob, rtol=1e-5, atol=1e-5)
 
 
 def test_ratio_to_the_sampler_is_one_on_policy(batch, rollout):
@@ -128,7 +133,9 @@ def test_banned_ids_are_never_sampled(batch):
     """10⁴ tokens; the policy's own scores prefer the banned ids by far."""
     params = tiny.params()
     table = params["decoder"]["embedding"]["embedding"]
-    loved = {"decoder": {**params["decoder"], "embedding": {"embedding": table.at[tiny.TOKENIZER.banned].multiply(20.0)}}}
+    loved = {
+        "decoder": {**params["decoder"], "embedding": {"embedding": table.at[tiny.TOKENIZER.banned].multiply(20.0)}}
+    }
     many = dataclasses.replace(DRAW, group=1000, length=5)
     said = jax.jit(lambda p, b, k: sample_group(tiny.AGENT, p, b, k, many))(loved, batch, jax.random.key(0))
     tokens = said.tokens[said.mask]

@@ -64,7 +64,9 @@ def test_decode_reads_no_row_of_the_cache_after_its_own(params):
     x = jnp.asarray(rng.normal(size=(L, D)), jnp.float32)
     prefix = prefill(params, x)[1]
     shape = (CONFIG.num_kv_heads, T, CONFIG.head_dim)
-    step = jax.jit(lambda c: DECODER.apply({"params": params}, jnp.int32(7), jnp.int32(0), prefix, c, method=Decoder.decode))
+    step = jax.jit(
+        lambda c: DECODER.apply({"params": params}, jnp.int32(7), jnp.int32(0), prefix, c, method=Decoder.decode)
+    )
     caches = [tuple(LayerCache(jnp.full(shape, v), jnp.full(shape, v)) for _ in range(2)) for v in (0.0, 5.0)]
     hidden = [step(c)[0] for c in caches]
     np.testing.assert_array_equal(*hidden)

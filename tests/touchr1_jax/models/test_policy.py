@@ -59,10 +59,8 @@ def test_positions_without_a_stream_by_hand():
 def test_time_ids_are_distinct_frame_indices():
     """Zero or repeated time ids would make the shuffle control vacuous."""
     index = np.array([[[0, 4, 9, 17], [1, 2, 3, 30]]])
-    time = Policy(tiny.CONFIG).token_time(jnp.asarray(index))
+    time = Policy(tiny.CONFIG).token_time(jnp.asarray(index), jnp.ones(index.shape, bool))
     np.testing.assert_array_equal(time, [[[0, 0, 9, 9], [1, 1, 3, 3]]])
-    features = tiny.AGENT.policy.apply({}, jnp.asarray(index), method=Policy.token_time)
-    np.testing.assert_array_equal(features, time)
     rows = prompt_positions(time[0], jnp.ones(17, bool), SLOTS, grid=2)
     for s in range(2):
         steps = rows[0, SLOTS.touch[s]]
@@ -161,6 +159,28 @@ def test_vmap_over_prompts_is_the_loop(batch, before):
         features, ids, mask = jax.tree.map(lambda x, i=i: x[i], (batch.features, batch.ids, batch.mask))
         ours = one(tiny.params(), features, ids, mask, TOKENS[i])
         np.testing.assert_allclose(ours, before[i], rtol=1e-5, atol=2e-5)
+
+
+def test_time_steps_without_a_frame_do_not_exist():
+    """A recording of fewer frames than a clip: the padded step adds no token, whatever stands in its frames."""
+    index, mask = jnp.array([[[2, 7, 0, 0]]]), jnp.array([[[True, True, False, False]]])
+    time = Policy(tiny.CONFIG).token_time(index, mask)
+    np.testing.assert_array_equal(time, [[[2, 2, -1, -1]]])
+    late = Policy(tiny.CONFIG).token_time(index, jnp.array([[[False, True, True, False]]]))
+    np.testing.assert_array_equal(late, [[[7, 7, 0, 0]]])
+    one = jax.tree.map(lambda x: x[0], tiny.features(0, 1))
+    short = one.replace(touch_time=one.touch_time.at[0].set(time[0, 0]))
+    there = np.asarray(prompt_mask(short, jnp.asarray(tiny.LAYOUT.mask[0]), tiny.SLOTS))
+    np.testing.assert_array_equal(there[tiny.LAYOUT.touch], [[True, True, False, False], [True] * 4])
+    rows = prompt_positions(jnp.array([[2, 2, -1, -1], [2, 2, 5, 5]]), jnp.asarray(there_by_hand()), SLOTS, grid=2)
+    assert rows[0, 9] == 6  # the second name follows frame 2 of the block that starts at 3
+
+
+def there_by_hand() -> np.ndarray:
+    """`HAND_MASK` without the second step of the first stream."""
+    mask = HAND_MASK.copy()
+    mask[7:9] = False
+    return mask
 
 
 def test_names_of_absent_streams_do_not_exist():

@@ -48,6 +48,24 @@ def test_a_patch_sees_its_own_pixels_and_no_others(patches):
         np.testing.assert_array_equal(changed, expected)
 
 
+def test_a_stem_cell_is_a_square_of_pixels():
+    """Cells of 2 px, four to a patch, row by row: one pixel moves the response of one cell."""
+    module, frames = Patches(), np.zeros((F, H, W, 3), np.float32)
+    params = module.init(jax.random.key(0), jnp.asarray(frames))
+
+    def cells_of(x):
+        _, state = module.apply(params, jnp.asarray(x), capture_intermediates=lambda m, _: m.name == "stem")
+        return np.asarray(state["intermediates"]["stem"]["__call__"][0]).reshape(F, 6, 4, -1)
+
+    for f, y, x in [(0, 1, 0), (1, 1, 3), (3, 6, 10)]:
+        lit = frames.copy()
+        lit[f, y, x, 1] = 255
+        changed = np.any(cells_of(lit) != cells_of(frames), -1)
+        expected = np.zeros((F, 6, 4), bool)
+        expected[f, y // 4 * 3 + x // 4, y % 4 // 2 * 2 + x % 4 // 2] = True
+        np.testing.assert_array_equal(changed, expected)
+
+
 def test_the_first_frame_is_what_changes_are_measured_from(patches):
     frames = np.random.default_rng(1).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
     touched = frames.copy()
@@ -62,7 +80,9 @@ def test_frames_must_divide(shape):
         Patches().init(jax.random.key(0), jnp.zeros(shape))
 
 
-encode = jax.jit(lambda p, b: tiny.AGENT.encode_streams(p, b.frames, b.force_n, b.frame_index, b.frame_mask, jnp.arange(2)[None]))
+encode = jax.jit(
+    lambda p, b: tiny.AGENT.encode_streams(p, b.frames, b.force_n, b.frame_index, b.frame_mask, jnp.arange(2)[None])
+)
 
 
 def test_every_input_reaches_the_tokens():
@@ -82,10 +102,30 @@ def test_every_input_reaches_the_tokens():
         assert float(jnp.abs(encode(params, batch.replace(**{name: value})) - before).max()) > 1e-3, name
 
 
+def test_frames_that_do_not_exist_hold_nothing():
+    """Padding of a clip, inside a step and a whole step: other pixels, forces and indices there change no bit."""
+    batch, params = tiny.touch_batch(0), tiny.params()
+    mask = batch.frame_mask.copy()
+    mask[0, 0, 1], mask[0, 1, 2:] = False, False
+    short = batch.replace(frame_mask=mask)
+    other = tiny.touch_batch(1)
+    filled = short.replace(
+        frames=np.where(mask[..., None, None, None], batch.frames, other.frames),
+        force_n=np.where(mask[..., None], batch.force_n, other.force_n),
+    )
+    ours, theirs = encode(params, short), encode(params, filled)
+    np.testing.assert_array_equal(ours, theirs)
+    assert not (ours == encode(params, batch)).all()
+
+
 def test_sensors_have_embeddings_of_their_own():
     batch, params = tiny.touch_batch(0), tiny.params()
     same = jax.tree.map(lambda x: x.copy(), batch)
-    same.frames[:, 1], same.force_n[:, 1], same.frame_index[:, 1] = batch.frames[:, 0], batch.force_n[:, 0], batch.frame_index[:, 0]
+    same.frames[:, 1], same.force_n[:, 1], same.frame_index[:, 1] = (
+        batch.frames[:, 0],
+        batch.force_n[:, 0],
+        batch.frame_index[:, 0],
+    )
     tokens = encode(params, same)
     assert float(jnp.abs(tokens[:, 0] - tokens[:, 1]).max()) > 1e-3
 

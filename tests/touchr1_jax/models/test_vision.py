@@ -32,7 +32,9 @@ def test_pixels_keep_their_place_inside_a_patch():
     kernel = params["patch"]["kernel"]
 
     def patch_of(view):
-        _, state = TOWER.apply({"params": params}, jnp.asarray(view), capture_intermediates=lambda m, _: m.name == "patch")
+        _, state = TOWER.apply(
+            {"params": params}, jnp.asarray(view), capture_intermediates=lambda m, _: m.name == "patch"
+        )
         return state["intermediates"]["patch"]["__call__"][0]
 
     view = np.zeros((16, 16, 3), np.uint8)

@@ -11,9 +11,7 @@ from touchr1_jax.rl.advantages import degenerate, group_advantage
 
 def test_advantages_by_hand():
     """Mean ½, population σ ½."""
-    np.testing.assert_allclose(
-        group_advantage(jnp.array([1.0, 0, 0, 1]), epsilon=0.0), [1, -1, -1, 1], rtol=1e-6
-    )
+    np.testing.assert_allclose(group_advantage(jnp.array([1.0, 0, 0, 1]), epsilon=0.0), [1, -1, -1, 1], rtol=1e-6)
     # rewards 1, .4, 0, −.1: mean .325, σ² = mean of .675², .075², .325², .425²
     spread = np.sqrt((0.675**2 + 0.075**2 + 0.325**2 + 0.425**2) / 4)
     expected = np.array([0.675, 0.075, -0.325, -0.425]) / (spread + 1e-4)
@@ -61,4 +59,6 @@ def test_sum_is_zero_and_order_follows_the_reward(rewards):
     rewards = (rewards * 8)[:8]  # one shape, one compilation
     advantage = np.asarray(group_advantage(jnp.array(rewards)))
     assert abs(advantage.sum()) < 1e-4
-    np.testing.assert_array_equal(np.sign(np.subtract.outer(rewards, rewards)), np.sign(np.subtract.outer(advantage, advantage)))
+    np.testing.assert_array_equal(
+        np.sign(np.subtract.outer(rewards, rewards)), np.sign(np.subtract.outer(advantage, advantage))
+    )

@@ -1,8 +1,10 @@
 """Presets as they are published and reported."""
 
+import dataclasses
+
 import pytest
 
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import GRPOConfig, preset_name
 
 
 def test_paper_preset():
@@ -24,3 +26,9 @@ def test_stable_preset():
 def test_micro_batches_must_divide():
     with pytest.raises(ValueError, match="micro_prompts 3 must divide prompts 8; choose a divisor"):
         GRPOConfig(micro_prompts=3)
+
+
+def test_reports_name_the_nearest_preset_and_what_differs():
+    assert preset_name(GRPOConfig.paper()) == "paper"
+    assert preset_name(GRPOConfig.stable()) == "stable"
+    assert preset_name(dataclasses.replace(GRPOConfig.stable(), gamma=0.0)) == "stable with gamma=0.0"

@@ -1,0 +1,51 @@
+"""The objective once more, in NumPy and float64, from logits."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+def log_softmax(logits: np.ndarray) -> Float:
+    """log softmax of float64 logits."""
+    x = np.asarray(logits, np.float64)
+    x = x - x.max(-1, keepdims=True)
+    return x - np.log(np.exp(x).sum(-1, keepdims=True))
+
+
+def of_tokens(log_p: Float, tokens: np.ndarray) -> Float:
+    """Entry of each token."""
+    out = np.empty(tokens.shape)
+    for index in np.ndindex(tokens.shape):
+        out[index] = log_p[(*index, tokens[index])]
+    return out
+
+
+def terms(logits, reference, masked, tokens, old, mask, advantage, *, clip: float) -> dict[str, Float]:
+    """Surrogate, k3 to the reference and G_tg of each prompt [P]: rollouts' mean of the mean over their tokens.
+
+    Logits are [P, G, T, V], `tokens`, `old` and `mask` [P, G, T], `advantage` [P, G].
+    """
+    log_p, log_ref, log_masked = log_softmax(logits), log_softmax(reference), log_softmax(masked)
+    here = of_tokens(log_p, tokens)
+    ratio, a = np.exp(here - old), advantage[..., None]
+    log_r = of_tokens(log_ref, tokens) - here
+    p = np.exp(log_p)
+    kl = np.where(p > 0, p * (log_p - log_masked), 0).sum(-1)
+    per_token = {
+        "surrogate": np.minimum(ratio * a, np.clip(ratio, 1 - clip, 1 + clip) * a),
+        "kl": np.exp(log_r) - 1 - log_r,
+        "grounding": kl,
+    }
+    mean = lambda x: np.array([[x[i, g][mask[i, g]].mean() for g in range(x.shape[1])] for i in range(len(x))]).mean(1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return {name: mean(x) for name, x in per_token.items()}
+
+
+def advantages(reward: np.ndarray, epsilon: float) -> Float:
+    """(R − R̄)/(σ + ε) row by row, 0 where all are equal."""
+    out = np.zeros(reward.shape)
+    for i, row in enumerate(np.asarray(reward, np.float64)):
+        if np.ptp(row) > 1e-5:
+            out[i] = (row - row.mean()) / (row.std() + epsilon)
+    return out

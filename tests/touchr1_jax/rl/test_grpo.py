@@ -1,0 +1,284 @@
+"""The whole step: against a float64 reference, without compilation, and as a program that is traced once."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl import reference
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import (
+    Fixed,
+    GRPOState,
+    make_grpo_step,
+    mask_one_stream,
+    prompt_weights,
+    rollout_metrics,
+    sample_group,
+)
+from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.types import Parsed, Rollout, Target
+
+P, G, T, K = 4, 3, 4, 3
+AGENT = tiny.SHALLOW
+CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, beta=0.1, gamma=0.05, drop_degenerate=True)
+DRAW = SampleConfig(group=G, length=T, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id)
+FIXED = Fixed(
+    reference=tiny.shallow_params(1),
+    noise=jnp.asarray(
+        np.random.default_rng(5).normal(size=(K, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)), jnp.float32
+    ),
+)
+LEARNING_RATE = 0.05
+OPTIMIZER = optax.sgd(LEARNING_RATE)
+
+
+def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+    """Share of tokens that are the label modulo 3; the material question pays everybody the same."""
+    label = jnp.max(target.label)
+    right = jnp.mean(tokens % 3 == label)
+    reward = jnp.where(target.asked[3], 0.4, right)
+    level = jnp.where(target.asked, tokens[0] % 3, -1)
+    parsed = Parsed(
+        perceive=jnp.tile(level, (tiny.S, 1)),
+        compare=level,
+        conclude=level,
+        formatted=tokens[0] > 20,
+        truncated=jnp.all(tokens != 1),
+        length=jnp.sum(tokens > 1),
+    )
+    return reward, {"right": right}, parsed
+
+
+def state(seed: int = 0) -> GRPOState:
+    """A fresh state on buffers of its own, since the step takes them over."""
+    params = jax.tree.map(jnp.copy, tiny.shallow_params(0))
+    return GRPOState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0), key=jax.random.key(seed))
+
+
+class Run:
+    """Three steps on different batches, with the parameters before each."""
+
+    def __init__(self) -> None:
+        self.traces = 0
+
+        def counted(tokens: jax.Array, target: Target):
+            self.traces += 1
+            return score(tokens, target)
+
+        self.step = make_grpo_step(AGENT, counted, OPTIMIZER, CONFIG)
+        self.batches = [tiny.question_batch(seed, P) for seed in (1, 2, 2)]
+        self.before, self.metrics = [], []
+        now = state()
+        for batch in self.batches:
+            self.before.append(jax.tree.map(jnp.copy, now))
+            now, metrics = self.step(now, batch, FIXED)
+            self.metrics.append(metrics)
+        self.end = now
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    """One run, and one program, for all tests."""
+    return Run()
+
+
+def test_no_nan_under_debug_nans(run):
+    """`debug_nans` looks at every array that leaves the program."""
+    with jax.debug_nans(True):
+        run.step(jax.tree.map(jnp.copy, run.before[0]), run.batches[0], FIXED)
+
+
+draw = jax.jit(lambda p, b, k: sample_group(AGENT, p, b, k, DRAW))
+
+
+def experience_of(before: GRPOState, batch):
+    """What the step must have drawn, by the documented use of its key: fold in the step, split for sample and mask."""
+    sample_key, mask_key = jax.random.split(jax.random.fold_in(before.key, before.step))
+    return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FIXED.noise, mask_key)
+
+
+group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+
+
+@pytest.mark.parametrize("i", [0, 1])
+def test_loss_equals_a_float64_reference(run, i):
+    """Surrogate over the groups that differ − β k3 + γ G_tg over all; the step index is in the key."""
+    before, batch = run.before[i], run.batches[i]
+    rollout, masked_touch = experience_of(before, batch)
+    reward = np.asarray(jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, batch.target))
+    logits = [
+        np.asarray(group_logits(p, f, batch.ids, batch.mask, rollout.tokens))
+        for p, f in [
+            (before.params, batch.features),
+            (FIXED.reference, batch.features),
+            (before.params, batch.features.replace(touch=masked_touch)),
+        ]
+    ]
+    rollout = jax.tree.map(np.asarray, rollout)
+    advantage = reference.advantages(reward, CONFIG.epsilon)
+    terms = reference.terms(*logits, rollout.tokens, rollout.log_prob, rollout.mask, advantage, clip=0.2)
+    lively = np.ptp(reward, axis=1) > 1e-5
+    assert lively.sum() >= 2
+    assert not lively[3]
+    gain = terms["surrogate"][lively].mean() + (CONFIG.gamma * terms["grounding"] - CONFIG.beta * terms["kl"]).mean()
+    np.testing.assert_allclose(run.metrics[i]["loss"], -gain, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(run.metrics[i]["reward"], reward.mean(), rtol=1e-5)
+    np.testing.assert_allclose(run.metrics[i]["degenerate_share"], 1 - lively.mean(), rtol=1e-6)
+
+
+def test_update_is_the_gradient_of_the_written_out_objective(run):
+    """On policy the surrogate's value says nothing (advantages sum to 0), so the update is held to its gradient."""
+    before, batch = run.before[0], run.batches[0]
+    rollout, masked_touch = experience_of(before, batch)
+    tokens, mask = rollout.tokens, rollout.mask
+    reward = np.asarray(jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(tokens, batch.target))
+    lively = np.ptp(reward, axis=1) > 1e-5
+    advantage = jnp.asarray(reference.advantages(reward, CONFIG.epsilon))[..., None]
+    per_prompt = lambda x: jnp.mean(jnp.sum(jnp.where(mask, x, 0), -1) / jnp.sum(mask, -1), -1)
+
+    def objective(params):
+        log_p = jax.nn.log_softmax(group_logits(params, batch.features, batch.ids, batch.mask, tokens))
+        perturbed = batch.features.replace(touch=masked_touch)
+        log_masked = jax.nn.log_softmax(group_logits(params, perturbed, batch.ids, batch.mask, tokens))
+        log_ref = jax.nn.log_softmax(group_logits(FIXED.reference, batch.features, batch.ids, batch.mask, tokens))
+        here, there = (jnp.take_along_axis(x, tokens[..., None], -1)[..., 0] for x in (log_p, log_ref))
+        log_r = jnp.where(mask, there - here, 0)
+        learn = jnp.sum(per_prompt(advantage * here) * lively) / lively.sum()
+        grounding = per_prompt(jnp.sum(jnp.exp(log_p) * (log_p - log_masked), -1))
+        k3 = per_prompt(jnp.exp(log_r) - 1 - log_r)
+        return learn + jnp.mean(CONFIG.gamma * grounding - CONFIG.beta * k3)
+
+    ascent = jax.jit(jax.grad(objective))(before.params)
+    for g, a, b in zip(*map(jax.tree.leaves, (ascent, before.params, run.before[1].params)), strict=True):
+        np.testing.assert_allclose(b - a, LEARNING_RATE * g, rtol=1e-3, atol=2e-7)
+
+
+def test_one_trace_serves_all_batches(run):
+    assert run.traces == 1
+    assert run.step._cache_size() == 1
+
+
+def test_nothing_leaves_the_device_inside_a_step(run):
+    batch = jax.tree.map(jnp.asarray, tiny.question_batch(4, P))
+    with jax.transfer_guard("disallow"):
+        now, metrics = run.step(jax.tree.map(jnp.copy, run.end), batch, FIXED)
+    assert int(now.step) == 4
+    assert all(isinstance(value, jax.Array) for value in metrics.values())
+    host = jax.tree.map(np.asarray, batch)
+    with jax.transfer_guard("disallow"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
+        run.step(jax.tree.map(lambda x: x, now), host, FIXED)  # the guard has teeth
+
+
+def test_state_advances_and_its_key_stays(run):
+    assert int(run.end.step) == 3
+    assert run.end.key == run.before[0].key
+    moved = [
+        bool((a != b).any()) for a, b in zip(*map(jax.tree.leaves, (run.end.params, run.before[0].params)), strict=True)
+    ]
+    assert all(moved)
+
+
+def test_steps_draw_afresh(run):
+    """The same batch at steps 1 and 2."""
+    one, two = (experience_of(run.before[i], run.batches[i])[0].tokens for i in (1, 2))
+    assert (one != two).any()
+
+
+def test_state_is_donated_and_nothing_else(run):
+    now = jax.tree.map(jnp.copy, run.before[0])
+    run.step(now, run.batches[0], FIXED)
+    assert all(leaf.is_deleted() for leaf in jax.tree.leaves(now))
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves((run.batches[0], FIXED)))
+
+
+def test_metrics_are_finite_scalars(run):
+    for metrics in run.metrics:
+        for name, value in metrics.items():
+            assert value.shape == (), name
+            assert np.isfinite(value), name
+    expected = {"loss", "surrogate", "kl", "grounding", "entropy", "clip_share", "reward", "reward_right", "grad_norm"}
+    assert expected <= set(run.metrics[0])
+
+
+def test_surrogate_is_on_policy(run):
+    """Sampler and learner agree: no token is clipped at the first update, and the mean advantage of each group is 0."""
+    assert all(metrics["clip_share"] == 0 for metrics in run.metrics)
+
+
+def assert_first_step(run, end: GRPOState, metrics: dict[str, jax.Array]) -> None:
+    """A first step by other means came to the same."""
+    for name, value in run.metrics[0].items():
+        np.testing.assert_allclose(value, metrics[name], rtol=1e-4, atol=1e-6, err_msg=name)
+    for a, b in zip(*map(jax.tree.leaves, (end.params, run.before[1].params)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_step_outside_jit_is_the_compiled_one(run):
+    """The Python function itself; its loops are compiled one by one."""
+    plain = make_grpo_step(AGENT, score, OPTIMIZER, CONFIG).__wrapped__
+    assert_first_step(run, *plain(state(), run.batches[0], FIXED))
+
+
+@pytest.mark.slow
+def test_uncompiled_step_is_the_compiled_one(run):
+    """Operation by operation, loops in Python, and no operation anywhere gives NaN."""
+    with jax.disable_jit(), jax.debug_nans(True):
+        end, metrics = make_grpo_step(AGENT, score, OPTIMIZER, CONFIG)(state(), run.batches[0], FIXED)
+    assert_first_step(run, end, metrics)
+
+
+def test_weights_of_prompts_that_count():
+    np.testing.assert_allclose(prompt_weights(jnp.array([True, False, True, False])), [0.5, 0, 0.5, 0])
+    np.testing.assert_array_equal(prompt_weights(jnp.zeros(3, bool)), [0, 0, 0])
+
+
+def test_one_present_stream_is_masked_uniformly():
+    p = 2000
+    features = tiny.features(0, 3)
+    present = jnp.array([[True, True], [False, True], [False, False]])
+    features = jax.tree.map(lambda x: jnp.repeat(x, p, 0), features.replace(stream_mask=present))
+    masked = mask_one_stream(features, FIXED.noise, jax.random.key(0))
+    changed = np.asarray(jnp.any(masked != features.touch, (-1, -2))).reshape(3, p, tiny.S)
+    np.testing.assert_array_equal(changed[0].sum(-1), 1)
+    assert abs(changed[0, :, 0].mean() - 0.5) < 5 * 0.5 / p**0.5
+    np.testing.assert_array_equal(changed[1], [[False, True]] * p)
+    assert not changed[2].any()
+    replaced = np.asarray(masked).reshape(3, p, tiny.S, -1)[1, :, 1]
+    bank = np.asarray(FIXED.noise).reshape(K, tiny.S, -1)
+    count = [(replaced == bank[k, 1]).all(-1).sum() for k in range(K)]  # a draw of this sensor's noise
+    assert sum(count) == p
+    assert min(count) > p / K - 5 * (p / K) ** 0.5
+
+
+def test_rollout_metrics_by_hand():
+    """Two prompts of two rollouts: hardness with label 2, material with label 1."""
+    conclude = np.full((2, 2, 4), -1)
+    conclude[0, :, 0] = 2, 1  # right; the middle
+    conclude[1, 1, 3] = 4  # ⊥; wrong, and 4 is the middle of 9 but material is not ordinal
+    parsed = Parsed(
+        perceive=jnp.zeros((2, 2, 2, 4), jnp.int32),
+        compare=jnp.zeros((2, 2, 4), jnp.int32),
+        conclude=jnp.asarray(conclude),
+        formatted=jnp.array([[True, True], [True, False]]),
+        truncated=jnp.array([[False, False], [False, True]]),
+        length=jnp.zeros((2, 2), jnp.int32),
+    )
+    mask = jnp.arange(4) < jnp.array([[4, 2], [1, 1]])[..., None]
+    reward = jnp.array([[1.0, 0.4], [0.0, 0.0]])
+    rollout = Rollout(tokens=jnp.zeros((2, 2, 4), jnp.int32), log_prob=jnp.zeros((2, 2, 4)), mask=mask)
+    target = tiny.target(np.array([0, 3]), np.array([2, 1]))
+    ours = rollout_metrics(rollout, reward, jnp.array([False, True]), parsed, target)
+    expected = {
+        "reward": 0.35,
+        "reward_std": 0.15,
+        "degenerate_share": 0.5,
+        "accuracy": 0.25,
+        "middle_rate": 0.5,
+        "parse_rate": 0.5,  # the two of prompt 0; one ⊥, one not formatted
+        "truncated_share": 0.25,
+        "length": 2.0,
+    }
+    assert {name: pytest.approx(float(value), rel=1e-5) for name, value in ours.items()} == expected

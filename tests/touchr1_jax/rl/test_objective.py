@@ -1,0 +1,169 @@
+"""The objective and its gradient, away from the sampling policy so that every part is alive."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl import reference
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.kl import estimated_kl, exact_kl
+from touchr1_jax.rl.losses import token_log_probs
+from touchr1_jax.rl.objective import Experience, objective_gradient, prompt_terms, reference_kl
+from touchr1_jax.types import Rollout
+
+P, G, T = 4, 2, 4
+AGENT = tiny.SHALLOW
+PARAMS, REFERENCE = tiny.shallow_params(0), tiny.shallow_params(1)
+CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, beta=0.1, gamma=0.05)
+ALONE = dataclasses.replace(CONFIG, beta=0.0, gamma=0.0)  # the policy gradient alone
+
+group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+
+
+@pytest.fixture(scope="module")
+def experience() -> Experience:
+    """Random completions, some ended early, with old log-probabilities off by up to ±.6."""
+    rng = np.random.default_rng(0)
+    batch = tiny.question_batch(1, P)
+    tokens = tiny.completions(0, P, G, T)
+    log_p = jax.nn.log_softmax(group_logits(PARAMS, batch.features, batch.ids, batch.mask, tokens))
+    old = token_log_probs(log_p, tokens) + jnp.asarray(rng.uniform(-0.6, 0.6, tokens.shape), jnp.float32)
+    length = rng.integers(1, T + 1, (P, G, 1))
+    return Experience(
+        batch=batch,
+        masked_touch=tiny.features(7, P).touch,
+        rollout=Rollout(tokens=tokens, log_prob=old, mask=jnp.arange(T) < length),
+        advantage=jnp.asarray(rng.normal(size=(P, G)), jnp.float32),
+        weight=jnp.array([0.5, 0.0, 0.25, 0.25]),
+    )
+
+
+def gradient(config: GRPOConfig):
+    """The jitted (experience, parameters) → gradient and parts."""
+    return jax.jit(lambda e, params=PARAMS: objective_gradient(AGENT, config, params, REFERENCE, e))
+
+
+compute = gradient(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def whole(experience):
+    """Gradient and parts under `CONFIG`."""
+    return compute(experience, PARAMS)
+
+
+def logits_of(experience: Experience) -> list[np.ndarray]:
+    """Logits of policy, reference and perturbed policy."""
+    b = experience.batch
+    masked = b.features.replace(touch=experience.masked_touch)
+    runs = (PARAMS, b.features), (REFERENCE, b.features), (PARAMS, masked)
+    return [np.asarray(group_logits(p, f, b.ids, b.mask, experience.rollout.tokens)) for p, f in runs]
+
+
+def test_loss_and_parts_equal_a_float64_reference(experience, whole):
+    rollout = jax.tree.map(np.asarray, experience.rollout)
+    terms = reference.terms(
+        *logits_of(experience),
+        rollout.tokens,
+        rollout.log_prob,
+        rollout.mask,
+        np.asarray(experience.advantage),
+        clip=0.2,
+    )
+    gain = np.asarray(experience.weight) @ terms["surrogate"]
+    gain += (CONFIG.gamma * terms["grounding"] - CONFIG.beta * terms["kl"]).mean()
+    parts = whole[1]
+    np.testing.assert_allclose(parts["loss"], -gain, rtol=1e-5)
+    for name, value in terms.items():
+        np.testing.assert_allclose(parts[name], value.mean(), rtol=1e-4, err_msg=name)
+    assert 0 < parts["clip_share"] < 1
+    assert parts["kl"] > 0.1
+    assert parts["grounding"] > 0.1
+
+
+def test_gradient_is_that_of_the_loss(experience, whole):
+    """A directional derivative of the float32 loss against the dot product with the gradient."""
+    rng = np.random.default_rng(1)
+    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), PARAMS)
+    forward = lambda params: compute(experience, params)[1]["loss"]
+    h = 1e-3
+    ahead, behind = (jax.tree.map(lambda x, d, s=s: x + s * h * d, PARAMS, direction) for s in (1, -1))
+    slope = (float(forward(ahead)) - float(forward(behind))) / (2 * h)
+    dot = sum(float(jnp.vdot(g, d)) for g, d in zip(*map(jax.tree.leaves, (whole[0], direction)), strict=True))
+    assert slope == pytest.approx(dot, rel=2e-2)
+
+
+@pytest.mark.parametrize("micro", [1, 4])
+def test_micro_batches_of_any_size_give_the_same_gradient(experience, whole, micro):
+    grads, parts = gradient(dataclasses.replace(CONFIG, micro_prompts=micro))(experience)
+    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[0]))
+    for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(whole[0]), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+    np.testing.assert_allclose(parts["loss"], whole[1]["loss"], rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    """Gradient of the policy-gradient term."""
+    return gradient(ALONE)
+
+
+def test_zero_advantage_has_a_gradient_of_exactly_zero(experience, alone):
+    grads, parts = alone(experience._replace(advantage=jnp.zeros((P, G))))
+    assert not any(g.any() for g in jax.tree.leaves(grads))
+    assert parts["loss"] == 0
+    assert parts["grounding"] == 0  # not computed at γ = 0
+
+
+def test_prompts_of_weight_zero_do_not_count(experience, alone):
+    """Whatever the rollouts of prompt 1, whose weight is 0, earned."""
+    other = experience._replace(advantage=experience.advantage.at[1].set(100.0))
+    for a, b in zip(*(jax.tree.leaves(alone(e)[0]) for e in (experience, other)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_what_stands_after_the_end_does_not_count(experience, alone):
+    """Other tokens and log-probabilities where the mask is false; padding has a log-probability of −1e9 there."""
+    r = experience.rollout
+    filler = r.replace(tokens=jnp.where(r.mask, r.tokens, AGENT.pad_id), log_prob=jnp.where(r.mask, r.log_prob, 0.0))
+    assert not r.mask.all()
+    for a, b in zip(*(jax.tree.leaves(alone(experience._replace(rollout=x))) for x in (r, filler)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)
+
+
+terms_of = jax.jit(lambda e: prompt_terms(AGENT, CONFIG, PARAMS, REFERENCE, e))
+
+
+def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(experience):
+    """Each stream in turn: no modality is silently left out of the perturbed branch."""
+    one = jax.tree.map(lambda x: x[0], experience)
+    touch = one.batch.features.touch
+    assert abs(float(terms_of(one._replace(masked_touch=touch))["grounding"])) <= 1e-12
+    for stream in range(tiny.S):
+        perturbed = touch.at[stream].set(one.masked_touch[stream])
+        assert float(terms_of(one._replace(masked_touch=perturbed))["grounding"]) > 1e-2
+
+
+def test_grounding_ignores_a_stream_that_is_not_there(experience):
+    one = jax.tree.map(lambda x: x[0], experience)
+    features = one.batch.features
+    absent = one._replace(batch=one.batch.replace(features=features.replace(stream_mask=jnp.array([True, False]))))
+    perturbed = features.touch.at[1].set(one.masked_touch[1])
+    assert abs(float(terms_of(absent._replace(masked_touch=perturbed))["grounding"])) <= 1e-12
+
+
+@pytest.mark.parametrize("estimator", ["k1", "k2", "k3", "exact"])
+def test_reference_kl_by_the_configured_estimator(estimator):
+    rng = np.random.default_rng(0)
+    log_p, log_ref = (jax.nn.log_softmax(jnp.asarray(rng.normal(size=(G, T, 5)), jnp.float32)) for _ in range(2))
+    tokens = jnp.asarray(rng.integers(0, 5, (G, T)))
+    ours = reference_kl(dataclasses.replace(CONFIG, kl=estimator), log_p, log_ref, tokens)
+    if estimator == "exact":
+        expected = exact_kl(log_p, log_ref)
+    else:
+        expected = estimated_kl(token_log_probs(log_p, tokens), token_log_probs(log_ref, tokens), estimator)
+    np.testing.assert_array_equal(ours, expected)

@@ -1,0 +1,81 @@
+"""Learning problems with a known answer: a bandit, and one that only touch can solve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step
+from touchr1_jax.types import Parsed, Target
+
+P, AGENT = 8, tiny.SHALLOW
+CONFIG = GRPOConfig(prompts=P, group=8, length=2, micro_prompts=8, beta=0.0, gamma=0.0)
+OPTIMIZER = optax.adam(0.02)
+PAYS = jnp.array([10, 17])
+"""The token that is paid for each label."""
+
+
+def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+    """1 where the first token is the one that the label pays."""
+    reward = (tokens[0] == PAYS[jnp.max(target.label)]).astype(jnp.float32)
+    level = jnp.full(tiny.A, -1)
+    parsed = Parsed(
+        perceive=jnp.tile(level, (tiny.S, 1)),
+        compare=level,
+        conclude=level,
+        formatted=reward > 0,
+        truncated=reward > 0,
+        length=jnp.int32(2),
+    )
+    return reward, {}, parsed
+
+
+@pytest.fixture(scope="module")
+def step():
+    """One program for both problems: they differ in their batches."""
+    return make_grpo_step(AGENT, score, OPTIMIZER, CONFIG)
+
+
+prefill = jax.jit(jax.vmap(AGENT.prefill, in_axes=(None, 0, 0, 0)))
+
+
+def batch_of(pattern: np.ndarray, label: np.ndarray):
+    """All ask for hardness and see nothing but touch: one of two patterns, the same in both streams."""
+    patterns = tiny.features(3, 2).touch[:, :1]
+    batch = tiny.question_batch(0, P)
+    one = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), batch)
+    touch = jnp.broadcast_to(patterns[pattern], one.features.touch.shape)
+    features = one.features.replace(touch=touch, view_mask=jnp.zeros(P, bool))
+    return one.replace(features=features, target=tiny.target(np.zeros(P, int), label))
+
+
+def train(step, batch, steps: int) -> jax.Array:
+    """Probability [P] of the paid token after some steps."""
+    params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
+    state = GRPOState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0), key=jax.random.key(0))
+    fixed = Fixed(reference=tiny.shallow_params(0, loud=0.2), noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
+    for _ in range(steps):
+        state, _ = step(state, batch, fixed)
+    first, _ = prefill(state.params, batch.features, batch.ids, batch.mask)
+    return jax.nn.softmax(first)[jnp.arange(P), PAYS[jnp.max(batch.target.label, -1)]]
+
+
+def test_bandit_is_solved(step):
+    batch = batch_of(np.arange(P) % 2, np.zeros(P, int))
+    assert train(step, batch, 0).mean() < 0.2
+    assert train(step, batch, 60).mean() >= 0.99
+
+
+def test_touch_is_read(step):
+    """Nothing but the pattern of the streams says which token is paid; without it one half is the best."""
+    pattern = np.arange(P) % 2
+    assert train(step, batch_of(pattern, pattern), 120).mean() >= 0.95
+
+
+def test_touch_problem_cannot_be_solved_blind(step):
+    """The control: the same pattern in all prompts leaves only guessing."""
+    pattern = np.arange(P) % 2
+    assert train(step, batch_of(0 * pattern, pattern), 60).mean() <= 0.6

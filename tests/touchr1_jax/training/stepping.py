@@ -1,0 +1,36 @@
+"""A small problem with all that a checkpoint must carry: parameters, Adam's moments, a key, an iterator."""
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from touchr1_jax.rl.grpo import GRPOState
+
+OPTIMIZER = optax.adam(0.1)
+
+
+def feed(seed: int = 0):
+    """Shuffled batches of four numbers, for ever."""
+    numbers = grain.MapDataset.range(10).seed(seed).shuffle().repeat().batch(4)
+    return iter(numbers.map(lambda x: np.asarray(x, np.float32)).to_iter_dataset())
+
+
+def start(width: int = 3) -> GRPOState:
+    """Fresh state."""
+    params = {"w": jnp.arange(width, dtype=jnp.float32), "b": jnp.zeros(())}
+    return GRPOState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0), key=jax.random.key(7))
+
+
+def _step(state: GRPOState, batch: jax.Array) -> tuple[GRPOState, dict[str, jax.Array]]:
+    noise = jax.random.normal(jax.random.fold_in(state.key, state.step), (3,))
+    loss = lambda p: jnp.mean((jnp.sum(p["w"] * noise) + p["b"] - batch) ** 2)
+    value, grads = jax.value_and_grad(loss)(state.params)
+    updates, opt_state = OPTIMIZER.update(grads, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, updates)
+    after = GRPOState(params=params, opt_state=opt_state, step=state.step + 1, key=state.key)
+    return after, {"loss": value, "first": batch[0]}
+
+
+step = jax.jit(_step, donate_argnums=0)
