@@ -1,7 +1,8 @@
 """From a configuration to the objects of one experiment: tokenizer, prompts, policy, parser, rewards."""
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -54,10 +55,13 @@ class Assembly:
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """Fresh parameters."""
-        layout = self.layout
-        return init_policy(
-            self.agent.policy, jax.random.key(seed), batch, layout.ids[0], layout.mask[0], self.agent.slots
-        )
+        return self._init(jax.random.key(seed), batch)
+
+    @functools.cached_property
+    def _init(self) -> Callable[[Array, TouchBatch], Params]:
+        """Compiled once for all seeds."""
+        policy, slots, layout = self.agent.policy, self.agent.slots, self.layout
+        return jax.jit(lambda key, batch: init_policy(policy, key, batch, layout.ids[0], layout.mask[0], slots))
 
     def score(self, weights: Weights, prior: Float[np.ndarray, "A K"]) -> ScoreFn:
         """Total reward of one completion under the given weights."""

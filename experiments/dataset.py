@@ -29,12 +29,16 @@ class Dataset:
     has_force: bool
 
     def prior(self) -> np.ndarray:
-        """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0."""
+        """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0.
+
+        An attribute that nobody annotated has equal shares: no question asks for it.
+        """
         train = self.label[np.concatenate([self.parts["sft"], self.parts["grpo"]])]
         rows = np.zeros((len(ATTRIBUTES), max(LEVELS.values())), np.float32)
         for a, name in enumerate(ATTRIBUTES):
             known = train[train[:, a] >= 0, a]
-            rows[a, : LEVELS[name]] = np.bincount(known, minlength=LEVELS[name]) / max(len(known), 1)
+            counts = np.bincount(known, minlength=LEVELS[name]) if len(known) else np.ones(LEVELS[name])
+            rows[a, : LEVELS[name]] = counts / counts.sum()
         return rows
 
     def summary(self) -> dict[str, Any]:

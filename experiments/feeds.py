@@ -80,7 +80,8 @@ class AnswerFeed(Feed):
     """SFT batches: each contact with one question per attribute and the verified answer to it.
 
     `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
-    most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the label.
+    most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the
+    label.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ from touchr1_jax.rl.grpo import Fixed, GRPOState, ScoreFn, make_grpo_step
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig, fit
-from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.optimizer import OptimizerConfig, constant_adamw, make_optimizer
 from touchr1_jax.training.sft import SFTState, make_sft_step
 from touchr1_jax.types import Params, Parsed
 
@@ -49,9 +49,13 @@ class SFTConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Probed:
-    """Fixed features of every contact's streams, float32 [contact, S, D], and of its force alone, [contact, D']."""
+    """Fixed features of every contact's streams, float32 [contact, S, D], and of its force alone, [contact, D'].
+
+    `present` [contact, S] says which streams were recorded.
+    """
 
     streams: np.ndarray
+    present: np.ndarray
     force: np.ndarray
 
 
@@ -59,25 +63,33 @@ def probe_features(data: Dataset, context: Context) -> Probed:
     """Summarise all contacts once; every seed shares it."""
     rows = np.arange(len(data.store))
     clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
-    streams, force = [], []
+    streams, present, force = [], [], []
     with context.progress("reading touch", len(rows)) as advance:
         for clip in clips:
             streams.append(np.asarray(stream_features(clip["frames"], clip["force_n"])))
+            present.append(clip["stream_mask"])
             force.append(clip["force_n"].reshape(len(clip["force_n"]), -1))
             advance(len(clip["contact"]))
-    return Probed(streams=np.concatenate(streams), force=np.concatenate(force))
+    return Probed(streams=np.concatenate(streams), present=np.concatenate(present), force=np.concatenate(force))
 
 
 def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
-    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts, −inf for all others."""
+    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts.
+
+    Levels that an attribute lacks have −inf.  A stream that was not recorded says nothing, 0 for every level, and so
+    does every stream about an attribute that too few objects are annotated for.
+    """
     rows = data.parts["sft"]
-    groups = data.object_ids[rows]
     out = np.full((len(data.store), len(data.clip.sensors), len(ATTRIBUTES), max(LEVELS.values())), -np.inf, np.float32)
-    for s in range(len(data.clip.sensors)):
-        for a, name in enumerate(ATTRIBUTES):
-            out[rows, s, a, : LEVELS[name]] = cross_fit(
-                probed.streams[rows, s], data.label[rows, a], groups, LEVELS[name], config
-            )
+    for a, name in enumerate(ATTRIBUTES):
+        out[:, :, a, : LEVELS[name]] = 0.0
+        for s in range(len(data.clip.sensors)):
+            felt = rows[probed.present[rows, s]]
+            label, groups = data.label[felt, a], data.object_ids[felt]
+            if len(np.unique(groups[label >= 0])) >= config.folds:
+                out[felt, s, a, : LEVELS[name]] = cross_fit(
+                    probed.streams[felt, s], label, groups, LEVELS[name], config
+                )
     return out
 
 
@@ -147,27 +159,38 @@ def noise_bank(
 ) -> Float[Array, "K S N D"]:
     """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
 
-    The statistics are those of `probe` SFT contacts.  Frame times are those of an undisturbed stream.
+    The statistics are those of the recorded frames of `probe` SFT contacts; frame times are those of the same contacts,
+    so that nothing but the touch itself is out of the ordinary.
     """
     clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=probe, seed=seed, repeat=False)
     clip = next(iter(clips))
-    pixels, force = clip["frames"].astype(np.float32), clip["force_n"]
-    pixel_stats = pixels.mean((0, 2, 3, 4)), pixels.std((0, 2, 3, 4))  # [S, 3]
-    force_stats = force.mean((0, 2)), force.std((0, 2))
-    s, f, h, w = pixels.shape[1:5]
+    seen = np.where(clip["frame_mask"], 1.0, np.nan).astype(np.float32)
+    pixel_mean, pixel_std = _statistics(clip["frames"].astype(np.float32) * seen[..., None, None, None], (0, 2, 3, 4))
+    force_mean, force_std = _statistics(clip["force_n"] * seen[..., None], (0, 2))
+    s, f, h, w = clip["frames"].shape[1:5]
 
-    @jax.jit
-    def draw(key: Array) -> Float[Array, "S N D"]:
+    def draw(x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
+        key, index, mask = x
         pixel_key, force_key = jax.random.split(key)
-        noise = (
-            jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_stats[1][:, None, None, None]
-            + pixel_stats[0][:, None, None, None]
-        )
-        push = jax.random.normal(force_key, (s, f, 3)) * force_stats[1][:, None] + force_stats[0][:, None]
-        index, mask = jnp.asarray(clip["frame_index"][0]), jnp.asarray(clip["frame_mask"][0])
-        return agent.encode_streams(params, jnp.clip(noise, 0, 255), push, index, mask, jnp.arange(s))
+        pixels = jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_std[:, None, None, None]
+        pixels = jnp.clip(pixels + pixel_mean[:, None, None, None], 0, 255)
+        push = jax.random.normal(force_key, (s, f, 3)) * force_std[:, None] + force_mean[:, None]
+        return agent.encode_streams(params, pixels, push, index, mask, jnp.arange(s))
 
-    return jax.lax.map(draw, jax.random.split(jax.random.key(seed), draws))
+    rows = np.arange(draws) % len(clip["frame_index"])
+    keys = jax.random.split(jax.random.key(seed), draws)
+    times = jnp.asarray(clip["frame_index"][rows]), jnp.asarray(clip["frame_mask"][rows])
+    return jax.jit(lambda x: jax.lax.map(draw, x))((keys, *times))
+
+
+def _statistics(x: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of what is not NaN; 0 where nothing is."""
+    known = ~np.isnan(x)
+    n = np.maximum(known.sum(axes), 1)
+    mean = np.where(known, x, 0.0).sum(axes) / n
+    shape = [1 if i in axes else size for i, size in enumerate(x.shape)]
+    square = np.where(known, (x - mean.reshape(shape)) ** 2, 0.0).sum(axes)
+    return mean.astype(np.float32), np.sqrt(square / n).astype(np.float32)
 
 
 def run_grpo(
@@ -200,10 +223,7 @@ def run_grpo(
 @functools.cache
 def grpo_program(agent: Agent, score: ScoreFn, config: GRPOConfig) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds of an arm."""
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.adamw(config.learning_rate * config.lr_scale, weight_decay=0.0),
-    )
+    optimizer = constant_adamw(config.learning_rate * config.lr_scale, config.max_grad_norm)
     return optimizer, make_grpo_step(agent, score, optimizer, config)
 
 

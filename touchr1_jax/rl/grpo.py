@@ -112,7 +112,7 @@ def rollout_metrics(
     asked = target.asked[:, None]
     label, middle = target.label[:, None], (target.levels[:, None] - 1) // 2
     ordinal = asked & target.ordinal[:, None]
-    right = parsed.conclude == label
+    right = (parsed.conclude == label) & (label >= 0)
     return {
         "reward": jnp.mean(reward),
         "reward_std": jnp.mean(jnp.std(reward, -1)),

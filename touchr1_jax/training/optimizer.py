@@ -26,6 +26,11 @@ class OptimizerConfig:
         return self.learning_rate * self.lr_scale
 
 
+def constant_adamw(learning_rate: float, max_grad_norm: float) -> optax.GradientTransformation:
+    """Clip the global gradient norm, then AdamW at one learning rate, without decay: the optimizer of GRPO."""
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adamw(learning_rate, weight_decay=0.0))
+
+
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
     """Clip the global gradient norm, then AdamW on the schedule of `steps` steps."""
     warmup = min(config.warmup_steps, steps // 2)

@@ -136,7 +136,7 @@ ATTRIBUTES = ("hardness", "roughness", "protrusion", "material")
 
 def test_evaluate_gives_every_metric_in_the_order_of_the_table():
     table = evaluate(answers(4, alone=True), ATTRIBUTES, (3, 3, 3, 9))
-    assert list(table) == list(METRICS)
+    assert list(table) == [m for m in METRICS if m != "reward_trained"]  # that one depends on the arm
     accs = [table[f"{p}_acc"].mean() for p in "hrp"]
     assert table["acc"].mean() == pytest.approx(np.mean(accs))
 
