@@ -31,7 +31,7 @@ from experiments.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.scenes import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import Scores, evaluate
-from touchr1_jax.rl.config import preset_name
+from touchr1_jax.rl.config import GRPOConfig, preset_name
 
 ARMS: Mapping[str, Mapping[str, float]] = {
     "zero_one": {"exact": 0.6, "consistency": 0.3, "format": 0.1},
@@ -168,6 +168,7 @@ SMOKE = dataclasses.replace(
     scenes=SceneConfig(objects=60, sites=1),
     sft=SFTConfig(steps=12, batch_size=8),
     blind=SFTConfig(steps=12, batch_size=8),
+    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
     grpo_steps=4,
 )
 

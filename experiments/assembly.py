@@ -32,9 +32,9 @@ class ModelConfig:
     tactile: TactileViTConfig = TactileViTConfig(sensors=0)
     vision: VisionConfig = VisionConfig()
     decoder: DecoderConfig = DecoderConfig(vocab_size=0)
-    frames: int = 8
+    frames: int = 4
     image_px: int = 112
-    completion_tokens: int = 24
+    completion_tokens: int = 20
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

@@ -77,7 +77,7 @@ def random_streams(present: np.ndarray, full_share: float, rng: np.random.Genera
 
 
 class AnswerFeed(Feed):
-    """SFT batches: each contact with one question per attribute and the verified answer to it.
+    """SFT batches: each contact with Q questions, for different attributes at random, and the verified answers to them.
 
     `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
     most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the
@@ -91,29 +91,32 @@ class AnswerFeed(Feed):
         evidence: np.ndarray,
         *,
         batch_size: int,
+        questions: int,
         seed: int,
         blind: bool = False,
     ) -> None:
         clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=batch_size, seed=seed)
         super().__init__(clips, seed)
         self._assembly, self._evidence, self._blind = assembly, evidence, blind
+        self._questions = questions
 
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> SFTBatch:
         """Write the answers of one batch of clips."""
-        layout, (p, a) = self._assembly.layout, element["label"].shape
-        present = np.repeat(element["stream_mask"], a, 0)
+        layout, (p, a), q = self._assembly.layout, element["label"].shape, self._questions
+        chosen = np.argsort(rng.random((p, a)), 1)[:, :q]
+        present = np.repeat(element["stream_mask"], q, 0)
         streams = np.zeros_like(present) if self._blind else random_streams(present, 0.5, rng)
-        streams = streams.reshape(p, a, -1)
+        streams = streams.reshape(p, q, -1)
         pairs = [
-            self._answer(element["contact"][i], q, element["label"][i], streams[i, q])
+            self._answer(element["contact"][i], chosen[i, j], element["label"][i], streams[i, j])
             for i in range(p)
-            for q in range(a)
+            for j in range(q)
         ]
-        tokens, masks = (np.stack(x).reshape(p, a, -1) for x in zip(*pairs, strict=True))
+        tokens, masks = (np.stack(x).reshape(p, q, -1) for x in zip(*pairs, strict=True))
         return SFTBatch(
             touch=touch_batch(element),
-            ids=jnp.broadcast_to(layout.ids, (p, *layout.ids.shape)),
-            mask=jnp.broadcast_to(layout.mask, (p, *layout.mask.shape)),
+            ids=jnp.asarray(layout.ids[chosen]),
+            mask=jnp.asarray(layout.mask[chosen]),
             streams=jnp.asarray(streams),
             tokens=jnp.asarray(tokens),
             token_mask=jnp.asarray(masks),

@@ -41,8 +41,10 @@ EVAL_BATCH = 64
 class SFTConfig:
     """Stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
 
-    steps: int = 300
+    steps: int = 450
     batch_size: int = 16
+    questions: int = 2
+    """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
 
@@ -105,7 +107,15 @@ def run_sft(
     blind: bool = False,
 ) -> Params:
     """Train a policy from scratch on verified answers; a blind one never feels anything."""
-    feed = AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, seed=seed, blind=blind)
+    feed = AnswerFeed(
+        assembly,
+        data,
+        evidence,
+        batch_size=config.batch_size,
+        questions=config.questions,
+        seed=seed,
+        blind=blind,
+    )
     optimizer, step = sft_program(assembly.agent, config, blind)
     clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
     params = assembly.init(seed, touch_batch(next(iter(clips))))

@@ -63,8 +63,15 @@ class StudyConfig:
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
-    grpo_steps: int = 200
-    grpo_save_every: int = 50
+    grpo_steps: int = 120
+    grpo_save_every: int = 40
+
+    def __post_init__(self) -> None:
+        if self.grpo.length != self.model.completion_tokens:
+            raise ValueError(
+                f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
+                "the length that SFT teaches; set both"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """Tactile encoder: a vision transformer over the frames of one tactile stream, pooled to a few tokens per time step.
 
-A stream of F frames becomes F/2 time steps.  Each step is cut into spatial patches, every patch becomes a token, and
+A stream of frames becomes a few time steps.  Each step is cut into spatial patches, every patch becomes a token, and
 after the transformer each step is pooled by learned queries to `tokens_per_step` tokens that carry its frame index.
 """
 
@@ -18,18 +18,18 @@ class TactileViTConfig:
     """Shape of the tactile encoder.
 
     A frame of H × W pixels is read by `stem_px` cells first, then by patches of `patch_cells` cells; `frames_per_step`
-    frames make one time step.  With the defaults 8 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
+    frames make one time step.  With the defaults 4 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
     """
 
     sensors: int
-    width: int = 128
-    num_layers: int = 4
-    num_heads: int = 4
+    width: int = 96
+    num_layers: int = 2
+    num_heads: int = 3
     mlp_ratio: int = 2
     stem_px: int = 4
     stem_width: int = 16
     patch_cells: int = 7
-    frames_per_step: int = 2
+    frames_per_step: int = 1
     tokens_per_step: int = 2
     use_force: bool = True
 

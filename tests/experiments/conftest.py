@@ -1,0 +1,62 @@
+"""One set of tiny generated records for the session, and what the stages make of it."""
+
+import io
+
+import jax
+import pytest
+from rich.console import Console
+
+from experiments.assembly import assemble
+from experiments.context import Context
+from experiments.dataset import open_dataset
+from sensors_io.generate import generate_records
+from sensors_io.pipeline import ClipConfig
+from sensors_io.scenes import config_hash
+from tests.experiments import tiny
+from tests.touchr1_jax.quick import compile_quickly  # noqa: F401
+
+
+@pytest.fixture(scope="session")
+def cache_dir(tmp_path_factory):
+    """A data cache that holds the tiny scenes already."""
+    path = tmp_path_factory.mktemp("data")
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    generate_records(tiny.SCENES, path / f"scenes-{config_hash(tiny.SCENES)}")
+    jax.config.update("jax_disable_most_optimizations", before)
+    return path
+
+
+@pytest.fixture(scope="session")
+def records(cache_dir):
+    return cache_dir / f"scenes-{config_hash(tiny.SCENES)}"
+
+
+@pytest.fixture(scope="session")
+def data(records):
+    clip = ClipConfig(frames=tiny.MODEL.frames, image_px=tiny.MODEL.image_px, view_px=tiny.MODEL.vision.image_px)
+    return open_dataset(records, clip, 0.35)
+
+
+@pytest.fixture(scope="session")
+def assembly(data):
+    return assemble(tiny.MODEL, data.clip.sensors)
+
+
+@pytest.fixture(scope="session")
+def params(assembly, data):
+    return tiny.params(assembly, data)
+
+
+@pytest.fixture
+def console():
+    return Console(file=io.StringIO(), width=120)
+
+
+@pytest.fixture
+def context(tmp_path, console):
+    directory = tmp_path / "run"
+    directory.mkdir()
+    context = Context(directory, tmp_path / "cache", console)
+    yield context
+    context.close()

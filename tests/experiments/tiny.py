@@ -1,0 +1,74 @@
+"""A study small enough for a test: sixteen objects, pictures of 28 px, towers of widths 8 to 24."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.assembly import Assembly, ModelConfig
+from experiments.dataset import Dataset
+from experiments.feeds import touch_batch
+from experiments.stages import SFTConfig
+from experiments.study import StudyConfig
+from sensors_io.pipeline import clip_batches
+from sensors_io.scenes import SceneConfig
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.types import Params, TouchBatch
+
+SCENES = SceneConfig(
+    objects=16,
+    sites=1,
+    frames=4,
+    image_px=28,
+    contact_grid=24,
+    view_px=16,
+    split_shares=(0.6, 0.1, 0.3),
+    solver_tolerance=1e-2,
+    solver_max_iterations=20,
+)
+MODEL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
+    vision=VisionConfig(image_px=16, patch_px=8, width=8),
+    decoder=DecoderConfig(
+        vocab_size=0,
+        hidden_size=24,
+        num_layers=1,
+        num_heads=2,
+        num_kv_heads=1,
+        head_dim=8,
+        intermediate_size=32,
+        mrope_section=(1, 1, 2),
+    ),
+    frames=4,
+    image_px=28,
+    completion_tokens=20,
+)
+STUDY = StudyConfig(
+    seeds=2,
+    scenes=SCENES,
+    model=MODEL,
+    probe=ProbeConfig(folds=2, iterations=4),
+    sft=dataclasses.replace(SFTConfig(), steps=3, batch_size=4),
+    blind=dataclasses.replace(SFTConfig(), steps=2, batch_size=4),
+    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
+    grpo_steps=2,
+)
+
+
+def one_batch(data: Dataset) -> TouchBatch:
+    """The first test contact."""
+    rows = data.parts["test"][:1]
+    clips = clip_batches(data.store, rows, data.clip, batch_size=1, seed=0, shuffle=False, repeat=False)
+    return touch_batch(next(iter(clips)))
+
+
+def params(assembly: Assembly, data: Dataset, *, loud: float = 0.3) -> Params:
+    """Parameters drawn from N(0, loud²) in NumPy: compiling the initialisation takes longer than all else here."""
+    shapes = jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data))
+    rng = np.random.default_rng(0)
+    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, loud, leaf.shape), leaf.dtype), shapes)
