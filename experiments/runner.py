@@ -13,6 +13,7 @@ import dataclasses
 import difflib
 import importlib
 import importlib.util
+import itertools
 import shlex
 import signal
 import sys
@@ -210,7 +211,7 @@ def _signals() -> Iterator[None]:
 def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:
     """The scale that the arguments name; `default` where they name none or an unknown one, which tyro then answers."""
     named = "default"
-    for flag, value in zip(arguments, [*arguments[1:], ""], strict=True):
+    for flag, value in itertools.pairwise([*arguments, ""]):
         if flag == "--scale":
             named = value
         elif flag.startswith("--scale="):

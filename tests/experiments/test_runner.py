@@ -190,3 +190,7 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
     assert runs.newest_unfinished(tmp_path / "coin", {}) == max(made)
     assert runs.newest_unfinished(tmp_path / "coin", {"a": 1}) is None
     assert runs.newest_unfinished(tmp_path / "none", {}) is None
+
+
+def test_no_argument_at_all_is_the_default_scale():
+    assert runner.parse(coin.EXPERIMENT, [], "about").scale == "default"
