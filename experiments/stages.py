@@ -175,22 +175,28 @@ def noise_bank(
     clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=probe, seed=seed, repeat=False)
     clip = next(iter(clips))
     seen = np.where(clip["frame_mask"], 1.0, np.nan).astype(np.float32)
-    pixel_mean, pixel_std = _statistics(clip["frames"].astype(np.float32) * seen[..., None, None, None], (0, 2, 3, 4))
-    force_mean, force_std = _statistics(clip["force_n"] * seen[..., None], (0, 2))
-    s, f, h, w = clip["frames"].shape[1:5]
-
-    def draw(x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
-        key, index, mask = x
-        pixel_key, force_key = jax.random.split(key)
-        pixels = jax.random.normal(pixel_key, (s, f, h, w, 3)) * pixel_std[:, None, None, None]
-        pixels = jnp.clip(pixels + pixel_mean[:, None, None, None], 0, 255)
-        push = jax.random.normal(force_key, (s, f, 3)) * force_std[:, None] + force_mean[:, None]
-        return agent.encode_streams(params, pixels, push, index, mask, jnp.arange(s))
-
+    pixels = _statistics(clip["frames"].astype(np.float32) * seen[..., None, None, None], (0, 2, 3, 4))
+    force = _statistics(clip["force_n"] * seen[..., None], (0, 2))
     rows = np.arange(draws) % len(clip["frame_index"])
     keys = jax.random.split(jax.random.key(seed), draws)
     times = jnp.asarray(clip["frame_index"][rows]), jnp.asarray(clip["frame_mask"][rows])
-    return jax.jit(lambda x: jax.lax.map(draw, x))((keys, *times))
+    return noise_program(agent, clip["frames"].shape[3:5])(params, pixels, force, (keys, *times))
+
+
+@functools.cache
+def noise_program(agent: Agent, size: tuple[int, int]) -> Any:
+    """Compiled encoder of noise, (params, pixel statistics, force statistics, (key, index, mask)) → features."""
+
+    def draw(params: Params, pixel: Any, force: Any, x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
+        key, index, mask = x
+        pixel_key, force_key = jax.random.split(key)
+        (pixel_mean, pixel_std), (force_mean, force_std), shape = pixel, force, index.shape
+        noise = jax.random.normal(pixel_key, (*shape, *size, 3)) * pixel_std[:, None, None, None]
+        frames = jnp.clip(noise + pixel_mean[:, None, None, None], 0, 255)
+        push = jax.random.normal(force_key, (*shape, 3)) * force_std[:, None] + force_mean[:, None]
+        return agent.encode_streams(params, frames, push, index, mask, jnp.arange(shape[0]))
+
+    return jax.jit(lambda params, pixel, force, x: jax.lax.map(functools.partial(draw, params, pixel, force), x))
 
 
 def _statistics(x: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,9 @@ from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import config_hash
 from tests.experiments import tiny
-from tests.touchr1_jax.quick import compile_quickly  # noqa: F401
+from tests.touchr1_jax.quick import compile_quickly
+
+__all__ = ["compile_quickly"]
 
 
 @pytest.fixture(scope="session")

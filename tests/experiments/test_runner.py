@@ -12,7 +12,7 @@ import pytest
 
 from experiments import runs
 from experiments.artifacts import read_json
-from experiments.runner import Experiment, find, main
+from experiments.runner import Experiment, find, main, parse
 from tests.experiments.fakes import coin
 
 FAKES = "tests.experiments.fakes"
@@ -193,4 +193,4 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
 
 
 def test_no_argument_at_all_is_the_default_scale():
-    assert runner.parse(coin.EXPERIMENT, [], "about").scale == "default"
+    assert parse(coin.EXPERIMENT, [], "about").scale == "default"

@@ -14,6 +14,7 @@ from experiments.study import StudyConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
@@ -72,3 +73,17 @@ def params(assembly: Assembly, data: Dataset, *, loud: float = 0.3) -> Params:
     shapes = jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data))
     rng = np.random.default_rng(0)
     return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, loud, leaf.shape), leaf.dtype), shapes)
+
+
+def features(n: int, seed: int = 0) -> Features:
+    """N encoded contacts made up without an encoder, everything present; on the host, as the stages keep them."""
+    rng = np.random.default_rng(seed)
+    width, steps = MODEL.decoder.hidden_size, MODEL.frames // MODEL.tactile.frames_per_step
+    time = np.repeat(np.arange(steps), MODEL.tactile.tokens_per_step)
+    return Features(
+        touch=rng.normal(0, 1, (n, 4, len(time), width)).astype(np.float32),
+        touch_time=np.tile(time.astype(np.int32), (n, 4, 1)),
+        stream_mask=np.ones((n, 4), bool),
+        view=rng.normal(0, 1, (n, MODEL.vision.grid**2, width)).astype(np.float32),
+        view_mask=np.ones(n, bool),
+    )
