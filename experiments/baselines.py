@@ -31,15 +31,15 @@ def baselines(study: Study) -> dict[str, Evaluated]:
 
 def joint_mode(label: np.ndarray) -> np.ndarray:
     """The most frequent combination of ordinal levels in training, with its most frequent material, int [A]."""
-    known = label[(label >= 0).all(1)]
     ordinal = [ATTRIBUTES.index(a) for a in ORDINAL]
+    known = label[(label[:, ordinal] >= 0).all(1)]
     combinations = itertools.product(*(range(LEVELS[a]) for a in ORDINAL))
     mode = max(combinations, key=lambda c: int((known[:, ordinal] == c).all(1).sum()))
     same = known[(known[:, ordinal] == mode).all(1)]
     material = ATTRIBUTES.index("material")
     out = np.zeros(len(ATTRIBUTES), int)
     out[ordinal] = mode
-    out[material] = np.bincount(same[:, material]).argmax()
+    out[material] = np.bincount(same[:, material] + 1, minlength=2)[1:].argmax()  # unknown, −1, does not vote
     return out
 
 

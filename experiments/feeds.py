@@ -12,6 +12,7 @@ import grain
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from experiments.assembly import Assembly
 from experiments.dataset import Dataset
@@ -155,7 +156,7 @@ class QuestionFeed(Feed):
         seed: int,
         full_share: float = 0.75,
     ) -> None:
-        contact, attribute = np.nonzero(label >= 0)
+        contact, attribute = labelled(label)
         order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
         super().__init__(order.to_iter_dataset(), seed)
         self._assembly, self._features, self._label = assembly, features, label
@@ -166,6 +167,18 @@ class QuestionFeed(Feed):
         contact, attribute = self._contact[element], self._attribute[element]
         streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
         return question_batch(self._assembly, self._features, self._label, contact, attribute, streams)
+
+
+def labelled(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:
+    """Contact and attribute of every question that has an answer.
+
+    Raises:
+      ValueError: no label is known.
+    """
+    contact, attribute = np.nonzero(label >= 0)
+    if not len(contact):
+        raise ValueError(f"label has {len(label)} rows and none is known (≥ 0): annotate some contacts of this part")
+    return contact, attribute
 
 
 def question_batch(

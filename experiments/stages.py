@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from experiments.assembly import Assembly, Weights
 from experiments.context import Context
 from experiments.dataset import Dataset
-from experiments.feeds import AnswerFeed, QuestionFeed, each, question_batch, touch_batch
+from experiments.feeds import AnswerFeed, QuestionFeed, each, labelled, question_batch, touch_batch
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import Answers
@@ -86,9 +86,9 @@ def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float
     for a, name in enumerate(ATTRIBUTES):
         out[:, :, a, : LEVELS[name]] = 0.0
         for s in range(len(data.clip.sensors)):
-            felt = rows[probed.present[rows, s]]
+            felt = rows[probed.present[rows, s] & (data.label[rows, a] >= 0)]
             label, groups = data.label[felt, a], data.object_ids[felt]
-            if len(np.unique(groups[label >= 0])) >= config.folds:
+            if len(np.unique(groups)) >= config.folds:
                 out[felt, s, a, : LEVELS[name]] = cross_fit(
                     probed.streams[felt, s], label, groups, LEVELS[name], config
                 )
@@ -270,7 +270,7 @@ class Evaluated:
 
 def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
     """Ask every labelled question about every contact, with all streams and with each stream alone."""
-    contact, attribute = np.nonzero(label >= 0)
+    contact, attribute = labelled(label)
     present = np.asarray(features.stream_mask)[contact]
     ask = answer_program(assembly)
     said = _ask(ask, assembly, params, features, label, contact, attribute, present)
@@ -312,10 +312,16 @@ def reward_terms(
     assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray
 ) -> dict[str, Float[np.ndarray, "N"]]:
     """What each weighted reward adds to the total of each answer."""
-    rewards = make_rewards(prior)
     target = assembly.target(done.attribute, done.label, done.streams)
-    score = jax.jit(jax.vmap(lambda p, t: total_reward(rewards, weights, p, t)[1]))
+    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
     return jax.device_get(score(jax.tree.map(jnp.asarray, done.parsed), target))
+
+
+@functools.cache
+def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
+    """Compiled reward terms of many answers, made once for each set of weights."""
+    rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
+    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
 
 
 def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
@@ -329,6 +335,9 @@ def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeCon
     columns = []
     for a, name in enumerate(ATTRIBUTES):
         weight = (train & (data.label[:, a] >= 0))[None]
+        if not weight.any():  # nobody annotated it, so nobody is asked about it
+            columns.append(np.zeros(len(rows), int))
+            continue
         columns.append(
             probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)[0, rows].argmax(-1)
         )

@@ -1,4 +1,4 @@
-"""A study small enough for a test: sixteen objects, pictures of 28 px, towers of widths 8 to 24."""
+"""A study small enough for a test: sixteen objects, pictures of 28 px, one decoder layer, no encoder layer."""
 
 import dataclasses
 
@@ -33,8 +33,8 @@ SCENES = SceneConfig(
     solver_max_iterations=20,
 )
 MODEL = ModelConfig(
-    tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
-    vision=VisionConfig(image_px=16, patch_px=8, width=8),
+    tactile=TactileViTConfig(sensors=0, width=16, num_layers=0, num_heads=2, stem_width=4),
+    vision=VisionConfig(image_px=16, patch_px=8, width=8, num_layers=0),
     decoder=DecoderConfig(
         vocab_size=0,
         hidden_size=24,
@@ -68,11 +68,19 @@ def one_batch(data: Dataset) -> TouchBatch:
     return touch_batch(next(iter(clips)))
 
 
-def params(assembly: Assembly, data: Dataset, *, loud: float = 0.3) -> Params:
-    """Parameters drawn from N(0, loud²) in NumPy: compiling the initialisation takes longer than all else here."""
+def params(assembly: Assembly, data: Dataset, *, loud: float = 0.4, seed: int = 0) -> Params:
+    """Parameters drawn from N(0, loud²), scales from N(1, loud²), so that answers depend on what is asked and felt.
+
+    Drawn in NumPy from the traced shapes: compiling the initialisation takes longer than all else here.
+    """
     shapes = jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data))
-    rng = np.random.default_rng(0)
-    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(0, loud, leaf.shape), leaf.dtype), shapes)
+    rng = np.random.default_rng(seed)
+
+    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        centre = 1.0 if path[-1].key == "scale" else 0.0
+        return jnp.asarray(rng.normal(centre, loud, leaf.shape), leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 def features(n: int, seed: int = 0) -> Features:

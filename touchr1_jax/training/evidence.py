@@ -70,7 +70,15 @@ def probe_log_probs(
       weights: how much each example counts in each fit; 0 holds it out.
       levels: number of classes K.
       config: penalty and iterations.
+
+    Raises:
+      ValueError: a fit without a single weighted row.
     """
+    empty = np.flatnonzero(~np.any(weights, axis=1))
+    if empty.size:
+        raise ValueError(
+            f"weights[{empty[0]}] are all 0: a probe needs rows to learn from; label more or use fewer folds"
+        )
     fits = [
         _fit_probe(jnp.asarray(features), jnp.maximum(labels, 0), jnp.asarray(w, jnp.float32), levels, config)
         for w in weights
