@@ -76,9 +76,7 @@ def probe_log_probs(
     """
     empty = np.flatnonzero(~np.any(weights, axis=1))
     if empty.size:
-        raise ValueError(
-            f"weights[{empty[0]}] are all 0: a probe needs rows; label more or use fewer folds"
-        )
+        raise ValueError(f"weights[{empty[0]}] are all 0: a probe needs rows; label more or use fewer folds")
     fits = [
         _fit_probe(jnp.asarray(features), jnp.maximum(labels, 0), jnp.asarray(w, jnp.float32), levels, config)
         for w in weights
