@@ -23,7 +23,9 @@ LANGUAGE = dataclasses.replace(TOUCH_LANGUAGE, sensors=TOUCH_LANGUAGE.sensors[:2
 TOKENIZER = word_level(LANGUAGE, prompt_words())
 S, A, V = 2, 4, TOKENIZER.vocab_size
 CONFIG = PolicyConfig(
-    tactile=dataclasses.replace(TactileViTConfig(sensors=S), width=16, num_layers=1, num_heads=2, stem_width=4),
+    tactile=dataclasses.replace(
+        TactileViTConfig(sensors=S), width=16, num_layers=1, num_heads=2, stem_width=4, frames_per_step=2
+    ),
     vision=dataclasses.replace(VisionConfig(), image_px=16, patch_px=4, width=8),
     decoder=dataclasses.replace(
         DecoderConfig(vocab_size=V),

@@ -25,7 +25,7 @@ def test_stable_preset():
 
 def test_micro_batches_must_divide():
     with pytest.raises(ValueError, match="micro_prompts 3 must divide prompts 8; choose a divisor"):
-        GRPOConfig(micro_prompts=3)
+        GRPOConfig(prompts=8, micro_prompts=3)
 
 
 def test_reports_name_the_nearest_preset_and_what_differs():
