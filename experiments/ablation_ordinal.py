@@ -8,7 +8,7 @@ differ in the accuracy reward alone.  `zero_one` pays 1 for the right level, `or
 `debiased` takes from the ordinal credit what a constant answer would earn, so that no level is favoured.  All pay −0.1
 for an answer that cannot be parsed.
 
-Cost: under 20 minutes on two cores with five seeds; `--scale smoke` under two.
+Cost: about 20 minutes on two cores with five seeds; `--scale smoke` under two.
 
 Expected: ordinal credit pays the middle level for being near everything (answering the middle beats answering low as
 soon as p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`; a lower ordinal
