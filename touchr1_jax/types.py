@@ -7,7 +7,6 @@ Dimensions, used in every name and shape of this package:
 
 from typing import Any
 
-import jax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
@@ -69,8 +68,3 @@ class Rollout:
     tokens: Int[Array, "*batch T"]
     log_prob: Float[Array, "*batch T"]
     mask: Bool[Array, "*batch T"]
-
-
-def tree_size(tree: Any) -> int:
-    """Number of elements of all arrays of a pytree."""
-    return sum(leaf.size for leaf in jax.tree.leaves(tree))
