@@ -1,6 +1,5 @@
-"""A self-contained report of one run: one HTML file without scripts that needs nothing from outside itself."""
+"""The self-contained report of trained arms: one HTML file without scripts that needs nothing from outside itself."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from experiments import charts
 from experiments.artifacts import write_bytes, write_text
 from experiments.context import read_metrics
 from experiments.page import Html, document, image, row, table, tag
+from experiments.report_parts import appendix, data_and_time, header, number
 from experiments.report_rollouts import rollouts
 from experiments.results import Comparison, Estimate, Results
 from touchr1_jax.bench.metrics import METRICS
@@ -34,8 +34,8 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         _middle(directory, results, colour),
         _curves(directory, results, colour),
         rollouts(results.examples, colour),
-        _figures(results),
-        _appendix(description),
+        data_and_time(results.data, results.timing),
+        appendix(description),
     )
     path = directory / "report.html"
     write_text(path, page)
@@ -62,22 +62,8 @@ def _beyond_doubt(metric: str, pair: set[str], results: Results) -> bool:
 
 
 def _header(results: Results, question: str, rest: str, description: Mapping[str, Any]) -> Html:
-    git = description["git"]
-    shown = {
-        **results.settings,
-        "scale": description["scale"],
-        "seeds": len(next(iter(next(iter(results.arms.values())).values())).per_seed),
-        "code": git["commit"][:12] + (" with local changes" if git["dirty"] else ""),
-    }
-    settings = [tag("li", f"{name} ", tag("b", _plain(value))) for name, value in shown.items()]
-    return tag(
-        "header",
-        tag("h1", description["experiment"]),
-        tag("p", question, class_="question"),
-        tag("ul", *settings, class_="settings"),
-        tag("div", *[tag("p", sentence) for sentence in results.verdict], class_="verdict") if results.verdict else "",
-        tag("details", tag("summary", "About this experiment"), tag("pre", rest, class_="about")) if rest else "",
-    )
+    seeds = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
+    return header(question, rest, description, {**results.settings, "seeds": seeds}, results.verdict)
 
 
 def _answers(results: Results, colour: Mapping[str, str]) -> Html:
@@ -114,8 +100,8 @@ def _metric_table(metrics: list[str], results: Results, colour: Mapping[str, str
 def _cell(metric: str, value: Estimate | None, best: bool) -> Html | str:
     if value is None:
         return "–"
-    number = tag("b" if best else "span", _number(value.mean, METRICS[metric].format))
-    return tag("td", number, tag("span", _interval(value.ci95, METRICS[metric].format), class_="ci"))
+    shown = tag("b" if best else "span", number(value.mean, METRICS[metric].format))
+    return tag("td", shown, tag("span", _interval(value.ci95, METRICS[metric].format), class_="ci"))
 
 
 def _legend(metrics: list[str]) -> Html:
@@ -161,7 +147,7 @@ def _comparison(metric: str, pair: str, found: Mapping[str, Comparison], first: 
     return row(
         shown.title + ARROW[shown.better] if first else "",
         tag("td", pair, class_="text"),
-        _number(next(iter(found.values())).difference, spec) + _unit(shown.unit, bare=True),
+        number(next(iter(found.values())).difference, spec) + _unit(shown.unit, bare=True),
         _bounds(seeds, spec),
         f"{seeds.p_value:.3f}" if seeds and seeds.p_value is not None else "–",
         f"{seeds.improvement:.2f}" if seeds and seeds.improvement is not None else "–",
@@ -209,53 +195,15 @@ def _curves(directory: Path, results: Results, colour: Mapping[str, str]) -> Htm
     return tag("section", tag("h2", "Training curves"), tag("p", note, class_="note"), *figures)
 
 
-def _figures(results: Results) -> Html:
-    """Tables of the data and of the time, stages summed over seeds."""
-    seconds: dict[str, list[float]] = {}
-    for stage, value in results.timing.items():
-        seconds.setdefault(stage.rpartition("/")[0] or stage, []).append(value)
-    times = [row(name, str(len(s)), f"{sum(s) / len(s):,.1f}", f"{sum(s):,.1f}", head=1) for name, s in seconds.items()]
-    data = [row(name, _plain(value), head=1) for name, value in results.data.items()]
-    parts = [
-        tag("div", tag("h3", "Data"), table(["Quantity", "value"], data)) if data else Html(""),
-        tag("div", tag("h3", "Wall time"), table(["Stage", "runs", "mean (s)", "all (s)"], times))
-        if times
-        else Html(""),
-    ]
-    return tag("section", tag("h2", "Data and time"), tag("div", *parts, class_="columns"))
-
-
-def _appendix(description: Mapping[str, Any]) -> Html:
-    text = json.dumps(description, indent=2, ensure_ascii=False)
-    return tag("section", tag("h2", "Configuration"), tag("details", tag("summary", "config.json"), tag("pre", text)))
-
-
 def _named(arm: str, colour: Mapping[str, str]) -> Html:
     return tag("th", tag("span", class_="swatch", style=f"background:{colour[arm]}"), arm)
 
 
 def _interval(ci95: tuple[float, float], spec: str) -> str:
-    return f"[{_number(ci95[0], spec)}, {_number(ci95[1], spec)}]"
-
-
-def _number(value: float, spec: str) -> str:
-    """With a true minus sign, which is as wide as a digit."""
-    return format(value, spec).replace("-", "−")
+    return f"[{number(ci95[0], spec)}, {number(ci95[1], spec)}]"
 
 
 def _unit(unit: str, bare: bool = False) -> str:
     if not unit:
         return ""
     return f" {'points' if unit == '%' else unit}" if bare else f" ({unit})"
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:,.4g}"
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{value:,}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain(item) for item in value)
-    return str(value)

@@ -28,7 +28,9 @@ from rich.console import Console
 from experiments import runs
 from experiments.artifacts import jsonable, read_json, write_json
 from experiments.context import Context
+from experiments.findings import Findings
 from experiments.report import write_report
+from experiments.report_findings import write_findings
 from experiments.results import Results
 
 PROG = "python -m experiments"
@@ -43,13 +45,14 @@ class Experiment(Generic[C]):
     Args:
       name: the name of its module.
       config: the default configuration, a frozen keyword-only dataclass.
-      run: computes the results; it must skip the stages that `Context.done` names and continue from checkpoints.
+      run: computes results (trained arms) or findings (measurements); it must skip the stages that `Context.done` names
+        and continue from checkpoints.
       scales: further configurations by name, `smoke` for one that takes under two minutes.
     """
 
     name: str
     config: C
-    run: Callable[[C, Context], Results]
+    run: Callable[[C, Context], Results | Findings]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -175,7 +178,10 @@ def _run(experiment: Experiment[Any], config: Any, context: Context, about: str)
         results = experiment.run(config, context)
     description = read_json(context.directory / "config.json")
     results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
-    report = write_report(context.directory, results, about=about, description=description)
+    if isinstance(results, Findings):
+        report = write_findings(context.directory, results, about=about, description=description)
+    else:
+        report = write_report(context.directory, results, about=about, description=description)
     write_json(context.directory / "results.json", results.to_json(description))
     context.say(f"report: {report}")
     for sentence in results.verdict:
