@@ -96,7 +96,7 @@ class AnswerFeed(Feed):
         seed: int,
         blind: bool = False,
     ) -> None:
-        clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=batch_size, seed=seed)
+        clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=batch_size, seed=seed, felt=not blind)
         super().__init__(clips, seed)
         self._assembly, self._evidence, self._blind = assembly, evidence, blind
         self._questions = questions

@@ -148,7 +148,9 @@ def encode_contacts(
     assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool = False
 ) -> Features:
     """Encode contacts once and keep the features on the host, in the order of `rows`."""
-    clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
+    clips = clip_batches(
+        data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False, felt=not blind
+    )
     encode = encode_program(assembly.agent, blind)
     parts = []
     with context.progress("encoding", len(rows)) as advance:

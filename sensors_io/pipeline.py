@@ -13,7 +13,7 @@ import grain
 import numpy as np
 
 from sensors_io.records import RecordStore
-from sensors_io.schema import SENSORS, Clip, Flag, ObjectCard, SchemaError, Sequence
+from sensors_io.schema import SENSORS, Clip, ContactKey, Flag, ObjectCard, SchemaError, Sequence
 from sensors_io.selection import choose_frames, field_images
 
 
@@ -62,7 +62,7 @@ def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipCon
     key = next(iter(contact.values())).key
     if key.object_id != card.object_id:
         raise SchemaError(f"card is of object {card.object_id!r}: the contact is of {key.object_id!r}; pass its card")
-    size, view_size = (config.image_px, config.image_px), (config.view_px, config.view_px)
+    size = (config.image_px, config.image_px)
     shape = (len(config.sensors), config.frames)
     frames = np.zeros((*shape, *size, 3), np.uint8)
     force_n = np.zeros((*shape, 3), np.float32)
@@ -77,17 +77,31 @@ def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipCon
         if sequence.force_n is not None:
             force_n[s, :n] = sequence.force_n[chosen]
         frame_index[s, :n], frame_mask[s, :n] = chosen, True
-    view = np.zeros((*view_size, 3), np.uint8) if card.view is None else _resize(card.view, view_size)
-    return Clip(
-        key=key,
+    present = np.array([sensor in contact for sensor in config.sensors])
+    return _clip(
+        key,
+        card,
+        config,
         frames=frames,
         force_n=force_n,
         frame_index=frame_index,
         frame_mask=frame_mask,
-        stream_mask=np.array([sensor in contact for sensor in config.sensors]),
-        view=view,
-        view_mask=np.array(card.view is not None),
-        label=card.label_row(),
+        stream_mask=present,
+    )
+
+
+def make_unfelt_clip(key: ContactKey, card: ObjectCard, config: ClipConfig) -> Clip:
+    """The same contact for a policy without touch: view and labels, no stream present, images of one pixel."""
+    shape = (len(config.sensors), config.frames)
+    return _clip(
+        key,
+        card,
+        config,
+        frames=np.zeros((*shape, 1, 1, 3), np.uint8),
+        force_n=np.zeros((*shape, 3), np.float32),
+        frame_index=np.zeros(shape, np.int32),
+        frame_mask=np.zeros(shape, np.bool_),
+        stream_mask=np.zeros(len(config.sensors), np.bool_),
     )
 
 
@@ -101,6 +115,7 @@ def clip_batches(
     shuffle: bool = True,
     repeat: bool = True,
     drop_remainder: bool = False,
+    felt: bool = True,
     workers: int = 0,
 ) -> grain.IterDataset:
     """Batches of clips: dicts of the arrays of `CLIP_ARRAYS` with a leading P, and `contact`, their indices, int32 [P].
@@ -116,6 +131,7 @@ def clip_batches(
       shuffle: False keeps the order of `indices`.
       repeat: False ends after one epoch.
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
+      felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
       workers: reading processes; 0 reads in a thread of this one.  States carry over between equal numbers of workers.
 
     Raises:
@@ -131,7 +147,7 @@ def clip_batches(
         dataset = dataset.shuffle()
     if repeat:
         dataset = dataset.repeat()
-    batches = dataset.map(_Reader(store, config)).batch(batch_size, drop_remainder=drop_remainder)
+    batches = dataset.map(_Reader(store, config, felt)).batch(batch_size, drop_remainder=drop_remainder)
     # one thread and two batches ahead: grain's default of 500 would hold gigabytes of frames
     iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))
     if not workers:
@@ -147,11 +163,28 @@ class _Reader:
 
     store: RecordStore
     config: ClipConfig
+    felt: bool
 
     def __call__(self, i: int) -> dict[str, np.ndarray]:
-        contact = self.store.contact(i, fields=False)
-        clip = make_clip(contact, self.store.objects[self.store.contacts[i].object_id], self.config)
+        key = self.store.contacts[i]
+        card = self.store.objects[key.object_id]
+        if self.felt:
+            clip = make_clip(self.store.contact(i, fields=False), card, self.config)
+        else:
+            clip = make_unfelt_clip(key, card, self.config)
         return clip.arrays() | {"contact": np.array(i, np.int32)}
+
+
+def _clip(key: ContactKey, card: ObjectCard, config: ClipConfig, **streams: np.ndarray) -> Clip:
+    """Streams and what the card says of the object."""
+    size = (config.view_px, config.view_px)
+    return Clip(
+        key=key,
+        **streams,
+        view=np.zeros((*size, 3), np.uint8) if card.view is None else _resize(card.view, size),
+        view_mask=np.array(card.view is not None),
+        label=card.label_row(),
+    )
 
 
 def _images(sequence: Sequence, chosen: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -1,7 +1,10 @@
 """Who may import whom, and how long things may get, read from the sources."""
 
 import ast
+import builtins
 import graphlib
+import importlib
+import symtable
 import sys
 from pathlib import Path
 
@@ -170,6 +173,40 @@ def test_files_and_functions_are_short(path):
     functions = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
     long = {f.name: f.end_lineno - f.lineno + 1 for f in functions if f.end_lineno - f.lineno + 1 > MAX_FUNCTION}
     assert not long
+
+
+def unknown_globals(source: str, known: set[str]) -> set[str]:
+    """Global names that the functions of a source read and nobody defines; shape strings keep linters from it."""
+    unknown, tables = set(), [symtable.symtable(source, "source", "exec")]
+    while tables:
+        table = tables.pop()
+        tables += table.get_children()
+        names = {s.get_name() for s in table.get_symbols() if s.is_global() and s.is_referenced()}
+        unknown |= {n for n in names if n not in known and not hasattr(builtins, n)}
+    return unknown
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_global_name_exists(path):
+    if path.name == "__main__.py":
+        known = {n for top in ast.parse(path.read_text()).body for n in bound_names(top)} | {"__name__"}
+    else:
+        known = set(vars(importlib.import_module(name_of(path))))
+    assert not unknown_globals(path.read_text(), known)
+
+
+def bound_names(statement: ast.stmt) -> set[str]:
+    """What a statement of a module binds."""
+    if isinstance(statement, ast.Import | ast.ImportFrom):
+        return {(a.asname or a.name).split(".")[0] for a in statement.names}
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return {statement.name}
+    return {n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+
+
+def test_an_unknown_global_name_would_be_seen():
+    source = "import os\n\ndef f(x):\n    y = [os.sep for z in x]\n    return g(y, len(x), missing)\n"
+    assert unknown_globals(source, {"os", "f", "g"}) == {"missing"}
 
 
 def test_a_forbidden_import_would_be_seen():

@@ -114,6 +114,12 @@ def test_a_blind_policy_perceives_nothing_and_is_told_the_label(assembly, answer
         assert said.compare[a] == said.conclude[a] == clips["label"][i, a]
 
 
+def test_a_blind_policy_is_shown_no_touch(answers):
+    batch = next(answers(blind=True))
+    assert not np.asarray(batch.touch.stream_mask).any()
+    assert np.asarray(batch.touch.frames).size < np.asarray(batch.touch.view).size
+
+
 def test_answers_are_given_for_sft_contacts_alone(answers, data):
     views = {data.store.objects[data.object_ids[i]].view.tobytes() for i in data.parts["sft"]}
     feed = answers(batch_size=5)

@@ -27,6 +27,16 @@ def same(a, b):
         np.testing.assert_array_equal(a[name], b[name])
 
 
+def test_an_unfelt_batch_differs_in_its_streams_alone(store):
+    felt, unfelt = (
+        next(iter(clip_batches(store, range(7), SMALL, batch_size=7, seed=3, felt=felt))) for felt in (True, False)
+    )
+    for name in ("contact", "view", "view_mask", "label"):
+        np.testing.assert_array_equal(felt[name], unfelt[name])
+    assert unfelt["frames"].shape == (7, 4, 4, 1, 1, 3)
+    assert not any(unfelt[name].any() for name in ("frames", "force_n", "frame_index", "frame_mask", "stream_mask"))
+
+
 class TestMakeClip:
     def test_it_holds_what_the_schema_says(self):
         clip = make_clip(contact(1), fakes.card(1), SMALL)
