@@ -4,9 +4,10 @@
     make experiment EXP=ablation_ordinal ARGS="--data physiclear --data-dir DIR"
 
 Three arms of GRPO start from the same SFT checkpoint of each seed and see the same questions in the same order; they
-differ in the accuracy reward alone.  `zero_one` pays 1 for the right level, `ordinal` also 0.4 for a neighbour, and
-`debiased` takes from the ordinal credit what a constant answer would earn, so that no level is favoured.  All pay −0.1
-for an answer that cannot be parsed.
+differ in the reward alone.  `zero_one` pays 1 for the right level, `ordinal` also 0.4 for a neighbour, both beside the
+published consistency term.  `debiased` takes from the ordinal credit what a constant answer would earn, so that no
+level is favoured, and pays for consistency only where the answer is right.  All pay −0.1 for an answer that cannot be
+parsed.
 
 Cost: about 20 minutes on two cores with five seeds; `--scale smoke` under two.
 
@@ -36,7 +37,7 @@ from touchr1_jax.rl.config import GRPOConfig, preset_name
 ARMS: Mapping[str, Mapping[str, float]] = {
     "zero_one": {"exact": 0.6, "consistency": 0.3, "format": 0.1},
     "ordinal": {"accuracy": 0.6, "consistency": 0.3, "format": 0.1},
-    "debiased": {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1},
+    "debiased": {"accuracy_debiased": 0.6, "consistency_gated": 0.3, "format": 0.1},
 }
 YARDSTICK = ARMS["ordinal"]
 """The published reward, by which `reward` is reported for every row, whatever an arm was trained on."""
@@ -87,8 +88,13 @@ def score(study: Study, said: Evaluated) -> dict[str, Scores]:
 
 
 def own_reward(study: Study) -> dict[str, tuple[list[float], list[float]]]:
-    """Greedy held-out reward under each arm's own weights, per seed: of the arm, and of its SFT checkpoint."""
-    mean = lambda said, weights: float(reward_of(study.assembly, said, weights, study.prior).mean())
+    """Greedy held-out reward under each arm's own weights on what GRPO asks, per seed: of the arm, and of its SFT."""
+    asked = [i for i, name in enumerate(ATTRIBUTES) if name in study.config.grpo_attributes]
+
+    def mean(said: Evaluated, weights: Mapping[str, float]) -> float:
+        reward = reward_of(study.assembly, said, weights, study.prior)
+        return float(reward[np.isin(said.attribute, asked)].mean())
+
     return {
         arm: ([mean(a, weights) for a in study.answers[arm]], [mean(a, weights) for a in study.answers[SFT]])
         for arm, weights in ARMS.items()

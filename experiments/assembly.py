@@ -27,7 +27,7 @@ Weights = Mapping[str, float]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig:
-    """Sizes of the towers, about one million parameters by default; sensors and vocabulary come from the data."""
+    """Sizes of the towers, 0.64 million parameters by default; sensors and vocabulary come from the data."""
 
     tactile: TactileViTConfig = TactileViTConfig(sensors=0)
     vision: VisionConfig = VisionConfig()

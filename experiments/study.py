@@ -52,19 +52,19 @@ class StudyConfig:
     """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
     data_dir: Path | None = None
     """Folder of the videos or records."""
-    scenes: SceneConfig = SceneConfig(objects=1200, sites=2)
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1)
     physiclear: PhysiclearConfig = PhysiclearConfig()
     grpo_share: float = 0.35
     """Share of the training objects that SFT never sees."""
     model: ModelConfig = ModelConfig()
     probe: ProbeConfig = ProbeConfig()
     sft: SFTConfig = SFTConfig()
-    blind: SFTConfig = SFTConfig(steps=150)
+    blind: SFTConfig = SFTConfig()
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
-    grpo_steps: int = 120
-    grpo_save_every: int = 40
+    grpo_steps: int = 180
+    grpo_save_every: int = 60
 
     def __post_init__(self) -> None:
         if self.grpo.length != self.model.completion_tokens:

@@ -8,8 +8,8 @@ from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards
 from sensors_io.schema import SENSORS
 
-CONTACTS_PER_SHARD = 32
-"""At about three contacts a second, a killed generation loses ten seconds."""
+RECORDS_PER_SHARD = 2880
+"""At the several hundred records a second of two cores, a killed generation loses some seconds."""
 
 
 def generate_records(
@@ -32,7 +32,8 @@ def generate_records(
         sensors=SENSORS,
         notes={"config": dataclasses.asdict(config)},
     )
-    with RecordWriter(out, meta=meta, contacts_per_shard=CONTACTS_PER_SHARD, resume=True) as writer:
+    per_shard = max(1, RECORDS_PER_SHARD // (len(SENSORS) * config.frame_count))
+    with RecordWriter(out, meta=meta, contacts_per_shard=per_shard, resume=True) as writer:
         for card in object_cards(config):
             if card.object_id not in writer.objects_done:
                 writer.write_object(card)

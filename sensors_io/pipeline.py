@@ -5,14 +5,13 @@ Dimensions as in the schema: N frames of a sequence, F of a clip, S sensors, P c
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import absl.flags
 import cv2
 import grain
 import numpy as np
 
-from sensors_io.records import RecordStore
 from sensors_io.schema import SENSORS, Clip, ContactKey, Flag, ObjectCard, SchemaError, Sequence
 from sensors_io.selection import choose_frames, field_images
 
@@ -41,6 +40,23 @@ class ClipConfig:
                 raise SchemaError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
         if not self.sensors or len(set(self.sensors)) != len(self.sensors):
             raise SchemaError(f"sensors is {self.sensors}: at least one, each once; correct the list")
+
+
+class Contacts(Protocol):
+    """Where contacts come from by number: `records.RecordStore`, or `live.LiveScenes` that makes them when asked."""
+
+    @property
+    def contacts(self) -> tuple[ContactKey, ...]:
+        """Identity of every contact."""
+
+    @property
+    def objects(self) -> Mapping[str, ObjectCard]:
+        """Cards of all objects by id."""
+
+    def __len__(self) -> int: ...
+
+    def contact(self, i: int, *, fields: bool = True) -> Mapping[str, Sequence]:
+        """Contact i by sensor; without `fields`, those of sequences that have camera frames may be missing."""
 
 
 def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipConfig) -> Clip:
@@ -106,7 +122,7 @@ def make_unfelt_clip(key: ContactKey, card: ObjectCard, config: ClipConfig) -> C
 
 
 def clip_batches(
-    store: RecordStore,
+    store: Contacts,
     indices: Any,
     config: ClipConfig,
     *,
@@ -117,6 +133,7 @@ def clip_batches(
     drop_remainder: bool = False,
     felt: bool = True,
     workers: int = 0,
+    threads: int = 1,
 ) -> grain.IterDataset:
     """Batches of clips: dicts of the arrays of `CLIP_ARRAYS` with a leading P, and `contact`, their indices, int32 [P].
 
@@ -132,7 +149,8 @@ def clip_batches(
       repeat: False ends after one epoch.
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
       felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
-      workers: reading processes; 0 reads in a thread of this one.  States carry over between equal numbers of workers.
+      workers: reading processes; 0 reads in threads of this one.  States carry over between equal numbers of workers.
+      threads: reading threads of each process.
 
     Raises:
       SchemaError: no contact, or one that the store does not hold.
@@ -148,8 +166,8 @@ def clip_batches(
     if repeat:
         dataset = dataset.repeat()
     batches = dataset.map(_Reader(store, config, felt)).batch(batch_size, drop_remainder=drop_remainder)
-    # one thread and two batches ahead: grain's default of 500 would hold gigabytes of frames
-    iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=1, prefetch_buffer_size=2))
+    # a batch or two ahead: grain's default of 500 would hold gigabytes of frames
+    iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=1 + threads))
     if not workers:
         return iterable
     if not absl.flags.FLAGS.is_parsed():
@@ -161,7 +179,7 @@ def clip_batches(
 class _Reader:
     """Contact index → arrays of its clip; a class, so that worker processes can be sent it."""
 
-    store: RecordStore
+    store: Contacts
     config: ClipConfig
     felt: bool
 

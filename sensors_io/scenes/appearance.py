@@ -10,7 +10,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from sensors_io.scenes.objects import PROTRUSION, ROUGHNESS
+from sensors_io.scenes.properties import PROTRUSION, ROUGHNESS
 
 VIEW_MM = 45.0
 """Side of the view."""

@@ -4,28 +4,38 @@ import dataclasses
 import hashlib
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sensors_io.scenes.sensors import MODELS
 
-GENERATOR = 1
+GENERATOR = 2
 """Version of the generator: part of the hash, raised whenever the same config would give other records."""
 
-_STREAMS = {"object": 1, "view": 2, "split": 3, "unit": 4, "contact": 5, "press": 6}
+_STREAMS = {"object": 1, "view": 2, "split": 3, "unit": 4, "contact": 5, "press": 6, "schedule": 7}
+
+PRESS_FRAMES, PROTOCOL_FRAMES = 8, 90
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What to generate.
+    """What to generate: presses alone, or the whole protocol.
 
-    `split_shares` are the shares of objects in train, val and test.  Forces are `frames` geometric levels between
-    `min_force_n` and `max_force_n`; the ramp misses its targets by `force_jitter` (relative), the force sensor has a
-    relative gain error per press and noise on each axis.  The last two numbers but the seed are the contact solver's.
+    Without `sequences` every object is pressed at `sites` sites: `frames` geometric levels between `min_force_n` and
+    `max_force_n`, frames past the strain limit flagged.  With `sequences`, a multiple of the number of sensors, every
+    object is pressed once and all other contacts are exploratory motions; `sites` does not count, and frames past the
+    strain limit are replaced, see `schedule`.
+
+    `frames` is by default 8 for presses and 90 for the protocol.  `split_shares` are the shares of objects in train,
+    val and test.  The hand misses its targets by `force_jitter` (relative), the force sensor has a relative gain error
+    per sequence and noise on each axis.  The last two numbers but the seed are the contact solver's.
     """
 
     objects: int = 600
     sites: int = 3
-    frames: int = 8
+    sequences: int | None = None
+    frames: int | None = None
     image_px: int = 112
     contact_grid: int = 64
     view_px: int = 64
@@ -44,7 +54,9 @@ class SceneConfig:
     def __post_init__(self) -> None:
         require(self.objects >= 1, "objects", self.objects, "must be ≥ 1")
         require(self.sites >= 1, "sites", self.sites, "must be ≥ 1")
-        require(self.frames >= 1, "frames", self.frames, "must be ≥ 1")
+        least = 1 if self.sequences is None else 20
+        require(self.frame_count >= least, "frames", self.frames, f"must be ≥ {least}")
+        self._check_sequences()
         require(self.image_px >= 16, "image_px", self.image_px, "must be ≥ 16")
         require(self.view_px >= 16, "view_px", self.view_px, "must be ≥ 16")
         require(self.contact_grid >= 24, "contact_grid", self.contact_grid, "must be ≥ 24 to resolve a contact")
@@ -57,10 +69,26 @@ class SceneConfig:
         require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
         require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")
 
+    def _check_sequences(self) -> None:
+        if self.sequences is None:
+            return
+        sensors = len(MODELS)
+        whole = f"must be a multiple of {sensors}: all sensors see every contact"
+        require(self.sequences % sensors == 0, "sequences", self.sequences, whole)
+        enough = f"must be ≥ {sensors * self.objects}: every one of {self.objects} objects is pressed by all sensors"
+        require(self.sequences >= sensors * self.objects, "sequences", self.sequences, enough)
+
+    @property
+    def frame_count(self) -> int:
+        """Frames of a sequence."""
+        if self.frames is not None:
+            return self.frames
+        return PRESS_FRAMES if self.sequences is None else PROTOCOL_FRAMES
+
     @property
     def contact_count(self) -> int:
         """Contacts of the data set; each gives one sequence per sensor."""
-        return self.objects * self.sites
+        return self.objects * self.sites if self.sequences is None else self.sequences // len(MODELS)
 
     @property
     def shortest_wave_mm(self) -> float:
@@ -77,6 +105,11 @@ def config_hash(config: SceneConfig) -> str:
 def stream(seed: int, name: str, *index: int) -> np.random.Generator:
     """Randomness of one thing, independent of that of all others and of the order in which they are made."""
     return np.random.default_rng([seed, _STREAMS[name], *index])
+
+
+def as_f32(value: float | np.ndarray) -> jax.Array:
+    """A number or an array of the host for a compiled program."""
+    return jnp.asarray(value, jnp.float32)
 
 
 def require(ok: bool, field: str, value: object, constraint: str) -> None:

@@ -1,23 +1,40 @@
-"""Frictionless normal contact at a prescribed force, by spectral projected gradients in float32.
+"""Frictionless normal contact at a prescribed force, in float32.
 
 The unknown is the pressure p ≥ 0 on an [N, N] grid with Σ p dA = F.  With the compliance G of layer and object in
 series and the gap g₀ of the undeformed bodies, the complementarity conditions are
 
     w = G ∗ p + g₀,   w = δ where p > 0,   w ≥ δ where p = 0,
 
-those of the convex quadratic ½ pᵀGp + pᵀg₀.
+those of the convex quadratic ½ pᵀGp + pᵀg₀.  They are solved on grids 4 and 2 times coarser first, each solution being
+the next one's start: a coarse iteration costs a sixteenth or a quarter of a fine one, and what is left is local.
 """
+
+import enum
+import math
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-BISECTIONS = 26
+from sensors_io.scenes import nested, winkler
+from sensors_io.scenes.spg import Problem, State, convolve, inverse_compliance, minimise, press_detail
+from sensors_io.scenes.validity import Validity, judge
+
+__all__ = ["MAX_ITERATIONS", "TOLERANCE", "Contact", "Tier", "convolve", "solve", "solve_winkler"]
+
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-3
-_TINY = 1e-30
-_STEP_RANGE = 1e4  # Barzilai–Borwein steps stay within this factor of the first step
+
+_COARSE_ITERATIONS = 30  # a coarse grid that needs more has nothing to tell the fine one
+_COARSE_SLACK = 4.0  # a coarse solution differs from the fine one by more than this anyway
+
+
+class Tier(enum.IntEnum):
+    """How a contact was solved, cheapest first."""
+
+    WINKLER = 1
+    SPG = 2
 
 
 @struct.dataclass
@@ -25,7 +42,10 @@ class Contact:
     """One solved contact.
 
     `displacement_mm` is that of the gel surface, into the gel; `approach_mm` is δ, by how much the object came closer.
-    `residual` is the relative violation of complementarity; `converged` says that it is below the tolerance.
+    `residual` estimates the relative L₂ error of the displacement; `converged` says that it is below the tolerance.
+    `iterations` are those on the finest grid, `coarse_iterations` those on all others; `convolutions` counts padded
+    ones on the finest grid.  `strain` is the greatest displacement over the gel's thickness.  `validity` says what of
+    this may be believed.
     """
 
     pressure_mpa: Float[Array, "N N"]
@@ -34,41 +54,11 @@ class Contact:
     residual: Float[Array, ""]
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
-
-
-@struct.dataclass
-class _State:
-    p: Float[Array, "N N"]
-    gradient: Float[Array, "N N"]
-    step: Float[Array, ""]
-    best: Float[Array, "N N"]
-    best_approach: Float[Array, ""]
-    best_residual: Float[Array, ""]
-    iterations: Int[Array, ""]
-
-
-def convolve(field: Float[Array, "N N"], spectrum: Array) -> Float[Array, "N N"]:
-    """Zero-padded convolution of a field with a kernel given by its `rfft2` half plane [M, M//2 + 1]."""
-    n, m = field.shape[-1], spectrum.shape[-2]
-    return jnp.fft.irfft2(jnp.fft.rfft2(field, s=(m, m)) * spectrum, s=(m, m))[..., :n, :n]
-
-
-def winkler_pressure(gap: Float[Array, "N N"], total: Float[Array, ""], stiffness: Float[Array, ""]) -> Array:
-    """Pressure of a bed of springs, p = K max(δ − g₀, 0), with δ bisected (geometric midpoints) so that Σ p = total."""
-    target = total / stiffness
-    high = jnp.max(gap) + target / gap.size
-    low = jnp.minimum(target / gap.size, high) * 1e-3 + 1e-9
-
-    def halve(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        middle = jnp.sqrt(low * high)
-        short = jnp.sum(jnp.maximum(middle - gap, 0)) < target
-        return jnp.where(short, middle, low), jnp.where(short, high, middle)
-
-    low, high = jax.lax.fori_loop(0, BISECTIONS, halve, (low, high))
-    rise = jnp.maximum(high - gap, 0)
-    rise = jnp.where(jnp.sum(rise) > 0, rise, (gap <= jnp.min(gap)).astype(gap.dtype))  # never an empty contact
-    return _rescale(rise, total)
+    coarse_iterations: Int[Array, ""]
+    convolutions: Int[Array, ""]
+    strain: Float[Array, ""]
+    tier: Int[Array, ""]
+    validity: Validity
 
 
 @jax.jit
@@ -80,107 +70,113 @@ def solve(
     spacing_mm: float,
     tolerance: float = TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
+    *,
+    thickness_mm: float = math.inf,
 ) -> Contact:
     """Press a body of shape `gap_mm` into the gel by `force_n`.
 
-        p ← P(p − τ d),   d = g where p > 0 or g < 0,   g = w − mean over p > 0 of w,
-
-    P clips at 0 and rescales to the force; τ alternates the two Barzilai–Borwein lengths.  One convolution a step.
-    Stops on  (Σ p|g| / Σ p + 0.1 max over p = 0 of −g) / δ < tolerance,  or at the cap with `converged` false and the
-    best iterate seen.  No output is ever NaN for finite input; map with `jax.lax.map`, which stops per scene.
+    Iterates as `spg.minimise` says, from a bed of springs on the coarsest grid to the finest.  For finite input no
+    output is NaN.  Map with `jax.lax.map`, which stops per scene.
 
     Args:
-      gap_mm: distance of the undeformed bodies [N, N], any offset.
+      gap_mm: distance of the undeformed bodies [N, N], N even, any offset.
       force_n: prescribed force, > 0.
       gel: compliance spectrum of the gel [M, M//2 + 1], mm/MPa; M − N is the padding.
       body: that of the object in series, added to the gel's; zeros for a rigid one.
       spacing_mm: pixel size.
-      tolerance: stop criterion.
-      max_iterations: cap.
+      tolerance: relative error of the displacement to stop at; float32 carries down to about 2e-5.
+      max_iterations: cap on the finest grid; on reaching it `converged` is false and the best iterate is returned.
+      thickness_mm: of the gel, to judge its strain by; infinite for a half-space, which has none by this measure.
 
-    Source: Birgin, Martínez & Raydan 2000 (spectral projected gradients), without line search; the start is a Winkler
-    bed of stiffness 1/G(q ≈ 0.2 rad/mm).
+    Raises:
+      ValueError: a gap that is not square and even, or a spectrum that does not fit it.
     """
+    _check(gap_mm, gel, body)
     gap = gap_mm - jnp.min(gap_mm)
-    total = force_n / spacing_mm**2
+    total = jnp.asarray(force_n / spacing_mm**2, gap.dtype)
     compliance = gel + body
-    first_step = 1 / compliance[0, compliance.shape[1] // 8]
-    start = winkler_pressure(gap, total, 1 / _bed_compliance(compliance, spacing_mm))
-    begin = _begin(start, gap, compliance, first_step)
-    state = jax.lax.while_loop(
-        lambda s: (s.best_residual >= tolerance) & (s.iterations < max_iterations),
-        lambda s: _iterate(s, gap, total, compliance, first_step),
-        begin,
-    )
+    start, coarse_iterations = _approach_from_coarse(gap, total, compliance, spacing_mm, tolerance, max_iterations)
+    found = minimise(_problem(gap, total, compliance, 1), start, tolerance, max_iterations)
+    return _contact(found, gel, tolerance, thickness_mm, coarse_iterations, Tier.SPG)
+
+
+@jax.jit
+def solve_winkler(
+    gap_mm: Float[Array, "N N"],
+    force_n: Float[Array, ""],
+    gel: Float[Array, "M K"],
+    body: Float[Array, "M K"],
+    spacing_mm: float,
+    tolerance: float = TOLERANCE,
+    *,
+    thickness_mm: float = math.inf,
+) -> Contact:
+    """The pressure of a bed of springs, and the gel's true response to it: arguments as for `solve`.
+
+    Two convolutions, one of them for an honest residual.
+    """
+    _check(gap_mm, gel, body)
+    gap = gap_mm - jnp.min(gap_mm)
+    total = jnp.asarray(force_n / spacing_mm**2, gap.dtype)
+    compliance = gel + body
+    p = winkler.pressure(gap, total, 1 / winkler.bed_compliance(compliance, spacing_mm))
+    problem = _problem(gap, total, compliance, 1)
+    found = minimise(problem, p, tolerance, 0)
+    return _contact(found, gel, tolerance, thickness_mm, jnp.int32(0), Tier.WINKLER)
+
+
+def _approach_from_coarse(
+    gap: Array, total: Array, compliance: Array, spacing_mm: float, tolerance: float, max_iterations: int
+) -> tuple[Array, Array]:
+    """Pressure on the finest grid interpolated from the solution on coarser ones, and the iterations these took."""
+    factors = (*nested.factors(gap.shape[0], compliance.shape[0]), 1)
+    coarse = _problem(gap, total, compliance, factors[0])
+    bed = winkler.bed_compliance(coarse.compliance, spacing_mm * factors[0])
+    p, iterations = winkler.pressure(coarse.gap, coarse.total, 1 / bed), jnp.int32(0)
+    cap = jnp.minimum(max_iterations, _COARSE_ITERATIONS)
+    for factor in factors[1:]:
+        found = minimise(coarse, p, _COARSE_SLACK * tolerance, cap)
+        fine = _problem(gap, total, compliance, factor)
+        p = press_detail(nested.refine(found.best), fine.gap - nested.refine(coarse.gap), fine)
+        coarse, iterations = fine, iterations + found.iterations
+    return p, iterations
+
+
+def _problem(gap: Array, total: Array, compliance: Array, factor: int) -> Problem:
+    """The problem on a grid coarser by `factor`."""
+    if factor > 1:
+        gap, total, compliance = nested.coarsen(gap, factor), total / factor**2, nested.truncate(compliance, factor)
+    return Problem(gap=gap, total=total, compliance=compliance, inverse=inverse_compliance(compliance, gap.shape[0]))
+
+
+def _contact(
+    found: State, gel: Array, tolerance: float, thickness_mm: float, coarse_iterations: Array, tier: Tier
+) -> Contact:
+    displacement = convolve(found.best, gel)
+    strain = jnp.max(displacement) / thickness_mm
+    converged = found.best_residual < tolerance
     return Contact(
-        pressure_mpa=state.best,
-        displacement_mm=convolve(state.best, gel),
-        approach_mm=state.best_approach,
-        residual=state.best_residual,
-        iterations=state.iterations,
-        converged=state.best_residual < tolerance,
+        pressure_mpa=found.best,
+        displacement_mm=displacement,
+        approach_mm=found.best_approach,
+        residual=found.best_residual,
+        iterations=found.iterations,
+        converged=converged,
+        coarse_iterations=coarse_iterations,
+        convolutions=found.iterations + 2,
+        strain=strain,
+        tier=jnp.int32(tier),
+        validity=judge(found.best, strain, converged),
     )
 
 
-def _bed_compliance(compliance: Array, spacing_mm: float) -> Array:
-    """G at the wave number next to 0.2 rad/mm, the scale of a finger-sized contact."""
-    points = compliance.shape[0]
-    index = jnp.round(0.2 * points * spacing_mm / (2 * jnp.pi)).astype(jnp.int32)
-    return compliance[0, jnp.clip(index, 1, compliance.shape[1] - 1)]
-
-
-def _rescale(p: Array, total: Array) -> Array:
-    return p * (total / jnp.maximum(jnp.sum(p), _TINY))
-
-
-def _gradient(p: Array, gap: Array, compliance: Array) -> tuple[Array, Array, Array]:
-    """Gap minus its contact mean, that mean (the approach δ), and the relative violation of complementarity."""
-    w = convolve(p, compliance) + gap
-    contact = p > 0
-    approach = jnp.sum(jnp.where(contact, w, 0)) / jnp.maximum(jnp.sum(contact), 1)
-    g = w - approach
-    uneven = jnp.sum(p * jnp.abs(g)) / jnp.maximum(jnp.sum(p), _TINY)
-    penetration = jnp.max(jnp.where(contact, 0, -g))
-    residual = (uneven + 0.1 * penetration) / jnp.maximum(jnp.abs(approach), _TINY)
-    return g, approach, jnp.where(jnp.isfinite(residual), residual, jnp.inf)
-
-
-def _begin(p: Array, gap: Array, compliance: Array, step: Array) -> _State:
-    g, approach, residual = _gradient(p, gap, compliance)
-    return _State(
-        p=p,
-        gradient=g,
-        step=step,
-        best=p,
-        best_approach=approach,
-        best_residual=residual,
-        iterations=jnp.zeros((), jnp.int32),
-    )
-
-
-def _iterate(state: _State, gap: Array, total: Array, compliance: Array, first_step: Array) -> _State:
-    p, g = state.p, state.gradient
-    direction = jnp.where((p > 0) | (g < 0), g, 0)
-    moved = _rescale(jnp.maximum(p - state.step * direction, 0), total)
-    new_g, approach, residual = _gradient(moved, gap, compliance)
-    step = _next_step(moved - p, jnp.where((p > 0) | (moved > 0), new_g - g, 0), state.iterations, first_step)
-    better = residual < state.best_residual
-    return _State(
-        p=moved,
-        gradient=new_g,
-        step=step,
-        best=jnp.where(better, moved, state.best),
-        best_approach=jnp.where(better, approach, state.best_approach),
-        best_residual=jnp.minimum(residual, state.best_residual),
-        iterations=state.iterations + 1,
-    )
-
-
-def _next_step(s: Array, y: Array, iteration: Array, first_step: Array) -> Array:
-    """Alternating Barzilai–Borwein step, safeguarded against overflow and against negative curvature by rounding."""
-    sy = jnp.sum(s * y)
-    long = jnp.sum(s * s) / jnp.maximum(sy, _TINY)
-    short = sy / jnp.maximum(jnp.sum(y * y), _TINY)
-    step = jnp.where(iteration % 2 == 0, long, short)
-    step = jnp.clip(step, first_step / _STEP_RANGE, first_step * _STEP_RANGE)
-    return jnp.where((sy > 0) & jnp.isfinite(step), step, first_step)
+def _check(gap: Array, gel: Array, body: Array) -> None:
+    if gap.ndim != 2 or gap.shape[0] != gap.shape[1] or gap.shape[0] % 2:
+        raise ValueError(f"gap_mm has shape {gap.shape}: must be [N, N] with even N; resample the gap")
+    for name, spectrum in (("gel", gel), ("body", body)):
+        m = spectrum.shape[0]
+        if spectrum.shape != (m, m // 2 + 1) or m < gap.shape[0]:
+            raise ValueError(
+                f"{name} has shape {spectrum.shape}: must be [M, M//2 + 1] with M ≥ N = {gap.shape[0]}; "
+                "compute it on the padded grid"
+            )

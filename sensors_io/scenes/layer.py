@@ -90,6 +90,30 @@ def shear_compliance(q: np.ndarray, layer: Layer) -> np.ndarray:
     return layer.thickness_mm / layer.shear_modulus_mpa * per_s
 
 
+def longitudinal_compliance(q: np.ndarray, layer: Layer) -> np.ndarray:
+    """Surface displacement along the wave vector per unit traction along it, in closed form.
+
+        G = (1−ν)/(μq) · (κ sinh 2s + 2s) / (κ cosh 2s + 2s² + (1+κ²)/2),  s = qh,  G(0) = h/μ
+
+    Args:
+      q: wave numbers of any shape, rad/mm, ≥ 0.
+      layer: the layer.
+
+    Returns:
+      G in mm/MPa, shaped as q.
+
+    Source: the boundary value problem of `depth_response` solved at the surface; the sum of two positive terms where
+    `normal_compliance` has their difference.
+    """
+    nu, h = layer.poisson, layer.thickness_mm
+    kappa = 3 - 4 * nu
+    s = np.asarray(q, np.float64) * h
+    decay = np.exp(-2 * s)
+    sinh_per_s = np.divide(-np.expm1(-4 * s), s, out=np.full_like(s, 4.0), where=s > 0)
+    denominator = kappa * (1 + decay**2) + (4 * s**2 + 1 + kappa**2) * decay
+    return (1 - nu) * h / layer.shear_modulus_mpa * (kappa * sinh_per_s + 4 * decay) / denominator
+
+
 def depth_response(q: np.ndarray, layer: Layer, depth_mm: float) -> DepthResponse:
     """Displacement at `depth_mm` below the surface, from the four boundary conditions solved per wave number.
 

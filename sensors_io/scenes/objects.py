@@ -1,80 +1,52 @@
-"""Procedural objects: what they are made of, how their skin is shaped, and the levels that follow from both.
+"""Procedural objects: what they are made of and how their skin is shaped; their levels follow from both.
 
-A property is a monotone function of a normal latent x = m(material) + σ ε, so the ranges of all materials overlap and
-the material only shifts the odds.  Levels come from the physical value alone, by the thresholds below.  No value lies
-within 18 % of a threshold, where two annotators would disagree; next to that gap objects are hard to tell apart still.
+An object may vary over its surface: of two parts with a seam, or graded from one side to the other.  What a press feels
+is then what lies under it, `Solid.at`.
 """
 
-import bisect
 import dataclasses
 import math
 
 import numpy as np
 
-from sensors_io.schema import MATERIALS
+from sensors_io.scenes.properties import DYNAMIC, HARDNESS, PROPERTIES, PROTRUSION, ROUGHNESS
+from sensors_io.schema import MATERIALS, UNKNOWN
 
-HARDNESS_MPA = (0.5, 5.0)
-"""Effective Young's modulus of the skin below which an object is soft, from which it is hard (a gel has 0.2–0.45)."""
+SEAM_MM = 0.4
+"""Half width of the seam between two parts."""
 
-ROUGHNESS_MM = (0.01, 0.04)
-"""RMS height in the band 0.8–4 mm below which an object is smooth, from which it is rough."""
-
-PROTRUSION_MM = (0.15, 0.5)
-"""Height of the surface features below which an object is flat, from which it is protruding."""
-
-GAP = 1.4
-"""Ratio between the least value above a threshold and the greatest below it."""
-
-_TERTILE = 0.4307  # of the standard normal
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Property:
-    """One physical property: its thresholds, its extreme values, the mean latent of each material.
-
-    `means` follow the order of `MATERIALS`; `spread` is the standard deviation within a material.
-    """
-
-    thresholds: tuple[float, float]
-    extremes: tuple[float, float]
-    means: tuple[float, ...]
-    spread: float
-
-    def value(self, latent: float) -> float:
-        """Physical value of a latent x: the thirds of Φ(x) map to the three levels, log-linear within each."""
-        share = 3 * _normal_cdf(latent)
-        level = min(int(share), 2)
-        low = (self.extremes[0], *(t * math.sqrt(GAP) for t in self.thresholds))[level]
-        high = (*(t / math.sqrt(GAP) for t in self.thresholds), self.extremes[1])[level]
-        return low * (high / low) ** (share - level)
-
-    def level(self, value: float) -> int:
-        """0, 1 or 2: how many thresholds the value has reached."""
-        return bisect.bisect_right(self.thresholds, value)
-
-
-HARDNESS = Property(
-    thresholds=HARDNESS_MPA,
-    extremes=(0.08, 200.0),
-    means=(0.35, 0.9, -0.7, -0.85, -0.2, 0.75, -0.5, 0.55, -0.3),
-    spread=0.82,
-)
-ROUGHNESS = Property(
-    thresholds=ROUGHNESS_MM,
-    extremes=(0.001, 0.16),
-    means=(-0.5, -0.3, 0.95, 0.3, -0.4, -1.05, 0.4, 0.7, -0.1),
-    spread=0.82,
-)
-PROTRUSION = Property(
-    thresholds=PROTRUSION_MM,
-    extremes=(0.015, 1.6),
-    means=(0.45, 0.1, -0.3, 0.95, -0.9, -0.7, -0.45, 0.15, 0.7),
-    spread=0.82,
-)
-PROPERTIES = {"hardness": HARDNESS, "roughness": ROUGHNESS, "protrusion": PROTRUSION}
+GRADE_MM = (8.0, 16.0)
+"""Range of the half width over which a graded object changes."""
 
 PATTERNS = ("bumps", "ridges", "plateaus")
 """Shapes of the surface features."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Variation:
+    """How an object changes over its surface: its values on the far side of a line, and the line.
+
+        share of the far side at r = ½ + ½ tanh((r · (cos φ, sin φ) − offset) / width),
+
+    r in mm from the object's centre, φ = `direction_rad`.  Properties change geometrically with the share: a narrow
+    line is a seam between two parts, a wide one a gradient.
+    """
+
+    direction_rad: float
+    offset_mm: float
+    width_mm: float
+    modulus_mpa: float
+    rms_mm: float
+    feature_height_mm: float
+
+    def share(self, site_mm: np.ndarray) -> float:
+        """Share of the far side at a point [2] (x, y), in 0..1."""
+        along = site_mm[0] * math.cos(self.direction_rad) + site_mm[1] * math.sin(self.direction_rad)
+        return 0.5 + 0.5 * math.tanh((along - self.offset_mm) / self.width_mm)
+
+
+VARYING = ("modulus_mpa", "rms_mm", "feature_height_mm")
+"""Fields of `Solid` that a `Variation` changes, in the order of `PROPERTIES`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,7 +55,8 @@ class Solid:
 
     Curvature is R₁, R₂ along two axes, one turned by `turn_rad`.  Roughness is a sum of plane waves
     Σ a cos(k·r + φ): `wave_numbers` [K, 2] rad/mm, `wave_amplitudes_mm` [K], `wave_phases_rad` [K].
-    `looks_like` is the material that the object appears to be made of.
+    `looks_like` is the material that the object appears to be made of.  `energy_returned` and `friction` are what
+    unloading and sliding feel.  Where the object varies, modulus, rms and height are those of its near side.
     """
 
     material: int
@@ -100,35 +73,87 @@ class Solid:
     wave_numbers: np.ndarray
     wave_amplitudes_mm: np.ndarray
     wave_phases_rad: np.ndarray
+    energy_returned: float
+    friction: float
+    variation: Variation | None = None
 
     def labels(self) -> dict[str, int]:
-        """Level of every attribute."""
-        return {
-            "hardness": HARDNESS.level(self.modulus_mpa),
-            "roughness": ROUGHNESS.level(self.rms_mm),
-            "protrusion": PROTRUSION.level(self.feature_height_mm),
-            "material": self.material,
+        """Level of every attribute of the schema; unknown where the sides of the object differ in it."""
+        return {name: level for name, level in self.levels().items() if name not in DYNAMIC} | {
+            "material": self.material
         }
 
+    def levels(self) -> dict[str, int]:
+        """Level of all five ordinal properties; unknown where the sides of the object differ in it."""
+        near = self._levels()
+        if self.variation is None:
+            return near
+        v = self.variation
+        far = dataclasses.replace(
+            self, modulus_mpa=v.modulus_mpa, rms_mm=v.rms_mm, feature_height_mm=v.feature_height_mm
+        )._levels()
+        return {name: level if far[name] == level else UNKNOWN for name, level in near.items()}
+
+    def at(self, site_mm: np.ndarray) -> "Solid":
+        """The object as it is at a point [2] (x, y) of its surface, everywhere."""
+        if self.variation is None:
+            return self
+        share = self.variation.share(site_mm)
+        far = _far_side(self.variation)
+        modulus, rms, height = (getattr(self, name) ** (1 - share) * far[name] ** share for name in VARYING)
+        amplitudes = (self.wave_amplitudes_mm * (rms / self.rms_mm)).astype(np.float32)
+        return dataclasses.replace(
+            self,
+            modulus_mpa=modulus,
+            rms_mm=rms,
+            wave_amplitudes_mm=amplitudes,
+            feature_height_mm=height,
+            variation=None,
+        )
+
     def truth(self) -> dict[str, float]:
-        """The quantities behind the labels."""
-        names = ("modulus_mpa", "rms_mm", "feature_height_mm", "feature_pitch_mm", "radius_1_mm", "radius_2_mm")
-        return {name: float(getattr(self, name)) for name in names}
+        """The quantities behind the levels."""
+        body = ("feature_pitch_mm", "radius_1_mm", "radius_2_mm", "energy_returned", "friction")
+        found = {name: float(getattr(self, name)) for name in (*VARYING, *body)}
+        if self.variation is None:
+            return found
+        return found | {f"far_{name}": value for name, value in _far_side(self.variation).items()}
+
+    def _levels(self) -> dict[str, int]:
+        values = (self.modulus_mpa, self.rms_mm, self.feature_height_mm, self.energy_returned, self.friction)
+        return {name: p.level(v) for (name, p), v in zip((PROPERTIES | DYNAMIC).items(), values, strict=True)}
 
 
-def sample(rng: np.random.Generator, lie_share: float, shortest_wave_mm: float) -> Solid:
+def sample(
+    rng: np.random.Generator,
+    lie_share: float,
+    shortest_wave_mm: float,
+    part_share: float = 0.0,
+    graded_share: float = 0.0,
+) -> Solid:
     """Draw an object.
 
     Args:
-      rng: source of randomness.
-      lie_share: probability that the object looks like another material, one with other typical levels.
-      shortest_wave_mm: shortest wave of the roughness, what the contact grid resolves.
+      rng: source of randomness; what came to the objects later is drawn from a child of it, so that it left the rest
+        as it was.
+      lie_share: probability that the object looks like a material that it is not made of.
+      shortest_wave_mm: of the roughness, what the contact grid resolves.
+      part_share, graded_share: probabilities that the object has two parts, and that it is graded.
+
+    Raises:
+      ValueError: shares that are negative or sum to more than 1.
     """
+    if min(part_share, graded_share) < 0 or part_share + graded_share > 1:
+        raise ValueError(
+            f"part_share, graded_share are {part_share}, {graded_share}: must be ≥ 0 and sum to at most 1; lower them"
+        )
     material = int(rng.integers(len(MATERIALS)))
     latent = {name: p.means[material] + p.spread * rng.standard_normal() for name, p in PROPERTIES.items()}
     rms = ROUGHNESS.value(latent["roughness"])
     lies = rng.random() < lie_share
     numbers, amplitudes, phases = rough_waves(rng, rms, shortest_wave_mm)
+    later = rng.spawn(1)[0]
+    dynamic = {name: p.draw(material, later) for name, p in DYNAMIC.items()}
     return Solid(
         material=material,
         looks_like=int(rng.choice(lie_materials(material))) if lies else material,
@@ -144,7 +169,28 @@ def sample(rng: np.random.Generator, lie_share: float, shortest_wave_mm: float) 
         wave_numbers=numbers,
         wave_amplitudes_mm=amplitudes,
         wave_phases_rad=phases,
+        energy_returned=dynamic["elasticity"],
+        friction=dynamic["friction"],
+        variation=_variation(material, later, part_share, graded_share),
     )
+
+
+def _variation(material: int, rng: np.random.Generator, part_share: float, graded_share: float) -> Variation | None:
+    """Another specimen of the same material on the far side, or none."""
+    kind = rng.random()
+    if kind >= part_share + graded_share:
+        return None
+    far = {field: p.draw(material, rng) for field, p in zip(VARYING, PROPERTIES.values(), strict=True)}
+    return Variation(
+        direction_rad=rng.uniform(0, 2 * np.pi),
+        offset_mm=rng.uniform(-4, 4),
+        width_mm=SEAM_MM if kind < part_share else rng.uniform(*GRADE_MM),
+        **far,
+    )
+
+
+def _far_side(variation: Variation) -> dict[str, float]:
+    return {name: float(getattr(variation, name)) for name in VARYING}
 
 
 def rough_waves(
@@ -179,17 +225,6 @@ def lie_materials(material: int) -> list[int]:
         return sum(a != b for a, b in zip(own, typical_levels(other), strict=True))
 
     return [other for other in range(len(MATERIALS)) if differences(other) >= 2]
-
-
-def level_odds(prop: Property) -> np.ndarray:
-    """P(level | material) of a property, [9, 3], from the normal distribution of its latent."""
-    edges = np.array([-_TERTILE, _TERTILE])
-    below = np.array([[_normal_cdf((e - m) / prop.spread) for e in edges] for m in prop.means])
-    return np.stack([below[:, 0], below[:, 1] - below[:, 0], 1 - below[:, 1]], -1)
-
-
-def _normal_cdf(x: float) -> float:
-    return 0.5 * (1 + math.erf(x / math.sqrt(2)))
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

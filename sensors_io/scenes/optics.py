@@ -1,4 +1,4 @@
-"""What the camera behind the gel sees: one renderer per optical principle, all free of shadows.
+"""What the camera behind the gel sees: lamps over a gel, patterns on it, the camera's response.
 
 A renderer turns the deformed gel, sampled on the image grid, and the light of the unit into RGB [H, W, 3] in 0..1.
 Patterns are warped backwards: the picture at r shows the pattern at r − v, v = u − (u·∇)u, the second-order inverse of
@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
+
+Rgb = tuple[float, float, float]
 
 CAMERA_DISTANCE_MM = 25.0
 """From the pupil to the gel surface: indentation brings markers nearer, which magnifies them about the centre."""
@@ -35,12 +37,15 @@ class DeformedGel:
 
 @struct.dataclass
 class Light:
-    """Illumination of one unit at one time: overall exposure, gain of each of its three lights, printed pattern."""
+    """Illumination of one unit at one time: overall exposure, gain of each of its three lights, printed pattern.
+
+    The texture is that of the print or, where nothing is printed, the relative grain of the coating, per channel.
+    """
 
     exposure: Float[Array, ""]
     led_gain: Float[Array, "3"]
     pattern_shift_mm: Float[Array, "2"]
-    texture: Float[Array, "T T"]
+    texture: Float[Array, "*C T T"]
 
 
 def cubic_matrix(rows: int, columns: int) -> Array:
@@ -56,20 +61,13 @@ class Lamp:
     floor + peak · exp(−(x−x₀)²/2w_x² − (y−y₀)²/2w_y²) in window coordinates −1..1.
     """
 
-    colour: tuple[float, float, float]
+    colour: Rgb
     angle_deg: float
     floor: float
     peak: float = 0.0
     centre: tuple[float, float] = (0.0, 0.0)
     width: tuple[float, float] = (1.0, 1.0)
 
-
-MINI_LAMPS = (
-    Lamp(colour=(1, 0.04, 0.06), angle_deg=90, floor=0.16, peak=0.35, width=(0.9, 0.5)),
-    Lamp(colour=(0.04, 1, 0.08), angle_deg=210, floor=0.28, peak=0.10, width=(0.8, 0.9)),
-    Lamp(colour=(0.04, 0.10, 1), angle_deg=330, floor=0.22, peak=0.30, centre=(0, -0.2), width=(1.0, 0.65)),
-)
-"""Fitted by eye to the published background pictures of GelSight Minis and to presses of a ball."""
 
 SOFT_LAMPS = (
     Lamp(colour=(0.50, 0.24, 0.22), angle_deg=0, floor=0.35, peak=0.25, centre=(0.6, 0.0)),
@@ -84,16 +82,13 @@ WHITE_LAMPS = (
 )
 
 
-def photometric(gel: DeformedGel, light: Light) -> Float[Array, "H W 3"]:
-    """Marker-less gel under red, green and blue light from three sides (GelSight Mini)."""
-    return _shade(gel, light, MINI_LAMPS, slope_gain=2.0)
-
-
-def dots(gel: DeformedGel, light: Light, pitch_mm: float = 1.4, radius_mm: float = 0.28) -> Float[Array, "H W 3"]:
-    """Printed grid of dark dots over a softly lit gel (Xense)."""
-    skin = _shade(gel, light, SOFT_LAMPS, slope_gain=1.1)
+def dots(
+    gel: DeformedGel, light: Light, pitch_mm: tuple[float, float] = (19.4 / 14, 30.8 / 26), radius_mm: float = 0.28
+) -> Float[Array, "H W 3"]:
+    """Printed grid of dark dots over a softly lit gel (Xense): 14 × 26 on 19.4 × 30.8 mm."""
+    skin = shade(gel, light, SOFT_LAMPS, slope_gain=1.1)
     x, y = _pattern_coordinates(gel, light)
-    away = pitch_mm * jnp.hypot(x / pitch_mm - jnp.round(x / pitch_mm), y / pitch_mm - jnp.round(y / pitch_mm))
+    away = jnp.hypot(*(c - p * jnp.round(c / p) for c, p in zip((x, y), pitch_mm, strict=True)))
     softness = 0.5 * gel.spacing_mm
     ink = jax.nn.sigmoid((radius_mm - away) / softness)[..., None]
     return skin * (1 - 0.86 * ink)
@@ -101,7 +96,7 @@ def dots(gel: DeformedGel, light: Light, pitch_mm: float = 1.4, radius_mm: float
 
 def speckle(gel: DeformedGel, light: Light, contrast: float = 0.8) -> Float[Array, "H W 3"]:
     """Dense random pattern over a nearly white, evenly lit gel (DM-Tac)."""
-    skin = _shade(gel, light, WHITE_LAMPS, slope_gain=0.5)
+    skin = shade(gel, light, WHITE_LAMPS, slope_gain=0.5)
     size = light.texture.shape[0]
     x, y = _pattern_coordinates(gel, light)
     to_texel = (size - 1) / (1.5 * gel.window_mm)
@@ -119,14 +114,21 @@ def speckle_texture(rng: np.random.Generator, size: int, grain_texels: float) ->
 
 
 def expose(
-    image: Float[Array, "... H W 3"], noise: Float[Array, "... H W 3"], read_noise: float, shot_noise: float
-) -> Array:
-    """Camera response: noise of standard deviation read + shot √I for unit normal `noise`, clipped to uint8."""
-    noisy = image + (read_noise + shot_noise * jnp.sqrt(jnp.maximum(image, 0))) * noise
+    image: Float[Array, "... H W 3"],
+    noise: Float[Array, "... H W 3"],
+    read_noise: Rgb | float,
+    shot_noise: Rgb | float,
+) -> UInt8[Array, "... H W 3"]:
+    """Camera response: noise of standard deviation read + shot √I for unit normal `noise`, clipped to uint8.
+
+    Both are of one channel each, or one number for all three.
+    """
+    read, shot = jnp.asarray(read_noise, jnp.float32), jnp.asarray(shot_noise, jnp.float32)
+    noisy = image + (read + shot * jnp.sqrt(jnp.maximum(image, 0))) * noise
     return jnp.round(255 * jnp.clip(noisy, 0, 1)).astype(jnp.uint8)
 
 
-def _shade(gel: DeformedGel, light: Light, lamps: tuple[Lamp, ...], slope_gain: float) -> Float[Array, "H W 3"]:
+def shade(gel: DeformedGel, light: Light, lamps: tuple[Lamp, ...], slope_gain: float) -> Float[Array, "H W 3"]:
     """Sum over lamps of gain · flat-field light · (n_z + slope_gain (l + l³/5) − |n_t|²/4) · colour.
 
     l is the component of the in-plane normal n_t along the lamp, n_z its component out of the plane.

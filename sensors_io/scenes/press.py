@@ -1,4 +1,4 @@
-"""One press by one sensor, a single compiled program: skin → contact at every force → fields → pictures."""
+"""One contact by one sensor over time, a single compiled program: skin → pressure → traction → fields → pictures."""
 
 import dataclasses
 import functools
@@ -7,65 +7,52 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
-from sensors_io.scenes import contact, layer, optics, surface
+from sensors_io.scenes import contact, drag, failures, layer, motions, noise, readout, surface, traction
+from sensors_io.scenes.readout import Fields, Gel, Resampling, Unit
 from sensors_io.scenes.sensors import BODY, SensorModel
-
-FIELD_GRID = 20
-LOST_NODE_SHARE = 0.004
-"""Share of field nodes that a frame cannot read."""
 
 
 @struct.dataclass
-class Unit:
-    """One physical sensor: its gel's modulus relative to the model's, its light, the gains of its calibration."""
+class Path:
+    """What the hand does in each of F frames, in the gel's frame; the arrays are those of `motions.Plan`.
 
-    modulus_factor: Float[Array, ""]
-    light: optics.Light
-    lateral_gain: Float[Array, ""]
-    depth_gain: Float[Array, ""]
+    `force_n` is the elastic force, at which the contact is solved; 0 where nothing touches.
+    """
+
+    force_n: Float[Array, "F"]
+    slide_mm: Float[Array, "F 2"]
+    twist_rad: Float[Array, "F"]
+    tilt_rad: Float[Array, "F 2"]
 
 
 @struct.dataclass
 class Press:
-    """What is pressed: skin, pose, the object's effective modulus, the forces, the drift of exposure over the press."""
+    """What is touched: skin, pose, effective modulus and friction of the object, path, drift of exposure over it."""
 
     skin: surface.Skin
     pose: surface.Pose
     modulus_mpa: Float[Array, ""]
-    force_n: Float[Array, "F"]
+    friction: Float[Array, ""]
+    path: Path
     exposure_drift: Float[Array, ""]
 
 
 @struct.dataclass
-class Noise:
-    """Unit normal noise of one press, drawn on the host, where it is faster, and which field nodes are lost.
-
-    `pixels` is `None` without a camera; `nodes` is that of the fields' five channels, `plane` that of the depth field's
-    zero plane: offset and two slopes.
-    """
-
-    pixels: Float[Array, "F H W 3"] | None
-    nodes: Float[Array, "F 5 h w"]
-    plane: Float[Array, "F 3"]
-    lost: Bool[Array, "F h w"]
-
-
-@struct.dataclass
 class Recording:
-    """What comes out, F frames: pictures, fields on the 20 × 20 grid, and the solver's account of every frame.
+    """What comes out, F frames: pictures, fields on the 20 × 20 grid, load, and the solver's account of every frame.
 
-    `strain` is the greatest indentation over the gel's thickness; `border` says that contact reached the window's edge.
+    Force and moment act on the gel, about the window's centre.  `strain` is the greatest indentation over the gel's
+    thickness; `failures` are the bits of `failures.flags`.
     """
 
     frames: UInt8[Array, "F H W 3"] | None
-    deformation_mm: Float[Array, "F h w 2"]
-    shear_mm: Float[Array, "F h w 2"]
-    depth_mm: Float[Array, "F h w"]
-    valid: Bool[Array, "F h w"]
+    fields: Fields
+    force_n: Float[Array, "F 3"]
+    moment_nmm: Float[Array, "F 3"]
     strain: Float[Array, "F"]
-    border: Bool[Array, "F"]
+    failures: UInt32[Array, "F"]
     converged: Bool[Array, "F"]
     residual: Float[Array, "F"]
     iterations: Int[Array, "F"]
@@ -81,15 +68,14 @@ class Grid:
 
 @struct.dataclass
 class Kernels:
-    """Spectra of one gel on its padded contact grid [M, M//2 + 1], mm/MPa, and the resampling matrices."""
+    """Spectra of one gel on its padded contact grid, mm/MPa, and the resampling matrices."""
 
-    gel: Array
-    body: Array
-    marker_depth: Array
-    marker_x: Array
-    marker_y: Array
-    to_image: Array
-    to_field: Array
+    gel: Float[Array, "M K"]
+    body: Float[Array, "M K"]
+    gel_shear: traction.Compliance
+    body_shear: traction.Compliance
+    markers: traction.Response
+    resampling: Resampling
 
 
 def padded_size(grid: int, window_mm: float, thickness_mm: float) -> int:
@@ -102,156 +88,164 @@ def padded_size(grid: int, window_mm: float, thickness_mm: float) -> int:
 
 @functools.lru_cache(maxsize=16)
 def make_kernels(sensor: SensorModel, grid: Grid) -> Kernels:
-    """Host-side float64 kernels of a sensor, stored float32.
-
-    Odd kernels (lateral displacement) vanish at the Nyquist wave number, where they have no real representation.
-    """
+    """Host-side float64 kernels of a sensor, stored float32."""
     spacing = sensor.window_mm / grid.contact_grid
     size = padded_size(grid.contact_grid, sensor.window_mm, sensor.gel.thickness_mm)
-    q_y, q_x = layer.wave_numbers(size, spacing)
-    q = np.hypot(q_y, q_x)
-    markers = layer.depth_response(q, sensor.gel, sensor.marker_depth_mm or 0.0)
-    nyquist = np.pi / spacing * (1 - 1e-9)
-    odd = 1j * markers.lateral_pressure / np.where(q > 0, q, 1) * ((np.abs(q_y) < nyquist) & (q_x < nyquist))
+    q = np.hypot(*layer.wave_numbers(size, spacing))
     return Kernels(
         gel=jnp.asarray(layer.normal_compliance(q, sensor.gel), jnp.float32),
         body=jnp.asarray(layer.normal_compliance(q, BODY), jnp.float32),
-        marker_depth=jnp.asarray(markers.normal_pressure, jnp.float32),
-        marker_x=jnp.asarray(odd * q_x, jnp.complex64),
-        marker_y=jnp.asarray(odd * q_y, jnp.complex64),
-        to_image=optics.cubic_matrix(grid.image_px, grid.contact_grid),
-        to_field=jnp.asarray(_node_matrix(grid.contact_grid)),
+        gel_shear=traction.make_compliance(sensor.gel, size, spacing),
+        body_shear=traction.make_compliance(BODY, size, spacing),
+        markers=traction.make_response(sensor.gel, size, spacing, sensor.marker_depth_mm or 0.0),
+        resampling=readout.make_resampling(grid.contact_grid, grid.image_px),
     )
 
 
-def draw_noise(rng: np.random.Generator, frames: int, sensor: SensorModel, image_px: int) -> Noise:
-    """Noise of one press of F frames."""
-    cells = (FIELD_GRID, FIELD_GRID)
-    shape = (frames, image_px, image_px, 3)
-    return Noise(
-        pixels=jnp.asarray(rng.standard_normal(shape, np.float32)) if sensor.render is not None else None,
-        nodes=jnp.asarray(rng.standard_normal((frames, 5, *cells), np.float32)),
-        plane=jnp.asarray(rng.standard_normal((frames, 3), np.float32)),
-        lost=jnp.asarray(rng.random((frames, *cells), np.float32) < LOST_NODE_SHARE),
-    )
-
-
-@functools.partial(jax.jit, static_argnames=("sensor", "grid"))
+@functools.partial(jax.jit, static_argnames=("sensor", "grid", "moving"))
 def record(
     press: Press,
     unit: Unit,
     kernels: Kernels,
-    noise: Noise,
+    key: UInt32[Array, "2"],
     sensor: SensorModel,
     grid: Grid,
     tolerance: float = contact.TOLERANCE,
     max_iterations: int = contact.MAX_ITERATIONS,
+    *,
+    moving: bool = False,
 ) -> Recording:
-    """Press, measure and photograph.
+    """Touch, measure and photograph.
 
     Args:
-      press: what is pressed, with F forces, N.
+      press: what is touched, with a path of F frames.
       unit: the physical sensor.
       kernels: `make_kernels(sensor, grid)`.
-      noise: `draw_noise`.
+      key: of all noise, `noise.key`.
       sensor: the sensor type.
       grid: sizes.
       tolerance: of the contact solver.
       max_iterations: its cap, past which `converged` is false.
+      moving: whether the object slides, twists or rolls.  Without, it is taken to stand where it was put, and what
+        little traction the spreading gel feels is left out.
     """
-    spacing = sensor.window_mm / grid.contact_grid
-    x = (jnp.arange(grid.contact_grid, dtype=jnp.float32) + 0.5) * spacing - sensor.window_mm / 2
-    gap = surface.gap(press.skin, press.pose, x)
-    gel, body = kernels.gel / unit.modulus_factor, kernels.body / press.modulus_mpa
+    scene = _Scene(press, unit, kernels, sensor, grid, (tolerance, max_iterations))
+    count = press.path.force_n.shape[0]
+    exposure = 1 + press.exposure_drift * jnp.arange(count) / max(count - 1, 1)
+    keys = jax.vmap(noise.fold, (None, 0))(key, jnp.arange(count))
+    if not moving:
+        gap = scene.gap(jax.tree.map(lambda leaf: leaf[0], press.path))
 
-    def solve(force: Array) -> contact.Contact:
-        return contact.solve(gap, force, gel, body, spacing, tolerance, max_iterations)
+        def press_on(frame: tuple[Path, Array, Array]) -> Recording:
+            path, exposure, key = frame
+            return scene.see(scene.solve(gap, path.force_n), None, exposure, key)
 
-    solved = jax.lax.map(solve, press.force_n)
-    plane = _marker_plane(solved, kernels, unit, sensor)
-    deformation, shear, depth = _measure(plane, unit, kernels, noise, sensor)
-    edge = jnp.ones(gap.shape, bool).at[1:-1, 1:-1].set(False)
-    return Recording(
-        frames=_photograph(solved.displacement_mm, plane, press, unit, kernels, noise, sensor),
-        deformation_mm=deformation,
-        shear_mm=shear,
-        depth_mm=depth,
-        valid=~noise.lost,
-        strain=jnp.max(solved.displacement_mm, (1, 2)) / sensor.gel.thickness_mm,
-        border=jnp.any((solved.pressure_mpa > 0) & edge, (1, 2)),
-        converged=solved.converged,
-        residual=solved.residual,
-        iterations=solved.iterations,
-    )
+        return jax.lax.map(press_on, (press.path, exposure, keys))
+
+    def move_on(history: drag.History, frame: tuple[Path, Array, Array, drag.Step]) -> tuple[drag.History, Recording]:
+        path, exposure, key, step = frame
+        solved = scene.solve(scene.gap(path), path.force_n)
+        history, dragged = scene.drag(history, solved, step)
+        seen = scene.see(solved, dragged.traction_mpa, exposure, key)
+        return history, dataclasses.replace(seen, converged=seen.converged & dragged.converged)
+
+    inputs = (press.path, exposure, keys, _steps(press))
+    return jax.lax.scan(move_on, drag.at_rest(grid.contact_grid), inputs)[1]
 
 
-def _marker_plane(solved: contact.Contact, kernels: Kernels, unit: Unit, sensor: SensorModel) -> Array:
-    """Displacement (x, y, depth) of the marker plane, [F, 3, N, N]; a gel without markers has only its surface."""
-    if sensor.marker_depth_mm is None:
-        still = jnp.zeros_like(solved.displacement_mm)
-        return jnp.stack([still, still, solved.displacement_mm], 1)
-    spectra = jnp.stack([kernels.marker_x, kernels.marker_y, kernels.marker_depth.astype(jnp.complex64)])
+@dataclasses.dataclass(frozen=True)
+class _Scene:
+    """One sensor over one object, while it is traced; `limits` are tolerance and cap of the contact solver."""
 
-    def respond(p: Array) -> Array:
-        n, m = p.shape[0], spectra.shape[1]
-        return jnp.fft.irfft2(jnp.fft.rfft2(p, s=(m, m)) * spectra, s=(m, m))[:, :n, :n] / unit.modulus_factor
+    press: Press
+    unit: Unit
+    kernels: Kernels
+    sensor: SensorModel
+    grid: Grid
+    limits: tuple[float, int]
 
-    return jax.lax.map(respond, solved.pressure_mpa)
+    @property
+    def spacing(self) -> float:
+        return self.sensor.window_mm / self.grid.contact_grid
 
+    @property
+    def x(self) -> Array:
+        """Pixel centres along both axes."""
+        return (jnp.arange(self.grid.contact_grid, dtype=jnp.float32) + 0.5) * self.spacing - self.sensor.window_mm / 2
 
-def _photograph(
-    depth: Array, plane: Array, press: Press, unit: Unit, kernels: Kernels, noise: Noise, sensor: SensorModel
-) -> Array | None:
-    """Pictures [F, H, W, 3] uint8, `None` without a camera."""
-    render = sensor.render
-    if render is None or noise.pixels is None:
-        return None
-    frames = depth.shape[0]
-    progress = jnp.arange(frames) / max(frames - 1, 1)
+    def gap(self, at: Path) -> Array:
+        """Distance of the undeformed skin from the gel in one frame."""
+        pose = motions.moved(self.press.pose, at.slide_mm, at.twist_rad, at.tilt_rad)
+        return surface.gap(self.press.skin, pose, self.x)
 
-    def one(scene: tuple[Array, Array, Array, Array]) -> Array:
-        depth, plane, progress, pixels = scene
-        up = functools.partial(_resample, kernels.to_image)
-        gel = optics.DeformedGel(
-            depth_mm=up(depth),
-            marker_x_mm=up(plane[0]),
-            marker_y_mm=up(plane[1]),
-            marker_depth_mm=up(plane[2]),
-            window_mm=sensor.window_mm,
+    def solve(self, gap: Array, force_n: Array) -> contact.Contact:
+        """The normal contact; without force nothing is pressed and nothing can fail."""
+        gel, body = self.kernels.gel / self.unit.modulus_factor, self.kernels.body / self.press.modulus_mpa
+        touches = force_n > 0
+        iterations = jnp.where(touches, self.limits[1], 0)
+        force = jnp.where(touches, force_n, 1.0)
+        thickness = self.sensor.gel.thickness_mm
+        solved = contact.solve(gap, force, gel, body, self.spacing, self.limits[0], iterations, thickness_mm=thickness)
+        return dataclasses.replace(
+            solved,
+            pressure_mpa=jnp.where(touches, solved.pressure_mpa, 0),
+            displacement_mm=jnp.where(touches, solved.displacement_mm, 0),
+            converged=solved.converged | ~touches,
+            strain=jnp.where(touches, solved.strain, 0),
         )
-        exposure = unit.light.exposure * (1 + press.exposure_drift * progress)
-        light = dataclasses.replace(unit.light, exposure=exposure)
-        return optics.expose(render(gel, light), pixels, sensor.read_noise, sensor.shot_noise)
 
-    return jax.lax.map(one, (depth, plane, progress, noise.pixels))
+    def drag(self, history: drag.History, solved: contact.Contact, step: drag.Step) -> tuple[drag.History, drag.Frame]:
+        """The traction of this frame."""
+        series = traction.in_series(
+            self.kernels.gel_shear, self.kernels.body_shear, self.unit.modulus_factor, self.press.modulus_mpa
+        )
+        bodies = drag.Bodies(compliance=series, coupling=None, response=self.kernels.markers)
+        return drag.advance(history, solved.pressure_mpa, self.press.friction, step, bodies, self.x)
+
+    def see(self, solved: contact.Contact, slip: Array | None, exposure: Array, key: Array) -> Recording:
+        """Everything that is recorded of one frame under pressure and traction."""
+        gel = self._gel(solved, slip)
+        carried = jnp.zeros(solved.pressure_mpa.shape, jnp.complex64) if slip is None else slip
+        force, moment = traction.resultant(solved.pressure_mpa, carried, self.x, self.spacing)
+        picture = readout.photograph(gel, self.unit, exposure, self.kernels.resampling, key, self.sensor)
+        fields = readout.measure(gel, self.unit, self.kernels.resampling, key, self.sensor)
+        failed = failures.flags(
+            saturated=jnp.zeros((), bool) if picture is None else failures.saturated(picture),
+            marker_loss=failures.marker_loss(fields.valid),
+            border_contact=failures.border_contact(solved.pressure_mpa),
+        )
+        return Recording(
+            frames=picture,
+            fields=fields,
+            force_n=force,
+            moment_nmm=moment,
+            strain=solved.strain,
+            failures=failed,
+            converged=solved.converged,
+            residual=solved.residual,
+            iterations=solved.iterations,
+        )
+
+    def _gel(self, solved: contact.Contact, slip: Array | None) -> Gel:
+        depth, pressure, response = solved.displacement_mm, solved.pressure_mpa, self.kernels.markers
+        still = jnp.zeros(depth.shape, jnp.complex64)
+        if self.sensor.marker_depth_mm is None:
+            return Gel(depth_mm=depth, marker_depth_mm=depth, markers_mm=still, shear_mm=still)
+        if slip is None:
+            along = traction.lateral_displacement(pressure, response.lateral)
+            into, sheared = contact.convolve(pressure, response.depth), still
+        else:
+            along, into = traction.displacement(pressure, slip, response)
+            sheared = traction.shear_displacement(slip, response.shear)
+        softer = 1 / self.unit.modulus_factor
+        return Gel(depth_mm=depth, marker_depth_mm=into * softer, markers_mm=along * softer, shear_mm=sheared * softer)
 
 
-def _measure(
-    plane: Array, unit: Unit, kernels: Kernels, noise: Noise, sensor: SensorModel
-) -> tuple[Array, Array, Array]:
-    """Deformation, shear and depth as the sensor reports them: with its gains, drifting zero, noise and lost nodes.
-
-    No tangential load acts, so the shear field holds noise alone.
-    """
-    nodes = _resample(kernels.to_field, plane)  # [F, 3, h, w]
-    deformation = nodes[:, :2] * unit.lateral_gain + sensor.lateral_noise_mm * noise.nodes[:, :2]
-    shear = sensor.lateral_noise_mm * noise.nodes[:, 2:4]
-    x = jnp.linspace(-1, 1, FIELD_GRID)
-    offset, slope_x, slope_y = 0.5 * sensor.depth_noise_mm * noise.plane.T[..., None, None]
-    zero = offset + slope_x * x + slope_y * x[:, None]
-    depth = nodes[:, 2] * unit.depth_gain + zero + sensor.depth_noise_mm * noise.nodes[:, 4]
-    deformation, shear = (jnp.where(noise.lost[..., None], 0, jnp.moveaxis(f, 1, -1)) for f in (deformation, shear))
-    return deformation, shear, jnp.where(noise.lost, 0, depth)
-
-
-def _resample(matrix: Array, field: Array) -> Array:
-    return matrix @ field @ matrix.T
-
-
-def _node_matrix(grid: int) -> np.ndarray:
-    """Linear interpolation from pixel centres to the centres of FIELD_GRID cells, [h, N] float32."""
-    at = np.clip((np.arange(FIELD_GRID) + 0.5) * grid / FIELD_GRID - 0.5, 0, grid - 1)
-    return np.maximum(1 - np.abs(at[:, None] - np.arange(grid)), 0).astype(np.float32)
+def _steps(press: Press) -> drag.Step:
+    """Motion of every frame since the one before."""
+    path = press.path
+    slide, twist = (jnp.diff(a, axis=0, prepend=jnp.zeros_like(a[:1])) for a in (path.slide_mm, path.twist_rad))
+    return drag.Step(slide_mm=slide, twist_rad=twist, centre_mm=press.pose.offset_mm + path.slide_mm)
 
 
 def _is_smooth(size: int) -> bool:

@@ -5,14 +5,29 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from sensors_io.scenes.objects import Solid
+from sensors_io.scenes.objects import Solid, Variation
+
+
+@struct.dataclass
+class Seam:
+    """How relief and roughness change over the skin: factors of their far side, and the line of `objects.Variation`.
+
+    The line lies `offset_mm` from the site, along `direction_rad`.
+    """
+
+    relief_factor: Float[Array, ""]
+    roughness_factor: Float[Array, ""]
+    direction_rad: Float[Array, ""]
+    offset_mm: Float[Array, ""]
+    width_mm: Float[Array, ""]
 
 
 @struct.dataclass
 class Skin:
     """Shape of one object at one contact site, in the object's frame; the fields are those of `Solid`.
 
-    `site_mm` is the point of the relief and of the roughness that comes to lie at the apex.
+    `site_mm` is the point of the relief and of the roughness that comes to lie at the apex.  `seam` is `None` where the
+    object is the same everywhere.
     """
 
     curvature_per_mm: Float[Array, "2"]
@@ -25,6 +40,7 @@ class Skin:
     wave_numbers: Float[Array, "K 2"]
     wave_amplitudes_mm: Float[Array, "K"]
     wave_phases_rad: Float[Array, "K"]
+    seam: Seam | None = None
 
 
 @struct.dataclass
@@ -53,13 +69,29 @@ def make_skin(solid: Solid, site_mm: np.ndarray, curvature_factor: float) -> Ski
         wave_numbers=f(solid.wave_numbers),
         wave_amplitudes_mm=f(solid.wave_amplitudes_mm),
         wave_phases_rad=f(solid.wave_phases_rad),
+        seam=None if solid.variation is None else _seam(solid, solid.variation, site_mm),
     )
+
+
+def _seam(solid: Solid, variation: Variation, site_mm: np.ndarray) -> Seam:
+    direction = variation.direction_rad
+    along = site_mm[0] * np.cos(direction) + site_mm[1] * np.sin(direction)
+    numbers = {
+        "relief_factor": variation.feature_height_mm / solid.feature_height_mm,
+        "roughness_factor": variation.rms_mm / solid.rms_mm,
+        "direction_rad": direction,
+        "offset_mm": variation.offset_mm - along,
+        "width_mm": variation.width_mm,
+    }
+    return Seam(**{name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
 
 
 def gap(skin: Skin, pose: Pose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
     """Distance of the undeformed skin from the flat gel on the grid [y, x] of `x_mm` × `x_mm`, least value 0.
 
     z = A²/2R₁ + B²/2R₂ − height · pattern(A, B) + Σ a cos(k·r + φ) + tilt · r
+
+    Over a seam, height and a change by the power of their factors that is the share of the far side.
     """
     turn = pose.turn_rad
     x, y = x_mm[None, :] - pose.offset_mm[0], x_mm[:, None] - pose.offset_mm[1]
@@ -67,7 +99,12 @@ def gap(skin: Skin, pose: Pose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
     body = (skin.curvature_per_mm[0] * a**2 + skin.curvature_per_mm[1] * b**2) / 2
     site_a, site_b = _turned(skin.site_mm[0], skin.site_mm[1], skin.turn_rad)
     relief = _relief(skin, a + site_a, b + site_b)
-    z = body - skin.feature_height_mm * relief + _roughness(skin, pose, x_mm) + pose.tilt[0] * x + pose.tilt[1] * y
+    roughness = _roughness(skin, pose, x_mm)
+    if skin.seam is not None:
+        far, _ = _turned(x, y, turn + skin.seam.direction_rad)
+        share = 0.5 + 0.5 * jnp.tanh((far - skin.seam.offset_mm) / skin.seam.width_mm)
+        relief, roughness = relief * skin.seam.relief_factor**share, roughness * skin.seam.roughness_factor**share
+    z = body - skin.feature_height_mm * relief + roughness + pose.tilt[0] * x + pose.tilt[1] * y
     return z - jnp.min(z)
 
 

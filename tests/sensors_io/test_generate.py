@@ -1,8 +1,13 @@
 """Generated scenes become records once, and an interrupted generation goes on."""
 
+import signal
+import subprocess
+import sys
+
 import pytest
 
 from sensors_io import generate
+from sensors_io.codec import encode_sequence
 from sensors_io.records import IncompleteRecordsError, RecordsExistError, RecordStore
 from sensors_io.scenes import SceneConfig
 from tests.sensors_io import fakes
@@ -19,7 +24,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(generate, "object_cards", lambda config: [fakes.card(n) for n in range(config.objects)])
     monkeypatch.setattr(generate, "contacts", contacts)
-    monkeypatch.setattr(generate, "CONTACTS_PER_SHARD", 2)
+    monkeypatch.setattr(generate, "RECORDS_PER_SHARD", 64)
     return starts
 
 
@@ -56,3 +61,72 @@ def test_another_config_does_not_mix_in(tmp_path, asked):
     generate.generate_records(CONFIG, tmp_path)
     with pytest.raises(RecordsExistError, match="was made by config"):
         generate.generate_records(SceneConfig(objects=5, sites=1, seed=1), tmp_path)
+
+
+_CHILD = """
+import dataclasses, os, pathlib, signal, sys, types
+from tests.sensors_io import fakes
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    contact_count: int = 7
+    frame_count: int = 8
+
+scenes = types.ModuleType("sensors_io.scenes")  # without JAX, which takes seconds to import
+scenes.SceneConfig, scenes.config_hash = SceneConfig, str
+scenes.object_cards = lambda config: [fakes.card(n) for n in range(config.contact_count)]
+scenes.contacts = lambda config, start=0: (
+    [fakes.sequence(i, "xense"), fakes.sequence(i, "tac3d")] for i in range(start, config.contact_count)
+)
+sys.modules["sensors_io.scenes"] = scenes
+from sensors_io import generate, index, shards
+
+out, place, count = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+generate.RECORDS_PER_SHARD = 64
+seen = 0
+
+def die(at):
+    global seen
+    seen += at == place
+    if seen == count:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+def killing(owner, name, before, after):
+    method = getattr(owner, name)
+    def call(*args, **kwargs):
+        die(before)
+        result = method(*args, **kwargs)
+        die(after)
+        return result
+    setattr(owner, name, call)
+
+killing(shards.ShardWriter, "write", "before write", "after write")
+killing(shards.ShardWriter, "publish", "before publish", "after publish")
+killing(index.Index, "write", "before index", "after index")
+killing(os, "fsync", "before sync", "after sync")
+generate.generate_records(SceneConfig(), out)
+"""
+
+
+def _generate(out, place="nowhere", count=1):
+    command = [sys.executable, "-c", _CHILD, str(out), place, str(count)]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120).returncode
+
+
+def test_kill_9_at_five_places_changes_no_byte(tmp_path):
+    """Inside a shard, before and after it is published, inside the index, after it: the files come out the same."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert _generate(whole) == 0
+    places = [("after write", 10), ("before publish", 2), ("after publish", 2), ("before sync", 4), ("after index", 1)]
+    for place, count in places:
+        assert _generate(killed, place, count) == -signal.SIGKILL, place
+        assert not (killed / "index.json").exists() or not RecordStore(killed, allow_incomplete=True).complete
+    assert _generate(killed) == 0
+    assert RecordStore(killed).contacts == RecordStore(whole).contacts
+    for i in range(len(RecordStore(whole))):
+        for sensor, sequence in RecordStore(whole).contact(i).items():
+            assert encode_sequence(RecordStore(killed).contact(i)[sensor]) == encode_sequence(sequence)
+    names = sorted(f.name for f in whole.glob("contacts-*"))
+    assert names == sorted(f.name for f in killed.glob("contacts-*"))
+    for name in names:
+        assert (killed / name).read_bytes() == (whole / name).read_bytes()

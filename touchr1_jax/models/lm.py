@@ -22,11 +22,11 @@ class DecoderConfig:
 
     vocab_size: int
     hidden_size: int = 96
-    num_layers: int = 3
+    num_layers: int = 2
     num_heads: int = 3
     num_kv_heads: int = 1
     head_dim: int = 32
-    intermediate_size: int = 256
+    intermediate_size: int = 192
     mrope_section: tuple[int, int, int] = (4, 6, 6)
     rope_theta: float = 1e4
     tie_embedding: bool = True

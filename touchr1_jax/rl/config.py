@@ -13,12 +13,12 @@ class GRPOConfig:
     paper's learning rate for models trained from scratch, which stand still at 1e-6.
     """
 
-    prompts: int = 16
+    prompts: int = 32
     group: int = 8
     length: int = 20
-    micro_prompts: int = 4
+    micro_prompts: int = 8
     learning_rate: float = 1e-6
-    lr_scale: float = 100.0
+    lr_scale: float = 150.0
     max_grad_norm: float = 1.0
     clip_low: float = 0.2
     clip_high: float = 0.2

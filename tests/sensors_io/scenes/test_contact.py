@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.scenes import contact
+from sensors_io.scenes import contact, spg
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes.objects import rough_waves
@@ -53,12 +53,14 @@ def _check_finite(solved: contact.Contact) -> None:
 
 @functools.cache
 def _hertz_presses(points: int = 64, radius: float = 8.0, modulus: float = 0.4) -> list[tuple[Hertz, contact.Contact]]:
+    """Spheres whose apex lies on a pixel, with contact radii of 4 to 16 pixels."""
     spacing = WINDOW_MM / points
-    x = (np.arange(points) + 0.5) * spacing - WINDOW_MM / 2
+    x = (np.arange(points) - points // 2) * spacing
     gap = jnp.asarray((x[None] ** 2 + x[:, None] ** 2) / (2 * radius), jnp.float32)
     kernel = jnp.asarray(half_space_spectrum(points, spacing, modulus), jnp.float32)
     presses = []
-    for force in (0.2, 1.0, 5.0):
+    for pixels in (4, 6, 8, 12, 16):
+        force = 4 * modulus * (pixels * spacing) ** 3 / (3 * radius)
         solved = contact.solve(gap, force, kernel, jnp.zeros_like(kernel), spacing, 1e-5)
         presses.append((Hertz(radius_mm=radius, plane_modulus_mpa=modulus, force_n=force), jax.device_get(solved)))
     return presses
@@ -67,18 +69,18 @@ def _hertz_presses(points: int = 64, radius: float = 8.0, modulus: float = 0.4) 
 def test_half_space_reproduces_hertz() -> None:
     for hertz, solved in _hertz_presses():
         assert solved.converged
-        np.testing.assert_allclose(solved.approach_mm, hertz.approach_mm, rtol=0.01)
-        np.testing.assert_allclose(solved.pressure_mpa.max(), hertz.peak_pressure_mpa, rtol=0.04)
+        np.testing.assert_allclose(solved.approach_mm, hertz.approach_mm, rtol=0.002)
+        np.testing.assert_allclose(solved.pressure_mpa.max(), hertz.peak_pressure_mpa, rtol=0.01)
         points = solved.pressure_mpa.shape[0]
-        x = (np.arange(points) + 0.5) * WINDOW_MM / points - WINDOW_MM / 2
+        x = (np.arange(points) - points // 2) * WINDOW_MM / points
         u = hertz.displacement_mm(np.hypot(x[None], x[:, None]))
-        np.testing.assert_allclose(solved.displacement_mm, u, atol=0.02 * u.max())
+        np.testing.assert_allclose(solved.displacement_mm, u, atol=0.01 * u.max())
 
 
 def test_force_grows_with_depth_to_the_power_three_halves() -> None:
     force = [h.force_n for h, _ in _hertz_presses()]
     depth = [float(c.approach_mm) for _, c in _hertz_presses()]
-    assert np.polyfit(np.log(depth), np.log(force), 1)[0] == pytest.approx(1.5, abs=0.01)
+    assert np.polyfit(np.log(depth), np.log(force), 1)[0] == pytest.approx(1.5, abs=0.002)
 
 
 def test_hertz_closed_form_balances_its_force_and_is_continuous() -> None:
@@ -118,13 +120,13 @@ def test_agrees_with_the_float64_reference(name: str) -> None:
     gel, body = _spectrum(GEL), _spectrum(BODY) / modulus
     reference = solve_reference(gap, force, gel + body, SPACING)
     u = convolve(reference.pressure_mpa, gel)
-    for tolerance, u_error, p_error in ((1e-3, 1e-2, 0.05), (2e-5, 2e-4, 1e-3)):
+    for tolerance, u_error, p_error in ((1e-3, 2e-3, 0.05), (2e-5, 4e-5, 1e-3)):
         solved = _solve(gap, force, gel, body, tolerance=tolerance)
         assert solved.converged
         assert np.linalg.norm(solved.displacement_mm - u) < u_error * np.linalg.norm(u)
         p = reference.pressure_mpa
         assert np.linalg.norm(solved.pressure_mpa - p) < p_error * np.linalg.norm(p)
-        assert solved.approach_mm == pytest.approx(reference.approach_mm, rel=u_error)
+        assert solved.approach_mm == pytest.approx(reference.approach_mm, rel=max(u_error, 1e-4))
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -189,11 +191,31 @@ def test_hard_cases_give_no_nan_and_an_honest_flag(name: str) -> None:
     _check_finite(solved)
     p = solved.pressure_mpa.astype(np.float64)
     assert p.sum() * SPACING**2 == pytest.approx(force, rel=1e-4)
-    w = convolve(p, compliance) + gap - gap.min()
-    g = w - w[p > 0].mean()
-    residual = (np.sum(p * np.abs(g)) / p.sum() + 0.1 * max(0.0, np.max(-g[p == 0], initial=0))) / w[p > 0].mean()
     assert bool(solved.converged) == (solved.residual < contact.TOLERANCE)
-    assert residual == pytest.approx(float(solved.residual), rel=0.1, abs=1e-4)
+    assert _residual(p, compliance, gap - gap.min()) == pytest.approx(float(solved.residual), rel=0.05, abs=2e-6)
+    u = convolve(solve_reference(gap, force, compliance, SPACING, 1e-8, 20_000).pressure_mpa, compliance)
+    assert np.linalg.norm(solved.displacement_mm - u) < 2 * max(solved.residual, 1e-6) * np.linalg.norm(u)
+
+
+def _residual(p: np.ndarray, compliance: np.ndarray, gap: np.ndarray) -> float:
+    """The residual in float64, from its definition."""
+    u = convolve(p, compliance)
+    g = u + gap - (u + gap)[p > 0].mean()
+    uneven = np.sqrt(np.sum(p * g**2) / p.sum())
+    return spg.ESTIMATE * (uneven + 0.1 * max(0.0, np.max(-g[p == 0], initial=0))) / (np.sum(p * u) / p.sum())
+
+
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [("pin", "small_strain"), ("thin gel", "small_strain"), ("very soft gel", "small_strain"),
+     ("few pixels at 1 mN", "resolved"), ("tilt", None), ("white noise", None), ("full pad", None)],
+)  # fmt: skip
+def test_what_the_theory_does_not_carry_is_flagged(name: str, broken: str | None) -> None:
+    gap, force, gel = HARD_CASES[name]
+    judged = _solve(gap, force, _spectrum(gel), thickness_mm=gel.thickness_mm).validity
+    kept = {"converged": judged.converged, "small_strain": judged.small_strain, "resolved": judged.resolved}
+    assert {n for n, ok in kept.items() if not ok} == ({broken} if broken else set())
+    assert bool(judged.all) == (broken is None)
 
 
 def test_the_cap_clears_converged() -> None:
@@ -205,9 +227,47 @@ def test_the_cap_clears_converged() -> None:
     assert solved.residual >= contact.TOLERANCE
 
 
-def test_a_pin_leaves_small_strain() -> None:
+def test_strain_is_the_greatest_displacement_over_the_thickness() -> None:
     gap, force, gel = HARD_CASES["pin"]
-    assert _solve(gap, force, _spectrum(gel)).displacement_mm.max() / gel.thickness_mm > 0.3
+    solved = _solve(gap, force, _spectrum(gel), thickness_mm=gel.thickness_mm)
+    assert solved.strain == pytest.approx(solved.displacement_mm.max() / gel.thickness_mm, rel=1e-6)
+    assert solved.strain > 1
+    assert _solve(gap, force, _spectrum(gel)).strain == 0  # a half-space
+
+
+def test_counts_its_work() -> None:
+    gap, modulus, force = SCENES["rough sphere"]
+    solved = _solve(gap, force, _spectrum(GEL), _spectrum(BODY) / modulus)
+    assert solved.convolutions == solved.iterations + 2
+    assert solved.coarse_iterations > 0
+    assert solved.tier == contact.Tier.SPG
+    idle = _solve(gap, force, _spectrum(GEL), _spectrum(BODY) / modulus, max_iterations=0)
+    assert (idle.iterations, idle.coarse_iterations) == (0, 0)
+
+
+def test_the_winkler_tier_says_that_it_is_off() -> None:
+    gap, modulus, force = SCENES["rough sphere"]
+    gel, body = (jnp.asarray(a, jnp.float32) for a in (_spectrum(GEL), _spectrum(BODY) / modulus))
+    rough = jax.device_get(contact.solve_winkler(jnp.asarray(gap, jnp.float32), force, gel, body, SPACING))
+    exact = _solve(gap, force, _spectrum(GEL), _spectrum(BODY) / modulus, tolerance=1e-5)
+    error = np.linalg.norm(rough.displacement_mm - exact.displacement_mm) / np.linalg.norm(exact.displacement_mm)
+    assert rough.tier == contact.Tier.WINKLER
+    assert not rough.converged
+    assert 0.3 * error < rough.residual < 5 * error
+
+
+@pytest.mark.parametrize(
+    ("gap", "spectrum", "message"),
+    [
+        (np.zeros((48, 40)), np.zeros((72, 37)), "gap_mm has shape"),
+        (np.zeros((47, 47)), np.zeros((72, 37)), "even N"),
+        (np.zeros((48, 48)), np.zeros((72, 36)), "gel has shape"),
+        (np.zeros((48, 48)), np.zeros((40, 21)), "M ≥ N = 48"),
+    ],
+)
+def test_refuses_what_does_not_fit(gap: np.ndarray, spectrum: np.ndarray, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _solve(gap, 1.0, spectrum)
 
 
 def test_mapped_equals_single() -> None:
@@ -218,10 +278,3 @@ def test_mapped_equals_single() -> None:
     mapped = jax.jit(lambda f: jax.lax.map(lambda one: contact.solve(z, one, gel, body, SPACING), f))(forces)
     single = _solve(gap, 8.0, gel, body)
     np.testing.assert_allclose(mapped.displacement_mm[1], single.displacement_mm, atol=2e-3)
-
-
-def test_winkler_start_carries_the_force() -> None:
-    p = contact.winkler_pressure(jnp.asarray(R2 / 16, jnp.float32), jnp.float32(9.0), jnp.float32(0.1))
-    assert float(p.sum()) == pytest.approx(9.0, rel=1e-5)
-    level = np.asarray(p / 0.1 + R2 / 16)[np.asarray(p) > 0]
-    np.testing.assert_allclose(level, level.mean(), rtol=1e-3)

@@ -1,13 +1,19 @@
 """Procedural objects: labels follow the thresholds, materials inform without deciding, skins move rigidly."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensors_io.scenes import appearance, objects, surface
-from sensors_io.schema import MATERIALS
+from sensors_io.scenes import appearance, objects, properties, surface
+from sensors_io.schema import MATERIALS, UNKNOWN
+
+ALL = {**properties.PROPERTIES, **properties.DYNAMIC}
+OLD = (7, 7, 1, 6.169470845, 0.106939634, 0.349118311, 2.499351735, 4.172926426)
+"""Material, apparent material, pattern, modulus, rms, height, turn and last phase of the first object ever drawn."""
 
 NEAR_GAP = 0.999  # values come this close to the edge of the gap around a threshold
 
@@ -16,20 +22,20 @@ def _sample(count: int, lie_share: float = 0.3) -> list[objects.Solid]:
     return [objects.sample(np.random.default_rng(i), lie_share, 0.8) for i in range(count)]
 
 
-@pytest.mark.parametrize("name", objects.PROPERTIES)
+@pytest.mark.parametrize("name", ALL)
 @given(latent=st.floats(-6, 6))
 def test_level_follows_the_thresholds(name: str, latent: float) -> None:
-    prop = objects.PROPERTIES[name]
+    prop = ALL[name]
     value = prop.value(latent)
     assert prop.extremes[0] <= value <= prop.extremes[1]
     assert prop.level(value) == sum(value >= t for t in prop.thresholds)
     for threshold in prop.thresholds:
-        assert abs(np.log(value / threshold)) >= NEAR_GAP * np.log(objects.GAP) / 2
+        assert abs(np.log(value / threshold)) >= NEAR_GAP * np.log(prop.gap) / 2
 
 
-@pytest.mark.parametrize("name", objects.PROPERTIES)
+@pytest.mark.parametrize("name", ALL)
 def test_values_grow_with_the_latent_on_both_sides_of_each_threshold(name: str) -> None:
-    prop = objects.PROPERTIES[name]
+    prop = ALL[name]
     values = np.array([prop.value(x) for x in np.linspace(-3, 3, 400)])
     assert np.all(np.diff(values) > 0)
     for threshold in prop.thresholds:
@@ -38,9 +44,9 @@ def test_values_grow_with_the_latent_on_both_sides_of_each_threshold(name: str) 
         assert np.any((near < 0) & (near > -0.25))
 
 
-@pytest.mark.parametrize("name", objects.PROPERTIES)
+@pytest.mark.parametrize("name", ALL)
 def test_material_informs_but_does_not_decide(name: str) -> None:
-    odds = objects.level_odds(objects.PROPERTIES[name])
+    odds = properties.level_odds(ALL[name])
     np.testing.assert_allclose(odds.sum(1), 1)
     assert 0.50 <= odds.max(1).mean() <= 0.58  # what a guesser gets that knows the material alone
     assert np.all((odds.mean(0) > 0.28) & (odds.mean(0) < 0.38))
@@ -49,17 +55,17 @@ def test_material_informs_but_does_not_decide(name: str) -> None:
 
 def test_frequencies_follow_the_odds() -> None:
     solids = _sample(3000)
-    for name, prop in objects.PROPERTIES.items():
+    for name, prop in properties.PROPERTIES.items():
         levels = np.array([s.labels()[name] for s in solids])
-        np.testing.assert_allclose(np.bincount(levels) / 3000, objects.level_odds(prop).mean(0), atol=0.035)
+        np.testing.assert_allclose(np.bincount(levels) / 3000, properties.level_odds(prop).mean(0), atol=0.035)
 
 
 def test_truth_explains_the_labels() -> None:
     for solid in _sample(50):
         truth, labels = solid.truth(), solid.labels()
-        assert labels["hardness"] == sum(truth["modulus_mpa"] >= t for t in objects.HARDNESS_MPA)
-        assert labels["roughness"] == sum(truth["rms_mm"] >= t for t in objects.ROUGHNESS_MM)
-        assert labels["protrusion"] == sum(truth["feature_height_mm"] >= t for t in objects.PROTRUSION_MM)
+        assert labels["hardness"] == sum(truth["modulus_mpa"] >= t for t in properties.HARDNESS_MPA)
+        assert labels["roughness"] == sum(truth["rms_mm"] >= t for t in properties.ROUGHNESS_MM)
+        assert labels["protrusion"] == sum(truth["feature_height_mm"] >= t for t in properties.PROTRUSION_MM)
         assert labels["material"] == solid.material
 
 
@@ -137,3 +143,85 @@ def test_views_depend_on_the_apparent_material_alone(material: int) -> None:
     assert depth.dtype == np.float32
     assert picture.std() > 5
     assert 280 < depth.min() < 295 < depth.max() < 303
+
+
+def test_what_came_later_leaves_the_rest_as_it_was() -> None:
+    """The same object, whatever the shares of objects that vary, and the same generator afterwards."""
+    rngs = [np.random.default_rng(4) for _ in range(2)]
+    plain, varied = objects.sample(rngs[0], 0.3, 0.8), objects.sample(rngs[1], 0.3, 0.8, part_share=1.0)
+    for field in dataclasses.fields(objects.Solid):
+        if field.name != "variation":
+            np.testing.assert_array_equal(getattr(plain, field.name), getattr(varied, field.name))
+    assert plain.variation is None
+    assert varied.variation is not None
+    assert rngs[0].random() == rngs[1].random()
+
+
+def test_an_object_of_old_is_the_same_today() -> None:
+    solid = objects.sample(np.random.default_rng(0), 0.3, 0.8)
+    assert (solid.material, solid.looks_like, solid.pattern) == OLD[:3]
+    numbers = (solid.modulus_mpa, solid.rms_mm, solid.feature_height_mm, solid.turn_rad, solid.wave_phases_rad[-1])
+    np.testing.assert_allclose(numbers, OLD[3:], rtol=1e-6)
+
+
+def test_friction_and_elasticity_have_levels_of_their_own() -> None:
+    solids = _sample(2000)
+    for name, prop in properties.DYNAMIC.items():
+        levels = np.array([s.levels()[name] for s in solids])
+        np.testing.assert_allclose(np.bincount(levels) / 2000, properties.level_odds(prop).mean(0), atol=0.04)
+    values = np.array([s.friction for s in solids])
+    for threshold in properties.FRICTION:
+        assert np.mean(np.abs(np.log(values / threshold)) < 0.05) > 0.01  # no gap at the threshold
+    assert all(0 < s.energy_returned < 1 for s in solids)
+
+
+def test_a_part_has_its_own_values_and_the_object_no_common_label() -> None:
+    solids = [objects.sample(np.random.default_rng(i), 0.0, 0.8, part_share=1.0) for i in range(60)]
+    differing = 0
+    for solid in solids:
+        v = solid.variation
+        assert v is not None
+        along = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
+        near, far = (solid.at(along * (v.offset_mm + side)) for side in (-3, 3))
+        assert near.modulus_mpa == pytest.approx(solid.modulus_mpa, rel=1e-3)
+        assert far.modulus_mpa == pytest.approx(v.modulus_mpa, rel=1e-3)
+        same = near.labels()["hardness"] == far.labels()["hardness"]
+        assert solid.labels()["hardness"] == (near.labels()["hardness"] if same else UNKNOWN)
+        differing += not same
+    assert 10 < differing < 50
+
+
+def test_a_graded_object_changes_geometrically_and_steadily() -> None:
+    solid = objects.sample(np.random.default_rng(2), 0.0, 0.8, graded_share=1.0)
+    v = solid.variation
+    assert v is not None
+    along = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
+    values = [solid.at(along * (v.offset_mm + s)).rms_mm for s in np.linspace(-40, 40, 33)]
+    assert values[16] == pytest.approx(np.sqrt(solid.rms_mm * v.rms_mm))
+    assert np.all(np.diff(values) > 0) or np.all(np.diff(values) < 0)
+
+
+def test_the_skin_over_a_seam_is_that_of_each_side() -> None:
+    solid = objects.sample(np.random.default_rng(9), 0.0, 0.8, part_share=1.0)
+    v = solid.variation
+    assert v is not None
+    direction = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
+    site = direction * v.offset_mm
+    x = (jnp.arange(96) + 0.5) * 0.25 - 12.0
+    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
+
+    def heights(what: objects.Solid) -> np.ndarray:
+        return np.asarray(surface.gap(surface.make_skin(what, site, 0.0), pose, x))
+
+    both, near, far = heights(solid), heights(solid.at(-99 * direction)), heights(solid.at(99 * direction))
+    x_n = np.asarray(x)
+    along = x_n[None] * np.cos(v.direction_rad) + x_n[:, None] * np.sin(v.direction_rad)
+    for side, alone in ((along < -2, near), (along > 2, far)):
+        difference = (both - alone)[side]
+        np.testing.assert_allclose(difference, difference.mean(), atol=1e-3)
+
+
+@pytest.mark.parametrize("shares", [(-0.1, 0.0), (0.6, 0.6)])
+def test_shares_that_are_none_are_refused(shares: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="part_share, graded_share are"):
+        objects.sample(np.random.default_rng(0), 0.3, 0.8, *shares)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards
+from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards, readout
 from sensors_io.scenes import press as press_module
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
@@ -55,14 +55,14 @@ def test_each_contact_holds_the_four_sensors_in_order(some: list[list[Sequence]]
         assert tuple(s.sensor for s in contact) == SENSORS
         assert len({s.key for s in contact}) == 1
         for sequence in contact:
-            assert len(sequence) == SMALL.frames
+            assert len(sequence) == SMALL.frame_count
             assert np.all(np.diff(sequence.host_time_ns) > 0)
             camera = sequence.sensor != "tac3d"
             assert (sequence.frames is not None) == camera
             assert (sequence.mm_per_px is not None) == camera
             assert (sequence.shear_mm is None) == (sequence.sensor == "gelsight_mini")
             assert sequence.depth_mm is not None
-            assert sequence.depth_mm.shape == (SMALL.frames, 20, 20)
+            assert sequence.depth_mm.shape == (SMALL.frame_count, 20, 20)
             assert sequence.contact_region_px is not None
             x, y, width, height = sequence.contact_region_px
             assert 0 <= x < x + width <= SMALL.view_px
@@ -88,7 +88,7 @@ def test_fields_carry_noise_and_markers_spread(some: list[list[Sequence]]) -> No
         spread = [np.mean(c[order].deformation_mm[-1, ..., 0] * x) for c in some]
         assert np.mean(np.array(spread) > 0) > 0.95  # an almost incompressible layer flows outwards
     lost = np.mean([~s.valid for c in some for s in c])
-    assert lost == pytest.approx(press_module.LOST_NODE_SHARE, rel=0.3)
+    assert lost == pytest.approx(readout.LOST_NODE_SHARE, rel=0.3)
 
 
 def test_flags_say_what_happened(some: list[list[Sequence]]) -> None:

@@ -1,0 +1,105 @@
+"""Adhesion: whether it changes a contact by more than a tolerance, and the contact where it does.
+
+E* = E / (1 − ν²) is the plane-strain modulus, MPa; w the work of adhesion, N/mm (1 J/m² = 1e-3 N/mm).
+Sources: Johnson, Kendall & Roberts 1971; Derjaguin, Muller & Toporov 1975; Tabor 1977; Johnson & Greenwood 1997;
+Ciavarella 2018 (any shape).
+"""
+
+import dataclasses
+
+import numpy as np
+
+from sensors_io.scenes.config import require
+
+JKR_ABOVE, DMT_BELOW = 5.0, 0.1
+"""Tabor parameters past which one of the limits holds (Johnson & Greenwood 1997)."""
+
+RANGE_MM = 3e-7
+"""Range of the surface forces, 0.3 nm, an interatomic distance."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Adhesion:
+    """A smooth sphere of radius R on an elastic half-space, with work of adhesion w."""
+
+    radius_mm: float
+    plane_modulus_mpa: float
+    work_n_per_mm: float
+
+    def __post_init__(self) -> None:
+        require(self.radius_mm > 0, "radius_mm", self.radius_mm, "must be > 0")
+        require(self.plane_modulus_mpa > 0, "plane_modulus_mpa", self.plane_modulus_mpa, "must be > 0")
+        require(self.work_n_per_mm >= 0, "work_n_per_mm", self.work_n_per_mm, "must be ≥ 0")
+
+    @property
+    def tabor(self) -> float:
+        """(R w² / (E*² z₀³))^{1/3}: elastic stretch at pull-off over the range of the surface forces."""
+        stretch = self.radius_mm * self.work_n_per_mm**2 / self.plane_modulus_mpa**2
+        return float((stretch / RANGE_MM**3) ** (1 / 3))
+
+    @property
+    def pull_off_n(self) -> float:
+        """Greatest tension: 3/2 πwR in the JKR limit, 2πwR in the DMT limit, linear in the log of Tabor between."""
+        span = np.log(JKR_ABOVE / DMT_BELOW)
+        towards_jkr = np.clip(np.log(max(self.tabor, DMT_BELOW) / DMT_BELOW) / span, 0, 1)
+        return float((2 - 0.5 * towards_jkr) * np.pi * self.work_n_per_mm * self.radius_mm)
+
+    def hertz_force_n(self, force_n: float) -> float:
+        """Force F₁ at which the contact without adhesion is as wide: a³ = 3RF₁ / 4E*.
+
+            JKR  F₁ = F + 3πwR + √(6πwRF + (3πwR)²),   DMT  F₁ = F + 2πwR
+
+        The JKR one from a Tabor parameter of 1 on, the DMT one below.
+
+        Raises:
+          ValueError: a tension past the pull-off.
+        """
+        jkr = self.tabor >= 1
+        unit = np.pi * self.work_n_per_mm * self.radius_mm
+        least = -(1.5 if jkr else 2.0) * unit
+        require(force_n >= least, "force_n", force_n, f"must be ≥ {least:.3g}, the pull-off")
+        if not jkr:
+            return force_n + 2 * unit
+        return force_n + 3 * unit + float(np.sqrt(max(6 * unit * force_n + 9 * unit**2, 0.0)))
+
+    def relative_change(self, force_n: float) -> float:
+        """By how much adhesion widens the contact at a pressing force: (F₁/F)^{1/3} − 1.
+
+        Raises:
+          ValueError: a force not above 0.
+        """
+        require(force_n > 0, "force_n", force_n, "must be > 0")
+        return (self.hertz_force_n(force_n) / force_n) ** (1 / 3) - 1
+
+    def may_be_left_out(self, force_n: float, tolerance: float) -> bool:
+        """Whether contact radius changes by no more than `tolerance`, relative; roughness only lessens the change."""
+        return self.relative_change(force_n) <= tolerance
+
+
+def adhesive_ramp(
+    force_n: np.ndarray, approach_mm: np.ndarray, area_mm2: np.ndarray, work_n_per_mm: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Force and approach with adhesion, from a press without it, at equal contact areas.
+
+        F = F₁ − F₁'(δ₁) c,   δ = δ₁ − c,   c = √(2w A'(δ₁) / F₁''(δ₁))
+
+    Exact for a sphere, where it is JKR; what lies below the least F is not stable under a prescribed force.  The
+    pressure is p(F₁) − (F₁ − F) ∂p/∂F₁, the last factor that of a flat punch of the contact's shape.
+
+    Args:
+      force_n: F₁ [K], of a ramp without adhesion.
+      approach_mm: δ₁ [K], ascending.
+      area_mm2: contact area [K].
+      work_n_per_mm: w.
+
+    Raises:
+      ValueError: a ramp that does not stiffen or does not widen, of which the formula knows nothing.
+
+    Source: Ciavarella 2018, J. Mech. Phys. Solids 114, 209–218.
+    """
+    slope = np.gradient(force_n, approach_mm)
+    stiffening, widening = np.gradient(slope, approach_mm), np.gradient(area_mm2, approach_mm)
+    require(bool(np.all(stiffening > 0)), "force_n", float(stiffening.min()), "must stiffen with the approach")
+    require(bool(np.all(widening >= 0)), "area_mm2", float(widening.min()), "must not shrink with the approach")
+    stretch = np.sqrt(2 * work_n_per_mm * widening / stiffening)
+    return force_n - slope * stretch, approach_mm - stretch

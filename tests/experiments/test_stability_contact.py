@@ -1,0 +1,49 @@
+"""The failure suite, shrunk: nothing breaks in silence."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments import stability_contact
+from experiments.artifacts import read_json
+from experiments.contact_failures import suite
+from experiments.runner import main
+
+TINY = dataclasses.replace(stability_contact.SMOKE, scenes=12, forces_n=(0.01, 1.0), roughness=(2.0,))
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    home = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        small = dataclasses.replace(stability_contact.EXPERIMENT, config=TINY)
+        patch.setattr(stability_contact, "EXPERIMENT", small)
+        assert main(["stability_contact", "--runs-dir", str(home)]) == 0
+    (directory,) = (p for p in (home / "stability_contact").iterdir() if not p.is_symlink())
+    return directory
+
+
+def test_every_requirement_is_kept(directory):
+    results = read_json(directory / "results.json")
+    assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"]} == {}
+    assert results["data"]["good scenes"] >= 10
+
+
+def test_every_case_is_reported_and_the_maps_are_drawn(directory):
+    results = read_json(directory / "results.json")
+    assert [row[0] for row in results["tables"][0]["rows"]] == [case.name for case in suite(TINY.grid)]
+    assert {p.name for p in (directory / "plots").iterdir()} >= {"stability_roughness.svg", "stability_thickness.svg"}
+
+
+def test_a_dozen_pixels_touch_at_a_millinewton():
+    (case,) = (c for c in suite(32) if c.name == "a dozen pixels at 1 mN")
+    assert stability_contact.attempt(case).flagged is False
+    assert case.force_n == 1e-3
+
+
+@pytest.mark.parametrize("grid", [32, 64])
+def test_cases_are_finite_and_named_once(grid):
+    cases = suite(grid)
+    assert len({c.name for c in cases}) == len(cases)
+    assert all(np.all(np.isfinite(c.gap_mm)) for c in cases)

@@ -1,0 +1,93 @@
+"""The whole measurement over scenes that cost nothing: from the command line to the report."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments import scene_protocol, scene_rates, scene_stages, throughput_scenes
+from experiments.artifacts import read_json
+from experiments.runner import main
+from sensors_io import generate, live
+from sensors_io.scenes import SceneConfig, contact_key, protocol, strength
+from sensors_io.schema import SENSORS
+from tests.sensors_io import fakes
+
+
+def make_contact(config, index):
+    key = contact_key(config, index)
+    return [fakes.sequence(index, sensor, config.frame_count, key=key) for sensor in SENSORS]
+
+
+def contacts(config, start=0):
+    return (make_contact(config, i) for i in range(start, config.contact_count))
+
+
+def look(skins, turn_rad, modulus_mpa):
+    """Hard objects bear less than soft ones."""
+    bears = 12 + 13 / (1 + np.log10(1 + 10 * np.asarray(modulus_mpa)))
+    return strength.Limits(actual_n=bears, rigid_n=11.8 + 0.2 * np.cos(turn_rad))
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    monkeypatch.setattr(live, "make_contact", make_contact)
+    monkeypatch.setattr(scene_rates, "make_contact", make_contact)
+    monkeypatch.setattr(generate, "contacts", contacts)
+    monkeypatch.setattr(strength, "look", look)
+    ones = scene_stages.StageCosts(normal=1.0, friction=1.0, fields=1.0, picture=1.0)
+    monkeypatch.setattr(scene_stages, "stage_costs", lambda *_: ones)
+    protocol._plan.cache_clear()
+    yield monkeypatch
+    protocol._plan.cache_clear()
+
+
+def test_the_experiment_runs_shrunken(cheap, tmp_path):
+    def killed(arguments, out, shares, shards):
+        assert arguments[:4] == ["--objects", "4", "--sequences", "32"]
+        generate.generate_records(config.scenes(8, 32), out)
+        return len(shares)
+
+    config = dataclasses.replace(throughput_scenes.SMOKE, kill_shares=(0.2, 0.4, 0.6, 0.8, 0.9))
+    small = dataclasses.replace(throughput_scenes.EXPERIMENT, config=config)
+    cheap.setattr(throughput_scenes, "EXPERIMENT", small)
+    cheap.setattr(scene_rates, "killed_and_resumed", killed)
+    paths = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "cache")]
+    assert main(["throughput_scenes", *paths]) == 0
+    (directory,) = (p for p in (tmp_path / "runs" / "throughput_scenes").iterdir() if not p.is_symlink())
+    results = read_json(directory / "results.json")
+    named = {r["name"]: r for r in results["requirements"]}
+    assert named["kills survived"]["met"]
+    assert named["contacts that differ after kills"]["measured"] == 0
+    assert named["written frames past the strain limit"]["measured"] == 0
+    assert results["data"] == {"feed_records": 320, "large_records": 160, "written_records": 640}
+    assert results["tables"][0]["title"] == "Rates"
+    assert not (directory / "written").exists()
+
+
+def test_a_difference_is_counted(tmp_path):
+    a, b = fakes.write(tmp_path / "a", 4), fakes.write(tmp_path / "b", 4)
+    assert scene_rates.differing_contacts(a, b) == 0
+    c = fakes.write(tmp_path / "c", 4, sensors=SENSORS[:3])
+    assert scene_rates.differing_contacts(a, c) == 4
+    d = fakes.write(tmp_path / "d", 2)
+    assert scene_rates.differing_contacts(a, d) == 4
+
+
+def test_force_tells_hardness_when_frames_are_dropped_and_not_when_matched(cheap):
+    config = SceneConfig(objects=300, sequences=4 * 600)
+    dropped, rigid, matched = scene_protocol.leaks(config)
+    assert dropped.accuracy[0] > 70
+    assert rigid.accuracy[0] < 45
+    assert max(matched.accuracy) < 45
+    assert matched.median_n <= rigid.median_n
+
+
+def test_left_out_frames_are_tabled_by_material(cheap):
+    bands, rows = scene_protocol.left_out_by_material(SceneConfig(objects=40, sequences=4 * 80, frames=40))
+    assert bands[0] == "0–2 N"
+    assert bands[-1] == "15–20 N"
+    assert rows[-1][0] == "all"
+    for column in range(1, len(rows[0])):
+        assert sum(row[column] for row in rows[:-1]) == rows[-1][column]
+    assert rows[-1][2] == sum(rows[-1][4:])

@@ -1,0 +1,131 @@
+"""The parts of the contact solver: the bed of springs, nested grids, the preconditioned step."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import nested, spg, winkler
+from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
+
+N, M, SPACING = 32, 48, 0.5
+X = (np.arange(N) + 0.5) * SPACING - N * SPACING / 2
+R2 = (X[None] ** 2 + X[:, None] ** 2).astype(np.float32)
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+
+
+def _compliance(points: int, spacing: float = SPACING, gel: Layer = GEL) -> jnp.ndarray:
+    return jnp.asarray(normal_compliance(np.hypot(*wave_numbers(points, spacing)), gel), jnp.float32)
+
+
+def _problem(gap: np.ndarray, force: float) -> spg.Problem:
+    compliance = _compliance(M)
+    return spg.Problem(
+        gap=jnp.asarray(gap, jnp.float32),
+        total=jnp.float32(force / SPACING**2),
+        compliance=compliance,
+        inverse=spg.inverse_compliance(compliance, N),
+    )
+
+
+# The bed of springs --------------------------------------------------------------------------------------------------
+
+
+def test_springs_carry_the_force_at_one_level() -> None:
+    p = winkler.pressure(jnp.asarray(R2 / 16), jnp.float32(9.0), jnp.float32(0.1))
+    assert float(p.sum()) == pytest.approx(9.0, rel=1e-5)
+    level = np.asarray(p / 0.1 + R2 / 16)[np.asarray(p) > 0]
+    np.testing.assert_allclose(level, level.mean(), rtol=1e-3)
+
+
+def test_springs_under_a_sphere_touch_within_the_closed_form_radius() -> None:
+    """F = π K a⁴ / 4R."""
+    gel, force, radius = _compliance(M), 2.0, 8.0
+    stiffness = 1 / float(winkler.bed_compliance(gel, SPACING))
+    seen = winkler.look(jnp.asarray(R2 / (2 * radius)), jnp.float32(force), gel, SPACING)
+    assert float(seen.radius_mm) == pytest.approx((4 * radius * force / (np.pi * stiffness)) ** 0.25, rel=0.03)
+    assert not seen.at_border
+    inside = np.asarray(seen.contact)
+    assert float(seen.slope) == pytest.approx(np.sqrt((R2[inside] / radius**2).mean()), rel=0.02)
+
+
+def test_a_look_sees_the_border() -> None:
+    flat = jnp.zeros((N, N), jnp.float32)
+    seen = winkler.look(flat, jnp.float32(1.0), _compliance(M), SPACING)
+    assert seen.at_border
+    assert float(seen.slope) == 0
+
+
+def test_springs_are_never_empty() -> None:
+    gap = jnp.full((N, N), 1e3, jnp.float32).at[N // 2, N // 2].set(0)
+    assert float(winkler.pressure(gap, jnp.float32(1e-6), jnp.float32(10.0)).sum()) == pytest.approx(1e-6, rel=1e-5)
+
+
+# Nested grids --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("points", "padded", "found"),
+    [(128, 216, (4, 2)), (128, 180, (4, 2)), (48, 72, (2,)), (64, 90, (2,)), (24, 36, ()), (64, 65, ())],
+)
+def test_factors_divide_both_grids_and_leave_enough(points: int, padded: int, found: tuple[int, ...]) -> None:
+    assert nested.factors(points, padded) == found
+
+
+def test_a_truncated_spectrum_is_that_of_the_coarse_grid() -> None:
+    for factor in (2, 4):
+        coarse = _compliance(M // factor, SPACING * factor)
+        np.testing.assert_allclose(nested.truncate(_compliance(M), factor), coarse, rtol=1e-5)
+
+
+def test_refining_a_plane_is_exact_inside_and_coarsening_undoes_it() -> None:
+    plane = X[None] * 0.3 - X[:, None] * 0.1 + 1
+    up = np.asarray(nested.refine(jnp.asarray(plane, jnp.float32)))
+    fine = (np.arange(2 * N) + 0.5) * SPACING / 2 - N * SPACING / 2
+    np.testing.assert_allclose(up[2:-2, 2:-2], (fine[None] * 0.3 - fine[:, None] * 0.1 + 1)[2:-2, 2:-2], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(nested.coarsen(jnp.asarray(up), 2))[1:-1, 1:-1], plane[1:-1, 1:-1], atol=1e-5)
+
+
+# The step ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(N, N), (3, N, N)])
+@pytest.mark.parametrize("padded", [M, M + 1, N])
+def test_convolution_equals_two_full_transforms(shape: tuple[int, ...], padded: int) -> None:
+    field = np.random.default_rng(0).random(shape)
+    spectrum = np.asarray(_compliance(padded), np.float64)
+    full = np.fft.irfft2(np.fft.rfft2(field, s=(padded, padded)) * spectrum, s=(padded, padded))[..., :N, :N]
+    found = spg.convolve(jnp.asarray(field, jnp.float32), jnp.asarray(spectrum, jnp.float32))
+    np.testing.assert_allclose(found, full, rtol=1e-4, atol=1e-5 * np.abs(full).max())
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.48, 0.5])
+def test_the_preconditioner_is_near_the_inverse_and_positive(poisson: float) -> None:
+    gel = Layer(modulus_mpa=0.3, poisson=poisson, thickness_mm=4.0)
+    inverse = np.asarray(spg.inverse_compliance(_compliance(M, gel=gel), N))
+    assert np.all(np.isfinite(inverse))
+    assert np.all(inverse > 0)
+    product = inverse * np.asarray(_compliance(N, gel=gel))
+    np.testing.assert_allclose(product[2:-2, 2:], 1, atol=0.12)  # all but the longest waves
+
+
+def test_the_solution_is_a_fixed_point() -> None:
+    problem = _problem(R2 / 16, 2.0)
+    start = winkler.pressure(problem.gap, problem.total, jnp.float32(0.1))
+    found = spg.minimise(problem, start, 1e-6, 60)
+    again = spg.minimise(problem, found.best, 0.0, 3)
+    np.testing.assert_allclose(again.p, found.best, atol=1e-4 * float(found.best.max()))
+
+
+def test_no_step_lets_go_of_the_body() -> None:
+    """A gap so wild that every touching pixel would be clipped keeps the pressure from before."""
+    problem = _problem(R2 / 16, 2.0)
+    p = winkler.pressure(problem.gap, problem.total, jnp.float32(0.1))
+    found = spg.press_detail(p, 1e6 * jnp.asarray(np.random.default_rng(0).random((N, N)), jnp.float32), problem)
+    assert float(found.sum()) == pytest.approx(float(problem.total), rel=1e-4)
+    assert np.all(np.asarray(found) >= 0)
+
+
+def test_a_detail_that_is_no_detail_changes_nothing() -> None:
+    problem = _problem(R2 / 16, 2.0)
+    p = winkler.pressure(problem.gap, problem.total, jnp.float32(0.1))
+    np.testing.assert_allclose(spg.press_detail(p, jnp.full((N, N), 0.7), problem), p, atol=1e-4 * float(p.max()))

@@ -1,0 +1,61 @@
+"""Failures of one frame: each condition alone raises its own bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import failures
+from sensors_io.schema import Flag
+
+X = jnp.asarray((np.arange(40) + 0.5) * 0.4 - 8.0, jnp.float32)
+ZERO = jnp.zeros((40, 40))
+
+
+@pytest.mark.parametrize("end", [0, 255])
+def test_a_clipped_patch_saturates_and_a_few_pixels_do_not(end: int) -> None:
+    picture = np.full((112, 112, 3), 128, np.uint8)
+    picture[:7, :7, 1] = end  # 49 of 12,544 pixels
+    assert not failures.saturated(jnp.asarray(picture))
+    picture[:8, :8, 1] = end
+    assert failures.saturated(jnp.asarray(picture))
+
+
+def test_markers_are_lost_where_their_seen_area_leaves_the_range() -> None:
+    for strain, lost in ((-0.2, False), (-0.3, True), (0.3, False), (0.45, True)):  # area (1 + strain)²
+        found = failures.lost_markers(strain * X[None] + ZERO, strain * X[:, None] + ZERO, ZERO, 0.4)
+        assert bool(found.all()) == bool(found.any()) == lost, strain
+
+
+def test_a_rotation_and_a_shear_lose_no_markers() -> None:
+    c, s = np.cos(0.6), np.sin(0.6)
+    x, y = (c - 1) * X[None] - s * X[:, None], s * X[None] + (c - 1) * X[:, None]
+    assert not failures.lost_markers(x, y, ZERO, 0.4).any()
+    assert not failures.lost_markers(0.8 * X[:, None] + ZERO, ZERO, ZERO, 0.4).any()
+
+
+def test_markers_on_a_slope_past_45_degrees_are_hidden() -> None:
+    for slope, lost in ((0.95, False), (1.05, True)):
+        assert bool(failures.lost_markers(ZERO, ZERO, slope * X[None] + ZERO, 0.4).all()) == lost
+
+
+def test_marker_loss_counts_nodes() -> None:
+    valid = jnp.ones((20, 20), bool)
+    assert not failures.marker_loss(valid.at[0, :].set(False))  # 5 %
+    assert failures.marker_loss(valid.at[0, :].set(False).at[1, 0].set(False))
+
+
+@pytest.mark.parametrize("at", [(0, 7), (39, 7), (7, 0), (7, 39)])
+def test_contact_at_any_border_is_seen(at: tuple[int, int]) -> None:
+    assert failures.border_contact(ZERO.at[at].set(1e-6))
+    assert not failures.border_contact(ZERO.at[1:-1, 1:-1].set(1.0))
+
+
+def test_every_failure_has_its_own_bit_and_works_compiled() -> None:
+    names = ("saturated", "marker_loss", "border_contact")
+    want = (Flag.SATURATED, Flag.MARKER_LOSS, Flag.BORDER_CONTACT)
+    frames = jnp.eye(3, dtype=bool)
+    found = jax.jit(lambda f: failures.flags(**dict(zip(names, f, strict=True))))(frames)
+    assert [Flag(int(bits)) for bits in found] == list(want)
+    assert found.dtype == jnp.uint32
+    assert int(failures.flags(saturated=True, marker_loss=True, border_contact=True)) == sum(want)

@@ -1,0 +1,119 @@
+"""Unloading: the loop has the area it should, energy is never created, the virgin curve stays as it was."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sensors_io.scenes import history
+from sensors_io.scenes.layer import Layer
+
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+RAMP = np.linspace(0, 5, 4001)
+THERE_AND_BACK = np.concatenate([RAMP, RAMP[::-1]])
+
+paths = st.lists(st.floats(0, 10), min_size=1, max_size=12)
+losses = st.floats(0, 0.9)
+
+
+def _path(corners: list[float], between: int = 200) -> np.ndarray:
+    """From 0 by straight lines over all corners back to 0."""
+    at = [0.0, *corners, 0.0]
+    return np.interp(np.linspace(0, len(at) - 1, between * (len(at) - 1) + 1), np.arange(len(at)), at)
+
+
+def _depth(elastic_force: np.ndarray, exponent: float = 1.5) -> np.ndarray:
+    """Any virgin curve will do: F = δ^exponent."""
+    return elastic_force ** (1 / exponent)
+
+
+def test_by_hand() -> None:
+    force = np.array([0.0, 1.0, 2.0, 1.8, 1.5, 0.75, 0.9, 1.2, 3.0, 0.0])
+    expected = [0.0, 1.0, 2.0, 2.0, 2.0, 1.0, 1.0, 1.2, 3.0, 0.0]
+    np.testing.assert_allclose(history.elastic_force(force, 0.25), expected)
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.3])
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.4])
+def test_a_full_loop_loses_its_share_for_any_virgin_curve(exponent: float, loss: float) -> None:
+    depth = _depth(history.elastic_force(THERE_AND_BACK, loss), exponent)
+    put_in, _ = history.loop_work(THERE_AND_BACK, depth)
+    assert put_in == pytest.approx(5 ** (1 + 1 / exponent) / (1 + exponent), rel=1e-3)
+    assert history.returned_share(THERE_AND_BACK, depth) == pytest.approx(1 - loss, abs=2e-3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(corners=paths, loss=losses)
+def test_no_path_gains_energy(corners: list[float], loss: float) -> None:
+    force = _path(corners)
+    elastic = history.elastic_force(force, loss)
+    put_in, back = history.loop_work(force, _depth(elastic))
+    assert back <= put_in * (1 - loss) + 1e-2 * max(put_in, 1e-9) + 1e-9
+    assert np.all(elastic >= force)
+    assert elastic[0] == elastic[-1] == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(corners=paths, loss=losses)
+def test_loading_past_the_greatest_force_so_far_is_virgin(corners: list[float], loss: float) -> None:
+    force = _path(corners)
+    virgin = force >= np.maximum.accumulate(force)
+    np.testing.assert_array_equal(history.elastic_force(force, loss)[virgin], force[virgin])
+
+
+@settings(max_examples=60, deadline=None)
+@given(corners=paths, loss=losses, repeats=st.integers(2, 4))
+def test_the_rate_does_not_matter(corners: list[float], loss: float, repeats: int) -> None:
+    force = _path(corners, between=5)
+    slow = history.elastic_force(np.repeat(force, repeats), loss)
+    np.testing.assert_array_equal(slow[::repeats], history.elastic_force(force, loss))
+
+
+def test_an_inner_loop_closes() -> None:
+    force = _path([4.0, 2.0, 4.0, 2.0, 4.0], between=100)
+    elastic = history.elastic_force(force, 0.2)
+    np.testing.assert_allclose(elastic[100], elastic[300])
+    np.testing.assert_allclose(elastic[200:301], elastic[400:501])
+
+
+def test_elasticity_can_be_read_from_load_against_unload() -> None:
+    levels = {}
+    for loss in (0.4, 0.25, 0.05):
+        elastic = history.elastic_force(THERE_AND_BACK, loss)
+        share = history.returned_share(THERE_AND_BACK, _depth(elastic))
+        levels[loss] = (history.elasticity_level(loss), history.elasticity_level(1 - share))
+    assert levels == {0.4: (0, 0), 0.25: (1, 1), 0.05: (2, 2)}
+
+
+def test_losses_mix_by_stored_energy() -> None:
+    loss = history.Loss(gel=0.05, body=0.45)
+    assert loss.of_contact(0.0) == 0.05
+    assert loss.of_contact(1.0) == 0.45
+    assert loss.of_contact(0.25) == pytest.approx(0.15)
+
+
+def test_a_hard_object_stores_nothing() -> None:
+    soft, hard = (Layer(modulus_mpa=e, poisson=0.4, thickness_mm=20.0) for e in (0.3, 300.0))
+    assert history.body_share(GEL, hard, 4.0) < 0.003
+    assert history.body_share(GEL, soft, 4.0) > 0.5
+
+
+@pytest.mark.parametrize(("modulus", "radius", "stored"), [(0.3, 3.11, 0.735), (1.0, 5.13, 0.575), (5.0, 4.62, 0.195)])
+def test_the_share_of_energy_is_that_of_the_contact(modulus: float, radius: float, stored: float) -> None:
+    """`stored` is Σ p u_body / Σ p u of spheres (R = 8 mm; 1, 10 and 10 N) on 3 mm of gel, solved on 64² pixels."""
+    gel = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=3.0)
+    body = Layer(modulus_mpa=modulus, poisson=0.4, thickness_mm=20.0)
+    assert history.body_share(gel, body, radius) == pytest.approx(stored, abs=0.07)
+
+
+def test_impossible_input_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"loss is 1\.0: must lie in"):
+        history.elastic_force(RAMP, 1.0)
+    with pytest.raises(ValueError, match=r"force_n is -1\.0: must be ≥ 0"):
+        history.elastic_force(np.array([0.0, -1.0]), 0.1)
+    with pytest.raises(ValueError, match=r"body is 1\.2"):
+        history.Loss(gel=0.1, body=1.2)
+    with pytest.raises(ValueError, match=r"body_share is 1\.5"):
+        history.Loss(gel=0.1, body=0.2).of_contact(1.5)
+    with pytest.raises(ValueError, match="must do work"):
+        history.returned_share(np.zeros(3), np.zeros(3))

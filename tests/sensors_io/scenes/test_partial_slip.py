@@ -1,0 +1,148 @@
+"""The cheap tier: exact where it should be, within its promise elsewhere, and interpolation in a press ramp."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import contact, partial_slip, tangential, traction
+from sensors_io.scenes.hertz import Hertz, half_space_spectrum
+from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
+
+N, M, WINDOW_MM = 40, 80, 16.0
+SPACING = WINDOW_MM / N
+X = (np.arange(N) + 0.5) * SPACING - WINDOW_MM / 2
+RADIUS = np.hypot(X[None], X[:, None])
+FRICTION, FORCE, SHEAR_MODULUS = 0.5, 4.0, 0.15
+BODY = Layer(modulus_mpa=1.0, poisson=0.4, thickness_mm=20.0)
+STILL = jnp.zeros((N, N), jnp.complex64)
+IN_RAMP = jax.jit(partial_slip.in_ramp)
+
+
+def _pressure(force: float) -> np.ndarray:
+    hertz = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=force)
+    p = hertz.pressure_mpa(RADIUS)
+    return p * force / (p.sum() * SPACING**2)
+
+
+@functools.cache
+def _ramp(levels: int = 16) -> tuple[jax.Array, jax.Array]:
+    forces = np.geomspace(0.05, FORCE, levels)
+    return jnp.asarray(np.stack([_pressure(f) for f in forces]), jnp.float32), jnp.asarray(forces, jnp.float32)
+
+
+@functools.cache
+def _half_space() -> traction.Compliance:
+    """ν = 0: the tangential compliance is the normal one, so that the superposition is exact."""
+    half = half_space_spectrum(N, SPACING, 2 * SHEAR_MODULUS)
+    even = np.concatenate([half, np.roll(half[::-1], 1, 0)[:, N - 1 : 0 : -1]], 1)
+    return traction.Compliance(even=jnp.asarray(even, jnp.float32), odd=jnp.zeros((M, M), jnp.complex64))
+
+
+def _sum(field: jax.Array) -> complex:
+    return complex(np.asarray(field).sum(dtype=np.complex128)) * SPACING**2
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_half_space_is_exact(share: float) -> None:
+    """The superposition obeys the friction law of the exact problem to the discretisation of the pressures."""
+    pull = share * FRICTION * FORCE
+    cheap = partial_slip.ciavarella_jaeger(_pressure(FORCE), _pressure(FORCE - pull / FRICTION), FRICTION, 1j)
+    limit = jnp.asarray(FRICTION * _pressure(FORCE), jnp.float32)
+    exact = tangential.solve_force(limit, jnp.array([0.0, pull]), STILL, _half_space(), SPACING, 1e-4)
+    assert _sum(cheap) == pytest.approx(1j * pull, rel=0.02)
+    assert np.linalg.norm(cheap - exact.traction_mpa) < 0.06 * np.linalg.norm(cheap)
+
+
+def test_the_limits_are_exact() -> None:
+    p = _pressure(FORCE)
+    slipping = partial_slip.ciavarella_jaeger(p, 0 * p, FRICTION, 1.0)
+    np.testing.assert_allclose(slipping, FRICTION * p, rtol=1e-6)
+    np.testing.assert_array_equal(partial_slip.ciavarella_jaeger(p, p, FRICTION, 1.0), 0)
+
+
+def test_the_friction_limit_holds_after_interpolation() -> None:
+    p = _pressure(FORCE)
+    found = partial_slip.ciavarella_jaeger(p, 1.1 * p, FRICTION, 1.0)
+    np.testing.assert_array_equal(found, 0)
+
+
+def test_interpolation_meets_the_ramp_and_carries_every_force() -> None:
+    pressures, forces = _ramp()
+    for k in (0, 7, 15):
+        np.testing.assert_allclose(IN_RAMP(pressures, forces, forces[k]), pressures[k], atol=1e-6)
+    for force in (0.0, 0.01, 0.3, 2.9, 4.0, 5.0):
+        assert _sum(IN_RAMP(pressures, forces, jnp.float32(force))).real == pytest.approx(force, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize(("levels", "error"), [(8, 0.16), (16, 0.06)])
+def test_interpolation_error(levels: int, error: float) -> None:
+    pressures, forces = _ramp(levels)
+    for force in (0.4, 1.6, 2.8):
+        off = np.asarray(IN_RAMP(pressures, forces, jnp.float32(force))) - _pressure(force)
+        assert np.linalg.norm(off) < error * np.linalg.norm(_pressure(force))
+
+
+def test_a_prescribed_slide_finds_its_force() -> None:
+    """Cattaneo and Mindlin: δ = 3μF/(8Ga) [1 − (1 − Q/μF)^⅔]."""
+    pressures, forces = _ramp()
+    slides = jax.jit(partial_slip.core_slide)(pressures, _half_space(), jnp.complex64(1))
+    a = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=FORCE).contact_radius_mm
+    full = 3 * FRICTION * FORCE / (8 * SHEAR_MODULUS * a)
+    stuck = jax.jit(partial_slip.stuck_force)
+    for share in (0.0, 0.2, 0.5, 0.8):
+        slide = full * (1 - (1 - share) ** (2 / 3))
+        found = stuck(forces, slides, jnp.float32(FORCE), FRICTION, jnp.float32(slide))
+        assert float(FORCE - found) == pytest.approx(share * FORCE, abs=0.03 * FORCE)
+    assert stuck(forces, slides, jnp.float32(FORCE), FRICTION, jnp.float32(1.05 * full)) == 0
+
+
+def _dots() -> np.ndarray:
+    f = X / 3.3 - np.round(X / 3.3)
+    return RADIUS**2 / 50 - 0.12 * np.exp(-(f[None] ** 2 + f[:, None] ** 2) / 0.08)
+
+
+HELD_OUT = {
+    "thin gel": (RADIUS**2 / 24, Layer(modulus_mpa=0.4, poisson=0.49, thickness_mm=2.0), None),
+    "usual gel": (RADIUS**2 / 18, Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0), None),
+    "dots": (_dots(), Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=3.0), None),
+    "soft body": (RADIUS**2 / 30, Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0), 0.7),
+    "thick gel": (
+        X[None] ** 2 / 12 + X[:, None] ** 2 / 30,
+        Layer(modulus_mpa=0.3, poisson=0.4, thickness_mm=10.0),
+        5.0,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", HELD_OUT)
+def test_the_promise_holds_on_held_out_contacts(name: str) -> None:
+    gap, gel, modulus = HELD_OUT[name]
+    body = None if modulus is None else Layer(modulus_mpa=modulus, poisson=0.4, thickness_mm=20.0)
+    q = np.hypot(*wave_numbers(M, SPACING))
+    spectra = [jnp.asarray(normal_compliance(q, gel), jnp.float32)]
+    spectra.append(jnp.zeros_like(spectra[0]) if body is None else jnp.asarray(normal_compliance(q, body), jnp.float32))
+    made = [traction.make_compliance(layer, M, SPACING) for layer in (gel, BODY)]
+    compliance = made[0] if modulus is None else traction.in_series(*made, 1.0, modulus)
+    full, stuck = (
+        contact.solve(jnp.asarray(gap, jnp.float32), jnp.float32(f), *spectra, SPACING, 1e-4).pressure_mpa
+        for f in (FORCE, 0.4 * FORCE)
+    )
+    pull = jnp.array([0.6 * FRICTION * FORCE, 0.0])
+    exact = tangential.solve_force(FRICTION * full, pull, STILL, compliance, SPACING, 1e-4).traction_mpa
+    cheap = partial_slip.ciavarella_jaeger(full, stuck, FRICTION, 1.0 + 0j)
+    observed = traction.make_response(gel, M, SPACING, 0.5).shear
+    exact_mm, cheap_mm = (traction.shear_displacement(t, observed) for t in (exact, cheap))
+    radius = float(np.sqrt(np.sum(full > 0) * SPACING**2 / np.pi))
+    promise = partial_slip.promised_error(gel, body, radius)
+    assert np.linalg.norm(exact_mm - cheap_mm) < promise * np.linalg.norm(exact_mm)
+    assert promise < 0.2
+
+
+def test_the_choice_follows_the_promise() -> None:
+    thin, thick = (Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=h) for h in (2.0, 20.0))
+    assert partial_slip.promised_error(thin, None, 4.0) > 3 * partial_slip.promised_error(thick, None, 4.0)
+    assert partial_slip.is_enough(thick, None, 4.0, 0.05)
+    assert not partial_slip.is_enough(thin, None, 4.0, 0.05)

@@ -1,0 +1,105 @@
+"""Photometric optics: the formula, its symmetries, and that the stored constants are those of a Mini."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import optics, photometric
+from sensors_io.scenes.photometric import MINI, PhotometricOptics
+
+PX, WINDOW_MM = 56, 15.2
+X = (np.arange(PX) + 0.5) * WINDOW_MM / PX - WINDOW_MM / 2
+ZERO = np.zeros((PX, PX))
+
+
+def _gel(depth: np.ndarray) -> optics.DeformedGel:
+    still = jnp.zeros((PX, PX))
+    return optics.DeformedGel(
+        depth_mm=jnp.asarray(depth, jnp.float32),
+        marker_x_mm=still,
+        marker_y_mm=still,
+        marker_depth_mm=still,
+        window_mm=WINDOW_MM,
+    )
+
+
+def _light(texture: np.ndarray | None = None, gain: tuple[float, float, float] = (1, 1, 1)) -> optics.Light:
+    texture = np.zeros((2, 2), np.float32) if texture is None else texture
+    return optics.Light(
+        exposure=jnp.ones(()), led_gain=jnp.array(gain), pattern_shift_mm=jnp.zeros(2), texture=jnp.asarray(texture)
+    )
+
+
+def _random(seed: int) -> PhotometricOptics:
+    rng = np.random.default_rng(seed)
+    rows = lambda n, scale: tuple(tuple(float(v) for v in row) for row in scale * rng.standard_normal((n, 3)))
+    flat = ((0.5, 0.6, 0.7), *rows(44, 0.01))
+    return PhotometricOptics(half_window_mm=7.6, flat=flat, slope=rows(30, 0.03), depth=rows(1, 0.02), max_tilt=0.5)
+
+
+def test_a_picture_is_the_formula() -> None:
+    model, slope_x, slope_y = _random(0), 0.2, -0.1
+    depth = 1.0 + slope_x * X[None] + slope_y * X[:, None] + ZERO
+    up = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
+    n_x, n_y = slope_x * up, slope_y * up
+    at_y, at_x = 11, 40
+    place = X[[at_x]] / 7.6, X[[at_y]] / 7.6
+    flat = photometric.basis(*place, 8)[:, 0, 0] @ np.array(model.flat)
+    local = photometric.basis(*place, 2)[:, 0, 0] @ np.array(model.slope).reshape(5, 6, 3)
+    phi = np.array([n_x, n_y, n_x**2, n_x * n_y, n_y**2])
+    want = flat + phi @ local + depth[at_y, at_x] * np.array(model.depth[0])
+    picture = photometric.shade(_gel(depth), _light(gain=(1.0, 0.5, 2.0)), model)
+    np.testing.assert_allclose(picture[at_y, at_x], want * (1.0, 0.5, 2.0), rtol=1e-4)
+
+
+def test_terms_are_legendre_products_in_a_stable_order() -> None:
+    assert photometric.terms(1) == [(0, 0), (0, 1), (1, 0)]
+    grid = photometric.basis(np.array([0.3]), np.array([-0.5]), 2)[:, 0, 0]
+    np.testing.assert_allclose(grid, [1, -0.5, -0.125, 0.3, -0.15, -0.365], atol=1e-12)
+
+
+def test_gel_steeper_than_the_fit_is_shown_as_steep_as_the_fit() -> None:
+    steep, steepest = (np.asarray(photometric.tilt(jnp.array(s), jnp.array(0.0), 0.5)) for s in (0.5, 40.0))
+    np.testing.assert_allclose(steep, [0.5 / np.sqrt(1.25), 0])
+    np.testing.assert_allclose(steepest, [0.5, 0], atol=1e-6)
+    np.testing.assert_allclose(photometric.tilt(jnp.zeros(()), jnp.zeros(()), 0.5), 0)
+
+
+def test_constants_of_the_wrong_number_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"slope has shape \(29, 3\): must be \(30, 3\)"):
+        dataclasses.replace(MINI, slope=MINI.slope[1:])
+
+
+def test_grain_has_its_deviation_and_its_correlations() -> None:
+    grain = photometric.grain(np.random.default_rng(0), 200, (0.01, 0.02, 0.005), 0.6)
+    np.testing.assert_allclose(grain.std((1, 2)), (0.01, 0.02, 0.005), rtol=0.05)
+    assert np.corrcoef(grain[0].ravel(), grain[1].ravel())[0, 1] == pytest.approx(0.6, abs=0.05)
+    assert np.corrcoef(grain[0, 1:].ravel(), grain[0, :-1].ravel())[0, 1] == pytest.approx(0.5, abs=0.05)
+
+
+def test_grain_multiplies_the_flat_field_at_any_size_of_picture() -> None:
+    flat = np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
+    for size in (PX, 2):
+        lit = photometric.gelsight_mini(_gel(ZERO), _light(np.full((3, size, size), 0.1, np.float32)))
+        np.testing.assert_allclose(lit, 1.1 * flat, rtol=1e-5)
+
+
+def test_flat_gel_has_the_background_of_the_real_one() -> None:
+    """Read off the recording by eye: pink in the middle, blue-green above, dull green below."""
+    image = 255 * np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
+    middle, top, bottom = image[PX // 2, PX // 2], image[3, PX // 2], image[-4, PX // 2]
+    assert middle[0] > 1.4 * max(top[0], bottom[0])
+    assert top[2] > 1.2 * bottom[2]
+    assert top[1] > top[0]
+    assert np.all((image > 20) & (image < 180))
+
+
+def test_a_dent_is_red_above_and_blue_below() -> None:
+    bump = 0.8 * np.exp(-(X[None] ** 2 + X[:, None] ** 2) / 4)
+    change = np.asarray(photometric.gelsight_mini(_gel(bump), _light()))
+    change = change - np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
+    above, below = change[PX // 2 - 5, PX // 2], change[PX // 2 + 5, PX // 2]
+    assert above[0] > 0.05 > -0.05 > below[0]
+    assert below[2] > 0.05 > -0.05 > above[2]

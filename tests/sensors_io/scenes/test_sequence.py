@@ -1,0 +1,114 @@
+"""Touches over time: forces obey friction and the plan, repeat exactly, and what passes the limit is replaced."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sensors_io.scenes import SceneConfig, history, make_contact, motions, protocol, schedule, strength
+from sensors_io.scenes.sequence import make_sequence, site_of
+from sensors_io.schema import SENSORS, Flag
+
+CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
+TAC3D = SENSORS.index("tac3d")
+
+
+def _slot(motion: str, force_n: float = 2.0) -> schedule.Slot:
+    return schedule.Slot(object_index=3, site=1, motion=motion, force_n=force_n)
+
+
+@pytest.fixture(scope="module")
+def slide():
+    return make_sequence(CONFIG, 5, _slot("slide_x"), TAC3D, 0)
+
+
+@pytest.fixture(scope="module")
+def hold():
+    return make_sequence(CONFIG, 6, _slot("hold", 8.0), TAC3D, 0)
+
+
+def test_friction_follows_the_slide_and_keeps_to_coulomb(slide):
+    hand = motions.plan("slide_x", 2.0, schedule.pace(40))
+    moving = hand.phase == motions.Phase.MOVE
+    friction = site_of(CONFIG, 3, 1, 0).solid.friction
+    assert np.all(np.abs(slide.force_n[:, 0]) <= friction * np.abs(slide.force_n[:, 2]) * 1.1 + 0.15)
+    speed = np.gradient(hand.slide_mm[:, 0])
+    late = moving & (np.abs(np.diff(speed, prepend=speed[0])) < 1e-9) & (np.abs(speed) > 0)
+    assert np.corrcoef(slide.force_n[late, 0], speed[late])[0, 1] > 0.5
+    assert np.abs(slide.force_n[:, 1]).max() < 0.3
+    assert np.abs(slide.shear_mm[moving]).max() > 5 * np.abs(slide.shear_mm[: 1 + hand.phase.argmax()][0]).max() / 4
+
+
+def test_nothing_touches_before_the_approach_ends(slide):
+    free = slide.target_force_n == 0
+    assert free[0]
+    assert np.abs(slide.force_n[free]).max() < 0.2
+    assert np.abs(slide.depth_mm[free]).max() < 0.2
+    assert not np.any(slide.flags[free])
+
+
+def test_a_held_object_gives_back_less_than_it_took(hold):
+    deepest = np.sort(hold.depth_mm.reshape(len(hold), -1), -1)[:, -40:].mean(-1)  # a tenth of the field
+    assert history.returned_share(np.maximum(-hold.force_n[:, 2].astype(float), 0), deepest) < 0.97
+
+
+def test_moment_is_the_lever_of_the_load(slide):
+    assert slide.moment_nmm is not None
+    still = slide.target_force_n == 0
+    np.testing.assert_array_equal(slide.moment_nmm[still], 0)
+    assert np.abs(slide.moment_nmm[:, 2]).max() < 10 * np.abs(slide.force_n[:, :2]).max() + 1
+
+
+def test_frames_come_on_the_cameras_clock(slide, hold):
+    for sequence in (slide, hold):
+        assert np.all(np.diff(sequence.host_time_ns) > 0)
+        seconds = (sequence.host_time_ns - sequence.host_time_ns[0]) / 1e9
+        assert seconds[-1] == pytest.approx(39 * 0.04, abs=0.04)
+        np.testing.assert_array_equal(sequence.force_time_ns, sequence.host_time_ns - 2_000_000)
+
+
+def test_a_sequence_repeats_bit_for_bit(slide):
+    again = make_sequence(CONFIG, 5, _slot("slide_x"), TAC3D, 0)
+    for name, array in vars(slide).items():
+        if isinstance(array, np.ndarray):
+            np.testing.assert_array_equal(array, getattr(again, name), err_msg=name)
+
+
+def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold):
+    tried = []
+
+    def fake(config, index, what, order, trial):
+        tried.append(trial)
+        flags = np.where(np.arange(40) == 39, np.uint32(Flag.STRAIN_LIMIT if trial < 2 else 0), np.uint32(0))
+        return dataclasses.replace(hold, flags=flags.astype(np.uint32), sensor=SENSORS[order])
+
+    monkeypatch.setattr(protocol, "make_sequence", fake)
+    monkeypatch.setattr(protocol, "slot", lambda config, index: _slot("hold"))
+    made = make_contact(CONFIG, 0)
+    assert tried == [0] * 4 + [1] * 4 + [2] * 4
+    assert not any(s.flags.any() for s in made)
+    tried.clear()
+    make_contact(SceneConfig(objects=12), 0)
+    assert tried == [0] * 4
+
+
+def test_another_attempt_is_another_site():
+    first, second = (site_of(CONFIG, 3, 1, trial) for trial in (0, 1))
+    assert np.abs(first.place_mm - second.place_mm).max() > 0.1
+
+
+def test_limits_lie_where_the_strain_does(monkeypatch):
+    """The look's limit, on one sensor and a coarse grid, against presses at that force."""
+    monkeypatch.setattr(strength, "MODELS", strength.MODELS[TAC3D : TAC3D + 1])
+    sites = [site_of(CONFIG, i, 0, 0) for i in range(10)]
+    limits = strength.look(
+        [s.skin for s in sites], np.array([s.turn_rad for s in sites]), np.array([s.solid.modulus_mpa for s in sites])
+    )
+    assert np.all(limits.rigid_n <= limits.actual_n * 1.02)
+    for factor, past in ((0.8, False), (1.6, True)):
+        for i in range(10):
+            if not 1.5 < limits.actual_n[i] < 20:
+                continue  # beyond the forces of the look its limit is a guess
+            slot = schedule.Slot(object_index=i, site=0, motion="hold", force_n=float(factor * limits.actual_n[i]))
+            flags = make_sequence(CONFIG, 20 + i, slot, TAC3D, 0).flags
+            assert bool(np.any(flags & np.uint32(Flag.STRAIN_LIMIT))) == past, (i, factor)

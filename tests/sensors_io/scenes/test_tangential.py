@@ -1,0 +1,293 @@
+"""Friction: closed forms of a sphere on a half-space, a float64 host solution of layers, the limits, the flags."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.scenes import tangential, traction
+from sensors_io.scenes.hertz import Hertz, half_space_spectrum
+from sensors_io.scenes.layer import Layer, depth_response, wave_numbers
+
+N, WINDOW_MM = 48, 16.0
+SPACING = WINDOW_MM / N
+X = (np.arange(N) + 0.5) * SPACING - WINDOW_MM / 2
+RADIUS = np.hypot(X[None], X[:, None])
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+SHEAR_MODULUS, FRICTION = 0.15, 0.5
+SPHERE = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=2.0)
+"""On a half-space of ν = 0, whose tangential compliance 1/(μq) is isotropic: Cattaneo's solution is then exact."""
+STILL = jnp.zeros((N, N), jnp.complex64)
+SHEAR_DISPLACEMENT = jax.jit(traction.shear_displacement)
+
+
+@functools.cache
+def _half_space() -> traction.Compliance:
+    half = half_space_spectrum(N, SPACING, 2 * SHEAR_MODULUS)
+    mirrored = np.roll(half[::-1], 1, 0)[:, N - 1 : 0 : -1]
+    even = jnp.asarray(np.concatenate([half, mirrored], 1), jnp.float32)
+    return traction.Compliance(even=even, odd=jnp.zeros_like(even, jnp.complex64))
+
+
+@functools.cache
+def _layer() -> traction.Compliance:
+    return traction.make_compliance(GEL, 2 * N, SPACING)
+
+
+def _limit() -> np.ndarray:
+    """μp of the sphere, which carries the force exactly."""
+    p = SPHERE.pressure_mpa(RADIUS)
+    return FRICTION * p * SPHERE.force_n / (p.sum() * SPACING**2)
+
+
+def _slide(limit: np.ndarray, target: np.ndarray | complex, compliance: traction.Compliance, **kwargs):
+    field = jnp.asarray(np.broadcast_to(target, limit.shape), jnp.complex64)
+    return jax.device_get(tangential.solve(jnp.asarray(limit, jnp.float32), field, compliance, **kwargs))
+
+
+def _pull(limit: np.ndarray, force: tuple[float, float], compliance: traction.Compliance, tolerance: float = 1e-4):
+    q = jnp.asarray(force, jnp.float32)
+    return jax.device_get(
+        tangential.solve_force(jnp.asarray(limit, jnp.float32), q, STILL, compliance, SPACING, tolerance)
+    )
+
+
+def _force(solved: tangential.Traction) -> complex:
+    return complex(solved.traction_mpa.sum(dtype=np.complex128)) * SPACING**2
+
+
+def _rough_pressure(seed: int = 0) -> np.ndarray:
+    """A ragged contact, as of dots on a ball."""
+    rng = np.random.default_rng(seed)
+    wavy = np.cos(X[None] * 2.1 + rng.uniform(0, 6)) * np.cos(X[:, None] * 1.9 + rng.uniform(0, 6))
+    return 0.15 * np.maximum(1 - RADIUS**2 / 25 + 0.8 * wavy, 0) * (RADIUS < 6)
+
+
+# Closed forms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_cattaneo_and_mindlin(share: float) -> None:
+    most, a = FRICTION * SPHERE.force_n, SPHERE.contact_radius_mm
+    solved = _pull(_limit(), (share * most, 0.0), _half_space())
+    stick = a * (1 - share) ** (1 / 3)
+    slide = 3 * most * 2 / (16 * SHEAR_MODULUS * a) * (1 - (1 - share) ** (2 / 3))
+    inner = np.sqrt(np.maximum(1 - (RADIUS / stick) ** 2, 0)) * SPHERE.peak_pressure_mpa * stick / a
+    expected = FRICTION * (SPHERE.pressure_mpa(RADIUS) - inner)
+    assert solved.converged
+    assert solved.slide_mm.real == pytest.approx(slide, rel=0.01)
+    assert solved.slide_mm.imag == pytest.approx(0, abs=1e-5)
+    assert solved.stick_share == pytest.approx((stick / a) ** 2, abs=0.06)
+    assert np.linalg.norm(solved.traction_mpa - expected) < 0.06 * np.linalg.norm(expected)
+    assert _force(solved) == pytest.approx(share * most, rel=1e-5)
+
+
+def test_prescribed_slide_and_prescribed_force_agree() -> None:
+    pulled = _pull(_limit(), (0.3, 0.4), _half_space())
+    slid = _slide(_limit(), complex(pulled.slide_mm), _half_space(), tolerance=1e-4)
+    assert _force(slid) == pytest.approx(0.3 + 0.4j, rel=2e-3)
+    assert np.linalg.norm(slid.traction_mpa - pulled.traction_mpa) < 0.02 * np.linalg.norm(pulled.traction_mpa)
+
+
+def _lubkin(stick_ratio: float) -> tuple[float, float]:
+    """Twist and torque of a sphere that sticks within r < c = stick_ratio a.
+
+    A stack of twisted punches of radius t (Reissner & Sagoci: torque 16/3 G t³ each) makes τ = μp outside c by Abel's
+    transform: θ(c) = 3μF/(4πGa²) [K(k) − E(k)], k² = 1 − c²/a², and the torque ∫ 16/3 G t³ dθ(t) (Lubkin 1951).
+    """
+    a, angle = SPHERE.contact_radius_mm, np.linspace(0, np.pi / 2, 4001)
+
+    def twist(ratio: np.ndarray) -> np.ndarray:
+        root = np.sqrt(1 - (1 - ratio[:, None] ** 2) * np.sin(angle) ** 2)
+        scale = 3 * FRICTION * SPHERE.force_n / (4 * np.pi * SHEAR_MODULUS * a**2)
+        return scale * np.trapezoid(1 / root - root, angle, axis=1)
+
+    ratio = np.linspace(stick_ratio, 1, 400)
+    theta = twist(ratio)
+    return float(theta[0]), float(np.trapezoid(16 / 3 * SHEAR_MODULUS * (ratio * a) ** 3, -theta))
+
+
+@pytest.mark.parametrize("stick_ratio", [0.8, 0.5, 0.2])
+def test_lubkin_twist(stick_ratio: float) -> None:
+    twist, torque = _lubkin(stick_ratio)
+    x = jnp.asarray(X, jnp.float32)
+    solved = _slide(_limit(), 1j * twist * (X[None] + 1j * X[:, None]), _half_space(), tolerance=1e-4)
+    force, moment = jax.jit(traction.resultant)(jnp.zeros((N, N)), solved.traction_mpa, x, SPACING)
+    assert moment[2] == pytest.approx(torque, rel=0.02)
+    np.testing.assert_allclose(force, 0, atol=1e-4)
+    assert solved.stick_share == pytest.approx(stick_ratio**2, abs=0.08)
+
+
+def test_full_twist_torque() -> None:
+    solved = _slide(_limit(), 100j * (X[None] + 1j * X[:, None]), _half_space())
+    moment = np.sum(X[None] * solved.traction_mpa.imag - X[:, None] * solved.traction_mpa.real) * SPACING**2
+    expected = 3 * np.pi / 16 * FRICTION * SPHERE.force_n * SPHERE.contact_radius_mm
+    assert moment == pytest.approx(expected, rel=0.01)
+
+
+# Limits --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_long_slide_slips_everywhere() -> None:
+    limit = _rough_pressure()
+    solved = _slide(limit, 30 * np.exp(0.7j), _layer())
+    expected = limit * np.exp(0.7j)
+    assert solved.stick_share == 0
+    assert np.linalg.norm(solved.traction_mpa - expected) < 5e-3 * np.linalg.norm(expected)
+    assert abs(_force(solved)) == pytest.approx(limit.sum() * SPACING**2, rel=1e-4)
+
+
+def test_without_a_limit_it_sticks_and_is_linear() -> None:
+    limit = 1e3 * (_rough_pressure() > 0)
+    once, twice = (_slide(limit, s, _layer(), tolerance=1e-5) for s in (0.1 + 0.05j, 0.2 + 0.1j))
+    contact = limit > 0
+    assert once.stick_share == 1
+    np.testing.assert_allclose(once.displacement_mm[contact], 0.1 + 0.05j, atol=1e-4)
+    assert _force(twice) == pytest.approx(2 * _force(once), rel=1e-3)
+
+
+def test_the_force_limit_is_a_flag() -> None:
+    most = _limit().sum() * SPACING**2
+    past, at = _pull(_limit(), (1.2 * most, 0.0), _half_space()), _pull(_limit(), (0.999 * most, 0.0), _half_space())
+    assert at.converged
+    assert not past.converged
+    np.testing.assert_allclose(past.traction_mpa, _limit(), rtol=0.01, atol=1e-6)
+
+
+def test_no_contact_no_traction() -> None:
+    solved = _slide(np.zeros((N, N)), 0.3, _layer())
+    assert solved.converged
+    assert solved.iterations == 0
+    assert solved.stick_share == 0
+    np.testing.assert_array_equal(solved.traction_mpa, 0)
+    pulled = _pull(np.zeros((N, N)), (1.0, 0.0), _layer())
+    assert not pulled.converged
+    np.testing.assert_array_equal(pulled.traction_mpa, 0)
+
+
+def test_no_motion_no_traction() -> None:
+    solved = _slide(_rough_pressure(), 0.0, _layer())
+    assert solved.converged
+    np.testing.assert_array_equal(solved.traction_mpa, 0)
+
+
+# Reference -----------------------------------------------------------------------------------------------------------
+
+
+def _reference(limit: np.ndarray, target: np.ndarray, layer: Layer, points: int = 2 * N) -> np.ndarray:
+    """Float64, by real components and accelerated projected gradients with restarts, to a gap of 1e-7."""
+    q_y, q_x = wave_numbers(points, SPACING)
+    q = np.hypot(q_y, q_x)
+    at = depth_response(q, layer, 0.0)
+    inner = (np.abs(q_y) < np.pi / SPACING * 0.999) & (q_x < np.pi / SPACING * 0.999) & (q > 0)
+    c, s = (np.where(inner, part / np.where(q > 0, q, 1), 0) for part in (q_x, q_y))
+    even, odd = (at.lateral_shear + at.transverse) / 2, (at.lateral_shear - at.transverse) / 2
+    tensor = np.array([[even + odd * (c**2 - s**2), 2 * odd * c * s], [2 * odd * c * s, even - odd * (c**2 - s**2)]])
+
+    def moved(t: np.ndarray) -> np.ndarray:
+        spectrum = np.fft.rfft2(t, s=(points, points))
+        return np.fft.irfft2(np.einsum("abyx,byx->ayx", tensor, spectrum), s=(points, points))[:, :N, :N]
+
+    goal = np.stack([target.real, target.imag])
+    step, t, y, momentum = 1 / tensor.max(), np.zeros((2, N, N)), np.zeros((2, N, N)), 1.0
+    for _ in range(6000):
+        trial = y + step * (goal - moved(y))
+        new = trial * np.minimum(1, limit / np.maximum(np.hypot(*trial), 1e-300))
+        if np.sum((y - new) * (new - t)) > 0:
+            y, momentum = t, 1.0
+            continue
+        following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
+        y, t, momentum = new + (momentum - 1) / following * (new - t), new, following
+        slip = goal - moved(t)
+        gap = np.sum(limit * np.hypot(*slip) - np.sum(slip * t, 0))
+        if gap < 1e-7 * np.sum(limit * np.hypot(*goal)):
+            return t[0] + 1j * t[1]
+    raise RuntimeError(f"reference traction: gap {gap:.1e}; raise the cap")
+
+
+def _carried(field: np.ndarray) -> np.ndarray:
+    return jax.device_get(SHEAR_DISPLACEMENT(jnp.asarray(field, jnp.complex64), _layer()))
+
+
+REFERENCE_SCENES = {
+    "sphere": (_limit(), np.full((N, N), 0.2 + 0j)),
+    "dots": (_rough_pressure(1), np.full((N, N), 0.1 + 0.15j)),
+    "twist": (_rough_pressure(2), 0.1j * (X[None] + 1j * X[:, None])),
+    "slide and twist": (_rough_pressure(3), 0.1 + 0.06j * (X[None] - 2 + 1j * X[:, None])),
+}
+
+
+@pytest.mark.parametrize("name", REFERENCE_SCENES)
+def test_agrees_with_the_float64_reference(name: str) -> None:
+    limit, target = REFERENCE_SCENES[name]
+    reference = _reference(limit, target, GEL)
+    carried = _carried(reference)
+    for tolerance, u_error, t_error in ((2e-3, 0.03, 0.1), (5e-5, 1e-3, 0.015)):
+        solved = _slide(limit, target, _layer(), tolerance=tolerance, max_iterations=400)
+        assert solved.converged
+        assert np.linalg.norm(solved.displacement_mm - carried) < u_error * np.linalg.norm(carried)
+        assert np.linalg.norm(solved.traction_mpa - reference) < t_error * np.linalg.norm(reference)
+        assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
+
+
+@pytest.mark.parametrize("name", REFERENCE_SCENES)
+def test_the_residual_is_the_gap_of_the_friction_law(name: str) -> None:
+    limit, target = REFERENCE_SCENES[name]
+    solved = _slide(limit, target, _layer())
+    slip = target - _carried(solved.traction_mpa)
+    gap = np.sum(limit * np.abs(slip) - (slip.conj() * solved.traction_mpa).real) / np.sum(limit * np.abs(target))
+    assert gap == pytest.approx(float(solved.residual), abs=1e-5)
+    assert bool(solved.converged) == (solved.residual < tangential.TOLERANCE)
+
+
+# Failure cases -------------------------------------------------------------------------------------------------------
+
+
+def _one_pixel() -> np.ndarray:
+    limit = np.zeros((N, N))
+    limit[N // 2, N // 2] = 0.1
+    return limit
+
+
+THIN = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=0.3)
+INCOMPRESSIBLE = Layer(modulus_mpa=0.3, poisson=0.5, thickness_mm=4.0)
+VERY_SOFT = Layer(modulus_mpa=0.01, poisson=0.48, thickness_mm=4.0)
+HARD_CASES = {
+    "one pixel": (_one_pixel(), 0.2, GEL),
+    "full pad": (np.full((N, N), 0.05), 0.3 + 0.1j, GEL),
+    "white noise": (0.1 * np.random.default_rng(0).random((N, N)), 0.2, GEL),
+    "thin gel": (_rough_pressure(), 0.05, THIN),
+    "incompressible": (_rough_pressure(), 0.2, INCOMPRESSIBLE),
+    "very soft gel": (_rough_pressure(), 5.0, VERY_SOFT),
+    "tiny pressure": (1e-8 * _rough_pressure(), 0.2, GEL),
+    "tiny slide": (_rough_pressure(), 1e-7, GEL),
+}
+
+
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_hard_cases_converge_without_nan(name: str) -> None:
+    limit, target, gel = HARD_CASES[name]
+    solved = _slide(limit, target, traction.make_compliance(gel, 2 * N, SPACING))
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(solved))
+    assert solved.converged
+    assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
+
+
+def test_the_cap_clears_converged() -> None:
+    solved = _slide(_rough_pressure(), 0.15, _layer(), tolerance=1e-5, max_iterations=2)
+    assert not solved.converged
+    assert solved.iterations == 2
+    assert solved.residual >= 1e-5
+
+
+def test_mapped_equals_single_and_a_start_changes_nothing() -> None:
+    limit = jnp.asarray(_rough_pressure(), jnp.float32)
+    fields = jnp.asarray(np.stack([np.full((N, N), s) for s in (0.1, 0.2j)]), jnp.complex64)
+    solve = functools.partial(tangential.solve, limit, compliance=_layer(), tolerance=1e-4)
+    mapped = jax.jit(lambda f: jax.lax.map(lambda one: solve(one), f))(fields)
+    single = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4)
+    warm = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4, start_mpa=mapped.traction_mpa[0])
+    for found in (mapped.displacement_mm[1], warm.displacement_mm):
+        np.testing.assert_allclose(found, single.displacement_mm, atol=2e-3)
