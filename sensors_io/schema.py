@@ -45,6 +45,7 @@ class Flag(enum.IntFlag):
     UNSTABLE_FORCE = 32
     MARKER_LOSS = 64
     TIME_GAP = 128
+    ADHESION = 256  # touched so lightly that adhesion, which is left out, would change the contact
 
 
 class SchemaError(ValueError):
@@ -72,7 +73,7 @@ FRAME_ARRAYS: Mapping[str, Spec] = {
     "host_time_ns": Spec(np.int64, ("N",)),  # monotonic
     "device_time_ns": Spec(np.int64, ("N",), optional=True),
     "force_time_ns": Spec(np.int64, ("N",), optional=True),
-    "phase": Spec(np.uint8, ("N",)),  # 0 approach, 1 load, 2 hold, 3 unload
+    "phase": Spec(np.uint8, ("N",)),  # 0 approach, 1 load, 2 hold, 3 unload, 4 move
     "flags": Spec(np.uint32, ("N",)),  # bits of `Flag`
 }
 """Per-frame arrays of a `Sequence`; row n of each of them together is one tactile record."""

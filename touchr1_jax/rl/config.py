@@ -13,10 +13,10 @@ class GRPOConfig:
     paper's learning rate for models trained from scratch, which stand still at 1e-6.
     """
 
-    prompts: int = 32
+    prompts: int = 16
     group: int = 8
     length: int = 20
-    micro_prompts: int = 8
+    micro_prompts: int = 4
     learning_rate: float = 1e-6
     lr_scale: float = 150.0
     max_grad_norm: float = 1.0
