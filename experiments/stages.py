@@ -30,7 +30,7 @@ from touchr1_jax.rl.grpo import Fixed, GRPOState, ScoreFn, make_grpo_step
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig, fit
-from touchr1_jax.training.optimizer import OptimizerConfig, constant_adamw, make_optimizer
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.training.sft import SFTState, make_sft_step
 from touchr1_jax.types import Params, Parsed
 
@@ -227,7 +227,7 @@ def run_grpo(
 ) -> Params:
     """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
     feed = QuestionFeed(assembly, features, label, batch_size=config.prompts, seed=seed)
-    optimizer, step = grpo_program(assembly.agent, score, config)
+    optimizer, step = grpo_program(assembly.agent, score, config, loop.steps)
     decoder = {"decoder": params["decoder"]}
     trained = jax.tree.map(jnp.copy, decoder)
     state = GRPOState(
@@ -239,9 +239,12 @@ def run_grpo(
 
 
 @functools.cache
-def grpo_program(agent: Agent, score: ScoreFn, config: GRPOConfig) -> tuple[optax.GradientTransformation, Any]:
+def grpo_program(
+    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int
+) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds of an arm."""
-    optimizer = constant_adamw(config.learning_rate * config.lr_scale, config.max_grad_norm)
+    learning_rate = config.learning_rate * config.lr_scale
+    optimizer = falling_adamw(learning_rate, config.final_share, steps, config.max_grad_norm)
     return optimizer, make_grpo_step(agent, score, optimizer, config)
 
 

@@ -63,8 +63,8 @@ class StudyConfig:
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
-    grpo_steps: int = 330
-    grpo_save_every: int = 110
+    grpo_steps: int = 560
+    grpo_save_every: int = 200
 
     def __post_init__(self) -> None:
         if self.grpo.length != self.model.completion_tokens:

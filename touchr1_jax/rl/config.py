@@ -9,16 +9,18 @@ from touchr1_jax.rl.kl import KLEstimator
 class GRPOConfig:
     """The algorithm; `paper()` is the published objective with our values for what it leaves open.
 
-    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.  `lr_scale` multiplies the
-    paper's learning rate for models trained from scratch, which stand still at 1e-6.
+    `gamma`, the clip range, population σ, `epsilon` and `final_share`, to which the learning rate falls linearly, are
+    ours: the paper gives none.  `lr_scale` multiplies the paper's learning rate for models trained from scratch, which
+    stand still at 1e-6.
     """
 
-    prompts: int = 16
+    prompts: int = 8
     group: int = 8
     length: int = 20
     micro_prompts: int = 4
     learning_rate: float = 1e-6
-    lr_scale: float = 150.0
+    lr_scale: float = 200.0
+    final_share: float = 0.05
     max_grad_norm: float = 1.0
     clip_low: float = 0.2
     clip_high: float = 0.2

@@ -26,9 +26,15 @@ class OptimizerConfig:
         return self.learning_rate * self.lr_scale
 
 
-def constant_adamw(learning_rate: float, max_grad_norm: float) -> optax.GradientTransformation:
-    """Clip the global gradient norm, then AdamW at one learning rate, without decay: the optimizer of GRPO."""
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adamw(learning_rate, weight_decay=0.0))
+def falling_adamw(
+    learning_rate: float, final_share: float, steps: int, max_grad_norm: float
+) -> optax.GradientTransformation:
+    """Clip the global gradient norm, then AdamW without decay of weights: the optimizer of GRPO.
+
+    The learning rate falls linearly to `final_share` of itself over `steps` updates; 1 keeps it constant.
+    """
+    schedule = optax.linear_schedule(learning_rate, final_share * learning_rate, steps)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adamw(schedule, weight_decay=0.0))
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:

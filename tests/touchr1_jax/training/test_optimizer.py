@@ -5,14 +5,17 @@ import numpy as np
 import optax
 import pytest
 
-from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 
 CONFIG = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, warmup_steps=4, max_grad_norm=1e9)
 
 
 def step_sizes(config: OptimizerConfig, steps: int) -> np.ndarray:
+    return update_sizes(make_optimizer(config, steps), steps)
+
+
+def update_sizes(optimizer: optax.GradientTransformation, steps: int) -> np.ndarray:
     """Length of each update of one parameter under a constant gradient: Adam makes it the learning rate."""
-    optimizer = make_optimizer(config, steps)
     params = jnp.array(1.0)
     state, sizes = optimizer.init(params), []
     for _ in range(steps):
@@ -28,6 +31,12 @@ def test_rate_warms_up_to_the_scaled_rate_and_decays_to_its_share():
     assert (np.diff(sizes[4:]) < 0).all()
     cosine = 0.05 + 0.95 * (1 + np.cos(np.pi * 7 / 8)) / 2
     np.testing.assert_allclose(sizes[11], 1e-3 * cosine, rtol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_the_rate_of_grpo_falls_on_a_line(share):
+    sizes = update_sizes(falling_adamw(1e-4, share, 4, max_grad_norm=1e9), 4)
+    np.testing.assert_allclose(sizes, 1e-4 * (1 - (1 - share) * np.arange(4) / 4), rtol=1e-3)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])
