@@ -27,7 +27,7 @@ MARKERS = "Ds^vXph"
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps and values of one logged scalar of one stage."""
 
-_LOOK: dict[Any, Any] = {
+LOOK: dict[Any, Any] = {
     "svg.hashsalt": "touchr1-jax",  # the same data give the same file
     "font.size": 9,
     "axes.spines.top": False,
@@ -38,11 +38,19 @@ _LOOK: dict[Any, Any] = {
     "axes.axisbelow": True,
     "legend.frameon": False,
 }
+"""Settings of every chart, for `matplotlib.rc_context`."""
 
 
 def colours(arms: Iterable[str]) -> dict[str, str]:
     """The colour of every arm, the same in every chart and table."""
     return dict(zip(arms, itertools.cycle(PALETTE), strict=False))
+
+
+def svg(figure: Figure) -> bytes:
+    """The figure as SVG; the same figure gives the same bytes, made within `LOOK`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
 
 
 def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:
@@ -70,7 +78,7 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
     """
     columns = min(3, len(scalars))
     rows = math.ceil(len(scalars) / columns)
-    with mpl.rc_context(_LOOK):
+    with mpl.rc_context(LOOK):
         figure = Figure(figsize=(3.35 * columns, 0.35 + 2.15 * rows), layout="constrained")
         for i, (name, series) in enumerate(scalars.items()):
             axes = figure.add_subplot(rows, columns, i + 1)
@@ -82,7 +90,7 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
         if arms:
             lines = [Line2D([], [], color=colour.get(arm, SHARED), lw=2) for arm in arms]
             figure.legend(lines, list(arms), loc="outside upper left", ncols=len(arms))
-        return _svg(figure)
+        return svg(figure)
 
 
 def accuracy_against_middle(
@@ -91,7 +99,7 @@ def accuracy_against_middle(
     colour: Mapping[str, str],
 ) -> bytes | None:
     """Accuracy over the rate of middle answers: small dots are seeds, large ones their mean; `None` if not measured."""
-    with mpl.rc_context(_LOOK):
+    with mpl.rc_context(LOOK):
         figure = Figure(figsize=(6.6, 3.7), layout="constrained")
         axes = figure.add_subplot()
         drawn = [_draw_point(axes, name, row, colour[name], "o") for name, row in arms.items()]
@@ -102,7 +110,7 @@ def accuracy_against_middle(
         if not any(drawn):
             return None
         figure.legend(loc="outside right upper")
-        return _svg(figure)
+        return svg(figure)
 
 
 def _draw_series(axes: Axes, series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str]) -> None:
@@ -150,9 +158,3 @@ def _curve(points: Sequence[tuple[int, float]]) -> Curve:
     last = dict(points)
     steps = sorted(last)
     return np.array(steps), np.array([last[s] for s in steps])
-
-
-def _svg(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()

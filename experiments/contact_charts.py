@@ -1,9 +1,7 @@
 """Charts of the contact experiments: speed against error, and maps of where a method breaks."""
 
-import io
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -11,18 +9,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from experiments.charts import MARKERS, PALETTE
-
-_LOOK: dict[Any, Any] = {
-    "svg.hashsalt": "touchr1-jax",  # the same data give the same file
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#8a929c",
-    "axes.axisbelow": True,
-    "grid.color": "#eceff2",
-    "legend.frameon": False,
-}
+from experiments.charts import LOOK, MARKERS, PALETTE, svg
 
 Point = tuple[str, float, float, float]
 """Name, ms a frame, median error, 95th percentile of the error."""
@@ -36,7 +23,7 @@ def speed_against_error(groups: Mapping[str, Sequence[Point]], error: str, goal:
       error: label of the error axis.
       goal: time and error that must be kept, drawn as a corner; `None` for none.
     """
-    with mpl.rc_context(_LOOK):
+    with mpl.rc_context(LOOK):
         figure = Figure(figsize=(7.4, 4.6), layout="constrained")
         axes = figure.subplots()
         for (kind, points), colour, marker in zip(
@@ -51,9 +38,8 @@ def speed_against_error(groups: Mapping[str, Sequence[Point]], error: str, goal:
             limit, bound = goal
             axes.plot([limit, limit, axes.get_xlim()[0]], [axes.get_ylim()[0], bound, bound], "k:", lw=1)
         axes.set(xscale="log", yscale="log", xlabel="time a frame, ms", ylabel=error)
-        axes.grid(True)
         axes.legend(loc="best", fontsize=8)
-        return _svg(figure)
+        return svg(figure)
 
 
 def failure_maps(
@@ -71,7 +57,7 @@ def failure_maps(
       rows, columns: label and values of either axis.
       tolerance: the error at which the colours turn.
     """
-    with mpl.rc_context(_LOOK):
+    with mpl.rc_context(LOOK):
         figure = Figure(figsize=(2.6 * len(maps) + 0.9, 3.1), layout="constrained")
         panels = figure.subplots(1, len(maps), squeeze=False)[0]
         scale = ScalarMappable(LogNorm(tolerance * 1e-2, 1.0), "cividis")
@@ -80,16 +66,11 @@ def failure_maps(
             axes.imshow(shown, norm=scale.norm, cmap=scale.cmap, origin="lower", aspect="auto")
             y, x = np.nonzero(flagged[name])
             axes.plot(x, y, "x", color="white", ms=5)
+            axes.grid(False)
             axes.set_title(name, fontsize=9)
             axes.set_xticks(range(len(columns[1])), [f"{v:g}" for v in columns[1]], fontsize=7)
             axes.set_yticks(range(len(rows[1])), [f"{v:g}" for v in rows[1]], fontsize=7)
             axes.set_xlabel(columns[0])
         panels[0].set_ylabel(rows[0])
         figure.colorbar(scale, ax=panels, label="error of displacement").ax.axhline(2 * tolerance, color="white", lw=1)
-        return _svg(figure)
-
-
-def _svg(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+        return svg(figure)

@@ -126,7 +126,7 @@ def motions(config: GalleryConfig) -> Picture:
 
 def varied(config: GalleryConfig) -> Picture:
     """Height maps of objects that change over their surface, with the level of hardness where a press would land."""
-    x = jnp.linspace(-12, 12, 160)
+    x = jnp.linspace(-12, 12, 320)
     pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
     rows = {}
     for kind, shares in (("two parts", (1.0, 0.0)), ("graded", (0.0, 1.0))):
@@ -170,11 +170,13 @@ def _press_sheet(sequences: list[Sequence], index: int) -> Picture:
     assert forces is not None
     rows = {s.sensor: _frames(s, len(forces)) for s in sequences}
     change = {"its change × 3": _frames(sequences[0], len(forces), amplify=True)}
-    rows = {SENSORS[0]: rows.pop(SENSORS[0])} | change | rows
+    dense = {"its fields": _fields(sequences[-1], np.arange(len(forces)))}  # no eye follows its pattern
+    rows = {SENSORS[0]: rows.pop(SENSORS[0])} | change | rows | dense
     return Picture(
         name=f"press-{index}",
         title=f"Object {index} pressed",
-        caption="The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers.",
+        caption="The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers, as of "
+        "the dense pattern below; dark dots are nodes that were not read.",
         content=picture_rows(rows, [f"{force:.1f} N" for force in forces]),
         kind="png",
     )
@@ -187,6 +189,11 @@ def _frames(sequence: Sequence, columns: int, amplify: bool = False) -> list[np.
         frames = sequence.frames[at]
         change = 128 + 3 * (frames.astype(np.float32) - frames[0])
         return list(np.clip(change, 0, 255).astype(np.uint8) if amplify else frames)
+    return _fields(sequence, at)
+
+
+def _fields(sequence: Sequence, at: np.ndarray) -> list[np.ndarray]:
+    """Depth and displacement of some frames."""
     assert sequence.depth_mm is not None
     assert sequence.deformation_mm is not None
     top = float(sequence.depth_mm.max())
@@ -196,11 +203,15 @@ def _frames(sequence: Sequence, columns: int, amplify: bool = False) -> list[np.
 def _mark_levels(picture: np.ndarray, solid: objects.Solid) -> np.ndarray:
     """Writes the level of hardness at nine sites into the picture of 24 mm."""
     marked = picture.copy()
+    size = picture.shape[0] / 160
+    rim, stroke = max(2, round(4 * size)), max(1, round(size))
     for x in (-8, 0, 8):
         for y in (-8, 0, 8):
             level = solid.at(np.array([x, y])).levels()["hardness"]
-            at = (round((x / 24 + 0.5) * picture.shape[1]) - 5, round((y / 24 + 0.5) * picture.shape[0]) + 5)
-            cv2.putText(marked, "smh"[level], at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+            across, down = ((v / 24 + 0.5) * picture.shape[0] for v in (x, y))
+            at = (round(across - 5 * size), round(down + 5 * size))
+            for colour, width in (((0, 0, 0), rim), ((255, 255, 255), stroke)):  # readable on any relief
+                cv2.putText(marked, "smh"[level], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * size, colour, width, cv2.LINE_AA)
     return marked
 
 

@@ -7,6 +7,9 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from experiments.charts import LOOK, SHARED, svg
 
 CELL_INCH = 1.25
 DPI = 150
@@ -78,7 +81,7 @@ def strips(panels: Mapping[str, tuple[Mapping[str, tuple[float, ...]], tuple[flo
       panels: title → (row → low, middle, high; thresholds).
       colour: of the ranges.
     """
-    with mpl.rc_context({"font.size": 8, "svg.hashsalt": "touchr1-jax"}):
+    with mpl.rc_context(LOOK | {"font.size": 8, "axes.grid.axis": "x"}):
         figure = Figure(figsize=(2.2 * len(panels), 2.6), layout="constrained")
         for k, (title, (spans, thresholds)) in enumerate(panels.items()):
             axes = figure.add_subplot(1, len(panels), k + 1)
@@ -86,13 +89,11 @@ def strips(panels: Mapping[str, tuple[Mapping[str, tuple[float, ...]], tuple[flo
             low, middle, high = np.array(list(spans.values())).T
             axes.hlines(rows, low, high, color=colour, lw=3, alpha=0.35)
             axes.scatter(middle, rows, color=colour, s=14, zorder=3)
-            axes.vlines(thresholds, -0.6, len(spans) - 0.4, color="#4d5560", lw=0.8, ls="--")
+            axes.vlines(thresholds, -0.6, len(spans) - 0.4, color=SHARED, lw=0.8, ls="--")
             axes.set(xscale="log", title=title, ylim=(len(spans) - 0.4, -0.6))
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axes.set_yticks(rows, list(spans) if k == 0 else [""] * len(spans))
-            axes.spines[["top", "right"]].set_visible(False)
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-        return buffer.getvalue()
+        return svg(figure)
 
 
 def _coloured(scaled: np.ndarray) -> np.ndarray:

@@ -16,15 +16,15 @@ Expected: some 800 records a second at 112², so that the paper's 1.32 million r
 
 import dataclasses
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from experiments import scene_protocol, scene_rates, scene_stages
+from experiments import scene_charts, scene_protocol, scene_rates, scene_stages
 from experiments.context import Context
-from experiments.findings import Cell, Column, Findings, Requirement, Table
+from experiments.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.runner import Experiment
 from experiments.scene_rates import Rate
 from sensors_io.records import RecordStore
@@ -35,6 +35,11 @@ from sensors_io.schema import SENSORS, Flag
 
 PAPER_OBJECTS, PAPER_SEQUENCES, PAPER_FRAMES = 1000, 14_700, 90
 PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
+FEED_RATE, LARGE_RATE, WRITTEN_HOURS = 400, 150, 1.5
+"""What is required: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
+
+Stages = Mapping[str, Mapping[str, float]]
+"""Sensor → part of the work → milliseconds of one core a record."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,7 +104,7 @@ def run(config: ThroughputConfig, context: Context) -> Findings:
     found = _once(context, "written/0", lambda: _written(config, context))
     written = Written(**found | {"rate": Rate(**found["rate"])})
     context.say("timing stages")
-    stages = _stage_table(config)
+    stages = _stages(config)
     floor = _floor_table(config)
     context.say("looking at what force tells")
     paper = SceneConfig(
@@ -110,7 +115,14 @@ def run(config: ThroughputConfig, context: Context) -> Findings:
     return Findings(
         verdict=_verdict(feed, large, written),
         requirements=_requirements(feed, large, written, leaks),
-        tables=(_rate_table(config, feed, large, written), stages, floor, _left_out_table(paper), _leak_table(leaks)),
+        tables=(
+            _rate_table(config, feed, large, written),
+            _stage_table(config, stages),
+            floor,
+            _left_out_table(paper),
+            _leak_table(leaks),
+        ),
+        pictures=(_picture(config, feed, large, written, stages),),
         settings={"threads": config.threads, "frames": config.frames, "contact_grid": config.contact_grid},
         data={"feed_records": feed.records, "large_records": large.records, "written_records": written.rate.records},
         timing={"feed_s": feed.seconds, "large_s": large.seconds, "written_s": written.rate.seconds},
@@ -181,10 +193,10 @@ def _requirements(
     hours, write_hours = (PAPER_RECORDS / r.per_second / 3600 for r in (feed, written.rate))
     worst = max(leaks[-1].accuracy)
     return (
-        needs("feed at 112²", feed.per_second, 400, "higher", "records/s"),
-        needs("feed at 448²", large.per_second, 150, "higher", "records/s"),
+        needs("feed at 112²", feed.per_second, FEED_RATE, "higher", "records/s"),
+        needs("feed at 448²", large.per_second, LARGE_RATE, "higher", "records/s"),
         needs("paper-sized set as a feed", hours, 1, "lower", "h"),
-        needs("paper-sized set written", write_hours, 1.5, "lower", "h"),
+        needs("paper-sized set written", write_hours, WRITTEN_HOURS, "lower", "h"),
         needs("paper-sized set on disk", PAPER_RECORDS * written.bytes / 1e9, 60, "lower", "GB"),
         needs("kills survived", written.kills, 5, "higher", ""),
         needs("contacts that differ after kills", written.differing, 0, "lower", ""),
@@ -218,19 +230,44 @@ def _rate_table(config: ThroughputConfig, feed: Rate, large: Rate, written: Writ
     )
 
 
-def _stage_table(config: ThroughputConfig) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+def _picture(config: ThroughputConfig, feed: Rate, large: Rate, written: Written, stages: Stages) -> Picture:
+    rates = (
+        (f"feed {config.image_px}²", feed.per_second, FEED_RATE),
+        (f"feed {config.large_px}²", large.per_second, LARGE_RATE),
+        (f"written {config.image_px}²", written.rate.per_second, PAPER_RECORDS / WRITTEN_HOURS / 3600),
+    )
+    return Picture(
+        name="throughput",
+        title="How fast, and what takes the time",
+        caption=f"Records a second on {config.threads} threads; the work on a record with a picture of "
+        f"{config.image_px}², friction where the object moves.",
+        content=scene_charts.rates_and_stages(rates, stages),
+    )
+
+
+def _stages(config: ThroughputConfig) -> Stages:
     scenes = config.scenes(config.feed_contacts, config.image_px)
+    stages = {}
     for name in config.stage_sensors:
         cost = scene_stages.stage_costs(scenes, SENSORS.index(name), config.stage_objects)
-        rows.append((name, cost.normal, cost.friction, cost.fields, cost.picture))
+        stages[name] = {
+            "pressure": cost.normal,
+            "friction": cost.friction,
+            "fields": cost.fields,
+            "picture": cost.picture,
+        }
+    return stages
+
+
+def _stage_table(config: ThroughputConfig, stages: Stages) -> Table:
+    parts = next(iter(stages.values()))
     return Table(
         title=f"Where the time of a record goes, {config.image_px}²",
         columns=(
             Column(name="sensor"),
-            *(Column(name=n, unit="ms", format=".2f") for n in ("pressure", "friction", "fields", "picture")),
+            *(Column(name=n, unit="ms", format=".2f") for n in parts),
         ),
-        rows=tuple(rows),
+        rows=tuple((name, *costs.values()) for name, costs in stages.items()),
         note="Milliseconds of one core, by timing the program with and without each part; friction only when moving.",
     )
 

@@ -1,8 +1,13 @@
 """Adhesion: whether it changes a contact by more than a tolerance, and the contact where it does.
 
+The generator solves contacts without it.  It asks here for the least force at which that is within a tolerance and
+flags the frames of lighter touches; roughness, which keeps most surfaces from sticking, counts.  Leaving such frames
+out instead would tell the labels, since only smooth objects would lose theirs, and would tear every ramp open.
+
 E* = E / (1 − ν²) is the plane-strain modulus, MPa; w the work of adhesion, N/mm (1 J/m² = 1e-3 N/mm).
 Sources: Johnson, Kendall & Roberts 1971; Derjaguin, Muller & Toporov 1975; Tabor 1977; Johnson & Greenwood 1997;
-Ciavarella 2018 (any shape).
+Persson & Tosatti 2001
+(roughness); Ciavarella 2018 (any shape).
 """
 
 import dataclasses
@@ -10,6 +15,7 @@ import dataclasses
 import numpy as np
 
 from sensors_io.scenes.config import require
+from sensors_io.scenes.layer import Layer
 
 JKR_ABOVE, DMT_BELOW = 5.0, 0.1
 """Tabor parameters past which one of the limits holds (Johnson & Greenwood 1997)."""
@@ -71,9 +77,46 @@ class Adhesion:
         require(force_n > 0, "force_n", force_n, "must be > 0")
         return (self.hertz_force_n(force_n) / force_n) ** (1 / 3) - 1
 
+    def least_force_n(self, tolerance: float) -> float:
+        """Force from which on adhesion widens the contact by no more than `tolerance`: where the change equals it.
+
+            JKR  F = 6πwR s / (s − 1)²,   DMT  F = 2πwR / (s − 1),   s = (1 + tolerance)³
+
+        Raises:
+          ValueError: a tolerance not above 0.
+        """
+        require(tolerance > 0, "tolerance", tolerance, "must be > 0")
+        unit = np.pi * self.work_n_per_mm * self.radius_mm
+        excess = (1 + tolerance) ** 3 - 1
+        return float(6 * unit * (1 + excess) / excess**2 if self.tabor >= 1 else 2 * unit / excess)
+
     def may_be_left_out(self, force_n: float, tolerance: float) -> bool:
-        """Whether contact radius changes by no more than `tolerance`, relative; roughness only lessens the change."""
+        """Whether the contact radius changes by no more than `tolerance`, relative."""
         return self.relative_change(force_n) <= tolerance
+
+
+def plane_modulus_mpa(*bodies: Layer) -> float:
+    """E* of bodies in series, taken as half-spaces: 1/E* = Σ (1 − ν²)/E."""
+    return 1 / sum((1 - body.poisson**2) / body.modulus_mpa for body in bodies)
+
+
+def work_left(
+    work_n_per_mm: float, modulus_mpa: float, wave_numbers: np.ndarray, wave_amplitudes_mm: np.ndarray
+) -> float:
+    """Work of adhesion that is left of w on a rough surface, what it takes to flatten its waves paid: at least 0.
+
+        w − Σ E* |k| a² / 8
+
+    Args:
+      work_n_per_mm: w of the smooth surface.
+      modulus_mpa: E*.
+      wave_numbers: k [K, 2], rad/mm.
+      wave_amplitudes_mm: a [K].
+
+    Source: Persson & Tosatti 2001, J. Chem. Phys. 115, 5597–5610.  Waves finer than those given would lessen it more.
+    """
+    flattening = modulus_mpa * np.hypot(*wave_numbers.T) * wave_amplitudes_mm**2 / 8
+    return max(float(work_n_per_mm - flattening.sum()), 0.0)
 
 
 def adhesive_ramp(

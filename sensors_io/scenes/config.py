@@ -30,6 +30,10 @@ class SceneConfig:
     `frames` is by default 8 for presses and 90 for the protocol.  `split_shares` are the shares of objects in train,
     val and test.  The hand misses its targets by `force_jitter` (relative), the force sensor has a relative gain error
     per sequence and noise on each axis.  The last two numbers but the seed are the contact solver's.
+
+    Contacts are solved without adhesion; frames in which it would widen the contact by more than `adhesion_tolerance`,
+    relative, are flagged.  `adhesion_j_per_m2` is its work between gel and object.  The default is that of clean
+    silicone (Chaudhury & Whitesides 1991: 44 mJ/m²), an upper estimate: the coatings of real gels stick less.
     """
 
     objects: int = 600
@@ -46,6 +50,8 @@ class SceneConfig:
     force_gain_error: float = 0.01
     force_noise_n: float = 0.03
     ramp_s: float = 3.0
+    adhesion_j_per_m2: float = 0.05
+    adhesion_tolerance: float = 0.1
     split_shares: tuple[float, float, float] = (0.7, 0.1, 0.2)
     solver_tolerance: float = 1e-3
     solver_max_iterations: int = 200
@@ -65,6 +71,8 @@ class SceneConfig:
         ok = 0 < self.min_force_n <= self.max_force_n
         require(ok, "min_force_n", self.min_force_n, f"must lie in (0, max_force_n = {self.max_force_n}]")
         require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
+        require(self.adhesion_j_per_m2 >= 0, "adhesion_j_per_m2", self.adhesion_j_per_m2, "must be ≥ 0")
+        require(self.adhesion_tolerance > 0, "adhesion_tolerance", self.adhesion_tolerance, "must be > 0")
         ok = min(self.split_shares) >= 0 and abs(sum(self.split_shares) - 1) < 1e-6
         require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
         require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")

@@ -80,7 +80,7 @@ def advance(
     step: Step,
     bodies: Bodies,
     x_mm: Float[Array, "N"],
-    tolerance: float = tangential.TOLERANCE,
+    tolerance: Array | float = tangential.TOLERANCE,
     max_iterations: int = tangential.MAX_ITERATIONS,
 ) -> tuple[History, Frame]:
     """Go on by one frame: scan it over the frames of a sequence.

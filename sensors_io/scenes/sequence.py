@@ -7,9 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from sensors_io.scenes import history, motions, noise, objects, schedule, surface
+from sensors_io.scenes import adhesion, history, motions, noise, objects, schedule, surface
 from sensors_io.scenes.cards import object_id, region_px, solid_of
 from sensors_io.scenes.config import GENERATOR, SceneConfig, as_f32, stream
+from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.press import Grid, Path, Press, make_kernels, record
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
@@ -87,7 +88,7 @@ def make_sequence(config: SceneConfig, index: int, what: schedule.Slot, order: i
         host_time_ns=time_ns,
         force_time_ns=time_ns - _FORCE_LEAD_NS,
         phase=hand.phase,
-        flags=_flags(made),
+        flags=_flags(made) | _light(config, sensor, site, force),
     )
 
 
@@ -98,9 +99,12 @@ def key_of(what: schedule.Slot, trial: int) -> ContactKey:
 
 def _loss(sensor: SensorModel, solid: objects.Solid) -> float:
     """Share of the energy that gel and object keep on unloading."""
-    body = dataclasses.replace(BODY, modulus_mpa=solid.modulus_mpa)
-    share = history.body_share(sensor.gel, body, _CONTACT_MM)
+    share = history.body_share(sensor.gel, _body(solid), _CONTACT_MM)
     return history.Loss(gel=_GEL_LOSS, body=1 - solid.energy_returned).of_contact(share)
+
+
+def _body(solid: objects.Solid) -> Layer:
+    return dataclasses.replace(BODY, modulus_mpa=solid.modulus_mpa)
 
 
 def _record(config: SceneConfig, sensor: SensorModel, press: Press, unit: Unit, key: np.ndarray, moving: bool) -> Any:
@@ -117,6 +121,25 @@ def _flags(made: Any) -> np.ndarray:
     flags[made.strain > STRAIN_LIMIT] |= np.uint32(Flag.STRAIN_LIMIT)
     flags[~made.converged] |= np.uint32(Flag.NOT_CONVERGED)
     return flags
+
+
+def _light(config: SceneConfig, sensor: SensorModel, site: Site, force_n: np.ndarray) -> np.ndarray:
+    """Frames that touch so lightly that adhesion, which is left out, would count: bits [F] uint32.
+
+    Of the body's mean curvature and its roughness at the site; relief, which makes narrower contacts, is left out.
+    """
+    modulus = adhesion.plane_modulus_mpa(sensor.gel, _body(site.solid))
+    work = 1e-3 * config.adhesion_j_per_m2  # N/mm
+    contact = adhesion.Adhesion(
+        radius_mm=1 / float(np.mean(site.skin.curvature_per_mm)),
+        plane_modulus_mpa=modulus,
+        work_n_per_mm=adhesion.work_left(work, modulus, site.solid.wave_numbers, site.solid.wave_amplitudes_mm),
+    )
+    touches = force_n > 0
+    if contact.may_be_left_out(float(force_n[touches].min()), config.adhesion_tolerance):
+        return np.zeros(len(force_n), np.uint32)
+    light = touches & (force_n < contact.least_force_n(config.adhesion_tolerance))
+    return np.where(light, np.uint32(Flag.ADHESION), np.uint32(0))
 
 
 def _hand(config: SceneConfig, what: schedule.Slot) -> motions.Plan:

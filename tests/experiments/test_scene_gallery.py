@@ -37,7 +37,7 @@ def test_a_press_is_a_row_per_sensor(records: Path) -> None:
     sheet = scene_gallery._press_sheet([contact[sensor] for sensor in SENSORS], 3)
     image = cv2.imdecode(np.frombuffer(sheet.content, np.uint8), cv2.IMREAD_COLOR)
     assert sheet.name == "press-3"
-    assert image.shape[0] == pytest.approx(scene_sheets.DPI * (0.25 + 5 * scene_sheets.CELL_INCH), abs=1)
+    assert image.shape[0] == pytest.approx(scene_sheets.DPI * (0.25 + 6 * scene_sheets.CELL_INCH), abs=1)
 
 
 @pytest.mark.slow  # compiles eight programs

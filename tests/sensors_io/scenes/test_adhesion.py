@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.scenes.adhesion import JKR_ABOVE, Adhesion, adhesive_ramp
+from sensors_io.scenes.adhesion import JKR_ABOVE, Adhesion, adhesive_ramp, plane_modulus_mpa, work_left
+from sensors_io.scenes.layer import Layer
 
 GEL_MODULUS = 0.3 / (1 - 0.48**2)
 SOFT = Adhesion(radius_mm=8.0, plane_modulus_mpa=GEL_MODULUS, work_n_per_mm=5e-5)  # 0.05 J/m²
@@ -56,6 +57,33 @@ def test_adhesion_may_be_left_out_of_a_firm_press_only() -> None:
     assert dataclasses.replace(SOFT, work_n_per_mm=0.0).relative_change(0.02) == 0
 
 
+@pytest.mark.parametrize("of", [SOFT, STIFF], ids=["JKR", "DMT"])
+@pytest.mark.parametrize("tolerance", [0.01, 0.1, 0.5])
+def test_from_the_least_force_on_the_change_is_within_the_tolerance(of: Adhesion, tolerance: float) -> None:
+    least = of.least_force_n(tolerance)
+    assert of.relative_change(least) == pytest.approx(tolerance)
+    assert of.may_be_left_out(1.01 * least, tolerance)
+    assert not of.may_be_left_out(0.99 * least, tolerance)
+
+
+def test_without_adhesion_no_force_is_too_small() -> None:
+    assert dataclasses.replace(SOFT, work_n_per_mm=0.0).least_force_n(0.1) == 0
+
+
+def test_half_spaces_in_series() -> None:
+    gel, body = (Layer(modulus_mpa=e, poisson=nu, thickness_mm=4.0) for e, nu in ((0.3, 0.48), (1.0, 0.4)))
+    assert plane_modulus_mpa(gel) == pytest.approx(GEL_MODULUS)
+    assert plane_modulus_mpa(gel, body) == pytest.approx(1 / ((1 - 0.48**2) / 0.3 + (1 - 0.4**2) / 1.0))
+
+
+def test_roughness_pays_for_its_flattening_from_the_work() -> None:
+    """Pressure E*ka/2 cos flattens a wave a cos: half of their product, averaged, is E*ka²/8."""
+    waves = np.array([[3.0, 4.0], [0.0, 2.0]])
+    assert work_left(5e-5, 0.4, waves, np.array([0.01, 0.0])) == pytest.approx(5e-5 - 0.4 * 5 * 1e-4 / 8)
+    assert work_left(5e-5, 0.4, waves, np.zeros(2)) == 5e-5
+    assert work_left(5e-5, 0.4, waves, np.array([0.02, 0.05])) == 0
+
+
 def _sphere_ramp(points: int = 4000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     depth = np.linspace(0.005, 0.5, points)
     force = 4 / 3 * GEL_MODULUS * np.sqrt(SOFT.radius_mm) * depth**1.5
@@ -84,6 +112,8 @@ def test_impossible_input_is_refused() -> None:
         dataclasses.replace(SOFT, radius_mm=0)
     with pytest.raises(ValueError, match="work_n_per_mm is -1"):
         dataclasses.replace(SOFT, work_n_per_mm=-1)
+    with pytest.raises(ValueError, match=r"tolerance is 0\.0: must be > 0"):
+        SOFT.least_force_n(0.0)
     with pytest.raises(ValueError, match="the pull-off"):
         SOFT.hertz_force_n(-1.0)
     with pytest.raises(ValueError, match=r"force_n is 0\.0: must be > 0"):

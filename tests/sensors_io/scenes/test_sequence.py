@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import SceneConfig, history, make_contact, motions, protocol, schedule, strength
-from sensors_io.scenes.sequence import make_sequence, site_of
+from sensors_io.scenes.sensors import MODELS
+from sensors_io.scenes.sequence import _light, make_sequence, site_of
 from sensors_io.schema import SENSORS, Flag
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
@@ -72,6 +73,35 @@ def test_a_sequence_repeats_bit_for_bit(slide):
     for name, array in vars(slide).items():
         if isinstance(array, np.ndarray):
             np.testing.assert_array_equal(array, getattr(again, name), err_msg=name)
+
+
+def test_what_adhesion_would_change_is_flagged_and_nothing_else_changes(slide):
+    """Sixty times the work makes every touch at 2 N a light one; none makes none."""
+    configs = [dataclasses.replace(CONFIG, adhesion_j_per_m2=work) for work in (0.0, 3.0)]
+    without, much = (make_sequence(config, 5, _slot("slide_x"), TAC3D, 0) for config in configs)
+    touches = slide.target_force_n > 0
+    assert not np.any(without.flags & np.uint32(Flag.ADHESION))
+    np.testing.assert_array_equal((much.flags & np.uint32(Flag.ADHESION)) > 0, touches)
+    unflagged = lambda made: dataclasses.replace(made, flags=made.flags & ~np.uint32(Flag.ADHESION))
+    for other in (without, much):
+        for name, array in vars(unflagged(slide)).items():
+            if isinstance(array, np.ndarray):
+                np.testing.assert_array_equal(array, vars(unflagged(other))[name], err_msg=name)
+
+
+def test_adhesion_counts_in_the_lightest_touches_of_smooth_objects():
+    config = dataclasses.replace(CONFIG, objects=40)
+    force = np.array([0.0, 0.01, 0.1, 0.3, 1.0, 5.0])
+    found = []
+    for index in range(config.objects):
+        site = site_of(config, index, 0, 0)
+        found.append(_light(config, MODELS[TAC3D], site, force) > 0)
+        if site.solid.rms_mm > 0.03:
+            assert not found[-1].any()
+    share = np.mean(found, 0)
+    assert share[0] == share[-1] == 0
+    assert np.all(np.diff(share[1:]) <= 0)
+    assert 0.1 < share[1] < 0.7
 
 
 def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold):

@@ -1,0 +1,74 @@
+"""What the shape of an object alone tells: statistics of the true gap, to which no touch was added.
+
+They set the line that touch has to pass.  The material ties the properties of an object together, so its shape tells
+something of its hardness; roughness and protrusion are shape, so here the line is a ceiling.
+"""
+
+import itertools
+from collections.abc import Sequence as Seq
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sensors_io.scenes import surface
+
+WINDOW_MM, POINTS = 18.0, 108
+"""Part of the skin that is looked at: as much as a sensor covers, six points per mm."""
+
+WAVES_MM = (16.0, 8.0, 5.0, 3.5, 2.5, 1.8, 1.2, 0.7)
+"""Edges of the bands of wavelength, from the width of the window to below the shortest wave of any skin."""
+
+HEIGHTS_MM = (0.01, 0.03, 0.1, 0.3, 1.0)
+"""Heights above the deepest point at which the area below is taken."""
+
+_TINY = 1e-6  # mm; keeps logarithms of a perfectly smooth skin finite
+
+
+def statistics(skins: Seq[surface.Skin]) -> np.ndarray:
+    """Curvatures, roughness by band and bearing curve of every skin, all logarithmic, float32 [n, 14].
+
+    Per skin: the two principal curvatures of the least-squares paraboloid, the rms of what it leaves in each band of
+    `WAVES_MM` under a Hann window, and the share of the window below each of `HEIGHTS_MM` (Abbott & Firestone 1933).
+    """
+    spacing = WINDOW_MM / POINTS
+    x = (np.arange(POINTS) + 0.5) * spacing - WINDOW_MM / 2
+    basis = _paraboloids(x)
+    inverse = np.linalg.pinv(basis)
+    bands = _bands(spacing)
+    return np.stack([_summary(gap, basis, inverse, bands) for gap in _gaps(skins, x)]).astype(np.float32)
+
+
+def _gaps(skins: Seq[surface.Skin], x: np.ndarray) -> np.ndarray:
+    """Gaps of all skins under a level sensor over the site, [n, N, N] mm."""
+    zero = jnp.zeros(())
+    level = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=zero, tilt=jnp.zeros(2))
+    stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *jax.device_get(list(skins)))
+    gap_of = lambda skin: surface.gap(skin, level, jnp.asarray(x, jnp.float32))
+    return np.asarray(jax.jit(lambda s: jax.lax.map(gap_of, s))(stacked), np.float64)
+
+
+def _summary(gap: np.ndarray, basis: np.ndarray, inverse: np.ndarray, bands: np.ndarray) -> np.ndarray:
+    coefficients = inverse @ gap.ravel()
+    xx, xy, yy = coefficients[3:]
+    curvature = np.linalg.eigvalsh(np.array([[2 * xx, xy], [xy, 2 * yy]]))
+    left = (gap.ravel() - basis @ coefficients).reshape(gap.shape)
+    taper = np.hanning(POINTS)
+    power = np.abs(np.fft.fft2(left * np.outer(taper, taper))).ravel() ** 2 / gap.size**2
+    rms = np.sqrt(bands @ power)
+    below = np.mean(gap.ravel()[:, None] <= np.array(HEIGHTS_MM), axis=0)
+    return np.log(np.concatenate([np.maximum(curvature, 0) + _TINY, rms + _TINY, below + 1 / gap.size]))
+
+
+def _paraboloids(x: np.ndarray) -> np.ndarray:
+    """1, x, y, x², xy, y² at all points, [N², 6]."""
+    columns, rows = (a.ravel() for a in np.meshgrid(x, x))
+    return np.stack([np.ones_like(columns), columns, rows, columns**2, columns * rows, rows**2], -1)
+
+
+def _bands(spacing: float) -> np.ndarray:
+    """Which wave numbers belong to each band, [bands, N²] of 0 and 1."""
+    frequency = np.fft.fftfreq(POINTS, spacing)
+    per_mm = np.hypot(frequency[:, None], frequency[None]).ravel()
+    edges = 1 / np.array(WAVES_MM)
+    return np.array([(per_mm >= low) & (per_mm < high) for low, high in itertools.pairwise(edges)], float)
