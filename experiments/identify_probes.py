@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.training.evidence import ProbeConfig, probe_log_probs
+from touchr1_jax.training.evidence import ProbeConfig, group_folds, probe_log_probs
 
 LEVELS = 3
 
@@ -65,10 +65,7 @@ def transfer(
     Raises:
       ValueError: fewer objects than folds.
     """
-    names, which = np.unique(objects, return_inverse=True)
-    if len(names) < config.folds:
-        raise ValueError(f"objects has {len(names)} members, fewer than folds = {config.folds}; lower folds")
-    fold = np.random.default_rng(0).permutation(len(names))[which] % config.folds
+    fold = group_folds(objects, config, "objects")
     copies = 1 + len(tests)
     trained = fold != np.arange(config.folds)[:, None]
     weights = np.concatenate([trained, np.zeros((config.folds, len(fold) * (copies - 1)), bool)], 1)

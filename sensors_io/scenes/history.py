@@ -24,9 +24,6 @@ import numpy as np
 from sensors_io.scenes.config import require
 from sensors_io.scenes.layer import Layer, normal_compliance
 
-ELASTICITY_EDGES = (0.65, 0.85)
-"""Shares of the energy that come back between the levels 0, 1 and 2 of elasticity; our choice."""
-
 _ENERGY_WAVE = 1.5
 
 
@@ -111,8 +108,3 @@ def returned_share(force_n: np.ndarray, depth_mm: np.ndarray) -> float:
     put_in, back = loop_work(force_n, depth_mm)
     require(put_in > 0, "force_n", put_in, "must do work: record a load and its unload")
     return back / put_in
-
-
-def elasticity_level(loss: float) -> int:
-    """Ordinal elasticity of an object, 0, 1 or 2, from the share 1 − β that comes back."""
-    return int(np.searchsorted(ELASTICITY_EDGES, 1 - loss, side="right"))

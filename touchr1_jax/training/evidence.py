@@ -103,12 +103,26 @@ def cross_fit(
     Raises:
       ValueError: fewer groups than folds.
     """
-    names, group = np.unique(groups, return_inverse=True)
-    if len(names) < config.folds:
-        raise ValueError(f"groups has {len(names)} members, fewer than folds = {config.folds}; lower folds")
-    fold = np.random.default_rng(0).permutation(len(names))[group] % config.folds
+    fold = group_folds(groups, config)
     weights = np.stack([(fold != k) & (labels >= 0) for k in range(config.folds)])
     return probe_log_probs(features, labels, weights, levels, config)[fold, np.arange(len(fold))]
+
+
+def group_folds(groups: np.ndarray, config: ProbeConfig, field: str = "groups") -> Int[np.ndarray, "n"]:
+    """Fold of each row, 0 … folds − 1, dealt at random to whole groups by a fixed seed.
+
+    Args:
+      groups: identity of each row whose rows stay together.
+      config: number of folds.
+      field: what an error calls the groups.
+
+    Raises:
+      ValueError: fewer groups than folds.
+    """
+    names, group = np.unique(groups, return_inverse=True)
+    if len(names) < config.folds:
+        raise ValueError(f"{field} has {len(names)} members, fewer than folds = {config.folds}; lower folds")
+    return np.random.default_rng(0).permutation(len(names))[group] % config.folds
 
 
 @functools.partial(jax.jit, static_argnames=("levels", "config"))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensors_io.scenes import history
+from sensors_io.scenes import history, properties
 from sensors_io.scenes.layer import Layer
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
@@ -78,11 +78,11 @@ def test_an_inner_loop_closes() -> None:
 
 def test_elasticity_can_be_read_from_load_against_unload() -> None:
     levels = {}
-    for loss in (0.4, 0.25, 0.05):
+    for loss in (0.7, 0.4, 0.05):
         elastic = history.elastic_force(THERE_AND_BACK, loss)
         share = history.returned_share(THERE_AND_BACK, _depth(elastic))
-        levels[loss] = (history.elasticity_level(loss), history.elasticity_level(1 - share))
-    assert levels == {0.4: (0, 0), 0.25: (1, 1), 0.05: (2, 2)}
+        levels[loss] = (properties.ELASTICITY.level(1 - loss), properties.ELASTICITY.level(share))
+    assert levels == {0.7: (0, 0), 0.4: (1, 1), 0.05: (2, 2)}
 
 
 def test_losses_mix_by_stored_energy() -> None:
