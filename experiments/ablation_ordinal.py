@@ -21,14 +21,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.baselines import baselines
-from experiments.context import Context
-from experiments.estimates import compare_over_objects, compare_over_seeds, estimate
-from experiments.examples import rollout_examples
-from experiments.results import Comparison, Estimate, Results
-from experiments.runner import Experiment
-from experiments.stages import Evaluated, SFTConfig, reward_of
-from experiments.study import BLIND, SFT, Study, StudyConfig, run_study
+from experiments.policies.baselines import baselines
+from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.policies.examples import rollout_examples
+from experiments.policies.stages import Evaluated, SFTConfig, reward_of
+from experiments.policies.study import BLIND, SFT, Study, StudyConfig, run_study
+from experiments.reporting.results import Comparison, Estimate, Results
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from sensors_io.scenes import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import Scores, evaluate

@@ -23,13 +23,12 @@ from collections.abc import Sequence as Seq
 
 import numpy as np
 
-from experiments import identify_motions, identify_tables
-from experiments.context import Context
-from experiments.findings import Findings, Requirement
-from experiments.identify_figures import Figures, Studied, figures
-from experiments.identify_motions import MOTIONS, Moved
-from experiments.identify_presses import Pressed, press
-from experiments.identify_studies import (
+from experiments.identify import motions as identify_motions
+from experiments.identify import tables as identify_tables
+from experiments.identify.figures import Figures, Studied, figures
+from experiments.identify.motions import MOTIONS, Moved
+from experiments.identify.presses import Pressed, press
+from experiments.identify.studies import (
     DYNAMIC,
     FORCE,
     FUSED,
@@ -40,9 +39,11 @@ from experiments.identify_studies import (
     over_noise,
     without_touch,
 )
-from experiments.identify_tables import CHANCE, MAY_LOSE
-from experiments.identify_touch import Tier
-from experiments.runner import Experiment
+from experiments.identify.tables import CHANCE, MAY_LOSE
+from experiments.identify.touch import Tier
+from experiments.reporting.findings import Findings, Requirement
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from sensors_io.live import LiveScenes
 from sensors_io.scenes import SceneConfig
 from sensors_io.scenes.config import require

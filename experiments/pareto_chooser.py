@@ -21,11 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments import chooser_bench, chooser_charts, chooser_fit
-from experiments.chooser_bench import FAMILIES, Outcomes
-from experiments.context import Context
-from experiments.findings import Cell, Column, Findings, Picture, Requirement, Table
-from experiments.runner import Experiment
+from experiments.chooser import bench as chooser_bench
+from experiments.chooser import charts as chooser_charts
+from experiments.chooser import fit as chooser_fit
+from experiments.chooser.bench import FAMILIES, Outcomes
+from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from sensors_io.scenes import chooser
 from sensors_io.scenes.chooser import SLACK, Law, Setting, make_menu
 from sensors_io.scenes.sensors import MODELS

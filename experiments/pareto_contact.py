@@ -11,7 +11,6 @@ within each round.  One minute on two cores (`smoke` half a minute).  Expected: 
 """
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -20,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import zoom
 
-from experiments import contact_charts, contact_checks, contact_oracles
-from experiments.contact_methods import (
+from experiments.contact import checks as contact_checks
+from experiments.contact import oracles as contact_oracles
+from experiments.contact.methods import (
     Method,
     blur,
     polonsky_keer,
@@ -30,10 +30,12 @@ from experiments.contact_methods import (
     winkler_and_response,
     winkler_only,
 )
-from experiments.contact_scenes import Bench, Scenes, displacement_error, exact, make_bench, sample, slope_error
-from experiments.context import Context
-from experiments.findings import Column, Findings, Picture, Requirement, Table
-from experiments.runner import Experiment
+from experiments.contact.scenes import Bench, Scenes, displacement_error, exact, make_bench, sample, slope_error
+from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
+from experiments.reporting.pareto import Point, speed_against_error
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from experiments.running.timing import interleaved
 from sensors_io.scenes.contact import convolve
 from sensors_io.scenes.sensors import GELSIGHT_MINI, SensorModel
 
@@ -119,17 +121,6 @@ def measure(tiers: tuple[Method, ...], scenes: Scenes, bench: Bench, rounds: int
             "worst u": float(errors["u"].max()),
         }
     return rows
-
-
-def interleaved(calls: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, np.ndarray]:
-    """Seconds of every call in every round, [rounds] each; the calls must have run once before."""
-    seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(rounds):
-        for name, call in calls.items():
-            began = time.perf_counter()
-            jax.block_until_ready(call())
-            seconds[name].append(time.perf_counter() - began)
-    return {name: np.array(s) for name, s in seconds.items()}
 
 
 def grid_ladder(config: ParetoConfig) -> dict[int, dict[str, float]]:
@@ -252,7 +243,7 @@ def _ladder_table(ladder: Mapping[int, Mapping[str, float]]) -> Table:
 
 
 def _picture(rows: Mapping[str, Mapping[str, Any]]) -> Picture:
-    groups: dict[str, list[contact_charts.Point]] = {}
+    groups: dict[str, list[Point]] = {}
     for name, row in rows.items():
         label = name.removeprefix("nested ").removeprefix("plain ")
         groups.setdefault(row["kind"], []).append((label, row["ms"], row["slope median"], row["slope p95"]))
@@ -261,7 +252,7 @@ def _picture(rows: Mapping[str, Mapping[str, Any]]) -> Picture:
         title="Speed against error",
         caption="Slope error by the float64 solution on the same grid; bars reach from median to 95th percentile; the "
         "dotted corner is what is required of tolerance 1e-3.",
-        content=contact_charts.speed_against_error(groups, "slope error", (2.5, 0.05)),
+        content=speed_against_error(groups, "slope error", (2.5, 0.05)),
     )
 
 
@@ -272,7 +263,7 @@ def _ladder_picture(ladder: Mapping[int, Mapping[str, float]]) -> Picture:
         title="The ladder that is useful: the grid",
         caption="Slope error by the finest grid's solution at 1e-4; bars reach from median to 95th percentile. The "
         "finest grid shows its tolerance alone.",
-        content=contact_charts.speed_against_error({"nested 1e-3": points}, "slope error", None),
+        content=speed_against_error({"nested 1e-3": points}, "slope error", None),
     )
 
 

@@ -26,16 +26,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import tangential_checks, tangential_loops, tangential_scenes, tangential_tables
-from experiments import tangential_methods as ways
-from experiments.context import Context
-from experiments.findings import Findings, Requirement
-from experiments.pareto_contact import interleaved
-from experiments.runner import Experiment
-from experiments.tangential_checks import Promise
-from experiments.tangential_methods import Method
-from experiments.tangential_scenes import Bench, Case, Motion
-from experiments.tangential_tables import COMPARED, MAIN, PLAIN, SEQUENCE, SOLVER, SUPERPOSED, Row, Rows
+from experiments.reporting.findings import Findings, Requirement
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from experiments.running.timing import interleaved
+from experiments.tangential import checks as tangential_checks
+from experiments.tangential import loops as tangential_loops
+from experiments.tangential import methods as ways
+from experiments.tangential import scenes as tangential_scenes
+from experiments.tangential import tables as tangential_tables
+from experiments.tangential.checks import Promise
+from experiments.tangential.methods import Method
+from experiments.tangential.scenes import Bench, Case, Motion
+from experiments.tangential.tables import COMPARED, MAIN, PLAIN, SEQUENCE, SOLVER, SUPERPOSED, Row, Rows
 from sensors_io.scenes import tangential
 from sensors_io.schema import SENSORS
 

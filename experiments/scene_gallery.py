@@ -16,11 +16,11 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.charts import PALETTE
-from experiments.context import Context
-from experiments.findings import Findings, Picture
-from experiments.runner import Experiment
-from experiments.scene_sheets import depth_picture, field_picture, picture_rows, strips
+from experiments.reporting.charts import PALETTE
+from experiments.reporting.findings import Findings, Picture
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from experiments.scenes.sheets import depth_picture, field_picture, picture_rows, strips
 from sensors_io.scenes import SceneConfig, appearance, contact_key, make_contact, objects, properties, surface
 from sensors_io.schema import MATERIALS, SENSORS, Sequence
 

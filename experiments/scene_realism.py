@@ -21,14 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments import realism
-from experiments.artifacts import write_text
-from experiments.context import Context
-from experiments.findings import Column, Findings, Picture, Requirement, Table
-from experiments.runner import Experiment
-from experiments.scene_sheets import picture_rows
-from experiments.shadows import shadow_gain
-from experiments.two_sample import Distances, Judge, accuracy, distances
+from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
+from experiments.running.artifacts import write_text
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from experiments.scenes import realism
+from experiments.scenes.shadows import shadow_gain
+from experiments.scenes.sheets import picture_rows
+from experiments.scenes.two_sample import Distances, Judge, accuracy, distances
 from sensors_io.scenes import fitting, photometric
 
 SHOWN = 6

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import contact_charts
-from experiments.contact_checks import rough_sphere
-from experiments.contact_failures import SIDE_MM, Case, suite
-from experiments.contact_methods import polonsky_keer, spg_plain, winkler_and_response
-from experiments.contact_scenes import Scenes, displacement_error, exact, make_bench, sample
-from experiments.context import Context
-from experiments.findings import Cell, Column, Findings, Picture, Requirement, Table
-from experiments.runner import Experiment
+from experiments.contact import charts as contact_charts
+from experiments.contact.checks import rough_sphere
+from experiments.contact.failures import SIDE_MM, Case, suite
+from experiments.contact.methods import polonsky_keer, spg_plain, winkler_and_response
+from experiments.contact.scenes import Scenes, displacement_error, exact, make_bench, sample
+from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from sensors_io.scenes import contact
 from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.sensors import GELSIGHT_MINI

@@ -22,11 +22,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from experiments import scene_charts, scene_protocol, scene_rates, scene_stages
-from experiments.context import Context
-from experiments.findings import Cell, Column, Findings, Picture, Requirement, Table
-from experiments.runner import Experiment
-from experiments.scene_rates import Rate
+from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from experiments.scenes import charts as scene_charts
+from experiments.scenes import protocol as scene_protocol
+from experiments.scenes import rates as scene_rates
+from experiments.scenes import stages as scene_stages
+from experiments.scenes.rates import Rate
 from sensors_io.records import RecordStore
 from sensors_io.scenes import SceneConfig
 from sensors_io.scenes.press import padded_size

@@ -38,6 +38,13 @@ SENSORS_LAYERS = (
 )
 """The same; members of one layer do not know each other."""
 
+EXPERIMENTS_LAYERS = (
+    {"running", "reporting"},
+    {"policies", "contact", "scenes"},
+    {"chooser", "tangential", "identify"},
+)
+"""The same; an experiment itself is one file beside them, which nobody imports."""
+
 REWARDS_MAY_IMPORT = {
     "touchr1_jax.types",
     "touchr1_jax.masked",
@@ -145,6 +152,13 @@ def test_equal_layers_of_sensors_io_do_not_import_each_other():
     assert not wrong
 
 
+@pytest.mark.parametrize("module", [m for m in IMPORTS if starts(m, {"experiments"}) and m.count(".") > 1])
+def test_parts_of_experiments_know_no_experiment_and_no_part_above_them(module):
+    ours = [name for name in IMPORTS[module] if starts(name, {"experiments"})]
+    own = layer_of(module, EXPERIMENTS_LAYERS)
+    assert not [name for name in ours if layer_of(name, EXPERIMENTS_LAYERS) > own]
+
+
 def test_no_module_imports_itself_by_way_of_others():
     known = set(IMPORTS)
     graph = {}
@@ -211,8 +225,8 @@ def test_an_unknown_global_name_would_be_seen():
 
 def test_a_forbidden_import_would_be_seen():
     """Also one inside a function, and one by its parent package."""
-    hidden = "def f():\n    from sensors_io import schema\n    import experiments.runs\n"
-    assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.runs"}
+    hidden = "def f():\n    from sensors_io import schema\n    import experiments.running.runs\n"
+    assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.running.runs"}
     assert starts("sensors_io.schema", {"sensors_io"})
     assert not starts("sensors_io_extra", {"sensors_io"})
     with pytest.raises(AssertionError, match="relative import"):

@@ -6,9 +6,9 @@ import jax
 import pytest
 from rich.console import Console
 
-from experiments.assembly import assemble
-from experiments.context import Context
-from experiments.dataset import open_dataset
+from experiments.policies.assembly import assemble
+from experiments.policies.dataset import open_dataset
+from experiments.running.context import Context
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import config_hash

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from experiments import ablation_ordinal
-from experiments.artifacts import read_json
-from experiments.runner import main
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
 from tests.experiments import tiny
 
 ARMS = ["sft", "zero_one", "ordinal", "debiased"]

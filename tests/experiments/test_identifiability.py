@@ -7,20 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import (
-    identifiability,
-    identify_draw,
-    identify_geometry,
-    identify_motions,
-    identify_presses,
-    identify_probes,
-)
-from experiments.artifacts import read_json
-from experiments.identify_motions import Moved
-from experiments.identify_studies import SOURCES, STATIC
-from experiments.identify_threads import in_threads
-from experiments.identify_touch import Felt, Tier, feel, means, see
-from experiments.runner import main
+from experiments import identifiability
+from experiments.identify import draw as identify_draw
+from experiments.identify import geometry as identify_geometry
+from experiments.identify import motions as identify_motions
+from experiments.identify import presses as identify_presses
+from experiments.identify import probes as identify_probes
+from experiments.identify.motions import Moved
+from experiments.identify.studies import SOURCES, STATIC
+from experiments.identify.threads import in_threads
+from experiments.identify.touch import Felt, Tier, feel, means, see
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
 from sensors_io.scenes import SceneConfig, motions, schedule, surface
 from sensors_io.scenes.press import make_kernels
 from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE

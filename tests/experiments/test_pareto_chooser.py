@@ -6,10 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import chooser_bench, chooser_fit, pareto_chooser
-from experiments.artifacts import read_json
-from experiments.chooser_bench import FAMILIES, Outcomes
-from experiments.runner import main
+from experiments import pareto_chooser
+from experiments.chooser import bench as chooser_bench
+from experiments.chooser import fit as chooser_fit
+from experiments.chooser.bench import FAMILIES, Outcomes
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
 from sensors_io.scenes import chooser
 from sensors_io.scenes.sensors import XENSE
 

@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import contact_checks, contact_oracles, pareto_contact
-from experiments.artifacts import read_json
-from experiments.contact_methods import blur, polonsky_keer, spg_plain, winkler_and_response, winkler_only
-from experiments.contact_scenes import displacement_error, exact, make_bench, sample, slope_error
-from experiments.runner import main
+from experiments import pareto_contact
+from experiments.contact import checks as contact_checks
+from experiments.contact import oracles as contact_oracles
+from experiments.contact.methods import blur, polonsky_keer, spg_plain, winkler_and_response, winkler_only
+from experiments.contact.scenes import displacement_error, exact, make_bench, sample, slope_error
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 
 TINY = pareto_contact.ParetoConfig(scenes=3, grid=32, ladder=(24, 32), ladder_scenes=2, rounds=2, oracle_scenes=1)

@@ -6,13 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import pareto_tangential, tangential_checks, tangential_loops, tangential_scenes, tangential_tables
-from experiments import tangential_methods as ways
-from experiments.artifacts import read_json
-from experiments.results import ResultsError
-from experiments.runner import main
-from experiments.tangential_checks import Promise
-from experiments.tangential_tables import MAIN, PLAIN, SOLVER, Row
+from experiments import pareto_tangential
+from experiments.reporting.results import ResultsError
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from experiments.tangential import checks as tangential_checks
+from experiments.tangential import loops as tangential_loops
+from experiments.tangential import methods as ways
+from experiments.tangential import scenes as tangential_scenes
+from experiments.tangential import tables as tangential_tables
+from experiments.tangential.checks import Promise
+from experiments.tangential.tables import MAIN, PLAIN, SOLVER, Row
 from sensors_io.scenes.sensors import XENSE
 from tests.touchr1_jax.quick import compile_quickly
 

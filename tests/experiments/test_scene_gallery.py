@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import scene_gallery, scene_sheets
-from experiments.artifacts import read_json
-from experiments.runner import main
+from experiments import scene_gallery
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from experiments.scenes import sheets as scene_sheets
 from sensors_io.records import RecordStore
 from sensors_io.scenes import SceneConfig, objects
 from sensors_io.schema import SENSORS

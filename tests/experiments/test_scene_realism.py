@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments import realism
-from experiments.artifacts import read_json
-from experiments.results import ResultsError
-from experiments.runner import main
-from experiments.shadows import shadow_gain
+from experiments.reporting.results import ResultsError
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from experiments.scenes import realism
+from experiments.scenes.shadows import shadow_gain
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from experiments import stability_contact
-from experiments.artifacts import read_json
-from experiments.contact_failures import suite
-from experiments.runner import main
+from experiments.contact.failures import suite
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
 
 TINY = dataclasses.replace(stability_contact.SMOKE, scenes=12, forces_n=(0.01, 1.0), roughness=(2.0,))
 

@@ -5,9 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments import scene_protocol, scene_rates, scene_stages, throughput_scenes
-from experiments.artifacts import read_json
-from experiments.runner import main
+from experiments import throughput_scenes
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from experiments.scenes import protocol as scene_protocol
+from experiments.scenes import rates as scene_rates
+from experiments.scenes import stages as scene_stages
 from sensors_io import generate, live
 from sensors_io.scenes import SceneConfig, contact_key, protocol, strength
 from sensors_io.schema import SENSORS

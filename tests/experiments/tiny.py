@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.assembly import Assembly, ModelConfig
-from experiments.dataset import Dataset
-from experiments.feeds import touch_batch
-from experiments.stages import SFTConfig
-from experiments.study import StudyConfig
+from experiments.policies.assembly import Assembly, ModelConfig
+from experiments.policies.dataset import Dataset
+from experiments.policies.feeds import touch_batch
+from experiments.policies.stages import SFTConfig
+from experiments.policies.study import StudyConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig

@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.artifacts import read_json, write_json
-from experiments.context import Context
-from experiments.estimates import compare_over_objects, compare_over_seeds, estimate
-from experiments.results import Results, RolloutExample
-from experiments.runner import Experiment
+from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.reporting.results import Results, RolloutExample
+from experiments.running.artifacts import read_json, write_json
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from touchr1_jax.bench.metrics import Answers, Scores, evaluate
 
 ATTRIBUTES = ("hardness", "roughness", "protrusion")

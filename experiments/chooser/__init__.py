@@ -1,0 +1,1 @@
+"""Of the chooser's trial: the bench, the fit, charts."""

@@ -1,0 +1,1 @@
+"""Of the contact experiments: scenes, methods, oracles, failures, charts."""

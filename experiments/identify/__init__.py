@@ -1,0 +1,1 @@
+"""Of `identifiability`: touches drawn, probes, studies, tables."""

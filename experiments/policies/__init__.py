@@ -1,0 +1,1 @@
+"""Training and scoring of policies: data, feeds, stages, baselines, one study."""

@@ -1,0 +1,70 @@
+"""Where the data of an experiment comes from: generated scenes, imported recordings, or existing records."""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from experiments.running.context import Context
+from experiments.running.progress import Advance
+from sensors_io.generate import generate_records
+from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
+from sensors_io.scenes import SceneConfig, config_hash
+
+Source = Literal["generated", "physiclear", "records"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SourceConfig:
+    """Which data; `directory` holds the recordings or records, and is not used for generated scenes."""
+
+    kind: Source
+    directory: Path | None
+    scenes: SceneConfig
+    physiclear: PhysiclearConfig
+
+
+def prepare_records(config: SourceConfig, context: Context) -> Path:
+    """Directory of the records, made or imported first where the cache lacks them; an interrupted making goes on.
+
+    Raises:
+      ValueError: recordings or records without a directory, or a directory given for generated scenes.
+    """
+    if (config.directory is None) != (config.kind == "generated"):
+        need = "takes no data_dir: drop it" if config.kind == "generated" else "needs data_dir: the folder to read"
+        raise ValueError(f"data_dir is {config.directory}: data {config.kind!r} {need}")
+    if config.directory is None:
+        path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
+        _make(context, "making scenes", lambda tell: generate_records(config.scenes, path, progress=tell))
+        return path
+    if config.kind == "records":
+        return config.directory
+    source = config.directory.resolve()
+    identity = json.dumps([str(source), dataclasses.asdict(config.physiclear)], sort_keys=True)
+    path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
+    _make(
+        context,
+        "importing videos",
+        lambda tell: import_physiclear(source, path, config=config.physiclear, progress=tell),
+    )
+    return path
+
+
+def _make(context: Context, title: str, make: Callable[[Callable[[int, int], None]], object]) -> None:
+    """Run `make` under a progress bar that its first report opens."""
+    with contextlib.ExitStack() as stack, context.timed("data"):
+        bar: list[Advance] = []
+        seen = 0
+
+        def tell(done: int, total: int) -> None:
+            nonlocal seen
+            if not bar:
+                bar.append(stack.enter_context(context.progress(title, total, done)))
+            elif done > seen:
+                bar[0](done - seen)
+            seen = done
+
+        make(tell)

@@ -1,0 +1,349 @@
+"""The stages that experiments are made of: evidence, SFT, encoding, GRPO, evaluation.
+
+Each is a function of its configuration and inputs; what it leaves behind lies in the run's directory, so that a stopped
+run goes on from its last checkpoint.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from experiments.policies.assembly import Assembly, Weights
+from experiments.policies.dataset import Dataset
+from experiments.policies.feeds import AnswerFeed, QuestionFeed, each, labelled, question_batch, touch_batch
+from experiments.running.context import Context
+from sensors_io.pipeline import clip_batches
+from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.bench.metrics import Answers
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.greedy import make_answer
+from touchr1_jax.rl.grpo import Fixed, GRPOState, ScoreFn, make_grpo_step
+from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
+from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
+from touchr1_jax.training.sft import SFTState, make_sft_step
+from touchr1_jax.types import Params, Parsed
+
+EVAL_BATCH = 64
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SFTConfig:
+    """Stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 450
+    batch_size: int = 16
+    questions: int = 2
+    """Questions per contact and step; the contact is encoded once for all of them."""
+    save_every: int = 100
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Probed:
+    """Fixed features of every contact's streams, float32 [contact, S, D], and of its force alone, [contact, D'].
+
+    `present` [contact, S] says which streams were recorded.
+    """
+
+    streams: np.ndarray
+    present: np.ndarray
+    force: np.ndarray
+
+
+def probe_features(data: Dataset, context: Context) -> Probed:
+    """Summarise all contacts once; every seed shares it."""
+    rows = np.arange(len(data.store))
+    clips = clip_batches(data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False)
+    streams, present, force = [], [], []
+    with context.progress("reading touch", len(rows)) as advance:
+        for clip in clips:
+            streams.append(np.asarray(stream_features(clip["frames"], clip["force_n"])))
+            present.append(clip["stream_mask"])
+            force.append(clip["force_n"].reshape(len(clip["force_n"]), -1))
+            advance(len(clip["contact"]))
+    return Probed(streams=np.concatenate(streams), present=np.concatenate(present), force=np.concatenate(force))
+
+
+def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
+    """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts.
+
+    Levels that an attribute lacks have −inf.  A stream that was not recorded says nothing, 0 for every level, and so
+    does every stream about an attribute that too few objects are annotated for.
+    """
+    rows = data.parts["sft"]
+    out = np.full((len(data.store), len(data.clip.sensors), len(ATTRIBUTES), max(LEVELS.values())), -np.inf, np.float32)
+    for a, name in enumerate(ATTRIBUTES):
+        out[:, :, a, : LEVELS[name]] = 0.0
+        for s in range(len(data.clip.sensors)):
+            felt = rows[probed.present[rows, s] & (data.label[rows, a] >= 0)]
+            label, groups = data.label[felt, a], data.object_ids[felt]
+            if len(np.unique(groups)) >= config.folds:
+                out[felt, s, a, : LEVELS[name]] = cross_fit(
+                    probed.streams[felt, s], label, groups, LEVELS[name], config
+                )
+    return out
+
+
+def run_sft(
+    assembly: Assembly,
+    data: Dataset,
+    evidence: np.ndarray,
+    config: SFTConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+    blind: bool = False,
+) -> Params:
+    """Train a policy from scratch on verified answers; a blind one never feels anything."""
+    feed = AnswerFeed(
+        assembly,
+        data,
+        evidence,
+        batch_size=config.batch_size,
+        questions=config.questions,
+        seed=seed,
+        blind=blind,
+    )
+    optimizer, step = sft_program(assembly.agent, config, blind)
+    clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
+    params = assembly.init(seed, touch_batch(next(iter(clips))))
+    state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
+    return _fit(step, state, feed, LoopConfig(steps=config.steps, save_every=config.save_every), context, stage).params
+
+
+@functools.cache
+def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds."""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    return optimizer, make_sft_step(agent, optimizer, blind=blind)
+
+
+def _fit(step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str) -> Any:
+    """`fit` with the run's checkpoints, log and progress bar."""
+    with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
+        start = checkpoints.latest() or 0
+        context.rewind(stage, start)
+        with context.progress(stage, loop.steps, start) as advance:
+
+            def log(t: int, metrics: dict[str, float]) -> None:
+                context.log(stage, t, **metrics)
+                advance()
+
+            return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
+
+
+def encode_contacts(
+    assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool = False
+) -> Features:
+    """Encode contacts once and keep the features on the host, in the order of `rows`."""
+    clips = clip_batches(
+        data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False, felt=not blind
+    )
+    encode = encode_program(assembly.agent, blind)
+    parts = []
+    with context.progress("encoding", len(rows)) as advance:
+        for clip in clips:
+            parts.append(jax.device_get(encode(params, touch_batch(clip))))
+            advance(len(clip["contact"]))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@functools.cache
+def encode_program(agent: Agent, blind: bool) -> Any:
+    """Compiled encoder, made once."""
+    return jax.jit(lambda p, b: agent.encode(p, b, blind=blind))
+
+
+def noise_bank(
+    agent: Agent, params: Params, data: Dataset, *, seed: int, draws: int = 64, probe: int = 64
+) -> Float[Array, "K S N D"]:
+    """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
+
+    The statistics are those of the recorded frames of `probe` SFT contacts; frame times are those of the same contacts,
+    so that nothing but the touch itself is out of the ordinary.
+    """
+    clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=probe, seed=seed, repeat=False)
+    clip = next(iter(clips))
+    seen = np.where(clip["frame_mask"], 1.0, np.nan).astype(np.float32)
+    pixels = _statistics(clip["frames"].astype(np.float32) * seen[..., None, None, None], (0, 2, 3, 4))
+    force = _statistics(clip["force_n"] * seen[..., None], (0, 2))
+    rows = np.arange(draws) % len(clip["frame_index"])
+    keys = jax.random.split(jax.random.key(seed), draws)
+    times = jnp.asarray(clip["frame_index"][rows]), jnp.asarray(clip["frame_mask"][rows])
+    return noise_program(agent, clip["frames"].shape[3:5])(params, pixels, force, (keys, *times))
+
+
+@functools.cache
+def noise_program(agent: Agent, size: tuple[int, int]) -> Any:
+    """Compiled encoder of noise, (params, pixel statistics, force statistics, (key, index, mask)) → features."""
+
+    def draw(params: Params, pixel: Any, force: Any, x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
+        key, index, mask = x
+        pixel_key, force_key = jax.random.split(key)
+        (pixel_mean, pixel_std), (force_mean, force_std), shape = pixel, force, index.shape
+        noise = jax.random.normal(pixel_key, (*shape, *size, 3)) * pixel_std[:, None, None, None]
+        frames = jnp.clip(noise + pixel_mean[:, None, None, None], 0, 255)
+        push = jax.random.normal(force_key, (*shape, 3)) * force_std[:, None] + force_mean[:, None]
+        return agent.encode_streams(params, frames, push, index, mask, jnp.arange(shape[0]))
+
+    return jax.jit(lambda params, pixel, force, x: jax.lax.map(functools.partial(draw, params, pixel, force), x))
+
+
+def _statistics(x: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of what is not NaN; 0 where nothing is."""
+    known = ~np.isnan(x)
+    n = np.maximum(known.sum(axes), 1)
+    mean = np.where(known, x, 0.0).sum(axes) / n
+    shape = [1 if i in axes else size for i, size in enumerate(x.shape)]
+    square = np.where(known, (x - mean.reshape(shape)) ** 2, 0.0).sum(axes)
+    return mean.astype(np.float32), np.sqrt(square / n).astype(np.float32)
+
+
+def run_grpo(
+    assembly: Assembly,
+    params: Params,
+    features: Features,
+    label: np.ndarray,
+    noise: Float[Array, "K S N D"],
+    score: ScoreFn,
+    config: GRPOConfig,
+    loop: LoopConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+) -> Params:
+    """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
+    feed = QuestionFeed(assembly, features, label, batch_size=config.prompts, seed=seed)
+    optimizer, step = grpo_program(assembly.agent, score, config, loop.steps)
+    decoder = {"decoder": params["decoder"]}
+    trained = jax.tree.map(jnp.copy, decoder)
+    state = GRPOState(
+        params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32), key=jax.random.key(seed)
+    )
+    fixed = Fixed(reference=decoder, noise=noise)
+    end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage)
+    return {**params, **end.params}
+
+
+@functools.cache
+def grpo_program(
+    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int
+) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds of an arm."""
+    learning_rate = config.learning_rate * config.lr_scale
+    optimizer = falling_adamw(learning_rate, config.final_share, steps, config.max_grad_norm)
+    return optimizer, make_grpo_step(agent, score, optimizer, config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluated:
+    """Greedy answers to every question about some contacts; question n is about contact `contact[n]`."""
+
+    contact: np.ndarray
+    attribute: np.ndarray
+    streams: np.ndarray
+    tokens: np.ndarray
+    parsed: Parsed
+    label: np.ndarray  # int32 [N, A], −1 where not asked
+    alone: np.ndarray | None  # int32 [N, S, A]
+
+    def answers(self, reward: np.ndarray) -> Answers:
+        """What the metrics read."""
+        return Answers(
+            conclude=np.asarray(self.parsed.conclude),
+            label=self.label,
+            formatted=np.asarray(self.parsed.formatted),
+            reward=reward,
+            streams=self.streams,
+            perceive=np.asarray(self.parsed.perceive),
+            alone=self.alone,
+        )
+
+
+def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
+    """Ask every labelled question about every contact, with all streams and with each stream alone."""
+    contact, attribute = labelled(label)
+    present = np.asarray(features.stream_mask)[contact]
+    ask = answer_program(assembly)
+    said = _ask(ask, assembly, params, features, label, contact, attribute, present)
+    s = present.shape[1]
+    alone = None
+    if present.any() and s > 1:
+        each_alone = [
+            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
+            for i in range(s)
+        ]
+        alone = np.stack([x.parsed.conclude for x in each_alone], 1)
+    return Evaluated(
+        contact=contact,
+        attribute=attribute,
+        streams=present,
+        tokens=said.tokens,
+        parsed=said.parsed,
+        label=np.where(assembly.layout.asked[attribute], label[contact], -1),
+        alone=alone,
+    )
+
+
+@functools.cache
+def answer_program(assembly: Assembly) -> Any:
+    """Compiled greedy answerer, made once."""
+    return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
+
+
+def _ask(ask, assembly, params, features, label, contact, attribute, streams):
+    """Greedy answers to all questions, in blocks of one size so that the program is compiled once."""
+    decoder, blocks = {"decoder": params["decoder"]}, []
+    for rows, real in each(len(contact), EVAL_BATCH):
+        batch = question_batch(assembly, features, label, contact[rows], attribute[rows], streams[rows])
+        blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(decoder, batch)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+def reward_terms(
+    assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray
+) -> dict[str, Float[np.ndarray, "N"]]:
+    """What each weighted reward adds to the total of each answer."""
+    target = assembly.target(done.attribute, done.label, done.streams)
+    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
+    return jax.device_get(score(jax.tree.map(jnp.asarray, done.parsed), target))
+
+
+@functools.cache
+def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
+    """Compiled reward terms of many answers, made once for each set of weights."""
+    rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
+    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
+
+
+def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
+    """Total reward of each answer under the given weights."""
+    return sum(reward_terms(assembly, done, weights, prior).values(), start=np.zeros(len(done.contact), np.float32))
+
+
+def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
+    """Levels that a probe on the measured forces alone gives contacts, int [len(rows), A]: what the ramp gives away."""
+    train = np.isin(np.arange(len(data.store)), np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+    columns = []
+    for a, name in enumerate(ATTRIBUTES):
+        weight = (train & (data.label[:, a] >= 0))[None]
+        if not weight.any():  # nobody annotated it, so nobody is asked about it
+            columns.append(np.zeros(len(rows), int))
+            continue
+        columns.append(
+            probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)[0, rows].argmax(-1)
+        )
+    return np.stack(columns, 1)

@@ -1,0 +1,219 @@
+"""A study: several arms of GRPO from one SFT checkpoint per seed, on the same data in the same order.
+
+What a finished policy said lies in `answers/NAME-SEED.npz` of the run, so a resumed run asks nothing twice.
+"""
+
+import dataclasses
+import functools
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble
+from experiments.policies.dataset import Dataset, open_dataset
+from experiments.policies.sources import Source, SourceConfig, prepare_records
+from experiments.policies.stages import (
+    Evaluated,
+    Probed,
+    SFTConfig,
+    encode_contacts,
+    evaluate_policy,
+    gather_evidence,
+    noise_bank,
+    probe_features,
+    run_grpo,
+    run_sft,
+)
+from experiments.running.artifacts import write_bytes
+from experiments.running.context import Context
+from sensors_io.importers.physiclear import PhysiclearConfig
+from sensors_io.pipeline import ClipConfig
+from sensors_io.scenes import SceneConfig
+from sensors_io.schema import UNKNOWN, Flag
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import ScoreFn
+from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.types import Parsed
+
+SFT, BLIND = "sft", "tactile_blind"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StudyConfig:
+    """Everything that a study depends on."""
+
+    seeds: int = 5
+    """Training seeds, paired between arms."""
+    data: Source = "generated"
+    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
+    data_dir: Path | None = None
+    """Folder of the videos or records."""
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1)
+    physiclear: PhysiclearConfig = PhysiclearConfig()
+    grpo_share: float = 0.35
+    """Share of the training objects that SFT never sees."""
+    model: ModelConfig = ModelConfig()
+    probe: ProbeConfig = ProbeConfig()
+    sft: SFTConfig = SFTConfig()
+    blind: SFTConfig = SFTConfig()
+    grpo: GRPOConfig = GRPOConfig.paper()
+    grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
+    """What GRPO asks about; the arms may differ in how they pay for it."""
+    grpo_steps: int = 560
+    grpo_save_every: int = 200
+
+    def __post_init__(self) -> None:
+        if self.grpo.length != self.model.completion_tokens:
+            raise ValueError(
+                f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
+                "the length that SFT teaches; set both"
+            )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Study:
+    """What a study knows when it is done; `answers[name][seed]` are the answers about the test contacts."""
+
+    config: StudyConfig
+    data: Dataset
+    assembly: Assembly
+    probed: Probed
+    prior: np.ndarray
+    arms: Mapping[str, Weights]
+    answers: Mapping[str, Sequence[Evaluated]]
+
+    @property
+    def test_label(self) -> np.ndarray:
+        """Labels of the test contacts, int32 [contact, A]."""
+        return self.data.label[self.data.parts["test"]]
+
+
+def run_study(config: StudyConfig, arms: Mapping[str, Weights], context: Context) -> Study:
+    """Make the data, train every arm of every seed, ask every policy.
+
+    Args:
+      config: sizes, data, algorithm.
+      arms: reward weights of each arm.
+      context: the run.
+    """
+    data = open_study_data(config, context)
+    assembly = assemble(config.model, data.clip.sensors)
+    probed = probe_features(data, context)
+    evidence = gather_evidence(data, probed, config.probe)
+    prior = data.prior()
+    scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
+    answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND)}
+    for seed in range(config.seeds):
+        for name, said in _Seed(config, data, assembly, evidence, scores, context, seed).answers().items():
+            answers[name].append(said)
+    return Study(config=config, data=data, assembly=assembly, probed=probed, prior=prior, arms=arms, answers=answers)
+
+
+def open_study_data(config: StudyConfig, context: Context) -> Dataset:
+    """Records of the configured source, with clips of the model's size.
+
+    Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
+    """
+    source = SourceConfig(
+        kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
+    )
+    path = prepare_records(source, context)
+    clip = ClipConfig(
+        frames=config.model.frames,
+        image_px=config.model.image_px,
+        view_px=config.model.vision.image_px,
+        rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
+    )
+    return open_dataset(path, clip, config.grpo_share)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Seed:
+    """One seed: its SFT checkpoint, the arms that start from it, and its blind baseline."""
+
+    config: StudyConfig
+    data: Dataset
+    assembly: Assembly
+    evidence: np.ndarray
+    scores: Mapping[str, ScoreFn]
+    context: Context
+    seed: int
+
+    def answers(self) -> dict[str, Evaluated]:
+        """Answers of all policies of this seed, from disk where they are there."""
+        names = (SFT, *self.scores, BLIND)
+        if not all(self._path(name).exists() for name in names):
+            self._train()
+        return {name: load_answers(self._path(name)) for name in names}
+
+    def _train(self) -> None:
+        config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
+        params = run_sft(assembly, data, self.evidence, config.sft, context, seed=seed, stage=f"sft/{seed}")
+        encode = functools.partial(encode_contacts, assembly, params, data, context=context)
+        test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
+        noise = noise_bank(assembly.agent, params, data, seed=seed)
+        self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
+        for arm, score in self.scores.items():
+            tuned = run_grpo(
+                assembly,
+                params,
+                train,
+                self._grpo_label(),
+                noise,
+                score,
+                config.grpo,
+                LoopConfig(steps=config.grpo_steps, save_every=config.grpo_save_every),
+                context,
+                seed=seed,
+                stage=f"grpo/{arm}/{seed}",
+            )
+            self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
+        self._ask(BLIND, self._blind)
+
+    def _blind(self) -> Evaluated:
+        config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
+        stage = f"blind/{seed}"
+        params = run_sft(assembly, data, self.evidence, config.blind, context, seed=seed, stage=stage, blind=True)
+        features = encode_contacts(assembly, params, data, data.parts["test"], context, blind=True)
+        return evaluate_policy(assembly, params, features, self._label("test"))
+
+    def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:
+        if not self._path(name).exists():
+            with self.context.timed(f"ask/{name}/{self.seed}"):
+                save_answers(self._path(name), evaluate())
+
+    def _label(self, part: str) -> np.ndarray:
+        return self.data.label[self.data.parts[part]]
+
+    def _grpo_label(self) -> np.ndarray:
+        """Labels of the GRPO contacts, with those of attributes that GRPO does not ask about hidden."""
+        names = [a.name for a in self.assembly.language.attributes]
+        return np.where(np.isin(names, self.config.grpo_attributes), self._label("grpo"), UNKNOWN)
+
+    def _path(self, name: str) -> Path:
+        return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
+
+
+def save_answers(path: Path, answers: Evaluated) -> None:
+    """Publish answers as one file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    flat: dict[str, Any] = {f: getattr(answers, f) for f in _FLAT if getattr(answers, f) is not None}
+    flat |= {f"parsed_{f}": getattr(answers.parsed, f) for f in _PARSED}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **flat)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_answers(path: Path) -> Evaluated:
+    """Answers that `save_answers` published."""
+    with np.load(path) as file:
+        flat: dict[str, Any] = {f: file.get(f) for f in _FLAT}
+        return Evaluated(**flat, parsed=Parsed(**{f: file[f"parsed_{f}"] for f in _PARSED}))
+
+
+_FLAT = tuple(f.name for f in dataclasses.fields(Evaluated) if f.name != "parsed")
+_PARSED = tuple(f.name for f in dataclasses.fields(Parsed))

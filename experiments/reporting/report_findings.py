@@ -1,0 +1,87 @@
+"""The self-contained report of a measuring experiment: requirements, tables, pictures in one HTML file."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from experiments.reporting.findings import Cell, Findings, Picture, Requirement, Table
+from experiments.reporting.page import Html, document, image, row, table, tag
+from experiments.reporting.report_parts import appendix, data_and_time, header, number
+from experiments.running.artifacts import write_bytes, write_text
+
+MEDIA = {"svg": "svg+xml", "png": "png"}
+
+
+def write_findings(directory: Path, findings: Findings, *, about: str, description: Mapping[str, Any]) -> Path:
+    """Write `report.html` and `plots/*` of a run and return the path of the report.
+
+    Args:
+      directory: the run's.
+      about: docstring of the experiment; its first line is the question.
+      description: content of the run's `config.json`.
+    """
+    question, _, rest = about.strip().partition("\n")
+    for picture in findings.pictures:
+        write_bytes(directory / "plots" / f"{picture.name}.{picture.kind}", picture.content)
+    page = document(
+        f"{description['experiment']} · {description['scale']}",
+        header(question, rest.strip(), description, findings.settings, findings.verdict),
+        _requirements(findings.requirements),
+        *[_picture(p) for p in findings.pictures],
+        *[_table(t) for t in findings.tables],
+        data_and_time(findings.data, findings.timing),
+        appendix(description),
+    )
+    path = directory / "report.html"
+    write_text(path, page)
+    return path
+
+
+def _requirements(requirements: tuple[Requirement, ...]) -> Html:
+    if not requirements:
+        return Html("")
+    sign = {"lower": "≤", "higher": "≥"}
+    rows = [
+        row(
+            r.name,
+            tag("b" if r.met else "span", f"{number(r.measured, '.4g')} {r.unit}".strip()),
+            f"{sign[r.better]} {number(r.bound, '.4g')} {r.unit}".strip(),
+            "met" if r.met else "NOT MET",
+            tag("td", r.note, class_="text"),
+            head=1,
+        )
+        for r in requirements
+    ]
+    head = ["Requirement", "measured", "bound", "", tag("th", "How", class_="text")]
+    return tag("section", tag("h2", "Requirements"), table(head, rows))
+
+
+def _picture(picture: Picture) -> Html:
+    shown = image(picture.content, MEDIA[picture.kind], picture.title)
+    return tag("section", tag("h2", picture.title), tag("figure", shown, tag("figcaption", picture.caption)))
+
+
+def _table(shown: Table) -> Html:
+    head = [f"{c.name} ({c.unit})" if c.unit else c.name for c in shown.columns]
+    rows = [
+        row(*(_cell(value, c.format) for value, c in zip(cells, shown.columns, strict=True)), head=1)
+        for cells in shown.rows
+    ]
+    meanings = [tag("p", f"{c.name}: {c.meaning}.", class_="note") for c in shown.columns if c.meaning]
+    return tag(
+        "section",
+        tag("h2", shown.title),
+        tag("p", shown.note, class_="note") if shown.note else "",
+        table(head, rows),
+        tag("details", tag("summary", "What the columns mean", class_="note"), *meanings) if meanings else "",
+    )
+
+
+def _cell(value: Cell, spec: str) -> Html | str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return tag("td", value, class_="text")
+    return number(value, spec if isinstance(value, float) else ",")

@@ -1,0 +1,91 @@
+"""The part of a report that shows single answers: the touch, the trace with its parsed slots, the reward."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from experiments.reporting.page import Html, image, row, table, tag
+from experiments.reporting.results import RolloutExample, Slot
+
+
+def rollouts(examples: Sequence[RolloutExample], colour: Mapping[str, str]) -> Html:
+    """A section with one card per example, empty where there are none."""
+    if not examples:
+        return Html("")
+    kinds = [tag("mark", kind, class_=kind) for kind in ("perceive", "compare", "conclude")]
+    marks = [part for kind in kinds for part in (kind, " ")]
+    note = tag("p", "Under each frame its normal force. Parsed slots of the trace: ", *marks, class_="note")
+    return tag("section", tag("h2", "A few rollouts"), note, *[_card(example, colour) for example in examples])
+
+
+def strip_png(frames: np.ndarray) -> bytes:
+    """The frames of one sensor side by side with two white pixels between them, as a PNG.
+
+    Args:
+      frames: uint8 [F, H, W, 3], RGB.
+    """
+    apart = np.pad(frames, ((0, 0), (0, 0), (1, 1), (0, 0)), constant_values=255)
+    return _png(np.concatenate(list(apart), axis=1))
+
+
+def highlighted(trace: str, slots: Sequence[Slot]) -> Html:
+    """The trace with each slot marked by the segment it belongs to."""
+    parts: list[str] = []
+    end = 0
+    for start, stop, kind in slots:
+        parts += [trace[end:start], tag("mark", trace[start:stop], class_=kind)]
+        end = stop
+    return tag("div", *parts, trace[end:], class_="trace")
+
+
+def _card(example: RolloutExample, colour: Mapping[str, str]) -> Html:
+    swatch = [tag("span", class_="swatch", style=f"background:{colour[example.arm]}")] if example.arm in colour else []
+    view = [] if example.view is None else [_view(example.view)]
+    strips = tag("div", *[_strip(sensor, example) for sensor in example.frames], class_="strips")
+    return tag(
+        "article",
+        tag("h3", *swatch, f"{example.arm} · {example.object_id}"),
+        tag("p", tag("b", "Question "), example.question),
+        tag("div", *view, strips, class_="touch"),
+        highlighted(example.trace, example.slots),
+        tag("p", tag("b", "Label "), example.label),
+        _reward(example),
+        class_="rollout",
+    )
+
+
+def _view(view: np.ndarray) -> Html:
+    return tag("figure", image(_png(view), "png", "Picture of the object", class_="view"), tag("figcaption", "view"))
+
+
+def _strip(sensor: str, example: RolloutExample) -> Html:
+    frames = example.frames[sensor]
+    picture = image(strip_png(frames), "png", f"{len(frames)} frames of {sensor}", class_="strip")
+    parts = [tag("figcaption", sensor), picture]
+    if sensor in example.force_n:
+        pushes = [tag("span", f"{-float(force[2]):.1f} N") for force in example.force_n[sensor]]
+        parts.append(tag("div", *pushes, class_="forces", style=f"grid-template-columns:repeat({len(pushes)},1fr)"))
+    return tag("figure", *parts)
+
+
+def _reward(example: RolloutExample) -> Html:
+    largest = max(1.0, *(abs(value) for value in (*example.reward.values(), example.total)))
+    terms = [*example.reward.items(), ("total", example.total)]
+    rows = [
+        row(name, f"{value:.2f}".replace("-", "−"), tag("td", _bar(value / largest)), head=1) for name, value in terms
+    ]
+    return table(["Reward", "", ""], rows)
+
+
+def _bar(share: float) -> Html:
+    """A bar of a signed share of its width; negative values in their own colour."""
+    kind = "negative" if share < 0 else "positive"
+    return tag("div", tag("i", class_=kind, style=f"left:0;width:{100 * abs(share):.1f}%"), class_="bar")
+
+
+def _png(picture: np.ndarray) -> bytes:
+    done, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    if not done:
+        raise ValueError(f"picture is {picture.dtype}{list(picture.shape)}: OpenCV cannot encode it; give uint8 RGB")
+    return content.tobytes()

@@ -1,0 +1,1 @@
+"""Running an experiment: the command line, its runs on disk, progress."""

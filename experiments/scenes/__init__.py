@@ -1,0 +1,1 @@
+"""Of the experiments on generated scenes: rates, sheets, realism."""

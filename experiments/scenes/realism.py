@@ -1,0 +1,198 @@
+"""Real and generated pictures of the same touches: recordings of a GelSight Mini, the fit to them, renderings of it."""
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.reporting.results import ResultsError, require
+from sensors_io.scenes import fitting, mini_optics, optics, photometric
+from sensors_io.scenes.fitting import BallPresses, Noise, Profiles
+from sensors_io.scenes.optics import DeformedGel, Lamp, Light
+from sensors_io.scenes.photometric import PhotometricOptics
+from sensors_io.scenes.sensors import GELSIGHT_MINI, Renderer
+
+BY_EYE = (
+    Lamp(colour=(1, 0.04, 0.06), angle_deg=90, floor=0.16, peak=0.35, width=(0.9, 0.5)),
+    Lamp(colour=(0.04, 1, 0.08), angle_deg=210, floor=0.28, peak=0.10, width=(0.8, 0.9)),
+    Lamp(colour=(0.04, 0.10, 1), angle_deg=330, floor=0.22, peak=0.30, centre=(0, -0.2), width=(1.0, 0.65)),
+)
+"""What the generator had before: lamps set by eye to published pictures, with the noise below."""
+
+
+BY_EYE_NOISE = Noise(read=(0.004,) * 3, shot=(0.008,) * 3, grain=(0.0,) * 3, shared=0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """One way to make pictures: a renderer and its noise."""
+
+    render: Renderer
+    noise: Noise
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Study:
+    """The held-out presses and what was fitted to the others."""
+
+    presses: BallPresses
+    profiles: Profiles
+    touches: np.ndarray
+    held_out: np.ndarray
+    fitted: PhotometricOptics
+    noise: Noise
+
+
+def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: float, image_px: int) -> BallPresses:
+    """The square middles of the recordings, shrunk by area.
+
+    Args:
+      data_dir: holds `background.png` and `<ball>/<i>/gelsight.png`.
+      ball: folder of the presses.
+      diameter_mm: of the ball.
+      mm_per_px: of the recordings.
+      image_px: side of the pictures afterwards.
+
+    Raises:
+      ResultsError: no directory, a file that is missing or no picture, too few presses, frames that are not landscape.
+    """
+    fix = "give --data-dir the folder that holds background.png"
+    if data_dir is None:
+        raise ResultsError(f"data_dir is None: must name the folder of the recordings; {fix}")
+    paths = sorted((data_dir / ball).glob("*/gelsight.png"), key=lambda path: int(path.parent.name))
+    found = f"{len(paths)} pictures {ball}/<i>/gelsight.png"
+    require(len(paths) >= 16, f"data_dir {data_dir}", found, "must hold at least 16", fix)
+    pictures = [_square(path, image_px) for path in [data_dir / "background.png", *paths]]
+    height = _read(paths[0]).shape[0]
+    return BallPresses(
+        pictures=np.stack(pictures[1:]),
+        background=pictures[0],
+        radius_mm=diameter_mm / 2,
+        mm_per_px=mm_per_px * height / image_px,
+    )
+
+
+def fit(presses: BallPresses) -> Study:
+    """Fit to the even presses, align the odd ones."""
+    profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
+    train = np.arange(0, len(presses.pictures), 2)
+    fitted, touches = fitting.fit_jointly(presses, profiles, train)
+    chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
+    return Study(
+        presses=presses,
+        profiles=profiles,
+        touches=touches,
+        held_out=np.arange(1, len(presses.pictures), 2),
+        fitted=fitted,
+        noise=fitting.measure_noise(chosen, touches[train], fitted),
+    )
+
+
+def candidates(study: Study) -> dict[str, Candidate]:
+    """What is compared, from the first optics to the fit of this run."""
+    stored = Noise(
+        read=GELSIGHT_MINI.read_noise,
+        shot=GELSIGHT_MINI.shot_noise,
+        grain=mini_optics.GRAIN,
+        shared=mini_optics.GRAIN_SHARED,
+    )
+    by_eye = lambda gel, light: optics.shade(gel, light, BY_EYE, slope_gain=2.0)
+    fitted = lambda gel, light: photometric.shade(gel, light, study.fitted)
+    return {
+        "lamps by eye": Candidate(render=by_eye, noise=BY_EYE_NOISE),
+        "fitted optics, old noise": Candidate(render=fitted, noise=BY_EYE_NOISE),
+        "fitted optics and noise": Candidate(render=fitted, noise=dataclasses.replace(study.noise, grain=(0.0,) * 3)),
+        "fitted, with grain": Candidate(render=fitted, noise=study.noise),
+        "as stored in the generator": Candidate(
+            render=photometric.gelsight_mini,
+            noise=dataclasses.replace(
+                stored, grain=photometric.mini_optics.GRAIN, shared=photometric.mini_optics.GRAIN_SHARED
+            ),
+        ),
+    }
+
+
+def render(study: Study, candidate: Candidate, seed: int) -> np.ndarray:
+    """The held-out presses by one candidate, uint8 [P, N, N, 3]; one unit, whose grain they share."""
+    rng, n = np.random.default_rng(seed), study.presses.pictures.shape[1]
+    light = _light(photometric.grain(rng, n, candidate.noise.grain, candidate.noise.shared))
+    made = []
+    for touch in study.touches[study.held_out]:
+        noise = jnp.asarray(rng.standard_normal((n, n, 3), np.float32))
+        image = candidate.render(gel(study, touch), light)
+        made.append(np.asarray(optics.expose(image, noise, candidate.noise.read, candidate.noise.shot)))
+    return np.stack(made)
+
+
+def gel(study: Study, touch: np.ndarray) -> DeformedGel:
+    """The gel under the ball at one touch."""
+    axis = study.presses.axis_mm
+    depth, _, _ = study.profiles.field(touch, axis[None, :], axis[:, None])
+    still = jnp.zeros(depth.shape, jnp.float32)
+    return DeformedGel(
+        depth_mm=jnp.asarray(depth, jnp.float32),
+        marker_x_mm=still,
+        marker_y_mm=still,
+        marker_depth_mm=still,
+        window_mm=study.presses.window_mm,
+    )
+
+
+def clean(study: Study, model: PhotometricOptics) -> np.ndarray:
+    """Held-out presses without noise or grain."""
+    light = _light(np.zeros((2, 2), np.float32))
+    return np.stack([photometric.shade(gel(study, t), light, model) for t in study.touches[study.held_out]])
+
+
+def source(fitted: PhotometricOptics, noise: Noise, presses: BallPresses) -> str:
+    """The constants as a Python module."""
+    scalars: dict[str, object] = {
+        "HALF_WINDOW_MM": round(fitted.half_window_mm, 4),
+        "MAX_TILT": round(fitted.max_tilt, 4),
+    }
+    scalars |= {"READ_NOISE": noise.read, "SHOT_NOISE": noise.shot}
+    scalars |= {"GRAIN": noise.grain, "GRAIN_SHARED": noise.shared}
+    lines = [f"{name} = {round(v, 4) if isinstance(v, float) else v}" for name, v in scalars.items()]
+    for name in ("depth", "slope", "flat"):
+        rows = "".join(f"    {row},\n" for row in getattr(fitted, name))
+        lines.append(f"{name.upper()} = (\n{rows})")
+    return (
+        SOURCE_DOC.format(presses=(len(presses.pictures) + 1) // 2, ball=2 * presses.radius_mm)
+        + "\n".join(lines)
+        + "\n"
+    )
+
+
+SOURCE_DOC = '''"""Constants of a real GelSight Mini, fitted by `python -m experiments scene_realism`; not to be edited.
+
+From {presses} presses of a ball of {ball:.2f} mm and one picture of the gel at rest, 320 × 240 px of 0.0634 mm, shrunk
+to 112 px a side: github.com/rpl-cmu/gelslam at e0ea7ded95c2288fcb8dc18bc806fce270fac483, MIT licence.  Their meaning is
+said in `photometric` and `fitting.Noise`.
+"""
+
+'''
+
+
+def _square(path: Path, px: int) -> np.ndarray:
+    image = _read(path)
+    height, width = image.shape[:2]
+    require(width >= height, "picture", f"{path} {width} × {height}", "must be landscape", "turn it")
+    left = (width - height) // 2
+    middle = image[:, left : left + height, ::-1].astype(np.float32) / 255
+    return cv2.resize(middle, (px, px), interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def _read(path: Path) -> np.ndarray:
+    """BGR uint8 [H, W, 3]."""
+    image = cv2.imread(str(path))
+    if image is None:
+        raise ResultsError(f"picture is {path}: it is missing or no picture; restore the file")
+    return image
+
+
+def _light(texture: np.ndarray) -> Light:
+    return Light(
+        exposure=jnp.ones(()), led_gain=jnp.ones(3), pattern_shift_mm=jnp.zeros(2), texture=jnp.asarray(texture)
+    )

@@ -1,0 +1,127 @@
+"""What the parts of a generated record cost, and the least that this machine could make of them."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.scenes.rates import Stopwatch
+from sensors_io.scenes import SceneConfig, contact, motions, noise, surface
+from sensors_io.scenes.press import Grid, Kernels, Path, Press, make_kernels, record
+from sensors_io.scenes.schedule import pace
+from sensors_io.scenes.sensors import MODELS, SensorModel
+from sensors_io.scenes.sequence import site_of
+from sensors_io.scenes.units import place, unit_of
+
+_Scene = tuple[Press, Any, np.ndarray]  # what is touched, by which unit, the key of the noise
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StageCosts:
+    """Milliseconds of one core per record of one sensor: of the contact solver, of friction, of fields, of pictures."""
+
+    normal: float
+    friction: float
+    fields: float
+    picture: float
+
+
+def stage_costs(config: SceneConfig, order: int, objects: int) -> StageCosts:
+    """What the parts of the compiled program cost, by timing it with and without them, over `objects` objects."""
+    sensor = MODELS[order]
+    blind = dataclasses.replace(sensor, render=None)
+    still = [_scene(config, i, order, "hold") for i in range(objects)]
+    moved = [_scene(config, i, order, "slide_x") for i in range(objects)]
+    normal = _cpu_ms(config, sensor, still, _pressures)
+    fields = _cpu_ms(config, blind, still, _record)
+    whole = _cpu_ms(config, sensor, still, _record) if sensor.render is not None else fields
+    slid = _cpu_ms(config, blind, moved, functools.partial(_record, moving=True))
+    return StageCosts(normal=normal, friction=slid - fields, fields=fields - normal, picture=whole - fields)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Machine:
+    """Measured rates of one core: float32 operations of matrix products, bytes copied, a pair of padded transforms."""
+
+    flops_per_s: float
+    bytes_per_s: float
+    transform_s: float
+
+
+def measure_machine(padded: int, grid: int, image_px: int) -> Machine:
+    """Rates at the sizes that records have: cubic resampling products, copies of a picture in floats, transforms."""
+    left, field = jnp.ones((image_px, grid)), jnp.ones((grid, grid))
+    product = jax.jit(lambda a, b: a @ b @ a.T)
+    flops = 2 * (image_px * grid * grid + image_px * grid * image_px)
+    picture = np.ones((image_px, image_px, 3), np.float32)
+    forth = jax.jit(lambda p: jnp.fft.irfft2(jnp.fft.rfft2(p, s=(padded, padded)), s=(padded, padded))[:grid, :grid])
+    return Machine(
+        flops_per_s=flops / _seconds(lambda: product(left, field)),
+        bytes_per_s=2 * picture.nbytes / _seconds(picture.copy),
+        transform_s=_seconds(lambda: forth(field)),
+    )
+
+
+def _seconds(call: Callable[[], Any], times: int = 40) -> float:
+    """Least time of one call: what the machine can do when nobody disturbs it."""
+    found = []
+    for _ in range(times):
+        begin = time.perf_counter()
+        jax.block_until_ready(call())
+        found.append(time.perf_counter() - begin)
+    return min(found)
+
+
+def _scene(config: SceneConfig, index: int, order: int, motion: str) -> _Scene:
+    rng = np.random.default_rng((config.seed, index, order))
+    site = site_of(config, index, 0, 0)
+    hand = motions.plan(motion, motions.FORCES_N[1], pace(config.frame_count))
+    moves = (hand.force_n, hand.slide_mm, hand.twist_rad, hand.tilt_rad)
+    force, slide, twist, tilt = (jnp.asarray(each, jnp.float32) for each in moves)
+    press = Press(
+        skin=site.skin,
+        pose=place(site.turn_rad, rng),
+        modulus_mpa=jnp.float32(site.solid.modulus_mpa),
+        friction=jnp.float32(site.solid.friction),
+        path=Path(force_n=force, slide_mm=slide, twist_rad=twist, tilt_rad=tilt),
+        exposure_drift=jnp.float32(0.0),
+    )
+    return press, unit_of(config.seed, order, 0), noise.key(rng)
+
+
+def _cpu_ms(config: SceneConfig, sensor: SensorModel, scenes: list[_Scene], run: Callable[..., Any]) -> float:
+    grid = Grid(contact_grid=config.contact_grid, image_px=config.image_px)
+    kernels = make_kernels(sensor, grid)
+    jax.block_until_ready(run(*scenes[0], kernels, sensor, grid))
+    watch = Stopwatch()
+    for scene in scenes:
+        jax.block_until_ready(run(*scene, kernels, sensor, grid))
+    return watch.rate(len(scenes) * config.frame_count).cpu_ms
+
+
+def _record(
+    press: Press, unit: Any, key: np.ndarray, kernels: Kernels, sensor: SensorModel, grid: Grid, moving: bool = False
+) -> Any:
+    return record(press, unit, kernels, key, sensor, grid, moving=moving)
+
+
+@functools.partial(jax.jit, static_argnames=("sensor", "grid"))
+def _pressures(
+    press: Press, unit: Any, key: np.ndarray, kernels: Kernels, sensor: SensorModel, grid: Grid
+) -> tuple[jax.Array, jax.Array]:
+    """Pressure and displacement of every frame with load, one of force 1 N in place of the others."""
+    spacing = sensor.window_mm / grid.contact_grid
+    x = (jnp.arange(grid.contact_grid, dtype=jnp.float32) + 0.5) * spacing - sensor.window_mm / 2
+    gap = surface.gap(press.skin, press.pose, x)
+    gel, body = kernels.gel / unit.modulus_factor, kernels.body / press.modulus_mpa
+
+    def solve(force: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = contact.solve(gap, jnp.where(force > 0, force, 1.0), gel, body, spacing)
+        return found.pressure_mpa, found.displacement_mm
+
+    return jax.lax.map(solve, press.path.force_n)

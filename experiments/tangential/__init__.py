@@ -1,0 +1,1 @@
+"""Of the tangential experiment: scenes, methods, checks, charts."""

@@ -1,0 +1,99 @@
+"""Logging, stages, timing and progress of a run."""
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.running import progress
+from experiments.running.context import Context, MetricLog, read_metrics
+
+
+@pytest.fixture
+def context(tmp_path):
+    made = Context(tmp_path, tmp_path / "cache", Console(file=io.StringIO()))
+    yield made
+    made.close()
+
+
+def log_steps(path, stage, steps):
+    log = MetricLog(path)
+    for step in steps:
+        log.append(stage, step, {"loss": 1 / (1 + step)})
+    log.close()
+
+
+def test_an_interrupted_log_equals_an_uninterrupted_one(tmp_path):
+    whole, broken = tmp_path / "whole.jsonl", tmp_path / "broken.jsonl"
+    log_steps(whole, "sft/0", range(10))
+    log_steps(broken, "sft/0", range(8))
+    with broken.open("a") as file:
+        file.write('{"stage": "sft/0", "step": 8, "lo')  # torn by a crash
+    log_steps(broken, "sft/0", range(5, 10))
+    assert broken.read_bytes() == whole.read_bytes()
+
+
+def test_rewinding_one_stage_leaves_the_others(context):
+    for step in range(3):
+        context.log("sft/0", step, loss=1.0)
+    context.log("sft/1", 5, loss=2.0)
+    context.rewind("sft/0", 1)
+    assert [(row["stage"], row["step"]) for row in read_metrics(context.directory)] == [("sft/0", 0), ("sft/1", 5)]
+
+
+def test_several_lines_of_one_step_are_kept(context):
+    context.log("sft/0", 0, loss=1.0)
+    context.log("sft/0", 0, accuracy=np.float32(0.5))
+    assert read_metrics(context.directory)[1] == {"stage": "sft/0", "step": 0, "accuracy": 0.5}
+
+
+def test_a_diverged_scalar_is_named(context):
+    with pytest.raises(ValueError, match=r"grpo/paid/0 step 7\.kl is nan"):
+        context.log("grpo/paid/0", 7, kl=float("nan"))
+    with pytest.raises(ValueError, match="step"):
+        context._log.append("sft/0", 0, {"step": 1})
+
+
+@pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
+def test_a_stage_name_is_a_safe_path(context, stage):
+    with pytest.raises(ValueError, match="stage is"):
+        context.checkpoint_dir(stage)
+
+
+def test_a_stage_is_done_once_it_is_saved(context):
+    assert not context.done("sft/0")
+    with pytest.raises(FileNotFoundError, match="sft/0"):
+        context.load_stage("sft/0")
+    context.save_stage("sft/0", {"answers": np.arange(3)})
+    assert context.done("sft/0")
+    assert context.load_stage("sft/0") == {"answers": [0, 1, 2]}
+
+
+def test_timing_adds_up_and_survives_an_error(context):
+    with context.timed("sft/0"):
+        pass
+    first = context.timing()["sft/0"]
+    with pytest.raises(KeyError), context.timed("sft/0"):
+        raise KeyError
+    assert context.timing()["sft/0"] >= first
+
+
+def test_progress_writes_plain_lines_where_there_is_no_terminal(context, monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
+    with context.progress("sft [0]", 4, completed=2) as advance:
+        advance(1, "loss 0.5")
+        advance()
+    lines = context.console.file.getvalue().splitlines()
+    assert lines[0].startswith("sft [0]: 3/4")
+    assert "s left" in lines[0]
+    assert lines[0].endswith("loss 0.5")
+    assert lines[-1].startswith("sft [0]: 4/4")
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with progress.progress(console, "grpo", 2) as advance:
+        advance(2, "reward 0.5")
+    assert "2/2" in console.file.getvalue()
+    assert "reward 0.5" in console.file.getvalue()
