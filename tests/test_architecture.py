@@ -34,6 +34,7 @@ SENSORS_LAYERS = (
     {"records"},
     {"pipeline", "importers", "scenes"},
     {"generate", "live", "overview"},
+    {"commands"},
     {"__main__"},
 )
 """The same; members of one layer do not know each other."""

@@ -1,0 +1,1 @@
+"""The commands of `python -m sensors_io`, one file each."""

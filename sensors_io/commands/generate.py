@@ -1,0 +1,30 @@
+"""`python -m sensors_io generate`."""
+
+import dataclasses
+import pathlib
+
+from sensors_io import overview
+from sensors_io.commands.console import OUT, progress_bar
+from sensors_io.generate import generate_records
+from sensors_io.records import RecordStore
+from sensors_io.scenes import SceneConfig
+from sensors_io.schema import SENSORS
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Generate:
+    """Generate scenes.  An interrupted generation goes on where it stopped.
+
+    `--objects 1000 --sequences 14700` is the set of the paper's size: 1.32 million records.
+    """
+
+    out: pathlib.Path
+    """Directory of the records."""
+    config: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+
+    def run(self) -> int:
+        each = len(SENSORS) * self.config.frame_count
+        with progress_bar("records") as progress:
+            generate_records(self.config, self.out, progress=lambda done, total: progress(done * each, total * each))
+        OUT.print(overview.summary_table(RecordStore(self.out)))
+        return 0
