@@ -7,8 +7,9 @@ friction limit, slid and twisted from rest, and dragged over sequences of 90 fra
 the marker displacement, by a float64 solution on the same grid that its duality gap proves: the superposition of
 Ciavarella and Jäger, the package's solver at several tolerances, and a plain solver, the same projected gradients with
 a cold start and a fixed number of iterations.  Compares the two solvers at equal error, holds the superposition's
-promised error to contacts that it was not fitted to, and the solver to closed forms.  With DIR, a folder of the
-vendor's Tac3D recordings, also tells whether the loops of real presses are a loss of the gel or a lag of the force.
+promised error to contacts that it was not fitted to, and the solver to closed forms.  Measures what it changes, and
+costs, to couple friction to the sideways motion of the gel under pressure.  With DIR, a folder of the vendor's Tac3D
+recordings, also tells whether the loops of real presses are a loss of the gel or a lag of the force.
 
 Cost: under six minutes on two cores (`smoke` under one).
 
@@ -31,11 +32,13 @@ from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from experiments.running.timing import interleaved
 from experiments.tangential import checks as tangential_checks
+from experiments.tangential import coupling as tangential_coupling
 from experiments.tangential import loops as tangential_loops
 from experiments.tangential import methods as ways
 from experiments.tangential import scenes as tangential_scenes
 from experiments.tangential import tables as tangential_tables
 from experiments.tangential.checks import Promise
+from experiments.tangential.coupling import Change
 from experiments.tangential.methods import Method
 from experiments.tangential.scenes import Bench, Case, Motion
 from experiments.tangential.tables import COMPARED, MAIN, PLAIN, SEQUENCE, SOLVER, SUPERPOSED, Row, Rows
@@ -62,6 +65,7 @@ class TangentialConfig:
       frames: of a sequence.
       motions: of the protocol, one sequence of each on every gel.
       rounds: of timing.
+      coupled_bodies: objects over which coupling is measured, on every gel with markers.
       closed_grid: side of the grid that is held to closed forms.
       data_dir: Tac3D recordings; `None` leaves the loops of real presses out.
       seed: of the contacts.
@@ -73,6 +77,7 @@ class TangentialConfig:
     frames: int = 90
     motions: tuple[str, ...] = ("slide_x", "twist")
     rounds: int = 5
+    coupled_bodies: int = 3
     closed_grid: int = 64
     data_dir: Path | None = None
     seed: int = 11
@@ -127,15 +132,18 @@ def run(config: TangentialConfig, context: Context) -> Findings:
     with context.timed("closed-forms"):
         mindlin = tangential_checks.cattaneo_mindlin(config.closed_grid)
         torque = tangential_checks.lubkin(config.closed_grid)
+    with context.timed("coupling"):
+        coupled = couple(config, context)
     promises = hold_promises(gels, tasks["force"][SUPERPOSED])
     return Findings(
-        verdict=verdict(tasks, promises),
+        verdict=(*verdict(tasks, promises), tangential_coupling.verdict(coupled)),
         requirements=requirements(tasks, promises, mindlin, torque),
         tables=(
             *(tangential_tables.task_table(task, rows, config.grid) for task, rows in tasks.items()),
             tangential_tables.equal_table(tasks),
             tangential_checks.promise_table(promises),
             tangential_checks.decision_table(promises),
+            tangential_coupling.change_table(coupled),
             tangential_checks.closed_form_table(mindlin, torque, config.closed_grid),
             *loops,
         ),
@@ -183,6 +191,17 @@ def measure(gels: Sequence[Gel], config: TangentialConfig, context: Context) -> 
             tasks[task] = {m.name: Row(kind=m.kind, label=m.label, ms=ms[m.name], errors=errors[m.name]) for m in tiers}
             advance(1)
     return tasks
+
+
+def couple(config: TangentialConfig, context: Context) -> list[Change]:
+    """What coupling changes on every gel with markers."""
+    marked = [s for s in tangential_scenes.sensors(config.sensors) if s.marker_depth_mm is not None]
+    found: list[Change] = []
+    with context.progress("coupling", len(marked)) as advance:
+        for sensor in marked:
+            found += tangential_coupling.measure(sensor, config.grid, config.frames, config.coupled_bodies, config.seed)
+            advance(1)
+    return found
 
 
 def hold_promises(gels: Sequence[Gel], superposed: Row) -> list[Promise]:
@@ -280,7 +299,14 @@ def _errors(task: str, found: list[Any], true: list[np.ndarray], gels: Sequence[
 
 DEFAULT = TangentialConfig()
 SMOKE = TangentialConfig(
-    contacts=2, sensors=("xense", "dmtac_x"), grid=32, frames=32, motions=("slide_x",), rounds=3, closed_grid=48
+    contacts=2,
+    sensors=("xense", "dmtac_x"),
+    grid=32,
+    frames=32,
+    motions=("slide_x",),
+    rounds=3,
+    closed_grid=48,
+    coupled_bodies=1,
 )
 
 EXPERIMENT = Experiment(name="pareto_tangential", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -5,11 +5,23 @@ from typing import Annotated
 
 import tyro
 
+from sensors_io.calibration.geometry import GeometryError
+from sensors_io.commands.calibrate import Calibrate
 from sensors_io.commands.console import ERR, complain
+from sensors_io.commands.devices import Devices
+from sensors_io.commands.extract import Extract
 from sensors_io.commands.generate import Generate
+from sensors_io.commands.geometry import Geometry
 from sensors_io.commands.imports import Import
+from sensors_io.commands.record import Record
 from sensors_io.commands.records import Check, List
-from sensors_io.importers.physiclear import ImportSourceError
+from sensors_io.commands.view import View
+from sensors_io.devices.errors import DeviceError
+from sensors_io.fields.sources import SourceError
+from sensors_io.fields.types import CalibrationError
+from sensors_io.force import ForceError
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.recording.journal import JournalError
 from sensors_io.records import RecordsError
 from sensors_io.schema import SchemaError
 
@@ -18,7 +30,27 @@ Command = (
     | Annotated[Generate, tyro.conf.subcommand("generate")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Geometry, tyro.conf.subcommand("geometry")]
+    | Annotated[Devices, tyro.conf.subcommand("devices")]
+    | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[View, tyro.conf.subcommand("view")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Extract, tyro.conf.subcommand("extract")]
 )
+
+KNOWN_ERRORS = (
+    RecordsError,
+    SchemaError,
+    ImportSourceError,
+    DeviceError,
+    ForceError,
+    JournalError,
+    SourceError,
+    CalibrationError,
+    GeometryError,
+    OSError,
+)
+"""Whose message says all that a user needs."""
 
 
 def main(args: list[str] | None = None) -> int:
@@ -30,7 +62,7 @@ def main(args: list[str] | None = None) -> int:
     command = tyro.cli(Command, args=args, prog="sensors_io", config=(tyro.conf.OmitArgPrefixes,))
     try:
         return command.run()
-    except (RecordsError, SchemaError, ImportSourceError, OSError) as error:
+    except KNOWN_ERRORS as error:
         complain(error)
         return 1
     except KeyboardInterrupt:

@@ -2,13 +2,16 @@
 
     magic (4 bytes) | crc32 of all that follows (u32) | header length (u32) | header | array | array | …
 
-Little-endian; the header and every array are padded to 8 bytes.  Camera frames and times are stored as they are, masks
-as packed bits, fields and forces as int16 counts of a recorded scale:
+Little-endian; the header and every array are padded to 8 bytes.  Camera frames are stored as differences in time, along
+the rows or both, whichever the frames want (`deltas`; the header says which); times as they are, masks as packed bits,
+fields and forces as int16 counts of a recorded scale:
 
     counts = round(x / scale),   scale = the smallest power of two with max|x| ≤ 32767 · scale
 
 The error is at most scale/2 and must not exceed `TOLERANCE`.  A power of two makes decoding exact in float32, so that
 storing a decoded sequence again gives the same bytes: copies of a data set never drift.
+
+Entries of the first version, TCH1, stored their frames as they are and are read as well.
 """
 
 import dataclasses
@@ -21,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.deltas import FILTERS, accumulate, choose_filter, difference
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, ObjectCard, SchemaError, Sequence, Spec
 
 TOLERANCE: Mapping[str, float] = {
@@ -35,7 +39,7 @@ TOLERANCE: Mapping[str, float] = {
 
 FIELDS = ("deformation_mm", "shear_mm", "depth_mm", "valid")
 
-_MAGIC = b"TCH1"
+_MAGIC, _OLD_MAGIC = b"TCH2", b"TCH1"
 _PREFIX = struct.Struct("<4sII")
 _TOP = 32767
 _LEAST_SCALE = 2.0**-40  # keeps the scale of an all but vanishing array a normal float32
@@ -132,6 +136,9 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
             array, entry["scale"] = quantise(name, array, where=where)
         elif array.dtype == np.bool_:
             array, entry["bits"] = np.packbits(array), True
+        elif name == "frames":
+            entry["filter"] = choose_filter(array)
+            array = difference(array, entry["filter"])
         entry["dtype"] = array.dtype.newbyteorder("<").str
         described.append(entry)
         payloads.append(_padded(np.ascontiguousarray(array).astype(entry["dtype"], copy=False).tobytes()))
@@ -149,8 +156,8 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
 
 def _open(data: bytes, kind: str) -> tuple[dict[str, Any], memoryview]:
     """Header and array bytes of an entry, after its checksum held."""
-    if len(data) < _PREFIX.size or data[:4] != _MAGIC:
-        raise CorruptRecordsError(f"the entry does not start with {_MAGIC!r}")
+    if len(data) < _PREFIX.size or data[:4] not in (_MAGIC, _OLD_MAGIC):
+        raise CorruptRecordsError(f"the entry starts with {data[:4]!r}, not with {_MAGIC!r} or {_OLD_MAGIC!r}")
     _, checksum, length = _PREFIX.unpack_from(data)
     if zlib.crc32(memoryview(data)[8:]) != checksum:
         raise CorruptRecordsError("the entry's checksum does not hold")
@@ -173,9 +180,20 @@ def _unpack(header: Mapping[str, Any], payload: memoryview, skip: tuple[str, ...
                 array = np.unpackbits(array, count=count).view(np.bool_)
             elif "scale" in entry:
                 array = array * np.float32(entry["scale"])
-            arrays[entry["name"]] = array.reshape(shape)
+            arrays[entry["name"]] = _undo(array.reshape(shape), entry)
         start += -(-stored * dtype.itemsize // 8) * 8
     return arrays
+
+
+def _undo(array: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
+    """The array itself, where differences of it were stored."""
+    if "filter" not in entry:
+        return array
+    if entry["filter"] not in FILTERS:
+        raise CorruptRecordsError(
+            f"{entry['name']} went through filter {entry['filter']!r}: must be one of {[*FILTERS]}"
+        )
+    return accumulate(array, entry["filter"])
 
 
 def _padded(data: bytes, fill: bytes = b"\0", offset: int = 0) -> bytes:

@@ -16,7 +16,10 @@ from sensors_io.schema import ContactKey
 from sensors_io.shards import Shard
 
 FORMAT = "touchr1-records"
-VERSION = 1
+VERSION = 2
+READABLE = (1, 2)
+"""Versions whose records this code reads; 1 stored camera frames as they are, 2 stores differences."""
+
 INDEX = "index.json"
 
 
@@ -70,12 +73,12 @@ class Index:
         try:
             tree = json.loads(path.read_text())
             found = (tree["format"], tree["version"])
-            if found == (FORMAT, VERSION):
+            if found in [(FORMAT, version) for version in READABLE]:
                 return cls._from_tree(tree)
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptRecordsError(f"{path} is damaged ({error!r}); delete {root} and write it again") from error
         raise RecordsVersionError(
-            f"{path} is {found[0]!r} version {found[1]!r}, this code reads {FORMAT!r} version {VERSION}; "
+            f"{path} is {found[0]!r} version {found[1]!r}, this code reads {FORMAT!r} versions {READABLE}; "
             "write the records again, or read them with the code that wrote them"
         )
 

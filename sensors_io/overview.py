@@ -7,9 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 from rich.table import Table
 
-from sensors_io.importers.physiclear import ImportReport
+from sensors_io.importers.catalogue import ImportReport
+from sensors_io.importers.keep import Skip
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, SPLITS, UNKNOWN, Flag, Sequence
+
+SKIPS_BY_NAME = 5
+"""Up to so many things left out for one reason are named each."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,10 +63,10 @@ def object_table(store: RecordStore) -> Table:
     return table
 
 
-def flag_table(counts: FlagCounts) -> Table:
+def flag_table(counts: FlagCounts, title: str = "flags") -> Table:
     """Frames by quality flag and sensor; a frame may carry several."""
     sensors = list(counts.frames)
-    table = Table("frames", *sensors)
+    table = Table("frames", *sensors, title=title)
     table.add_row("all", *(str(counts.frames[sensor]) for sensor in sensors), end_section=True)
     for flag in (Flag.NONE, *Flag):
         table.add_row(str(flag.name).lower(), *(str(counts.flags[sensor, flag]) for sensor in sensors))
@@ -70,13 +74,21 @@ def flag_table(counts: FlagCounts) -> Table:
 
 
 def import_table(report: ImportReport) -> Table:
-    """What an import took in, then every file, object and label that it did not."""
+    """What an import took in, then all that it did not: by name, or in one row where many have one reason."""
     table = Table("what", "count or reason", title="import")
-    table.add_row("videos imported", str(report.videos))
+    table.add_row("contacts imported", str(report.contacts))
     for split, count in report.objects.items():
         table.add_row(f"objects in {split}", str(count))
     table.add_row("skipped", str(len(report.skipped)))
     table.add_row("labels missing", str(len(report.unlabelled)))
+    table.add_row("nobody annotated", ", ".join(report.unannotated) or "·")
+    by_reason: dict[str, list[Skip]] = {}
     for skip in (*report.skipped, *report.unlabelled):
-        table.add_row(skip.name, skip.reason)
+        by_reason.setdefault(skip.reason, []).append(skip)
+    for reason, skips in by_reason.items():
+        if len(skips) > SKIPS_BY_NAME:
+            table.add_row(f"{len(skips)}: {skips[0].name} … {skips[-1].name}", reason)
+        else:
+            for skip in skips:
+                table.add_row(skip.name, reason)
     return table

@@ -12,8 +12,9 @@ import cv2
 import grain
 import numpy as np
 
+from sensors_io.augment import AugmentConfig, apply_symmetry, draw_kept, draw_symmetry, jitter_exposure
 from sensors_io.schema import SENSORS, Clip, ContactKey, Flag, ObjectCard, SchemaError, Sequence
-from sensors_io.selection import choose_frames, field_images
+from sensors_io.selection import Chooser, choose_frames, field_images, pick_frames
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,6 +27,7 @@ class ClipConfig:
       view_px: rows and columns of the object's view.
       sensors: the streams, in order.
       rejected: a frame with one of these flags is left out where a sequence has others.
+      choose: by what the frames of a stream are chosen, see `choose_frames`.
     """
 
     frames: int = 8
@@ -33,6 +35,7 @@ class ClipConfig:
     view_px: int = 64
     sensors: tuple[str, ...] = SENSORS
     rejected: tuple[Flag, ...] = (Flag.STRAIN_LIMIT, Flag.NOT_CONVERGED, Flag.SATURATED)
+    choose: Chooser = "auto"
 
     def __post_init__(self) -> None:
         for name in ("frames", "image_px", "view_px"):
@@ -59,7 +62,14 @@ class Contacts(Protocol):
         """Contact i by sensor; without `fields`, those of sequences that have camera frames may be missing."""
 
 
-def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipConfig) -> Clip:
+def make_clip(
+    contact: Mapping[str, Sequence],
+    card: ObjectCard,
+    config: ClipConfig,
+    *,
+    augment: AugmentConfig | None = None,
+    rng: np.random.Generator | None = None,
+) -> Clip:
     """One training example from one contact: F chosen frames of each sensor, resized, with masks for what is missing.
 
     The whole window is stretched to the square image.  A sequence without camera frames shows its fields instead, see
@@ -69,41 +79,20 @@ def make_clip(contact: Mapping[str, Sequence], card: ObjectCard, config: ClipCon
     Args:
       contact: the sequences of one contact by sensor; sensors outside `config.sensors` are ignored.
       card: the touched object.
+      config: shape of the clip.
+      augment: random changes; None for none.
+      rng: source of their randomness.
 
     Raises:
-      SchemaError: the contact is empty or belongs to another object.
+      SchemaError: the contact is empty or belongs to another object, or random changes without a source of randomness.
     """
     if not contact:
         raise SchemaError("contact is {}: a clip needs at least one sequence; skip empty contacts")
     key = next(iter(contact.values())).key
     if key.object_id != card.object_id:
         raise SchemaError(f"card is of object {card.object_id!r}: the contact is of {key.object_id!r}; pass its card")
-    size = (config.image_px, config.image_px)
-    shape = (len(config.sensors), config.frames)
-    frames = np.zeros((*shape, *size, 3), np.uint8)
-    force_n = np.zeros((*shape, 3), np.float32)
-    frame_index, frame_mask = np.zeros(shape, np.int32), np.zeros(shape, np.bool_)
-    for s, sensor in enumerate(config.sensors):
-        if sensor not in contact:
-            continue
-        sequence = contact[sensor]
-        chosen = choose_frames(sequence, config.frames, config.rejected)
-        n = len(chosen)
-        frames[s, :n] = _images(sequence, chosen, size)
-        if sequence.force_n is not None:
-            force_n[s, :n] = sequence.force_n[chosen]
-        frame_index[s, :n], frame_mask[s, :n] = chosen, True
-    present = np.array([sensor in contact for sensor in config.sensors])
-    return _clip(
-        key,
-        card,
-        config,
-        frames=frames,
-        force_n=force_n,
-        frame_index=frame_index,
-        frame_mask=frame_mask,
-        stream_mask=present,
-    )
+    streams = _streams(contact, config, augment or AugmentConfig(), rng)
+    return _clip(key, card, config, stream_mask=np.array([s in contact for s in config.sensors]), **streams)
 
 
 def make_unfelt_clip(key: ContactKey, card: ObjectCard, config: ClipConfig) -> Clip:
@@ -132,6 +121,7 @@ def clip_batches(
     repeat: bool = True,
     drop_remainder: bool = False,
     felt: bool = True,
+    augment: AugmentConfig | None = None,
     workers: int = 0,
     threads: int = 1,
 ) -> grain.IterDataset:
@@ -149,6 +139,7 @@ def clip_batches(
       repeat: False ends after one epoch.
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
       felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
+      augment: random changes of what is felt, for training; a function of `seed` and of the clip's place in the order.
       workers: reading processes; 0 reads in threads of this one.  States carry over between equal numbers of workers.
       threads: reading threads of each process.
 
@@ -165,7 +156,12 @@ def clip_batches(
         dataset = dataset.shuffle()
     if repeat:
         dataset = dataset.repeat()
-    batches = dataset.map(_Reader(store, config, felt)).batch(batch_size, drop_remainder=drop_remainder)
+    # grain rounds the number of batches up in floating point, to 2⁶³ for the 2⁶³ − 1 rows of an endless data set: one
+    # more than it can count to.  Without a remainder it divides whole numbers, and an endless data set never has one
+    whole = drop_remainder or repeat
+    reader = _Reader(store, config, felt, augment or AugmentConfig())
+    clips = dataset.random_map(reader.change) if felt and reader.augment.active else dataset.map(reader)
+    batches = clips.batch(batch_size, drop_remainder=whole)
     # a batch or two ahead: grain's default of 500 would hold gigabytes of frames
     iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=1 + threads))
     if not workers:
@@ -182,15 +178,21 @@ class _Reader:
     store: Contacts
     config: ClipConfig
     felt: bool
+    augment: AugmentConfig
 
-    def __call__(self, i: int) -> dict[str, np.ndarray]:
+    def __call__(self, i: int, rng: np.random.Generator | None = None) -> dict[str, np.ndarray]:
         key = self.store.contacts[i]
         card = self.store.objects[key.object_id]
         if self.felt:
-            clip = make_clip(self.store.contact(i, fields=False), card, self.config)
+            contact = self.store.contact(i, fields=False)
+            clip = make_clip(contact, card, self.config, augment=self.augment, rng=rng)
         else:
             clip = make_unfelt_clip(key, card, self.config)
         return clip.arrays() | {"contact": np.array(i, np.int32)}
+
+    def change(self, i: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """The clip, changed at random."""
+        return self(i, rng)
 
 
 def _clip(key: ContactKey, card: ObjectCard, config: ClipConfig, **streams: np.ndarray) -> Clip:
@@ -205,11 +207,41 @@ def _clip(key: ContactKey, card: ObjectCard, config: ClipConfig, **streams: np.n
     )
 
 
-def _images(sequence: Sequence, chosen: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Images of the chosen frames, uint8 [F, *size, 3]."""
+def _streams(
+    contact: Mapping[str, Sequence], config: ClipConfig, augment: AugmentConfig, rng: np.random.Generator | None
+) -> dict[str, np.ndarray]:
+    """Images, forces, positions and masks of all streams."""
+    if augment.active and rng is None:
+        raise SchemaError(f"rng is None: {augment} needs a source of randomness; pass one")
+    shape, size = (len(config.sensors), config.frames), (config.image_px, config.image_px)
+    frames = np.zeros((*shape, *size, 3), np.uint8)
+    force_n = np.zeros((*shape, 3), np.float32)
+    index, mask = np.zeros(shape, np.int32), np.zeros(shape, np.bool_)
+    element = None if rng is None else draw_symmetry(augment, rng)
+    for s, sensor in enumerate(config.sensors):
+        if sensor not in contact:
+            continue
+        chosen = choose_frames(contact[sensor], config.frames, config.rejected, config.choose)
+        picked = pick_frames(contact[sensor], chosen)
+        picked = picked if element is None else apply_symmetry(picked, element)
+        images, n = _images(picked, size), len(chosen)
+        by_camera = picked.frames is not None  # fields in mm know no exposure
+        frames[s, :n] = images if rng is None or not by_camera else jitter_exposure(images, augment, rng)
+        if picked.force_n is not None:
+            force_n[s, :n] = picked.force_n
+        index[s, :n], mask[s, :n] = chosen, True
+    if rng is not None:
+        mask = draw_kept(mask, augment, rng)
+        for array in (frames, force_n, index):
+            array[~mask] = 0
+    return {"frames": frames, "force_n": force_n, "frame_index": index, "frame_mask": mask}
+
+
+def _images(sequence: Sequence, size: tuple[int, int]) -> np.ndarray:
+    """Images of all frames, uint8 [N, *size, 3]."""
     if sequence.frames is not None:
-        return np.stack([_resize(sequence.frames[n], size) for n in chosen])
-    images = [cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR) for image in field_images(sequence, chosen)]
+        return np.stack([_resize(frame, size) for frame in sequence.frames])
+    images = [cv2.resize(image, size[::-1], interpolation=cv2.INTER_LINEAR) for image in field_images(sequence)]
     return np.clip(np.rint(images), 0, 255).astype(np.uint8)
 
 

@@ -7,16 +7,18 @@
 A shard is written under a temporary name, closed, counted, synced and renamed; then the index is replaced.  A killed
 writer leaves every published contact readable, and the next one goes on behind them.
 
-Frames are stored raw and each entry is compressed by ArrayRecord with zstd at level 1.  Measured on one shared core,
-real GelSight Mini clips of 8 × 112² RGB frames read at random: 27,600 frames/s at 0.65 of the raw size.  A row-delta
-filter before it: 17,700 at 0.30; a frame-delta filter 8,900 at 0.44; brotli-3 8,500 at 0.60; zlib-1 7,300 at 0.60;
-PNG-1 3,200 at 0.35; uncompressed 130,000 at 1.01.  Training reads 1,600 frames/s: zstd-1 costs it 6 % of a core.
+Frames are stored as the differences that they want (`codec`, `deltas`) and each entry is compressed by ArrayRecord with
+zstd at level 1.  `pareto_storage` chose this by a rule; one shared core, bytes as a share of the raw frames and frames
+read a second: generated scenes of 112² .46 and 37,600 (without differences .86 and 30,200), GelSight Mini videos at
+120 rows .26 and 16,200 (.39 and 18,800), camera stills of 240 rows .47 and 3,800 (.84 and 5,000).  PNG-1 is larger and
+reads 5 to 12 times slower; WebP and FFV1 are at best a third smaller and read 2 to 27 times slower.
 """
 
 import dataclasses
 import fcntl
 import os
 import pathlib
+from collections.abc import Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
 from typing import IO, Any, Self
@@ -105,6 +107,11 @@ class RecordWriter:
 
     def __contains__(self, key: ContactKey) -> bool:
         return key in self._keys
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Notes of the meta, those of earlier writers included."""
+        return self._index.meta.notes
 
     def note(self, **notes: Any) -> None:
         """Add JSON notes to the meta; they become visible with the next published shard."""

@@ -46,6 +46,10 @@ class Flag(enum.IntFlag):
     MARKER_LOSS = 64
     TIME_GAP = 128
     ADHESION = 256  # touched so lightly that adhesion, which is left out, would change the contact
+    SEVERAL_CONTACTS = 512  # more than one blob, where one contact was meant
+    INCOMPLETE = 1024  # a measured value of this row is missing
+    REFUSED = 2048  # a field was asked for that this input cannot carry
+    ERROR_UNMET = 4096  # generated on the best grid there is, which does not promise the error asked for
 
 
 class SchemaError(ValueError):
@@ -75,6 +79,7 @@ FRAME_ARRAYS: Mapping[str, Spec] = {
     "force_time_ns": Spec(np.int64, ("N",), optional=True),
     "phase": Spec(np.uint8, ("N",)),  # 0 approach, 1 load, 2 hold, 3 unload, 4 move
     "flags": Spec(np.uint32, ("N",)),  # bits of `Flag`
+    "contact_grid": Spec(np.uint16, ("N",), optional=True),  # side of the grid that a generated contact was solved on
 }
 """Per-frame arrays of a `Sequence`; row n of each of them together is one tactile record."""
 
@@ -137,6 +142,7 @@ class Sequence:
     force_time_ns: np.ndarray | None = None
     phase: np.ndarray
     flags: np.ndarray
+    contact_grid: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         _require_name("sensor", self.sensor)

@@ -28,11 +28,20 @@ TOUCHR1_LAYERS = (
 
 SENSORS_LAYERS = (
     {"schema"},
+    {"clock"},
+    {"sync", "force"},
+    {"deltas"},
+    {"quality"},
     {"codec"},
+    {"augment"},
     {"shards", "selection"},
     {"index"},
     {"records"},
     {"pipeline", "importers", "scenes"},
+    {"fields"},
+    {"calibration"},
+    {"devices"},
+    {"recording", "viewer"},
     {"generate", "live", "overview"},
     {"commands"},
     {"__main__"},
@@ -41,8 +50,13 @@ SENSORS_LAYERS = (
 
 EXPERIMENTS_LAYERS = (
     {"running", "reporting"},
+    {"storage"},
+    {"devices"},
     {"policies", "contact", "scenes"},
     {"chooser", "tangential", "identify"},
+    {"grpo"},
+    {"fields"},
+    {"loading"},
 )
 """The same; an experiment itself is one file beside them, which nobody imports."""
 

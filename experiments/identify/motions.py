@@ -16,8 +16,8 @@ from experiments.identify.touch import features_of, field_counts
 from sensors_io.live import LiveScenes
 from sensors_io.scenes import SceneConfig, motions
 from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import slot
-from sensors_io.scenes.sequence import site_of
 from sensors_io.schema import SENSORS, Sequence
 from touchr1_jax.models.tactile_vit import force_features
 

@@ -14,13 +14,13 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rewards import make_rewards, total_reward
-from touchr1_jax.rl.grpo import ScoreFn
+from touchr1_jax.rewards import make_rewards
+from touchr1_jax.rl.scoring import ScoreFn, make_score
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.parser import Parser, compile_parser
 from touchr1_jax.text.template import PromptLayout, build_layout, prompt_words
 from touchr1_jax.text.tokenizer import Tokenizer, word_level
-from touchr1_jax.types import Params, Parsed, Target, TouchBatch
+from touchr1_jax.types import Params, Target, TouchBatch
 
 Weights = Mapping[str, float]
 
@@ -65,14 +65,7 @@ class Assembly:
 
     def score(self, weights: Weights, prior: Float[np.ndarray, "A K"]) -> ScoreFn:
         """Total reward of one completion under the given weights."""
-        rewards = make_rewards(prior)
-
-        def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
-            parsed = self.parser(tokens)
-            reward, terms = total_reward(rewards, weights, parsed, target)
-            return reward, terms, parsed
-
-        return score
+        return make_score(self.parser, make_rewards(prior), weights)
 
     def target(self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray) -> Target:
         """Targets of single-attribute questions; labels of the attributes that are not asked are hidden."""

@@ -16,6 +16,7 @@ from jaxtyping import Int
 
 from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
+from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import CLIP_ARRAYS
 from touchr1_jax.models.policy import Features
@@ -82,7 +83,7 @@ class AnswerFeed(Feed):
 
     `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
     most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the
-    label.
+    label.  `augment` changes what is felt at random; the evidence stays that of the unchanged contact.
     """
 
     def __init__(
@@ -95,8 +96,17 @@ class AnswerFeed(Feed):
         questions: int,
         seed: int,
         blind: bool = False,
+        augment: AugmentConfig | None = None,
     ) -> None:
-        clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=batch_size, seed=seed, felt=not blind)
+        clips = clip_batches(
+            data.store,
+            data.parts["sft"],
+            data.clip,
+            batch_size=batch_size,
+            seed=seed,
+            felt=not blind,
+            augment=augment,
+        )
         super().__init__(clips, seed)
         self._assembly, self._evidence, self._blind = assembly, evidence, blind
         self._questions = questions

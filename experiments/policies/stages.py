@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import AnswerFeed, QuestionFeed, each, labelled, question_batch, touch_batch
+from experiments.policies.watching import watched_log
 from experiments.running.context import Context
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -26,7 +27,8 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.greedy import make_answer
-from touchr1_jax.rl.grpo import Fixed, GRPOState, ScoreFn, make_grpo_step
+from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig, fit
@@ -130,18 +132,25 @@ def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.Gra
     return optimizer, make_sft_step(agent, optimizer, blind=blind)
 
 
-def _fit(step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str) -> Any:
-    """`fit` with the run's checkpoints, log and progress bar."""
+def _fit(
+    step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str, *, watched: bool = False
+) -> Any:
+    """`fit` with the run's checkpoints, log and progress bar; a watched stage logs alarms too."""
     with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
         start = checkpoints.latest() or 0
         context.rewind(stage, start)
+        write = watched_log(context, stage, start) if watched else functools.partial(_write, context, stage)
         with context.progress(stage, loop.steps, start) as advance:
 
             def log(t: int, metrics: dict[str, float]) -> None:
-                context.log(stage, t, **metrics)
+                write(t, metrics)
                 advance()
 
             return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
+
+
+def _write(context: Context, stage: str, t: int, metrics: dict[str, float]) -> None:
+    context.log(stage, t, **metrics)
 
 
 def encode_contacts(
@@ -226,15 +235,12 @@ def run_grpo(
     stage: str,
 ) -> Params:
     """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
-    feed = QuestionFeed(assembly, features, label, batch_size=config.prompts, seed=seed)
+    feed = QuestionFeed(assembly, features, label, batch_size=config.drawn, seed=seed)
     optimizer, step = grpo_program(assembly.agent, score, config, loop.steps)
     decoder = {"decoder": params["decoder"]}
-    trained = jax.tree.map(jnp.copy, decoder)
-    state = GRPOState(
-        params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32), key=jax.random.key(seed)
-    )
+    state = start_state(decoder, optimizer, jax.random.key(seed), config)
     fixed = Fixed(reference=decoder, noise=noise)
-    end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage)
+    end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage, watched=True)
     return {**params, **end.params}
 
 
@@ -244,7 +250,8 @@ def grpo_program(
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds of an arm."""
     learning_rate = config.learning_rate * config.lr_scale
-    optimizer = falling_adamw(learning_rate, config.final_share, steps, config.max_grad_norm)
+    updates = steps * config.algorithm.updates
+    optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
     return optimizer, make_grpo_step(agent, score, optimizer, config)
 
 

@@ -33,8 +33,8 @@ from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import SceneConfig
 from sensors_io.schema import UNKNOWN, Flag
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import ScoreFn
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
+from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Parsed
@@ -92,14 +92,24 @@ class Study:
         return self.data.label[self.data.parts["test"]]
 
 
-def run_study(config: StudyConfig, arms: Mapping[str, Weights], context: Context) -> Study:
+def run_study(
+    config: StudyConfig,
+    arms: Mapping[str, Weights],
+    context: Context,
+    algorithms: Mapping[str, AnyAlgorithm] | None = None,
+) -> Study:
     """Make the data, train every arm of every seed, ask every policy.
 
     Args:
       config: sizes, data, algorithm.
       arms: reward weights of each arm.
       context: the run.
+      algorithms: those of the arms that do not use the configured one.
     """
+    configs = {
+        arm: dataclasses.replace(config.grpo, algorithm=(algorithms or {}).get(arm, config.grpo.algorithm))
+        for arm in arms
+    }
     data = open_study_data(config, context)
     assembly = assemble(config.model, data.clip.sensors)
     probed = probe_features(data, context)
@@ -108,7 +118,7 @@ def run_study(config: StudyConfig, arms: Mapping[str, Weights], context: Context
     scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND)}
     for seed in range(config.seeds):
-        for name, said in _Seed(config, data, assembly, evidence, scores, context, seed).answers().items():
+        for name, said in _Seed(config, data, assembly, evidence, scores, configs, context, seed).answers().items():
             answers[name].append(said)
     return Study(config=config, data=data, assembly=assembly, probed=probed, prior=prior, arms=arms, answers=answers)
 
@@ -140,6 +150,7 @@ class _Seed:
     assembly: Assembly
     evidence: np.ndarray
     scores: Mapping[str, ScoreFn]
+    configs: Mapping[str, GRPOConfig]
     context: Context
     seed: int
 
@@ -165,7 +176,7 @@ class _Seed:
                 self._grpo_label(),
                 noise,
                 score,
-                config.grpo,
+                self.configs[arm],
                 LoopConfig(steps=config.grpo_steps, save_every=config.grpo_save_every),
                 context,
                 seed=seed,

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
 
@@ -35,5 +36,8 @@ def speed_against_error(groups: Mapping[str, Sequence[Point]], error: str, goal:
             limit, bound = goal
             axes.plot([limit, limit, axes.get_xlim()[0]], [axes.get_ylim()[0], bound, bound], "k:", lw=1)
         axes.set(xscale="log", yscale="log", xlabel="time a frame, ms", ylabel=error)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # less than two decades leave few powers of ten
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.legend(loc="best", fontsize=8)
         return svg(figure)

@@ -26,7 +26,7 @@ class Leak:
 
 
 def leaks(config: SceneConfig) -> list[Leak]:
-    """Three ways to leave frames out: where they fail, by shape alone, and matched as the protocol does."""
+    """Frames past the limit left out where they fail, by shape alone, not at all, and matched, which is the default."""
     labels = _labels(config)
     made = plan(config)
     matched = np.zeros(config.objects)
@@ -36,7 +36,8 @@ def leaks(config: SceneConfig) -> list[Leak]:
     designs = {
         "frames past the limit dropped": np.minimum(made.limits.actual_n, motions.PRESS_FORCE_N),
         "dropped as if objects were rigid": np.minimum(made.limits.rigid_n, motions.PRESS_FORCE_N),
-        "matched (the protocol)": matched,
+        'all kept, flagged (past_limit="flag")': np.full(config.objects, motions.PRESS_FORCE_N),
+        "matched (the default)": matched,
     }
     rng = stream(config.seed, "schedule")
     jitter = 1 + config.force_jitter * rng.standard_normal(config.objects)

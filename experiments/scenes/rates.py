@@ -1,21 +1,15 @@
-"""How fast scenes are made: clocks, feeds without disk, written sets, and sets that were killed and resumed."""
+"""How fast scenes are made: clocks, feeds without disk, written sets."""
 
 import dataclasses
-import os
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sensors_io.generate import generate_records
 from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
-from sensors_io.records import RecordStore
 from sensors_io.scenes import SceneConfig, make_contact
 from sensors_io.schema import SENSORS
 
@@ -78,48 +72,6 @@ def write_rate(config: SceneConfig, out: Path, advance: Callable[[int], None]) -
     generate_records(config, out, progress=tell)
     records = config.contact_count * len(SENSORS) * config.frame_count
     return watch.rate(records), sum(f.stat().st_size for f in out.iterdir()) / records
-
-
-def killed_and_resumed(arguments: list[str], out: Path, shares: tuple[float, ...], shards: int) -> int:
-    """Run `python -m sensors_io generate` and kill it with SIGKILL as often as `shares` says; the last run ends.
-
-    Args:
-      arguments: of the command, without `--out`.
-      out: directory of the records.
-      shares: at which shares of the shards to kill; the process is somewhere inside the next shard by then.
-      shards: that the finished set has.
-
-    Returns:
-      How often it was killed before its end.
-    """
-    command = [sys.executable, "-m", "sensors_io", "generate", *arguments, "--out", str(out)]
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(out.parent / "compiled")}
-    killed = 0
-    for share in shares:
-        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        while process.poll() is None and len(list(out.glob("contacts-*"))) < max(1, round(share * shards)):
-            time.sleep(0.05)
-        time.sleep(0.2)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        killed += process.returncode == -signal.SIGKILL
-    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
-    return killed
-
-
-def differing_contacts(a: Path, b: Path) -> int:
-    """Number of contacts that two sets do not hold alike, bit for bit and in the same order."""
-    left, right = RecordStore(a), RecordStore(b)
-    if left.contacts != right.contacts:
-        return max(len(left), len(right))
-    return sum(not _same(left.contact(i), right.contact(i)) for i in range(len(left)))
-
-
-def _same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    if a.keys() != b.keys():
-        return False
-    pairs = ((vars(a[name]), vars(b[name])) for name in a)
-    return all(np.array_equal(x[field], y[field]) for x, y in pairs for field in x)
 
 
 def _one_of_each_program(config: SceneConfig) -> Iterator[int]:

@@ -107,9 +107,7 @@ def candidates(study: Study) -> dict[str, Candidate]:
         "fitted, with grain": Candidate(render=fitted, noise=study.noise),
         "as stored in the generator": Candidate(
             render=photometric.gelsight_mini,
-            noise=dataclasses.replace(
-                stored, grain=photometric.mini_optics.GRAIN, shared=photometric.mini_optics.GRAIN_SHARED
-            ),
+            noise=stored,
         ),
     }
 

@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.scenes.rates import Stopwatch
-from sensors_io.scenes import SceneConfig, contact, motions, noise, surface
-from sensors_io.scenes.press import Grid, Kernels, Path, Press, make_kernels, record
-from sensors_io.scenes.schedule import pace
+from sensors_io.scenes import SceneConfig, contact, motions, surface
+from sensors_io.scenes.draws import draw
+from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels, record
+from sensors_io.scenes.schedule import Slot
 from sensors_io.scenes.sensors import MODELS, SensorModel
-from sensors_io.scenes.sequence import site_of
-from sensors_io.scenes.units import place, unit_of
 
 _Scene = tuple[Press, Any, np.ndarray]  # what is touched, by which unit, the key of the noise
 
@@ -78,20 +77,9 @@ def _seconds(call: Callable[[], Any], times: int = 40) -> float:
 
 
 def _scene(config: SceneConfig, index: int, order: int, motion: str) -> _Scene:
-    rng = np.random.default_rng((config.seed, index, order))
-    site = site_of(config, index, 0, 0)
-    hand = motions.plan(motion, motions.FORCES_N[1], pace(config.frame_count))
-    moves = (hand.force_n, hand.slide_mm, hand.twist_rad, hand.tilt_rad)
-    force, slide, twist, tilt = (jnp.asarray(each, jnp.float32) for each in moves)
-    press = Press(
-        skin=site.skin,
-        pose=place(site.turn_rad, rng),
-        modulus_mpa=jnp.float32(site.solid.modulus_mpa),
-        friction=jnp.float32(site.solid.friction),
-        path=Path(force_n=force, slide_mm=slide, twist_rad=twist, tilt_rad=tilt),
-        exposure_drift=jnp.float32(0.0),
-    )
-    return press, unit_of(config.seed, order, 0), noise.key(rng)
+    slot = Slot(object_index=index, site=0, motion=motion, force_n=motions.FORCES_N[1])
+    drawn = draw(config, index, slot, order)
+    return drawn.press, drawn.unit, drawn.key
 
 
 def _cpu_ms(config: SceneConfig, sensor: SensorModel, scenes: list[_Scene], run: Callable[..., Any]) -> float:

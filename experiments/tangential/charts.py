@@ -32,13 +32,14 @@ def speed_panels(panels: Mapping[str, Mapping[str, Sequence[Point]]]) -> bytes:
         axes = figure.subplots(rows, 2, sharey=True, squeeze=False)
         shown = axes.ravel()[: len(panels)]
         for each, (title, groups) in zip(shown, panels.items(), strict=True):
-            for kind, points in groups.items():
+            for order, (kind, points) in enumerate(groups.items()):
                 names, ms, *errors = zip(*points, strict=True)
                 median, high = (np.maximum(error, _LEAST) for error in errors)
                 each.plot(ms, median, marker=marker[kind], color=colour[kind], lw=1.2, ms=5.5)
                 each.vlines(ms, median, high, color=colour[kind], lw=1, alpha=0.5)
                 for name, x, y in zip(names, ms, median, strict=True):
-                    each.annotate(name, (x, y), (5, 3), textcoords="offset points", fontsize=7, color=colour[kind])
+                    aside = (5, 3) if order % 2 else (-12, -9)  # curves that cross are named on either side
+                    each.annotate(name, (x, y), aside, textcoords="offset points", fontsize=7, color=colour[kind])
             each.set(xscale="log", yscale="log")
             each.set_title(title, fontsize=9.5, loc="left")
             each.set_xlabel("time a frame, ms")

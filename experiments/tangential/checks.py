@@ -130,7 +130,7 @@ def decision_table(promises: Iterable[Promise]) -> Table:
         title="The cheap tier, where its promise lets it in",
         columns=(
             Column(name="tolerance"),
-            Column(name="taken", unit="%", format=".0f", meaning="share of contacts that `is_enough` accepts"),
+            Column(name="taken", unit="%", format=".0f", meaning="share of contacts that promise it"),
             Column(name="of these within", unit="%", format=".0f"),
             Column(name="in hindsight", unit="%", format=".0f", meaning="share of contacts where it would have done"),
         ),

@@ -6,6 +6,7 @@ import numpy as np
 
 from experiments.reporting.findings import Cell, Column, Table
 from experiments.reporting.results import require
+from sensors_io.scenes import history
 
 RECORDING = "example_1_AD2-0065L.npz"
 """The vendor's longer recording, 20 × 20 markers, frames 32.7 ms apart."""
@@ -35,7 +36,8 @@ def loop_table(data_dir: Path) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for press in presses(force):
         t = time[press]
-        areas = (100 * loop_area(np.interp(t + lag, time, force), depth[press]) for lag in LAGS_S)
+        returned = (history.returned_share(np.interp(t + lag, time, force), depth[press]) for lag in LAGS_S)
+        areas = (100 * (1 - share) for share in returned)
         rows.append((f"{t[0]:.1f}–{t[-1]:.1f} s", float(force[press].max()), *areas))
     return Table(
         title="Loops of force over indentation in real presses",
@@ -54,9 +56,3 @@ def presses(force_n: np.ndarray) -> list[slice]:
     edges = np.diff((force_n > TOUCHES_N).astype(int))
     begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     return [slice(int(b), int(ends[ends > b][0]) + 2) for b in begins if np.any(ends > b)]
-
-
-def loop_area(force_n: np.ndarray, depth_mm: np.ndarray) -> float:
-    """∮ F du over the work of its loading part."""
-    work = (force_n[1:] + force_n[:-1]) / 2 * np.diff(depth_mm)
-    return float(work.sum() / work[work > 0].sum())

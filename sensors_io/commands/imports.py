@@ -8,31 +8,153 @@ import tyro
 
 from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
-from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
+from sensors_io.importers.catalogue import Catalogue, import_catalogue
+from sensors_io.importers.estimate_modulus import list_estimate_modulus
+from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
+from sensors_io.importers.keep import ImportConfig, Keep, Shares
+from sensors_io.importers.octopi import list_octopi
+from sensors_io.importers.physiclear import PhysiclearConfig, list_physiclear
+from sensors_io.importers.tac3d import list_tac3d
+from sensors_io.importers.tacquad import list_tacquad
+from sensors_io.importers.touch_and_go import list_touch_and_go
+from sensors_io.importers.tvl import list_tvl
+from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
+from sensors_io.importers.ycb_slide import list_ycb_slide
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Physiclear:
-    """Import the PhysiCLeAR videos.  An interrupted import goes on where it stopped."""
+class _Paths:
+    """From where to where."""
 
     source: tyro.conf.Positional[pathlib.Path]
-    """Directory with labels.json and videos/."""
+    """Directory of the data set as it is published."""
     out: pathlib.Path
     """Directory of the records."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Physiclear(_Paths):
+    """PhysiCLeAR: labels.json and videos/<object>_<trial>.mov."""
+
     config: PhysiclearConfig = dataclasses.field(default_factory=PhysiclearConfig)
 
-    def run(self) -> int:
-        with progress_bar("videos") as progress:
-            report = import_physiclear(self.source, self.out, config=self.config, progress=progress)
-        OUT.print(overview.import_table(report))
-        return 0
+    def catalogue(self) -> Catalogue:
+        return list_physiclear(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Octopi(_Paths):
+    """Octopi-1.5: <sample>/data.json and <sample>/tactile/*.jpg."""
+
+    config: Keep = dataclasses.field(default_factory=Keep)
+
+    def catalogue(self) -> Catalogue:
+        return list_octopi(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchAndGo(_Paths):
+    """Touch and Go: label.txt and dataset/<session>/gelsight_frame/*.jpg."""
+
+    config: ImportConfig = dataclasses.field(default_factory=ImportConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_touch_and_go(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tvl(_Paths):
+    """TVL, part HCT: data1/train.csv, data1/test.csv and the pictures that they name."""
+
+    config: ImportConfig = dataclasses.field(default_factory=ImportConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_tvl(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tacquad(_Paths):
+    """TacQuad: contact_*.csv and data_*/<item>/{gelsight,digit,duragel}/*.png."""
+
+    config: ImportConfig = dataclasses.field(default_factory=ImportConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_tacquad(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Vtv150k(_Paths):
+    """VTV150K, videos of one sensor: <object>_<n>.mp4."""
+
+    config: VTVConfig
+
+    def catalogue(self) -> Catalogue:
+        return list_vtv150k(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Feelanyforce(_Paths):
+    """FeelAnyForce: tables of tactile, depth, FT and the pictures that they name."""
+
+    config: FeelAnyForceConfig = dataclasses.field(default_factory=FeelAnyForceConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_feelanyforce(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class YcbSlide(_Paths):
+    """YCB-Slide, real: <object>/dataset_<k>/frames/*.jpg and digit_data.npy."""
+
+    config: ImportConfig = dataclasses.field(default_factory=ImportConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_ycb_slide(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tac3d(_Paths):
+    """Recordings of a Tac3D: <name>_<serial>.npz."""
+
+    config: Shares = dataclasses.field(default_factory=Shares)
+
+    def catalogue(self) -> Catalogue:
+        return list_tac3d(self.source, self.config)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EstimateModulus(_Paths):
+    """EstimateModulus: <object>_<n>.avi with its forces and widths."""
+
+    config: ImportConfig = dataclasses.field(default_factory=ImportConfig)
+
+    def catalogue(self) -> Catalogue:
+        return list_estimate_modulus(self.source, self.config)
+
+
+DataSet = (
+    Annotated[Physiclear, tyro.conf.subcommand("physiclear")]
+    | Annotated[Octopi, tyro.conf.subcommand("octopi")]
+    | Annotated[TouchAndGo, tyro.conf.subcommand("touch-and-go")]
+    | Annotated[Tvl, tyro.conf.subcommand("tvl")]
+    | Annotated[Tacquad, tyro.conf.subcommand("tacquad")]
+    | Annotated[Vtv150k, tyro.conf.subcommand("vtv150k")]
+    | Annotated[Feelanyforce, tyro.conf.subcommand("feelanyforce")]
+    | Annotated[YcbSlide, tyro.conf.subcommand("ycb-slide")]
+    | Annotated[Tac3d, tyro.conf.subcommand("tac3d")]
+    | Annotated[EstimateModulus, tyro.conf.subcommand("estimate-modulus")]
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Import:
-    """Import published recordings."""
+    """Import published recordings.  An interrupted import goes on where it stopped."""
 
-    dataset: Annotated[Physiclear, tyro.conf.subcommand("physiclear")] | Annotated[None, tyro.conf.Suppress]
+    dataset: DataSet
 
     def run(self) -> int:
-        return self.dataset.run() if self.dataset else 2
+        catalogue = self.dataset.catalogue()
+        with progress_bar("contacts") as progress:
+            report = import_catalogue(catalogue, self.dataset.out, progress=progress)
+        OUT.print(overview.import_table(report))
+        return 0

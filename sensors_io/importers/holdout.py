@@ -1,4 +1,4 @@
-"""A deterministic held-out split by object."""
+"""Deterministic held-out splits by object."""
 
 import collections
 import dataclasses
@@ -42,6 +42,18 @@ def hold_out(cards: Seq[ObjectCard], share: float) -> list[ObjectCard]:
         taken += _count([best])
         left -= _count([best])
     return [dataclasses.replace(c, split="test") if c.object_id in moved else c for c in cards]
+
+
+def split_by_name(names: Iterable[str], *, val_share: float, test_share: float) -> dict[str, str]:
+    """Split of each name, for sources without labels to balance: in the order of their SHA-256, first test, then val.
+
+    Args:
+      names: ids of the objects, or of whatever must not be torn apart, such as a session; repeats count once.
+      val_share, test_share: shares of the names, rounded.
+    """
+    order = sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+    test, val = round(test_share * len(order)), round(val_share * len(order))
+    return {n: "test" if i < test else "val" if i < test + val else "train" for i, n in enumerate(order)}
 
 
 def _cells(card: ObjectCard) -> list[Cell]:

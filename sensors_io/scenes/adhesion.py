@@ -6,8 +6,7 @@ out instead would tell the labels, since only smooth objects would lose theirs, 
 
 E* = E / (1 − ν²) is the plane-strain modulus, MPa; w the work of adhesion, N/mm (1 J/m² = 1e-3 N/mm).
 Sources: Johnson, Kendall & Roberts 1971; Derjaguin, Muller & Toporov 1975; Tabor 1977; Johnson & Greenwood 1997;
-Persson & Tosatti 2001
-(roughness); Ciavarella 2018 (any shape).
+Persson & Tosatti 2001 (roughness); Ciavarella 2018 (any shape).
 """
 
 import dataclasses
@@ -16,9 +15,6 @@ import numpy as np
 
 from sensors_io.scenes.config import require
 from sensors_io.scenes.layer import Layer
-
-JKR_ABOVE, DMT_BELOW = 5.0, 0.1
-"""Tabor parameters past which one of the limits holds (Johnson & Greenwood 1997)."""
 
 RANGE_MM = 3e-7
 """Range of the surface forces, 0.3 nm, an interatomic distance."""
@@ -42,13 +38,6 @@ class Adhesion:
         """(R w² / (E*² z₀³))^{1/3}: elastic stretch at pull-off over the range of the surface forces."""
         stretch = self.radius_mm * self.work_n_per_mm**2 / self.plane_modulus_mpa**2
         return float((stretch / RANGE_MM**3) ** (1 / 3))
-
-    @property
-    def pull_off_n(self) -> float:
-        """Greatest tension: 3/2 πwR in the JKR limit, 2πwR in the DMT limit, linear in the log of Tabor between."""
-        span = np.log(JKR_ABOVE / DMT_BELOW)
-        towards_jkr = np.clip(np.log(max(self.tabor, DMT_BELOW) / DMT_BELOW) / span, 0, 1)
-        return float((2 - 0.5 * towards_jkr) * np.pi * self.work_n_per_mm * self.radius_mm)
 
     def hertz_force_n(self, force_n: float) -> float:
         """Force F₁ at which the contact without adhesion is as wide: a³ = 3RF₁ / 4E*.
@@ -89,10 +78,6 @@ class Adhesion:
         unit = np.pi * self.work_n_per_mm * self.radius_mm
         excess = (1 + tolerance) ** 3 - 1
         return float(6 * unit * (1 + excess) / excess**2 if self.tabor >= 1 else 2 * unit / excess)
-
-    def may_be_left_out(self, force_n: float, tolerance: float) -> bool:
-        """Whether the contact radius changes by no more than `tolerance`, relative."""
-        return self.relative_change(force_n) <= tolerance
 
 
 def plane_modulus_mpa(*bodies: Layer) -> float:

@@ -19,7 +19,13 @@ def object_cards(config: SceneConfig) -> list[ObjectCard]:
 @functools.lru_cache(maxsize=32)
 def solid_of(config: SceneConfig, index: int) -> objects.Solid:
     """Object number `index`."""
-    return objects.sample(stream(config.seed, "object", index), config.visual_lie_share, config.shortest_wave_mm)
+    return objects.sample(
+        stream(config.seed, "object", index),
+        config.visual_lie_share,
+        config.shortest_wave_mm,
+        config.part_share,
+        config.graded_share,
+    )
 
 
 def object_id(index: int) -> str:

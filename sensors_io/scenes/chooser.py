@@ -1,21 +1,13 @@
-"""Which grid, padding and tolerance a contact needs to stay below an error, chosen from a look that solves nothing.
+"""Which grid, padding and tolerance a contact needs to stay below an error, chosen from a first, coarse solution.
 
-A bed of springs tells where the bodies touch.  How much of the slope of its imprint is lost on grids two and four times
-coarser tells how the error falls with the grid; how far off its periodic image lies, what padding is needed.  The law
-
-    ê² = ê_grid² + ê_stop² + ê_wrap²
-    ln ê_grid = α·φ + (β·φ) ln(n/32),   ln ê_stop = γ·φ + c ln(tolerance),   ln ê_wrap = ε·(1, clearance/h, a/h)
-
-is that of the greater of the relative L₂ errors of displacement and slope; φ are the features of `Survey`, n the side
-of the grid, a the radius of the springs' contact, h the gel's thickness, clearance the padded side less 2a.  Its
-coefficients were fitted to random scenes (`LAW`); its margin is such that nearly all of these keep the promise.  No
-setting is a bed of springs alone: that is off by tens of per cent on every grid.
+Every scene is solved on 24² (`LOOK`), which takes a tenth of a millisecond.  What that solution and the gap on finer
+grids tell (`chooser_survey`) goes into a law of the error of every setting (`chooser_law`).  Where the coarse solution
+is good enough it is the answer; else the cheapest setting that is goes on from it, so that little of the look is lost.
+No setting is a bed of springs alone: that is off by tens of per cent on every grid.
 """
 
 import dataclasses
 import functools
-import itertools
-import math
 from collections.abc import Callable
 
 import jax
@@ -24,105 +16,41 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sensors_io.scenes import contact, layer, nested, winkler
+from sensors_io.scenes import contact, layer, nested
+from sensors_io.scenes.batching import chunks, gather, map_live
+from sensors_io.scenes.chooser_law import LAW, LOOK, MENU, Law, Survey, log_error, pick
+from sensors_io.scenes.chooser_survey import gel_share, survey
 from sensors_io.scenes.config import require
 from sensors_io.scenes.layer import Layer
 
-LOOK_GRID = 48
-"""Side of the grid that is looked at."""
+LOOK_GRIDS = (LOOK.grid, 2 * LOOK.grid, 4 * LOOK.grid)
+"""Sides of the grids on which a look takes the gap."""
 
-GRIDS = (24, 32, 48, 64, 96, 128, 192)
-PADDINGS = (1.5, 2.0)
-"""Sides of the padded grid over those of the window, the same for every gel, so that all share their programs."""
-
-TOLERANCES = (3e-2, 1e-2, 3e-3)
-
-SLACK = 1.5
-"""A promise is kept by an error up to this multiple of the one asked for."""
-
-_LEAST = 1e-3  # least value of what a logarithm is taken of
-_SLOPE = 0.01  # slope that no camera sees
-_TINY = 1e-30
+Gaps = Callable[[int, np.ndarray], Array | np.ndarray]
+"""Distance of the undeformed bodies, mm: from the side n of a grid and R indices of scenes to [R, n, n]."""
 
 Gap = Callable[[int], Array] | Array
-"""Distance of the undeformed bodies, mm: on a square grid of the window, or a function of the grid's side."""
+"""The same of one scene: a function of the grid's side, or an array on a fine grid."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Setting:
-    """How a contact may be solved: sides of the grid and of the padded grid, tolerance of the solver."""
+class Stage:
+    """Where contacts take place: the gel, its square window, and the object as a layer of 1 MPa, `None` if rigid."""
 
-    grid: int
-    padded: int
-    tolerance: float
+    gel: Layer
+    body: Layer | None
+    window_mm: float
 
-    @property
-    def cost(self) -> float:
-        """Time of a solve in arbitrary units, fitted to times on two cores; only its order matters."""
-        size = _OVERHEAD_POINTS + self.grid**2 + _PADDING_WEIGHT * self.padded**2
-        return size * (_START_DIGITS - math.log10(self.tolerance))
-
-
-_OVERHEAD_POINTS = 2000.0  # pixels whose work equals what every iteration takes on any grid
-_PADDING_WEIGHT = 0.45  # work a point of the padded grid over that of the grid itself
-_START_DIGITS = 1.0  # iterations from first guess to a tenth, in those that a further digit takes
-
-
-def make_menu(grids: tuple[int, ...], tolerances: tuple[float, ...] = TOLERANCES) -> tuple[Setting, ...]:
-    """All settings on these grids, cheapest first."""
-    settings = (
-        Setting(grid=n, padded=round(n * ratio), tolerance=t)
-        for n, ratio, t in itertools.product(grids, PADDINGS, tolerances)
-    )
-    return tuple(sorted(settings, key=lambda s: s.cost))
-
-
-MENU = make_menu(GRIDS)
-
-
-@struct.dataclass
-class Survey:
-    """What the law knows of a scene: features φ, the radius of the springs' contact and the gel's thickness.
-
-    φ = (1, ln r₂, ln r₄/r₂, ln a/h, border, ln (edge · h / area), ln slope, ln (depth/h), ln (gel's share)):
-    r₂ and r₄ are the shares of the imprint's slope that grids two and four times coarser than the look's lose, `border`
-    the share of the window's border that touches, edge and area those of the contact, slope that of the gap inside it,
-    depth the springs' greatest compression, of which the gel has its share and the body the rest.
-    """
-
-    features: Float[Array, "K"]
-    radius_mm: Float[Array, ""]
-    window_mm: Float[Array, ""]
-    thickness_mm: Float[Array, ""]
-
-
-@struct.dataclass
-class Law:
-    """Coefficients of ê as the module says them, and the factor from ê to what is promised."""
-
-    grid: Float[Array | np.ndarray, "K"]
-    rate: Float[Array | np.ndarray, "K"]
-    stop: Float[Array | np.ndarray, "K+1"]
-    wrap: Float[Array | np.ndarray, "3"]
-    margin: Float[Array | np.ndarray, ""]
-
-
-LAW = Law(
-    grid=np.array([-0.104, 1.612, -0.653, 0.272, 0.116, 0.050, 0.094, -0.101, -0.117]),
-    rate=np.array([-2.293, -0.644, -0.460, 0.084, -0.102, -0.005, 0.268, -0.258, 0.035]),
-    stop=np.array([-2.129, -0.773, -0.343, -0.015, 1.005, -0.095, -0.537, 0.288, -0.036, 0.643]),
-    wrap=np.array([-1.340, -0.743, -0.041]),
-    margin=np.array(1.646),
-)
-"""Fitted to 140 scenes on four gels, all on grids padded to 1.5 times the side."""
+    def __post_init__(self) -> None:
+        require(self.window_mm > 0, "window_mm", self.window_mm, "must be > 0")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Choice:
     """How to solve a contact, and what may be expected of it.
 
-    `promised_error` is the law's bound of the error.  `met` says that it keeps the promise, `promised_error` ≤ 1.5
-    times the error asked for; where it is false the setting is the one of least promised error, and not enough.
+    `promised_error` is the law's bound of the error.  Where `met` is false the setting is the one of least error, and
+    not enough.
     """
 
     grid: int
@@ -133,128 +61,107 @@ class Choice:
     met: bool
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bucket:
+    """The scenes that one grid and padding solved: their indices [R] and contacts, stacked."""
+
+    grid: int
+    padded: int
+    rows: np.ndarray
+    contacts: contact.Contact
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Solved:
+    """S scenes: the choice of each, and their contacts by grid."""
+
+    choices: tuple[Choice, ...]
+    buckets: tuple[Bucket, ...]
+
+
+@struct.dataclass
+class Look:
+    """One look: the coarse contact, what it tells, and what follows for the error asked for."""
+
+    contact: contact.Contact
+    survey: Survey
+    index: Int[Array, "..."]
+    promised: Float[Array, "..."]
+    met: Bool[Array, "..."]
+
+
 def choose(error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float) -> Choice:
-    """Choose the cheapest setting whose promised error is at most 1.5 times the error asked for.
+    """Choose as `solve` does, for who solves by other means."""
+    stage, gaps, modulus = _alone(gap, gel, body, window_mm)
+    seen = look(error, gaps, np.array([force_n]), modulus, stage)
+    return _choices(seen)[0]
+
+
+def solve(
+    error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float
+) -> tuple[Choice, contact.Contact]:
+    """Solve one contact on the cheapest setting whose promised error is at most 1.5 times the error asked for.
 
     Args:
       error: relative L₂ error that displacement and slope may have, in (0, 1].
-      gap: of the undeformed bodies, mm; an array's side must be a multiple of `LOOK_GRID`.
+      gap: of the undeformed bodies, mm; an array's side must be a multiple of all grids that are chosen.
       force_n: prescribed force, > 0.
       gel: the layer.
       body: the object in series as a layer; `None` for a rigid one.
       window_mm: side of the square window.
 
     Raises:
-      ValueError: an error, a force or a window out of range, a gap that does not fit the look.
+      ValueError: an error, a force or a window out of range, a gap that does not fit a grid.
     """
-    require(0 < error <= 1, "error", error, "must lie in (0, 1]")
-    require(force_n > 0, "force_n", force_n, "must be > 0")
-    require(window_mm > 0, "window_mm", window_mm, "must be > 0")
-    seen = gap_on(gap, LOOK_GRID)
-    soft = look_compliance(gel, window_mm)
-    series = 0 * soft if body is None else look_compliance(body, window_mm)
-    index, promised, met = jax.device_get(_choose(error, seen, force_n, soft, series, window_mm, gel.thickness_mm))
-    setting = MENU[index]
-    return Choice(
-        grid=setting.grid,
-        padded=setting.padded,
-        tolerance=setting.tolerance,
-        tier=contact.Tier.SPG,
-        promised_error=float(promised),
-        met=bool(met),
-    )
+    stage, gaps, modulus = _alone(gap, gel, body, window_mm)
+    solved = solve_many(error, gaps, np.array([force_n]), modulus, stage)
+    (bucket,) = solved.buckets
+    return solved.choices[0], jax.tree.map(lambda leaf: leaf[0], bucket.contacts)
 
 
-def solve(
-    error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float
-) -> tuple[Choice, contact.Contact]:
-    """Choose as `choose` does, and solve; an array's side must be a multiple of every grid of the menu.
+def solve_many(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: Stage) -> Solved:
+    """Solve S contacts on one gel, each as `solve` does; the host sorts them by grid between look and solution.
 
-    Compiles one program for every grid and padding that is ever chosen.
-    """
-    choice = choose(error, gap, force_n, gel, body, window_mm)
-    spacing = window_mm / choice.grid
-    soft = jnp.asarray(_compliance(gel, choice.padded, spacing), jnp.float32)
-    series = 0 * soft if body is None else jnp.asarray(_compliance(body, choice.padded, spacing), jnp.float32)
-    found = contact.solve(
-        gap_on(gap, choice.grid), force_n, soft, series, spacing, choice.tolerance, thickness_mm=gel.thickness_mm
-    )
-    return choice, found
-
-
-def pick(error: float | Array, promised: Float[Array, "T"]) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """Index of the first setting that keeps the promise, and whether one does; else that of the least error."""
-    keeps = promised <= SLACK * error
-    met = jnp.any(keeps)
-    return jnp.where(met, jnp.argmax(keeps), jnp.argmin(promised)), met
-
-
-def promise(seen: Survey, law: Law = LAW, menu: tuple[Setting, ...] = MENU) -> Float[Array, "T"]:
-    """Error that the law promises of every setting, margin × ê."""
-    return jnp.asarray(law.margin) * jnp.exp(log_error(seen, law, menu))
-
-
-def log_error(seen: Survey, law: Law, menu: tuple[Setting, ...]) -> Float[Array, "T"]:
-    """ln ê of every setting."""
-    n = np.array([s.grid for s in menu])
-    padded = np.array([s.padded for s in menu])
-    tolerance = np.array([s.tolerance for s in menu])
-    phi, h = seen.features, seen.thickness_mm
-    clearance = seen.window_mm * (padded / n) - 2 * seen.radius_mm
-    resolution = law.grid @ phi + (law.rate @ phi) * np.log(n / 32)
-    stop = law.stop[:-1] @ phi + law.stop[-1] * np.log(tolerance)
-    wrap = law.wrap[0] + law.wrap[1] * clearance / h + law.wrap[2] * seen.radius_mm / h
-    return 0.5 * jnp.log(jnp.exp(2 * resolution) + jnp.exp(2 * stop) + jnp.exp(2 * wrap))
-
-
-def survey(
-    gap_mm: Float[Array, "L L"],
-    force_n: Float[Array, ""],
-    gel: Float[Array, "M K"],
-    body: Float[Array, "M K"],
-    window_mm: float,
-    thickness_mm: float,
-) -> Survey:
-    """Look at a scene, without a convolution.
+    Compiles one program for the look and one for every grid and padding that is ever chosen.
 
     Args:
-      gap_mm: distance of the undeformed bodies [L, L], L a multiple of 4.
-      force_n: prescribed force, > 0.
-      gel, body: `look_compliance` of either; zeros for a rigid body.
-      window_mm, thickness_mm: sides of the window, thickness of the gel.
+      error: relative L₂ error that displacement and slope may have, in (0, 1].
+      gaps: of the undeformed bodies, mm.
+      force_n: prescribed forces, > 0, [S].
+      modulus_mpa: moduli of the objects, > 0, [S]; whatever for a rigid one.
+      stage: gel, object, window.
+
+    Raises:
+      ValueError: an error, a force or a modulus out of range.
     """
-    spacing, points = window_mm / gap_mm.shape[0], gap_mm.shape[0]
-    seen = winkler.look(gap_mm, force_n, gel + body, spacing)
-    p, bed = seen.pressure_mpa, winkler.bed_compliance(gel + body, spacing)
-    halved, quartered = nested.refine(nested.coarsen(p, 2)), nested.refine(nested.refine(nested.coarsen(p, 4)))
-    whole = jnp.maximum(_slope_norm(p), _TINY)  # 0 under a flat pad, which loses nothing
-    fine, coarse = (_slope_norm(p - q) / whole for q in (halved, quartered))
-    area = jnp.sum(seen.contact)
-    edges = jnp.sum(jnp.diff(seen.contact, axis=0)) + jnp.sum(jnp.diff(seen.contact, axis=1))
-    at_border = area - jnp.sum(seen.contact[1:-1, 1:-1])
-    ln = lambda x: jnp.log(jnp.maximum(x, _LEAST))
-    features = (
-        jnp.ones(()),
-        ln(fine),
-        ln(coarse) - ln(fine),
-        ln(seen.radius_mm / thickness_mm),
-        at_border / (4 * points),
-        ln(edges * thickness_mm / (area * spacing)),
-        ln(seen.slope + _SLOPE),
-        ln(bed * jnp.max(p) / thickness_mm),
-        ln(winkler.bed_compliance(gel, spacing) / bed),
-    )
-    return Survey(
-        features=jnp.stack(features),
-        radius_mm=seen.radius_mm,
-        window_mm=jnp.asarray(window_mm, jnp.float32),
-        thickness_mm=jnp.asarray(thickness_mm, jnp.float32),
-    )
+    seen = look(error, gaps, force_n, modulus_mpa, stage)
+    index = np.asarray(seen.index)
+    programs = np.array([(s.grid, s.padded) for s in MENU])
+    buckets = []
+    for grid, padded in np.unique(programs[index], axis=0).tolist():
+        rows = np.nonzero((programs[index] == (grid, padded)).all(1) & (index != MENU.index(LOOK)))[0]
+        if len(rows):
+            found = _go_on(seen, gaps, rows, force_n, modulus_mpa, stage, (grid, padded))
+            buckets.append(Bucket(grid=grid, padded=padded, rows=rows, contacts=found))
+    done = np.nonzero(index == MENU.index(LOOK))[0]
+    if len(done):
+        found = jax.tree.map(lambda leaf: leaf[done], seen.contact)
+        buckets.append(Bucket(grid=LOOK.grid, padded=LOOK.padded, rows=done, contacts=found))
+    return Solved(choices=_choices(seen), buckets=tuple(buckets))
 
 
-def look_compliance(body: Layer, window_mm: float) -> Float[Array, "M K"]:
-    """Spectrum of a layer for `survey`, on twice the window."""
-    return jnp.asarray(_compliance(body, 2 * LOOK_GRID, window_mm / LOOK_GRID), jnp.float32)
+def look(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: Stage, law: Law = LAW) -> Look:
+    """Solve S contacts on the coarsest grid and choose for each; arguments as for `solve_many`."""
+    require(0 < error <= 1, "error", error, "must lie in (0, 1]")
+    for name, values in (("force_n", force_n), ("modulus_mpa", modulus_mpa)):
+        require(bool(np.all(values > 0)), name, values, "must be > 0")
+    gel, body = _spectra(stage, LOOK.padded, stage.window_mm / LOOK.grid)
+    sizes = (stage.window_mm, stage.gel.thickness_mm)
+    parts = []
+    for rows, live in chunks(np.arange(len(force_n))):
+        given = (tuple(gaps(n, rows) for n in LOOK_GRIDS), force_n[rows], modulus_mpa[rows])
+        parts.append(_look(live, given, gel, body, sizes, error, law))
+    return gather(parts, len(force_n))
 
 
 def gap_on(gap: Gap, grid: int) -> Float[Array, "N N"]:
@@ -270,21 +177,81 @@ def gap_on(gap: Gap, grid: int) -> Float[Array, "N N"]:
     return nested.coarsen(gap, gap.shape[0] // grid)
 
 
+def _alone(gap: Gap, gel: Layer, body: Layer | None, window_mm: float) -> tuple[Stage, Gaps, np.ndarray]:
+    """One scene as many."""
+    soft = None if body is None else dataclasses.replace(body, modulus_mpa=1.0)
+    modulus = np.array([1.0 if body is None else body.modulus_mpa])
+    return Stage(gel=gel, body=soft, window_mm=window_mm), lambda n, rows: gap_on(gap, n)[None], modulus
+
+
+def _choices(seen: Look) -> tuple[Choice, ...]:
+    fields = zip(seen.index.tolist(), seen.promised.tolist(), seen.met.tolist(), strict=True)
+    return tuple(
+        Choice(**dataclasses.asdict(MENU[i]), tier=contact.Tier.SPG, promised_error=e, met=m) for i, e, m in fields
+    )
+
+
+def _go_on(
+    seen: Look,
+    gaps: Gaps,
+    rows: np.ndarray,
+    force_n: np.ndarray,
+    modulus_mpa: np.ndarray,
+    stage: Stage,
+    program: tuple[int, int],
+) -> contact.Contact:
+    """Contacts of some scenes on one grid, from where the look left them."""
+    grid, padded = program
+    spacing = stage.window_mm / grid
+    gel, body = _spectra(stage, padded, spacing)
+    tolerance = np.array([s.tolerance for s in MENU], np.float32)[seen.index]
+    parts = []
+    for chunk, live in chunks(rows):
+        known = contact.Known(gap_mm=jnp.asarray(gaps(LOOK.grid, chunk)), pressure_mpa=seen.contact.pressure_mpa[chunk])
+        given = (known, gaps(grid, chunk), force_n[chunk], modulus_mpa[chunk], tolerance[chunk])
+        parts.append(_resume(live, given, gel, body, spacing, stage.gel.thickness_mm))
+    return gather(parts, len(rows))
+
+
 @jax.jit
-def _choose(
-    error: Array, gap: Array, force_n: Array, gel: Array, body: Array, window_mm: float, thickness_mm: float
-) -> tuple[Array, Array, Array]:
-    """Index in the menu, promised error, whether it is met."""
-    promised = promise(survey(gap, force_n, gel, body, window_mm, thickness_mm))
-    index, met = pick(error, promised)
-    return index, promised[index], met
+def _look(
+    live: Array, given: tuple, gel: Array, body: Array, sizes: tuple[float, float], error: float, law: Law
+) -> Look:
+    window, thickness = sizes
+
+    def one(scene: tuple[Array, Array, Array]) -> contact.Contact:
+        gap, force, modulus = scene
+        spacing = window / LOOK.grid
+        return contact.solve(gap, force, gel, body / modulus, spacing, LOOK.tolerance, thickness_mm=thickness)
+
+    def tell(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> Look:
+        share = gel_share(gel, body / modulus)
+        told = survey(found.pressure_mpa, found.displacement_mm, gaps, share, window, thickness)
+        index, promised, met = pick(error, log_error(told, law, MENU), law)
+        return Look(contact=found, survey=told, index=index, promised=promised, met=met)
+
+    gaps, force, modulus = given
+    found = map_live(one, live, (gaps[0], force, modulus))
+    return jax.vmap(tell)(found, gaps, modulus)  # all at once: many small steps, none of which stops early
 
 
-@functools.lru_cache(maxsize=64)
-def _compliance(body: Layer, padded: int, spacing_mm: float) -> np.ndarray:
-    return layer.normal_compliance(np.hypot(*layer.wave_numbers(padded, spacing_mm)), body)
+@jax.jit
+def _resume(
+    live: Array, given: tuple, gel: Array, body: Array, spacing_mm: float, thickness_mm: float
+) -> contact.Contact:
+    def one(scene: tuple[contact.Known, Array, Array, Array, Array]) -> contact.Contact:
+        known, gap, force, modulus, tolerance = scene
+        return contact.resume(known, gap, force, gel, body / modulus, spacing_mm, tolerance, thickness_mm=thickness_mm)
+
+    return map_live(one, live, given)
 
 
-def _slope_norm(field: Array) -> Array:
-    """Root of the sum of squared differences between neighbours."""
-    return jnp.sqrt(jnp.sum(jnp.diff(field, axis=0) ** 2) + jnp.sum(jnp.diff(field, axis=1) ** 2))
+def _spectra(stage: Stage, padded: int, spacing_mm: float) -> tuple[Array, Array]:
+    """Compliance of the gel and of the object of 1 MPa."""
+    gel = _compliance(stage.gel, padded, spacing_mm)
+    return gel, jnp.zeros_like(gel) if stage.body is None else _compliance(stage.body, padded, spacing_mm)
+
+
+@functools.lru_cache(maxsize=128)
+def _compliance(body: Layer, padded: int, spacing_mm: float) -> Array:
+    return jnp.asarray(layer.normal_compliance(np.hypot(*layer.wave_numbers(padded, spacing_mm)), body), jnp.float32)

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,9 @@ _STREAMS = {"object": 1, "view": 2, "split": 3, "unit": 4, "contact": 5, "press"
 
 PRESS_FRAMES, PROTOCOL_FRAMES = 8, 90
 
+_LATER = ("past_limit", "coupled", "part_share", "graded_share", "error")
+"""Fields that came after records had been made: at their default, which changes nothing, they do not enter the hash."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
@@ -24,12 +28,28 @@ class SceneConfig:
 
     Without `sequences` every object is pressed at `sites` sites: `frames` geometric levels between `min_force_n` and
     `max_force_n`, frames past the strain limit flagged.  With `sequences`, a multiple of the number of sensors, every
-    object is pressed once and all other contacts are exploratory motions; `sites` does not count, and frames past the
-    strain limit are replaced, see `schedule`.
+    object is pressed once and all other contacts are exploratory motions; `sites` does not count, and `past_limit` says
+    what becomes of frames past the strain limit, where small-strain theory ends:
+
+    - "replace", for whatever is asked about labels: they are left out and others stand for them, so that the force of
+      a frame tells no label (`schedule`).  Few presses reach 20 N, since gels are strained long before.
+    - "flag", for studies of the force itself, or of what lies past the theory: every press reaches 20 N, motions are
+      dealt without regard to what objects bear, and frames past the limit carry `Flag.STRAIN_LIMIT`.  To reject these
+      afterwards, as `ClipConfig.rejected` does, is to let the force tell hardness and protrusion again.
 
     `frames` is by default 8 for presses and 90 for the protocol.  `split_shares` are the shares of objects in train,
     val and test.  The hand misses its targets by `force_jitter` (relative), the force sensor has a relative gain error
-    per sequence and noise on each axis.  The last two numbers but the seed are the contact solver's.
+    per sequence and noise on each axis.  `part_share` and `graded_share` are the shares of objects of two parts and of
+    graded ones, see `objects.Variation`.  The numbers that begin with `solver` are the contact solver's.
+
+    `coupled` lets the gel's sideways motion under pressure meet friction, in presses too; without, friction answers to
+    sliding, twisting and rolling alone.  It changes the markers' sideways displacement by a quarter in a press, twice
+    to thrice the noise of a node, and by 5 to 10 % in a motion, for half a millisecond a frame of a press
+    (`pareto_tangential`).  Studies that read markers closely want it; it is off since older records are without.
+
+    With `error`, the relative L₂ error that displacement and slope of a contact may have, the grid and the tolerance of
+    every sequence are chosen (`effort`) and its records say on which grid they were solved; without, all are solved on
+    `contact_grid` to `solver_tolerance`.
 
     Contacts are solved without adhesion; frames in which it would widen the contact by more than `adhesion_tolerance`,
     relative, are flagged.  `adhesion_j_per_m2` is its work between gel and object.  The default is that of clean
@@ -53,6 +73,11 @@ class SceneConfig:
     adhesion_j_per_m2: float = 0.05
     adhesion_tolerance: float = 0.1
     split_shares: tuple[float, float, float] = (0.7, 0.1, 0.2)
+    past_limit: Literal["replace", "flag"] = "replace"
+    part_share: float = 0.0
+    graded_share: float = 0.0
+    coupled: bool = False
+    error: float | None = None
     solver_tolerance: float = 1e-3
     solver_max_iterations: int = 200
     seed: int = 0
@@ -73,8 +98,14 @@ class SceneConfig:
         require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
         require(self.adhesion_j_per_m2 >= 0, "adhesion_j_per_m2", self.adhesion_j_per_m2, "must be ≥ 0")
         require(self.adhesion_tolerance > 0, "adhesion_tolerance", self.adhesion_tolerance, "must be > 0")
+        for name in ("part_share", "graded_share"):
+            require(0 <= getattr(self, name) <= 1, name, getattr(self, name), "must lie in [0, 1]")
+        most = f"must be ≤ 1 − part_share = {1 - self.part_share:g}: an object is of one kind"
+        require(self.part_share + self.graded_share <= 1, "graded_share", self.graded_share, most)
         ok = min(self.split_shares) >= 0 and abs(sum(self.split_shares) - 1) < 1e-6
         require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
+        ok = self.error is None or 0 < self.error <= 1
+        require(ok, "error", self.error, "must lie in (0, 1], or be None")
         require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")
 
     def _check_sequences(self) -> None:
@@ -94,6 +125,11 @@ class SceneConfig:
         return PRESS_FRAMES if self.sequences is None else PROTOCOL_FRAMES
 
     @property
+    def replaces(self) -> bool:
+        """Whether frames past the strain limit are left out and replaced: only the protocol does so."""
+        return self.sequences is not None and self.past_limit == "replace"
+
+    @property
     def contact_count(self) -> int:
         """Contacts of the data set; each gives one sequence per sensor."""
         return self.objects * self.sites if self.sequences is None else self.sequences // len(MODELS)
@@ -106,7 +142,11 @@ class SceneConfig:
 
 def config_hash(config: SceneConfig) -> str:
     """Hash of everything that decides the records: the config and the version of the generator."""
-    payload = json.dumps({"generator": GENERATOR, **dataclasses.asdict(config)}, sort_keys=True)
+    values = dataclasses.asdict(config)
+    for field in dataclasses.fields(config):
+        if field.name in _LATER and values[field.name] == field.default:
+            del values[field.name]
+    payload = json.dumps({"generator": GENERATOR, **values}, sort_keys=True)
     return hashlib.sha256(payload.encode()).hexdigest()[:16]
 
 

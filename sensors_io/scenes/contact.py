@@ -21,7 +21,7 @@ from sensors_io.scenes import nested, winkler
 from sensors_io.scenes.spg import Problem, State, convolve, inverse_compliance, minimise, press_detail
 from sensors_io.scenes.validity import Validity, judge
 
-__all__ = ["MAX_ITERATIONS", "TOLERANCE", "Contact", "Tier", "convolve", "solve", "solve_winkler"]
+__all__ = ["MAX_ITERATIONS", "TOLERANCE", "Contact", "Known", "Tier", "convolve", "resume", "solve", "solve_winkler"]
 
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-3
@@ -61,6 +61,14 @@ class Contact:
     validity: Validity
 
 
+@struct.dataclass
+class Known:
+    """A contact that was solved on some grid: gap of the undeformed bodies, any offset, and pressure."""
+
+    gap_mm: Float[Array, "n n"]
+    pressure_mpa: Float[Array, "n n"]
+
+
 @jax.jit
 def solve(
     gap_mm: Float[Array, "N N"],
@@ -91,12 +99,43 @@ def solve(
     Raises:
       ValueError: a gap that is not square and even, or a spectrum that does not fit it.
     """
-    _check(gap_mm, gel, body)
-    gap = gap_mm - jnp.min(gap_mm)
-    total = jnp.asarray(force_n / spacing_mm**2, gap.dtype)
-    compliance = gel + body
-    start, coarse_iterations = _approach_from_coarse(gap, total, compliance, spacing_mm, tolerance, max_iterations)
-    found = minimise(_problem(gap, total, compliance, 1), start, tolerance, max_iterations)
+    problem = _pose(gap_mm, force_n, gel, body, spacing_mm)
+    start, coarse_iterations = _approach_from_coarse(problem, spacing_mm, tolerance, max_iterations)
+    found = minimise(problem, start, tolerance, max_iterations)
+    return _contact(found, gel, tolerance, thickness_mm, coarse_iterations, Tier.SPG)
+
+
+@jax.jit
+def resume(
+    known: Known,
+    gap_mm: Float[Array, "N N"],
+    force_n: Float[Array, ""],
+    gel: Float[Array, "M K"],
+    body: Float[Array, "M K"],
+    spacing_mm: float,
+    tolerance: float = TOLERANCE,
+    max_iterations: int = MAX_ITERATIONS,
+    *,
+    thickness_mm: float = math.inf,
+) -> Contact:
+    """Solve on, from a contact that was solved on a coarser grid of the same window: what that took is not lost.
+
+    Arguments and result as for `solve`; grids coarser than the known one are left out.  `known` may be of another
+    padding, and its side need not divide that of the gap.
+
+    Raises:
+      ValueError: as `solve`; a known contact on a finer grid.
+    """
+    finest = _pose(gap_mm, force_n, gel, body, spacing_mm)
+    points, side = gap_mm.shape[0], known.gap_mm.shape[0]
+    if side > points:
+        raise ValueError(f"known is on {side}²: must be no finer than gap_mm on {points}²; resume on a finer grid")
+    factors = tuple(f for f in (*nested.factors(points, finest.compliance.shape[0]), 1) if points // f >= side)
+    coarsest = _coarser(finest, factors[0])
+    before, p = (nested.resample(field, points // factors[0]) for field in (known.gap_mm, known.pressure_mpa))
+    start = press_detail(winkler.rescale(p, coarsest.total), coarsest.gap - before, coarsest)
+    start, coarse_iterations = _climb(finest, start, factors, tolerance, max_iterations)
+    found = minimise(finest, start, tolerance, max_iterations)
     return _contact(found, gel, tolerance, thickness_mm, coarse_iterations, Tier.SPG)
 
 
@@ -115,37 +154,53 @@ def solve_winkler(
 
     Two convolutions, one of them for an honest residual.
     """
-    _check(gap_mm, gel, body)
-    gap = gap_mm - jnp.min(gap_mm)
-    total = jnp.asarray(force_n / spacing_mm**2, gap.dtype)
-    compliance = gel + body
-    p = winkler.pressure(gap, total, 1 / winkler.bed_compliance(compliance, spacing_mm))
-    problem = _problem(gap, total, compliance, 1)
-    found = minimise(problem, p, tolerance, 0)
+    problem = _pose(gap_mm, force_n, gel, body, spacing_mm)
+    bed = winkler.bed_compliance(problem.compliance, spacing_mm)
+    found = minimise(problem, winkler.pressure(problem.gap, problem.total, 1 / bed), tolerance, 0)
     return _contact(found, gel, tolerance, thickness_mm, jnp.int32(0), Tier.WINKLER)
 
 
+def _pose(gap_mm: Array, force_n: Array, gel: Array, body: Array, spacing_mm: float) -> Problem:
+    """The problem on the finest grid."""
+    _check(gap_mm, gel, body)
+    gap = gap_mm - jnp.min(gap_mm)
+    return _problem(gap, jnp.asarray(force_n / spacing_mm**2, gap.dtype), gel + body)
+
+
 def _approach_from_coarse(
-    gap: Array, total: Array, compliance: Array, spacing_mm: float, tolerance: float, max_iterations: int
+    finest: Problem, spacing_mm: float, tolerance: float, max_iterations: int
 ) -> tuple[Array, Array]:
     """Pressure on the finest grid interpolated from the solution on coarser ones, and the iterations these took."""
-    factors = (*nested.factors(gap.shape[0], compliance.shape[0]), 1)
-    coarse = _problem(gap, total, compliance, factors[0])
+    factors = (*nested.factors(finest.gap.shape[0], finest.compliance.shape[0]), 1)
+    coarse = _coarser(finest, factors[0])
     bed = winkler.bed_compliance(coarse.compliance, spacing_mm * factors[0])
-    p, iterations = winkler.pressure(coarse.gap, coarse.total, 1 / bed), jnp.int32(0)
+    start = winkler.pressure(coarse.gap, coarse.total, 1 / bed)
+    return _climb(finest, start, factors, tolerance, max_iterations)
+
+
+def _climb(
+    finest: Problem, start: Array, factors: tuple[int, ...], tolerance: float, max_iterations: int
+) -> tuple[Array, Array]:
+    """Solve on each grid but the last of `factors`, from `start` on the first; pressure on the last, and iterations."""
+    coarse, p, iterations = _coarser(finest, factors[0]), start, jnp.int32(0)
     cap = jnp.minimum(max_iterations, _COARSE_ITERATIONS)
     for factor in factors[1:]:
         found = minimise(coarse, p, _COARSE_SLACK * tolerance, cap)
-        fine = _problem(gap, total, compliance, factor)
+        fine = _coarser(finest, factor)
         p = press_detail(nested.refine(found.best), fine.gap - nested.refine(coarse.gap), fine)
         coarse, iterations = fine, iterations + found.iterations
     return p, iterations
 
 
-def _problem(gap: Array, total: Array, compliance: Array, factor: int) -> Problem:
+def _coarser(finest: Problem, factor: int) -> Problem:
     """The problem on a grid coarser by `factor`."""
-    if factor > 1:
-        gap, total, compliance = nested.coarsen(gap, factor), total / factor**2, nested.truncate(compliance, factor)
+    if factor == 1:
+        return finest
+    gap, compliance = nested.coarsen(finest.gap, factor), nested.truncate(finest.compliance, factor)
+    return _problem(gap, finest.total / factor**2, compliance)
+
+
+def _problem(gap: Array, total: Array, compliance: Array) -> Problem:
     return Problem(gap=gap, total=total, compliance=compliance, inverse=inverse_compliance(compliance, gap.shape[0]))
 
 

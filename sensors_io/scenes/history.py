@@ -88,23 +88,18 @@ def body_share(gel: Layer, body: Layer, contact_radius_mm: float) -> float:
     return soft / (soft + float(normal_compliance(q, gel)))
 
 
-def loop_work(force_n: np.ndarray, depth_mm: np.ndarray) -> tuple[float, float]:
-    """Work put in and work given back along a path, N mm: ∫ F dδ over growing and over shrinking depth.
+def returned_share(force_n: np.ndarray, depth_mm: np.ndarray) -> float:
+    """Share of the work that comes back over a path that begins and ends untouched: −∫ F dδ, δ shrinking, over ∫ F dδ,
+    δ growing; 1 for an elastic body, more where the force is read too early.
 
     Args:
       force_n: applied force [F].
-      depth_mm: approach or indentation [F].
-    """
-    work = (force_n[1:] + force_n[:-1]) / 2 * np.diff(depth_mm)
-    return float(work[work > 0].sum()), float(-work[work < 0].sum())
-
-
-def returned_share(force_n: np.ndarray, depth_mm: np.ndarray) -> float:
-    """Share of the work that comes back over a path that begins and ends untouched, 1 for an elastic body.
+      depth_mm: δ, approach or indentation [F].
 
     Raises:
       ValueError: a path along which no work was done.
     """
-    put_in, back = loop_work(force_n, depth_mm)
+    work = (force_n[1:] + force_n[:-1]) / 2 * np.diff(depth_mm)
+    put_in = float(work[work > 0].sum())
     require(put_in > 0, "force_n", put_in, "must do work: record a load and its unload")
-    return back / put_in
+    return float(-work[work < 0].sum()) / put_in

@@ -1,6 +1,7 @@
 """Nested grids of one window: what a contact looks like on a grid two or four times coarser, and back."""
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 COARSEST = 16
@@ -28,6 +29,14 @@ def coarsen(field: Float[Array, "N N"], factor: int) -> Float[Array, "n n"]:
 def refine(field: Float[Array, "n n"]) -> Float[Array, "N N"]:
     """Twice the resolution, linear between the centres of pixels; block means of the inner pixels change little."""
     return _refine_rows(_refine_rows(field).T).T
+
+
+def resample(field: Float[Array, "n n"], points: int) -> Float[Array, "N N"]:
+    """The field on a finer grid of any side, linear between the centres of pixels: `refine` for twice the side."""
+    side = field.shape[0]
+    at = np.clip((np.arange(points) + 0.5) * side / points - 0.5, 0, side - 1)
+    weights = np.maximum(1 - np.abs(at[:, None] - np.arange(side)), 0).astype(np.float32)
+    return weights @ field @ weights.T
 
 
 def truncate(spectrum: Float[Array, "M K"], factor: int) -> Float[Array, "m k"]:

@@ -122,8 +122,3 @@ def promised_error(gel: Layer, body: Layer | None, contact_radius_mm: float) -> 
     wide, narrow = np.log((along + across) / (2 * normal))
     anisotropy = abs(along[1] - across[1]) / (along[1] + across[1])
     return float(_ERROR_PER_CONTRAST * (abs(wide - narrow) + _TRANSVERSE_SHARE * anisotropy + _LEAST_CONTRAST))
-
-
-def is_enough(gel: Layer, body: Layer | None, contact_radius_mm: float, tolerance: float) -> bool:
-    """Whether `ciavarella_jaeger` meets a relative error of the marker displacement; else take `tangential`."""
-    return promised_error(gel, body, contact_radius_mm) <= tolerance

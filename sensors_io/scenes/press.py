@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
+from jaxtyping import Array, Bool, Complex, Float, Int, UInt8, UInt32
 
 from sensors_io.scenes import contact, drag, failures, layer, motions, noise, readout, surface, traction
 from sensors_io.scenes.readout import Fields, Gel, Resampling, Unit
@@ -68,12 +68,18 @@ class Grid:
 
 @struct.dataclass
 class Kernels:
-    """Spectra of one gel on its padded contact grid, mm/MPa, and the resampling matrices."""
+    """Spectra of one gel on its padded contact grid, mm/MPa, of the object per MPa, and the resampling matrices.
+
+    `gel_lateral` and `body_lateral`, the displacement along the surface by pressure, couple friction to the pressure;
+    `None` leaves that out.
+    """
 
     gel: Float[Array, "M K"]
     body: Float[Array, "M K"]
     gel_shear: traction.Compliance
     body_shear: traction.Compliance
+    gel_lateral: Complex[Array, "M M"] | None
+    body_lateral: Complex[Array, "M M"] | None
     markers: traction.Response
     resampling: Resampling
 
@@ -87,8 +93,8 @@ def padded_size(grid: int, window_mm: float, thickness_mm: float) -> int:
 
 
 @functools.lru_cache(maxsize=16)
-def make_kernels(sensor: SensorModel, grid: Grid) -> Kernels:
-    """Host-side float64 kernels of a sensor, stored float32."""
+def make_kernels(sensor: SensorModel, grid: Grid, *, coupled: bool = False) -> Kernels:
+    """Kernels of a sensor, made in float64 on the host and kept in float32; `coupled` as in `SceneConfig`."""
     spacing = sensor.window_mm / grid.contact_grid
     size = padded_size(grid.contact_grid, sensor.window_mm, sensor.gel.thickness_mm)
     q = np.hypot(*layer.wave_numbers(size, spacing))
@@ -97,6 +103,8 @@ def make_kernels(sensor: SensorModel, grid: Grid) -> Kernels:
         body=jnp.asarray(layer.normal_compliance(q, BODY), jnp.float32),
         gel_shear=traction.make_compliance(sensor.gel, size, spacing),
         body_shear=traction.make_compliance(BODY, size, spacing),
+        gel_lateral=traction.make_coupling(sensor.gel, size, spacing) if coupled else None,
+        body_lateral=traction.make_coupling(BODY, size, spacing) if coupled else None,
         markers=traction.make_response(sensor.gel, size, spacing, sensor.marker_depth_mm or 0.0),
         resampling=readout.make_resampling(grid.contact_grid, grid.image_px),
     )
@@ -120,7 +128,7 @@ def record(
     Args:
       press: what is touched, with a path of F frames.
       unit: the physical sensor.
-      kernels: `make_kernels(sensor, grid)`.
+      kernels: `make_kernels(sensor, grid)`; coupled ones let also a press that stands feel friction, if `moving`.
       key: of all noise, `noise.key`.
       sensor: the sensor type.
       grid: sizes.
@@ -199,8 +207,15 @@ class _Scene:
         series = traction.in_series(
             self.kernels.gel_shear, self.kernels.body_shear, self.unit.modulus_factor, self.press.modulus_mpa
         )
-        bodies = drag.Bodies(compliance=series, coupling=None, response=self.kernels.markers)
+        bodies = drag.Bodies(compliance=series, coupling=self._coupling(), response=self.kernels.markers)
         return drag.advance(history, solved.pressure_mpa, self.press.friction, step, bodies, self.x)
+
+    def _coupling(self) -> Array | None:
+        """By how much the gel's surface moves more by pressure than the object's."""
+        gel, body = self.kernels.gel_lateral, self.kernels.body_lateral
+        if gel is None or body is None:
+            return None
+        return gel / self.unit.modulus_factor - body / self.press.modulus_mpa
 
     def see(self, solved: contact.Contact, slip: Array | None, exposure: Array, key: Array) -> Recording:
         """Everything that is recorded of one frame under pressure and traction."""

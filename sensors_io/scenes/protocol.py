@@ -2,7 +2,8 @@
 
 Contacts follow a `schedule`, each by all four sensors in turn.  Contact i depends on (config, i) alone, so that
 generation may stop and go on anywhere.  Small strain is assumed and frames beyond it are flagged; the protocol does not
-keep such contacts but touches the object elsewhere instead, and counts how often in the contact's `trial`.
+keep such contacts, unless it is asked to, but touches the object elsewhere instead, and counts how often in the
+contact's `trial`.
 """
 
 import collections
@@ -16,8 +17,9 @@ import numpy as np
 
 from sensors_io.scenes import schedule, strength
 from sensors_io.scenes.config import SceneConfig, require
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.scenes.sequence import key_of, make_sequence, site_of
+from sensors_io.scenes.sequence import key_of, make_sequence
 from sensors_io.schema import ContactKey, Flag, Sequence
 
 ATTEMPTS = 8
@@ -45,11 +47,11 @@ def contacts(config: SceneConfig, start: int = 0) -> Iterator[list[Sequence]]:
 def make_contact(config: SceneConfig, index: int) -> list[Sequence]:
     """Contact `index`: the same patch of the same object, touched by every sensor in turn.
 
-    In the protocol, a contact that passes the strain limit is left out and replaced by another site of the same object,
-    up to `ATTEMPTS` times; the last one is kept as it is, flagged.
+    Where the protocol replaces frames past the strain limit, a contact that passes it all the same is left out and
+    replaced by another site of the same object, up to `ATTEMPTS` times; the last one is kept as it is, flagged.
     """
     what = slot(config, index)
-    attempts = 1 if config.sequences is None else ATTEMPTS
+    attempts = ATTEMPTS if config.replaces else 1
     orders = np.roll(np.arange(len(MODELS)), 2 * (index % 2)).tolist()  # two threads compile different sensors
     for trial in range(attempts):
         made = {order: make_sequence(config, index, what, order, trial) for order in orders}

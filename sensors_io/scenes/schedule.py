@@ -3,8 +3,9 @@
 The protocol.  Every object is pressed once, all other contacts are the six exploratory motions, dealt in turn at 2, 5
 and 10 N; all sensors see every contact; contacts come in a random order, so that every prefix is a fair sample.
 
-Frames past the strain limit are left out and replaced.  Leaving them out alone would tell the labels: a ramp that ends
-at 7 N is that of a hard, protruding object, one that reaches 20 N that of a soft one.  What is done instead:
+Frames past the strain limit are left out and replaced, if `SceneConfig.past_limit` says so.  Leaving them out alone
+would tell the labels: a ramp that ends at 7 N is that of a hard, protruding object, one that reaches 20 N that of a
+soft one.  What is done instead:
 
 - Only shape decides what a contact must bear, by its rigid limit (`strength`), so hardness does not.
 - Objects are matched within cells of equal protrusion and roughness level.  A press reaches the ceiling
@@ -16,6 +17,9 @@ at 7 N is that of a hard, protruding object, one that reaches 20 N that of a sof
 - A motion that its object cannot bear is replaced by the same motion at the same force on another object of the cell.
 
 The force then tells none of the three ordinal levels; the price is that few presses reach 20 N.
+
+Where frames past the limit are flagged instead, every object counts as one that bears any force: all presses reach 20 N
+and motions are dealt without regard to what objects bear.
 """
 
 import collections
@@ -52,7 +56,7 @@ class LeftOut:
     """Frames that the protocol would take without regard to what objects bear, by object and force band, [n, bands].
 
     `asked` are all frames of one sensor, `past_limit` those past the object's strain limit on at least one sensor,
-    `replaced` those that others stand for: the same, and what matching costs.
+    `replaced` those that others stand for: the same, and what matching costs; none where frames are only flagged.
     """
 
     asked: np.ndarray
@@ -107,8 +111,9 @@ def protocol(config: SceneConfig, limits: strength.Limits, cell: np.ndarray) -> 
       ValueError: no object bears a motion's force.
     """
     rng = stream(config.seed, "schedule")
-    ceiling = np.minimum(_ceilings(limits.rigid_n, cell, rng), motions.PRESS_FORCE_N)
-    asked, given = _deal(config.contact_count - config.objects, limits.rigid_n, cell, rng)
+    bears = limits.rigid_n if config.replaces else np.full(len(cell), np.inf)
+    ceiling = np.minimum(_ceilings(bears, cell, rng), motions.PRESS_FORCE_N)
+    asked, given = _deal(config.contact_count - config.objects, bears, cell, rng)
     press = [Slot(object_index=i, site=0, motion="press", force_n=float(c)) for i, c in enumerate(ceiling)]
     sites = collections.Counter(dict.fromkeys(range(config.objects), 1))
     moves = []
@@ -117,7 +122,7 @@ def protocol(config: SceneConfig, limits: strength.Limits, cell: np.ndarray) -> 
         sites[which] += 1
     slots = press + moves
     order = rng.permutation(len(slots))
-    counts = _count(config, limits, ceiling, asked)
+    counts = _count(config.frame_count, limits.actual_n, bears, ceiling, asked)
     return Schedule(slots=tuple(slots[i] for i in order), limits=limits, left_out=counts)
 
 
@@ -174,16 +179,23 @@ def _assign(tasks: list[_Task], rows: np.ndarray, limit: np.ndarray) -> list[_Gi
     return given
 
 
-def _count(config: SceneConfig, limits: strength.Limits, ceiling: np.ndarray, asked: list[_Given]) -> LeftOut:
-    """Count the frames that would have been taken of every object without regard to what it bears."""
+def _count(frames: int, limit: np.ndarray, bears: np.ndarray, ceiling: np.ndarray, asked: list[_Given]) -> LeftOut:
+    """Count the frames that would have been taken of every object without regard to what it bears.
+
+    Args:
+      frames: of a sequence.
+      limit: force at the strain limit, N, [n].
+      bears: force up to which motions are given to an object, [n].
+      ceiling: force that its press ends at, [n].
+      asked: motions, each of the object that it was first asked of.
+    """
     shape = (len(ceiling), len(BANDS_N))
     total, past, replaced = (np.zeros(shape, np.int64) for _ in range(3))
-    presses = [(("press", motions.PRESS_FORCE_N), which) for which in range(len(ceiling))]
-    for (motion, force), which in presses + asked:
-        load = _load(motion, force, config.frame_count)
-        bears = force if limits.rigid_n[which] >= _SPARE * force else 0.0
-        bears = ceiling[which] if motion == "press" else bears
-        for counts, most in ((total, 0.0), (past, limits.actual_n[which]), (replaced, bears)):
+    presses = [(("press", motions.PRESS_FORCE_N), which, most) for which, most in enumerate(ceiling)]
+    moves = [(task, i, task[1] if bears[i] >= _SPARE * task[1] else 0.0) for task, i in asked]
+    for (motion, force), which, kept in presses + moves:
+        load = _load(motion, force, frames)
+        for counts, most in ((total, 0.0), (past, limit[which]), (replaced, kept)):
             beyond = load[load > most + _ROUNDING]
             counts[which] += np.bincount(np.searchsorted(BANDS_N, beyond - _ROUNDING), minlength=len(BANDS_N))
     return LeftOut(asked=total, past_limit=past, replaced=replaced)

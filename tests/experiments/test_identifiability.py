@@ -139,12 +139,6 @@ def test_noise_is_scaled_and_nothing_else():
     assert (silent.gel, silent.window_mm, silent.name) == (TAC3D.gel, TAC3D.window_mm, TAC3D.name)
 
 
-def test_a_ramp_that_falls_is_refused():
-    flat = dataclasses.replace(SCENES, frames=40, min_force_n=2.9)
-    with pytest.raises(ValueError, match="frames is 40: must leave a ramp that rises"):
-        identify_draw.touches(flat, 0)
-
-
 def skin(radius_mm=(20.0, 40.0), wave_mm=1.5, amplitude_mm=0.0):
     """A paraboloid with one plane wave along x."""
     f = lambda value: jnp.asarray(value, jnp.float32)

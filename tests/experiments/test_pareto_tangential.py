@@ -163,10 +163,19 @@ def test_a_lag_of_the_force_makes_a_negative_loop_and_a_loss_a_positive_one(tmp_
     (row,) = tangential_loops.loop_table(tmp_path).rows[:1]
     by_lag = dict(zip(tangential_loops.LAGS_S, row[2:], strict=True))
     assert row[1] == pytest.approx(5, rel=0.01)
-    rising, falling = np.linspace(0, 1, 50), np.linspace(1, 0, 50)
-    lossy = np.concatenate([rising**1.5, 0.5 * falling**1.5])
-    assert tangential_loops.loop_area(lossy, np.concatenate([rising, falling])) == pytest.approx(0.5, abs=0.01)
     assert by_lag[0.0] < by_lag[0.03] < -0.5
     assert by_lag[0.06] == pytest.approx(0, abs=0.5)
     with pytest.raises(ResultsError, match="must hold example_1"):
         tangential_loops.loop_table(tmp_path / "nowhere")
+
+
+def test_coupling_is_measured_on_gels_with_markers(directory):
+    results = read_json(directory / "results.json")
+    (table,) = (t for t in results["tables"] if t["title"].startswith("What coupling changes"))
+    assert [row[0] for row in table["rows"]] == [f"{m}, xense" for m in ("hold", "slide_x", "twist")]
+    hold, slide, _ = table["rows"]
+    assert hold[5] is None
+    assert slide[5] > 0
+    assert 0 < hold[1] < 100
+    assert hold[4] < slide[4] + 20
+    assert "Coupling changes" in results["verdict"][-1]

@@ -81,3 +81,12 @@ def test_letters_of_a_uniform_object_are_all_the_same() -> None:
     corner, centre = marked[8:32, 10:34], marked[48:72, 50:74]
     assert corner.max() > 100
     assert marked.sum() == pytest.approx(9 * centre.sum(), rel=0.01)
+
+
+def test_odds_of_a_material_sum_to_all_and_beat_a_guess() -> None:
+    table = scene_gallery.odds()
+    *materials, right = table.rows
+    assert len(materials) == 9
+    for row in materials:
+        assert all(sum(map(int, cell.split(" · "))) == pytest.approx(100, abs=1) for cell in row[1:])
+    assert all(33 < float(cell) < 75 for cell in right[1:])

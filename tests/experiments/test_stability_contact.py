@@ -47,3 +47,11 @@ def test_cases_are_finite_and_named_once(grid):
     cases = suite(grid)
     assert len({c.name for c in cases}) == len(cases)
     assert all(np.all(np.isfinite(c.gap_mm)) for c in cases)
+
+
+def test_adhesion_is_flagged_where_it_counts(directory):
+    (table,) = (t for t in read_json(directory / "results.json")["tables"] if t["title"].startswith("Adhesion"))
+    assert len(table["rows"]) == 12
+    for _, flagged, counts, ratio in table["rows"]:
+        assert 0.7 * flagged < counts <= flagged  # a bonded gel sticks less than a half-space
+        assert ratio == pytest.approx(counts / flagged)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import zlib
 
 import hypothesis
 import numpy as np
@@ -10,7 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sensors_io import codec
+from sensors_io.deltas import FILTERS
 from sensors_io.schema import FRAME_ARRAYS, SENSORS, SchemaError
+from tests.sensors_io import old_entries
 from tests.sensors_io.fakes import card, sequence
 
 EXACT = [name for name in FRAME_ARRAYS if name not in codec.TOLERANCE]
@@ -111,6 +114,31 @@ def test_every_flipped_bit_is_found(data):
     entry[position] ^= 1 << data.draw(st.integers(0, 7))
     with pytest.raises(codec.CorruptRecordsError):
         codec.decode_sequence(bytes(entry))
+
+
+def test_entries_of_version_1_are_read():
+    old = codec.decode_sequence(old_entries.SEQUENCE)
+    assert old_entries.SEQUENCE[:4] == b"TCH1"
+    np.testing.assert_array_equal(old.frames.ravel(), np.arange(120))
+    np.testing.assert_array_equal(old.depth_mm, np.full((2, 2, 3), 0.25))
+    np.testing.assert_array_equal(codec.decode_card(old_entries.CARD).view, card(1).view)
+    again = codec.decode_sequence(codec.encode_sequence(old))
+    np.testing.assert_array_equal(again.frames, old.frames)
+
+
+def test_a_filter_that_this_code_does_not_know_is_refused():
+    entry = codec.encode_sequence(sequence(frames=np.zeros((12, 16, 20, 3), np.uint8)))
+    changed = entry[8:].replace(b'"filter": "none"', b'"filter": "nine"')
+    with pytest.raises(codec.CorruptRecordsError, match="frames went through filter 'nine': must be one of"):
+        codec.decode_sequence(entry[:4] + zlib.crc32(changed).to_bytes(4, "little") + changed)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_frames_come_back_through_every_filter(name, monkeypatch):
+    monkeypatch.setattr(codec, "choose_filter", lambda frames: name)
+    before = sequence(length=5)
+    after = codec.decode_sequence(codec.encode_sequence(before))
+    np.testing.assert_array_equal(after.frames, before.frames)
 
 
 def test_a_cut_entry_and_a_wrong_kind_are_found():

@@ -70,3 +70,8 @@ def test_splits_are_those_of_the_cards(scenes):
     assert [scenes.objects[scenes.contacts[i].object_id].split for i in rows] == [split] * len(rows)
     with pytest.raises(SchemaError, match="split is 'testing'"):
         scenes.contacts_of_split("testing")
+
+
+def test_an_endless_feed_of_single_clips_starts(scenes):
+    feed = clip_batches(scenes, range(6), CLIP, batch_size=1, seed=0, shuffle=False)
+    assert [int(batch["contact"][0]) for batch in itertools.islice(feed, 7)] == [0, 1, 2, 3, 4, 5, 0]

@@ -3,9 +3,10 @@
 import io
 
 import pytest
-import rich.console
 
 from sensors_io import __main__ as cli
+from sensors_io.commands import generate as generating
+from sensors_io.commands.console import ERR, OUT
 from sensors_io.records import RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.importers.films import entry, folder
@@ -17,8 +18,9 @@ def run(monkeypatch):
 
     def call(*args):
         out, err = io.StringIO(), io.StringIO()
-        monkeypatch.setattr(cli, "OUT", rich.console.Console(file=out, width=200))
-        monkeypatch.setattr(cli, "ERR", rich.console.Console(file=err, width=200))
+        for console, file in ((OUT, out), (ERR, err)):
+            monkeypatch.setattr(console, "file", file)
+            monkeypatch.setattr(console, "width", 200)
         return cli.main([str(arg) for arg in args]), out.getvalue(), err.getvalue()
 
     return call
@@ -70,7 +72,7 @@ def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):
         progress(1, 2)
         fakes.write(out, 2)
 
-    monkeypatch.setattr(cli, "generate_records", generate)
+    monkeypatch.setattr(generating, "generate_records", generate)
     status, out, _ = run("generate", "--objects", "7", "--frames", "5", "--out", tmp_path / "r")
     assert status == 0
     assert asked == [(7, 5)]
@@ -82,6 +84,23 @@ def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):
     [
         (["list", "nowhere"], "MissingIndexError: nowhere has no index.json"),
         (["import", "physiclear", "nowhere", "--out", "out"], "ImportSourceError: nowhere/labels.json is missing"),
+        *(
+            (
+                ["import", *name.split(), "nowhere", "--out", "out"],
+                "ImportSourceError: nowhere is no directory: expected ",
+            )
+            for name in (
+                "octopi",
+                "touch-and-go",
+                "tvl",
+                "tacquad",
+                "vtv150k --sensor digit",
+                "feelanyforce",
+                "ycb-slide",
+                "tac3d",
+                "estimate-modulus",
+            )
+        ),
     ],
 )
 def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
@@ -102,7 +121,7 @@ def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "generate_records", stop)
+    monkeypatch.setattr(generating, "generate_records", stop)
     status, _, err = run("generate", "--out", tmp_path / "r")
     assert status == 130
     assert "run the same command again" in err

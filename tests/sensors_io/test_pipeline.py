@@ -4,12 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import ClipConfig, clip_batches, make_clip
 from sensors_io.records import RecordStore
 from sensors_io.schema import CLIP_ARRAYS, SENSORS, UNKNOWN, Flag, SchemaError
 from tests.sensors_io import fakes
 
 SMALL = ClipConfig(frames=4, image_px=8, view_px=6)
+LIVELY = AugmentConfig(mirror=0.5, turn=0.5, exposure_stops=0.5, white_balance_stops=0.2, frame_dropout=0.3)
+RNG = lambda: np.random.default_rng(7)
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +115,45 @@ class TestMakeClip:
             ClipConfig(sensors=("xense", "xense"))
 
 
+class TestAugmentedClip:
+    def test_pictures_fields_and_forces_are_mirrored_together(self):
+        force = np.tile(np.float32([1, 2, -9]), (12, 1))
+        plain, mirrored = (
+            make_clip(contact(0, force_n=force), fakes.card(0), SMALL, augment=AugmentConfig(mirror=share), rng=RNG())
+            for share in (0, 1)
+        )
+        cameras = [0, 1, 3]
+        before = plain.frames[:, :, :, ::-1].astype(int)
+        np.testing.assert_allclose(mirrored.frames[cameras], before[cameras], atol=1)  # rounded before and behind
+        np.testing.assert_array_equal(mirrored.force_n, plain.force_n * [-1, 1, 1])
+        fields = mirrored.frames[2].astype(int)
+        np.testing.assert_allclose(fields[..., 0], 256 - before[2, ..., 0], atol=1)  # 128 is no displacement
+        np.testing.assert_allclose(fields[..., 1:], before[2, ..., 1:], atol=1)
+        for name in ("frame_index", "frame_mask", "view", "label"):
+            np.testing.assert_array_equal(getattr(mirrored, name), getattr(plain, name))
+
+    def test_exposure_leaves_fields_alone(self):
+        config = AugmentConfig(exposure_stops=1, white_balance_stops=0.5)
+        plain = make_clip(contact(0), fakes.card(0), SMALL)
+        bright = make_clip(contact(0), fakes.card(0), SMALL, augment=config, rng=RNG())
+        np.testing.assert_array_equal(bright.frames[2], plain.frames[2])
+        assert all((bright.frames[s] != plain.frames[s]).any() for s in (0, 1, 3))
+        np.testing.assert_array_equal(bright.force_n, plain.force_n)
+
+    def test_a_dropped_frame_is_masked_and_holds_nothing(self):
+        config = AugmentConfig(frame_dropout=0.6)
+        clip = make_clip(contact(0), fakes.card(0), SMALL, augment=config, rng=RNG())
+        assert 4 <= clip.frame_mask.sum() < 16
+        assert clip.stream_mask.all()
+        for name in ("frames", "force_n", "frame_index"):
+            assert not getattr(clip, name)[~clip.frame_mask].any()
+        assert clip.frames[clip.frame_mask].reshape(clip.frame_mask.sum(), -1).any(1).all()
+
+    def test_no_randomness_without_a_source(self):
+        with pytest.raises(SchemaError, match=r"rng is None: .* needs a source of randomness; pass one"):
+            make_clip(contact(0), fakes.card(0), SMALL, augment=AugmentConfig(mirror=1))
+
+
 class TestClipBatches:
     def batches(self, store, **changes):
         return clip_batches(store, range(len(store)), SMALL, **{"batch_size": 3, "seed": 5} | changes)
@@ -138,16 +180,31 @@ class TestClipBatches:
         np.testing.assert_array_equal(np.sort(epochs), np.tile(np.arange(7), (3, 1)))
         assert (epochs[0] != epochs[1]).any()
 
+    def test_changes_are_a_function_of_the_seed_and_of_the_place(self, store):
+        def frames(**options):
+            iterator = iter(self.batches(store, **options))
+            return [next(iterator) for _ in range(5)]
+
+        plain, changed, again = frames(), frames(augment=LIVELY), frames(augment=LIVELY)
+        for a, b, c in zip(plain, changed, again, strict=True):
+            np.testing.assert_array_equal(a["contact"], b["contact"])
+            same(b, c)
+        first, later = (np.concatenate([b["frames"] for b in part]) for part in (changed[:2], changed[2:4]))
+        assert not any((clip == other).all() for clip in first for other in later)  # another change each time
+        quiet = frames(augment=AugmentConfig())
+        same(plain[0], quiet[0])
+
     @pytest.mark.parametrize("stop", [0, 1, 2, 3, 6, 7])
-    def test_resumed_equals_uninterrupted(self, store, stop):
-        whole = iter(self.batches(store))
+    @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
+    def test_resumed_equals_uninterrupted(self, store, stop, augment):
+        whole = iter(self.batches(store, augment=augment))
         want = [next(whole) for _ in range(9)]
-        first = iter(self.batches(store))
+        first = iter(self.batches(store, augment=augment))
         for _ in range(stop):
             next(first)
         state = first.get_state()
         next(first)  # what is read after the state was taken does not matter
-        second = iter(self.batches(store))
+        second = iter(self.batches(store, augment=augment))
         second.set_state(state)
         for batch in want[stop:]:
             same(next(second), batch)
@@ -163,13 +220,27 @@ class TestClipBatches:
         assert [b["contact"].tolist() for b in batches] == [[5, 1]]
 
     def test_worker_processes_change_nothing_but_speed(self, store):
-        iterator = iter(self.batches(store, workers=2))
-        alone = iter(self.batches(store))
+        iterator = iter(self.batches(store, workers=2, augment=LIVELY))
+        alone = iter(self.batches(store, augment=LIVELY))
         try:
             for _ in range(3):
                 same(next(iterator), next(alone))
         finally:
             iterator.close()
+
+    def test_worker_processes_resume_exactly(self, store):
+        first = iter(self.batches(store, workers=2, augment=LIVELY))
+        second = iter(self.batches(store, workers=2, augment=LIVELY))
+        try:
+            next(first)
+            state = first.get_state()
+            want = [next(first) for _ in range(3)]
+            second.set_state(state)
+            for batch in want:
+                same(next(second), batch)
+        finally:
+            first.close()
+            second.close()
 
     def test_bad_indices_are_named(self, store):
         with pytest.raises(SchemaError, match="indices is empty: a pipeline needs at least one contact"):

@@ -224,9 +224,9 @@ class TestDamage:
             RecordStore(path)
 
     def test_another_version(self, path):
-        text = (path / "index.json").read_text().replace('"version":1', '"version":2')
+        text = (path / "index.json").read_text().replace('"version":2', '"version":3')
         (path / "index.json").write_text(text)
-        with pytest.raises(records.RecordsVersionError, match="version 2, this code reads 'touchr1-records' version 1"):
+        with pytest.raises(records.RecordsVersionError, match="version 3, this code reads 'touchr1-records' versions"):
             RecordStore(path)
 
     def test_a_missing_shard(self, path):

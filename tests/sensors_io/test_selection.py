@@ -8,7 +8,7 @@ import pytest
 from hypothesis import strategies as st
 
 from sensors_io.schema import ContactKey, Flag, SchemaError
-from sensors_io.selection import FIELD_MM_PER_COUNT, choose_frames, field_images, nearest_increasing
+from sensors_io.selection import FIELD_MM_PER_COUNT, choose_frames, field_images, nearest_increasing, pick_frames
 from tests.sensors_io.fakes import sequence
 
 REJECTED = (Flag.STRAIN_LIMIT, Flag.NOT_CONVERGED, Flag.SATURATED)
@@ -61,6 +61,28 @@ def test_a_slide_at_set_force_is_not_read_in_its_first_touch_only():
     key = ContactKey(object_id="object_0", site=0, motion="slide_x", trial=0)
     chosen = choose_frames(pressed(load, key=key), 8, REJECTED)
     assert np.count_nonzero(chosen >= 5) >= 6
+
+
+def test_a_chooser_can_be_named():
+    load = np.concatenate([np.linspace(0, 5, 5), np.full(45, 5.0)])
+    key = ContactKey(object_id="object_0", site=0, motion="slide_x", trial=0)
+    made = pressed(load, key=key)
+    assert np.count_nonzero(choose_frames(made, 8, REJECTED, "force") < 5) == 5
+    np.testing.assert_array_equal(choose_frames(made, 8, REJECTED, "salience"), choose_frames(made, 8, REJECTED))
+    ramp = pressed(np.linspace(0, 20, 50))
+    np.testing.assert_array_equal(choose_frames(ramp, 8, REJECTED, "force"), choose_frames(ramp, 8, REJECTED))
+    with pytest.raises(SchemaError, match="force_n is None: frames cannot be chosen by it; choose by 'auto'"):
+        choose_frames(filmed(np.zeros(20)), 8, REJECTED, "force")
+
+
+def test_picked_frames_are_rows_of_every_array():
+    made = sequence(sensor="xense")
+    picked = pick_frames(made, np.array([2, 7]))
+    assert len(picked) == 2
+    assert picked.key == made.key
+    for name in ("frames", "deformation_mm", "depth_mm", "valid", "force_n", "host_time_ns", "flags"):
+        np.testing.assert_array_equal(getattr(picked, name), getattr(made, name)[[2, 7]])
+    assert picked.shear_mm is None
 
 
 def test_film_without_force_is_read_densest_where_most_is_seen():
@@ -122,7 +144,7 @@ def test_field_images_have_one_fixed_scale():
     made.depth_mm[:] = 1.5
     made.valid[:] = True
     made.valid[:, 0, 0] = False
-    images = field_images(made, np.array([0, 1]))
+    images = field_images(made)
     assert pytest.approx(0.0118, rel=0.01) == FIELD_MM_PER_COUNT
     np.testing.assert_allclose(images[0, 2, 2], [128 + 63.5, 128 + 63.5, 255], rtol=1e-6)
     np.testing.assert_allclose(images[1, 2, 2], [1, 1, 255], rtol=1e-5)
@@ -130,6 +152,6 @@ def test_field_images_have_one_fixed_scale():
 
 
 def test_a_missing_field_is_no_displacement():
-    images = field_images(sequence(sensor="tac3d", deformation_mm=None, valid=None), np.array([11]))
+    images = field_images(pick_frames(sequence(sensor="tac3d", deformation_mm=None, valid=None), np.array([11])))
     np.testing.assert_array_equal(images[..., :2], 128)
     assert (images[..., 2] > 200).all()

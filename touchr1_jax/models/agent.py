@@ -24,6 +24,7 @@ class Agent:
       banned: [V], ids that are never sampled (padding, placeholders).
       end_ids: ids that end a completion.
       pad_id: id that follows the end.
+      cache_dtype: type of keys and values, that of the decoder's parameters.
     """
 
     policy: Policy
@@ -31,6 +32,7 @@ class Agent:
     banned: np.ndarray
     end_ids: tuple[int, ...]
     pad_id: int
+    cache_dtype: jnp.dtype = jnp.dtype(jnp.float32)
 
     def encode(self, params: Params, batch: TouchBatch, *, blind: bool = False) -> Features:
         """Encode a batch of contacts, [P, …]; a blind policy has no streams."""
@@ -41,11 +43,24 @@ class Agent:
         """Encode any batch of single streams; arguments as in `TactileViT`."""
         return self._apply(params, Policy.encode_streams, *stream)
 
+    @property
+    def touch_start(self) -> int:
+        """First prompt token that any touch can change: a tactile token or a sensor's name."""
+        stream = np.isin(self.slots.stream_text, np.arange(len(self.slots.touch)))
+        return int(min([*np.flatnonzero(stream), *self.slots.touch.ravel(), len(stream)]))
+
     def prefill(
-        self, params: Params, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"]
+        self,
+        params: Params,
+        features: Features,
+        ids: Int[Array, "L"],
+        mask: Bool[Array, "L"],
+        known: PrefixCache | None = None,
+        start: int = 0,
     ) -> tuple[Float[Array, "V"], PrefixCache]:
-        """Encode one prompt."""
-        return self._apply(params, Policy.prefill, features, ids, mask, self.slots, jnp.asarray(self.banned))
+        """Encode one prompt; with `known`, the encoding of a prompt that differs from `start` on, only from there."""
+        banned = jnp.asarray(self.banned)
+        return self._apply(params, Policy.prefill, features, ids, mask, self.slots, banned, known, start)
 
     def decode(
         self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: tuple[LayerCache, ...]
@@ -65,14 +80,32 @@ class Agent:
 
         Values and gradients equal those of G separate forward passes over prompt and completion.
         """
-        first, prefix = self.prefill(params, features, ids, mask)
+        return self.completion_logits(params, tokens, *self.prefill(params, features, ids, mask))
+
+    def completion_logits(
+        self, params: Params, tokens: Int[Array, "G T"], first: Float[Array, "V"], prefix: PrefixCache
+    ) -> Float[Array, "G T V"]:
+        """Logits of every token of a group of completions under a prompt that `prefill` encoded."""
         banned = jnp.asarray(self.banned)
         return jax.vmap(lambda o: self._apply(params, Policy.completion_logits, o, first, prefix, banned))(tokens)
+
+    def completion_log_probs(
+        self, params: Params, tokens: Int[Array, "G T"], first: Float[Array, "V"], prefix: PrefixCache, *, block: int
+    ) -> Float[Array, "G T"]:
+        """Log-probabilities of a group of completions, as from `completion_logits`, but `block` words at a time.
+
+        For vocabularies of a language model: nothing of size [G, T, V] exists, neither here nor in the gradient.
+        """
+        states = jax.vmap(lambda o: self._apply(params, Policy.completion_states, o, prefix))(tokens)
+        later, banned = tokens[:, 1:], jnp.asarray(self.banned)
+        flat = states.reshape(-1, states.shape[-1]), later.reshape(-1)
+        rest = self._apply(params, Policy.log_probs, *flat, banned, block).reshape(later.shape)
+        return jnp.concatenate([jax.nn.log_softmax(first)[tokens[:, :1]], rest], 1)
 
     def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
         """Caches of one completion of at most `length` tokens."""
         c = self.policy.config.decoder
-        zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim))
+        zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim), self.cache_dtype)
         return tuple(LayerCache(zeros, zeros) for _ in range(c.num_layers))
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.models.chunked import chunked_log_probs
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
 
 
@@ -29,6 +30,7 @@ class DecoderConfig:
     intermediate_size: int = 192
     mrope_section: tuple[int, int, int] = (4, 6, 6)
     rope_theta: float = 1e4
+    norm_epsilon: float = 1e-6
     tie_embedding: bool = True
 
     def __post_init__(self) -> None:
@@ -58,7 +60,7 @@ class DecoderLayer(nn.Module):
 
     def setup(self) -> None:
         c = self.config
-        self.norm_attention, self.norm_mlp = RMSNorm(), RMSNorm()
+        self.norm_attention, self.norm_mlp = RMSNorm(c.norm_epsilon), RMSNorm(c.norm_epsilon)
         self.q_proj = nn.Dense(c.num_heads * c.head_dim)
         self.k_proj = nn.Dense(c.num_kv_heads * c.head_dim)
         self.v_proj = nn.Dense(c.num_kv_heads * c.head_dim)
@@ -89,7 +91,7 @@ class Decoder(nn.Module):
         c = self.config
         self.embedding = nn.Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
         self.layers = [DecoderLayer(c) for _ in range(c.num_layers)]
-        self.norm = RMSNorm()
+        self.norm = RMSNorm(c.norm_epsilon)
         if not c.tie_embedding:
             self.head = nn.Dense(c.vocab_size, use_bias=False)
 
@@ -103,8 +105,21 @@ class Decoder(nn.Module):
         scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)
         return jnp.where(banned, MASKED, scores.astype(jnp.float32))
 
+    def log_probs(
+        self, x: Float[Array, "n D"], tokens: Int[Array, "n"], banned: Bool[Array, "V"], block: int
+    ) -> Float[Array, "n"]:
+        """Log-probability of the token after each hidden state, `block` words at a time; see `chunked`."""
+        tied = self.config.tie_embedding
+        table = self.embedding.embedding if tied else self.head.variables["params"]["kernel"].T
+        return chunked_log_probs(self.norm(x), table, tokens, banned, block=block)
+
     def prefill(
-        self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"]
+        self,
+        x: Float[Array, "L D"],
+        positions: Int[Array, "3 L"],
+        mask: Bool[Array, "L"],
+        known: PrefixCache | None = None,
+        start: int = 0,
     ) -> tuple[Float[Array, "D"], PrefixCache]:
         """Encode a prompt once.
 
@@ -112,19 +127,34 @@ class Decoder(nn.Module):
           x: embedded prompt; its last token must be a real one.
           positions: (time, row, column) of each token.
           mask: which tokens exist; the others are never attended to.
+          known: an earlier encoding of a prompt that is the same before `start`, whose keys are taken over.
+          start: first token that is computed.
 
         Returns:
           The hidden state of the last token and the cache that `extend` and `decode` read.
         """
+        x, rotation, caches = x[start:], self._rotation(positions[:, start:]), []
+        for i, layer in enumerate(self.layers):
+            q, own = layer.project(x, rotation)
+            cache = own if known is None else _continued(known.layers[i], own, start)
+            caches.append(cache)
+            if i < len(self.layers) - 1:
+                x = layer.finish(x, attend_causally(q, cache, mask))
+            else:  # the completion needs every key of the last layer, but only the last token's answer
+                x = layer.finish(x[-1:], attend(q[-1:], [KeySource(cache.k, cache.v, mask)]))
+        return x[0], PrefixCache(tuple(caches), mask, _after(positions, mask))
+
+    def states(
+        self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"]
+    ) -> tuple[Float[Array, "L D"], PrefixCache]:
+        """As `prefill`, with the hidden states of all tokens."""
         rotation = self._rotation(positions)
-        causal = jnp.tril(jnp.ones((x.shape[0], x.shape[0]), bool)) & mask
         caches = []
         for layer in self.layers:
             q, cache = layer.project(x, rotation)
-            x = layer.finish(x, attend(q, [KeySource(cache.k, cache.v, causal)]))
+            x = layer.finish(x, attend_causally(q, cache, mask))
             caches.append(cache)
-        last = jnp.max(jnp.where(mask, positions, -1)) + 1
-        return x[-1], PrefixCache(tuple(caches), mask, last)
+        return x, PrefixCache(tuple(caches), mask, _after(positions, mask))
 
     def extend(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T D"]:
         """Hidden states of a completion under its prompt, all tokens at once (the learner's forward pass)."""
@@ -155,6 +185,32 @@ class Decoder(nn.Module):
     def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
         c = self.config
         return mrope(positions, c.head_dim, c.mrope_section, c.rope_theta)
+
+
+PREFILL_ROWS = 128
+"""Queries that a prompt answers at a time: each block skips the keys after it, and its scores stay in cache."""
+
+
+def attend_causally(q: Float[Array, "n KV R d"], cache: LayerCache, mask: Bool[Array, "L"]) -> Float[Array, "n hd"]:
+    """Attention of the last n of L prompt tokens over the tokens up to themselves that exist, in blocks of queries."""
+    before, blocks = cache.k.shape[1] - q.shape[0], []
+    for begin in range(0, q.shape[0], PREFILL_ROWS):
+        end = min(begin + PREFILL_ROWS, q.shape[0])
+        keys = before + end
+        seen = jnp.tri(end - begin, keys, before + begin, dtype=bool) & mask[:keys]
+        blocks.append(attend(q[begin:end], [KeySource(cache.k[:, :keys], cache.v[:, :keys], seen)]))
+    return jnp.concatenate(blocks)
+
+
+def _continued(known: LayerCache, own: LayerCache, start: int) -> LayerCache:
+    """Rows before `start` of one cache, then all of another."""
+    join = lambda old, new: jnp.concatenate([old[:, :start], new], 1)
+    return LayerCache(join(known.k, own.k), join(known.v, own.v))
+
+
+def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, ""]:
+    """The position that follows a prompt."""
+    return jnp.max(jnp.where(mask, positions, -1)) + 1
 
 
 @custom_vmap

@@ -9,7 +9,7 @@ Every function but `encode` works on a single prompt or rollout and is batched b
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import flax.linen as nn
 import jax
@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax.models.layers import RMSNorm
 from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
-from touchr1_jax.models.vision import VisionConfig, VisionTower
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -45,7 +44,15 @@ class Slots(NamedTuple):
 
     touch: np.ndarray  # [S, N]
     view: np.ndarray  # [Nv]
-    stream_text: np.ndarray  # [L]: stream whose name a text token belongs to, −1 for other tokens
+    stream_text: np.ndarray  # [L]: stream whose text a token is, S for the view's marks, −1 for other tokens
+
+
+class ViewConfig(Protocol):
+    """What a policy must know of its vision tower: how many tokens stand in a row, and how it is built."""
+
+    @property
+    def grid(self) -> int: ...
+    def tower(self, out_width: int) -> nn.Module: ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,7 +60,7 @@ class PolicyConfig:
     """The three towers; `tactile.sensors` is the number S of streams."""
 
     tactile: TactileViTConfig
-    vision: VisionConfig
+    vision: ViewConfig
     decoder: DecoderConfig
 
 
@@ -68,7 +75,7 @@ class Policy(nn.Module):
         self.tactile_norm = RMSNorm()
         self.tactile_in = nn.Dense(2 * c.decoder.hidden_size)
         self.tactile_out = nn.Dense(c.decoder.hidden_size)
-        self.vision = VisionTower(c.vision, c.decoder.hidden_size)
+        self.vision = c.vision.tower(c.decoder.hidden_size)
         self.decoder = Decoder(c.decoder)
 
     def encode_streams(self, frames, force_n, frame_index, frame_mask, sensor) -> Float[Array, "*n N D"]:
@@ -108,14 +115,24 @@ class Policy(nn.Module):
         return jnp.repeat(first, c.tokens_per_step, -1)
 
     def prefill(
-        self, features: Features, ids: Int[Array, "L"], mask: Bool[Array, "L"], slots: Slots, banned: Bool[Array, "V"]
+        self,
+        features: Features,
+        ids: Int[Array, "L"],
+        mask: Bool[Array, "L"],
+        slots: Slots,
+        banned: Bool[Array, "V"],
+        known: PrefixCache | None = None,
+        start: int = 0,
     ) -> tuple[Float[Array, "V"], PrefixCache]:
-        """Encode one prompt: the logits of the first completion token, and the cache of the prefix."""
+        """Encode one prompt: the logits of the first completion token, and the cache of the prefix.
+
+        Where `known` encodes a prompt that is the same before `start`, only what follows is computed.
+        """
         x = self.decoder.embed(ids)
         x = x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
         mask = prompt_mask(features, mask, slots)
         positions = prompt_positions(features.touch_time, mask, slots, self.config.vision.grid)
-        hidden, prefix = self.decoder.prefill(x, positions, mask)
+        hidden, prefix = self.decoder.prefill(x, positions, mask, known, start)
         return self.decoder.logits(hidden, banned), prefix
 
     def completion_logits(
@@ -124,6 +141,16 @@ class Policy(nn.Module):
         """Logits that predict each completion token, the first from the prefix, the others from what precedes them."""
         hidden = self.decoder.extend(tokens[:-1], prefix)
         return jnp.concatenate([first[None], self.decoder.logits(hidden, banned)])
+
+    def completion_states(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T-1 D"]:
+        """Hidden states that predict each completion token but the first."""
+        return self.decoder.extend(tokens[:-1], prefix)
+
+    def log_probs(
+        self, states: Float[Array, "n D"], tokens: Int[Array, "n"], banned: Bool[Array, "V"], block: int
+    ) -> Float[Array, "n"]:
+        """Log-probabilities of the tokens that the states predict, `block` words at a time."""
+        return self.decoder.log_probs(states, tokens, banned, block)
 
     def decode(self, token, t, prefix: PrefixCache, caches: tuple[LayerCache, ...], banned: Bool[Array, "V"]):
         """Logits of completion token t + 1 after token t, and the grown caches."""
@@ -157,7 +184,7 @@ def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Boo
     felt = features.stream_mask[:, None] & (features.touch_time >= 0)
     mask = jnp.asarray(mask).at[slots.touch].set(felt)
     mask = mask.at[slots.view].set(features.view_mask)
-    named = features.stream_mask[np.maximum(slots.stream_text, 0)]
+    named = jnp.append(features.stream_mask, features.view_mask)[np.maximum(slots.stream_text, 0)]
     return mask & jnp.where(slots.stream_text >= 0, named, True)
 
 

@@ -26,6 +26,10 @@ class VisionConfig:
         """Tokens along one side after the merger."""
         return self.image_px // self.patch_px // 2
 
+    def tower(self, out_width: int) -> nn.Module:
+        """The module that makes tokens of `out_width` channels."""
+        return VisionTower(self, out_width)
+
 
 class VisionTower(nn.Module):
     """f(view) → grid² tokens of the language model's width, row by row."""

@@ -28,3 +28,16 @@ def group_advantage(
     if normalise:
         centred = centred / (jnp.std(reward, -1, keepdims=True) + epsilon)
     return jnp.where(degenerate(reward)[..., None], 0.0, centred)
+
+
+def added_after(bonus: Float[Array, "*p G"], weight: float) -> Float[Array, "*p G"]:
+    """α (m_i − m̄): a bonus that joins the advantage after normalisation.
+
+    One that joins the reward before it cancels as soon as every right rollout earns it.
+    """
+    return weight * (bonus - jnp.mean(bonus, -1, keepdims=True))
+
+
+def livelier_first(flat: Bool[Array, "D"], keep: int) -> Array:
+    """Rows of the first `keep` groups that are not degenerate, filled up with degenerate ones: dynamic sampling."""
+    return jnp.argsort(flat, stable=True)[:keep]

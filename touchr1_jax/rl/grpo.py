@@ -5,9 +5,11 @@
     G_tg   = mean_i 1/|o_i| Σ_t KL(π(· | q, T, o_<t) ‖ π(· | q, T_mask, o_<t))
 
 Touch-R1 (arXiv 2605.27154), eq. 5.  T_mask is the touch with one stream, chosen uniformly among those present, replaced
-by noise at the data's statistics.  Nothing leaves the device between the first line and the metrics.
+by noise at the data's statistics.  `config.Algorithm` says what else J may be.  Nothing leaves the device between the
+first line and the metrics.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -17,27 +19,32 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax import masked
 from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.advantages import degenerate, group_advantage
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.objective import Experience, GRPOBatch, objective_gradient
+from touchr1_jax.models.lm import PrefixCache
+from touchr1_jax.rl import tactile_use
+from touchr1_jax.rl.advantages import added_after, degenerate, group_advantage, livelier_first
+from touchr1_jax.rl.config import Algorithm, GRPOConfig, TactileUse
+from touchr1_jax.rl.counterfactual import drop_touch, mask_one_stream, noise_touch, shuffle_touch, swap_touch
+from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metrics, touch_metrics
+from touchr1_jax.rl.objective import Experience, GRPOBatch, at_precision, learner_log_probs, objective_gradient
 from touchr1_jax.rl.rollout import SampleConfig, sample
+from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
-
-ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, Array], Parsed]]
-"""(tokens, target) → (total reward, its named terms, parsed completion), for one rollout."""
 
 
 @struct.dataclass
 class GRPOState:
-    """What a step changes; `key` is the run's root key and the step is folded into it."""
+    """What a step changes; `key` is the run's root key and the step is folded into it.
+
+    `reference` is there only where the algorithm refreshes it; otherwise that of `Fixed` counts.
+    """
 
     params: Params
     opt_state: optax.OptState
     step: Int[Array, ""]
     key: Array
+    reference: Params | None = None
 
 
 class Fixed(NamedTuple):
@@ -51,75 +58,277 @@ class Fixed(NamedTuple):
     noise: Float[Array, "K S N D"]
 
 
-def make_grpo_step(
-    agent: Agent, score: ScoreFn, optimizer: optax.GradientTransformation, config: GRPOConfig
-) -> Callable[[GRPOState, GRPOBatch, Fixed], tuple[GRPOState, dict[str, Array]]]:
-    """Build the jitted step, (state, batch, fixed) → (state, metrics); the state's buffers are donated."""
-    draw = SampleConfig(group=config.group, length=config.length, end_ids=agent.end_ids, pad_id=agent.pad_id)
+NO_MOVE = 1e-2
+"""Advantages that a bonus moves by less, a hundredth of a standard deviation, are those without it."""
 
-    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed) -> tuple[GRPOState, dict[str, Array]]:
+
+class Prompts(NamedTuple):
+    """Encoded prompts, [P, …]: logits of the first token, and the keys that completions stand on."""
+
+    first: Float[Array, "P V"]
+    prefix: PrefixCache
+
+
+class Group(NamedTuple):
+    """The rollouts of D prompts and what became of them; every field has a leading D."""
+
+    batch: GRPOBatch
+    rollout: Rollout
+    parsed: Parsed
+    reward: Float[Array, "D G"]
+    terms: dict[str, Float[Array, "D G"]]
+    bonus: Float[Array, "D G"]
+
+
+def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
+    """State before the first step, on buffers of its own, since steps take them over."""
+    own = jax.tree.map(jnp.copy, params)
+    reference = jax.tree.map(jnp.copy, params) if config.algorithm.reference_every is not None else None
+    step = jnp.zeros((), jnp.int32)
+    return GRPOState(params=own, opt_state=optimizer.init(own), step=step, key=key, reference=reference)
+
+
+def make_grpo_step(
+    agent: Agent,
+    score: ScoreFn,
+    optimizer: optax.GradientTransformation,
+    config: GRPOConfig,
+    constraint: Constraint | None = None,
+) -> Callable[[GRPOState, GRPOBatch, Fixed], tuple[GRPOState, dict[str, Array]]]:
+    """Build the jitted step, (state, batch, fixed) → (state, metrics); the state's buffers are donated.
+
+    Args:
+      agent: policy, prompts, vocabulary.
+      score: reward of one rollout (see `scoring`).
+      optimizer: applied to the gradient of −J.
+      config: sizes and algorithm; a batch holds `config.drawn` prompts.
+      constraint: what completions may say; `None` leaves them free.
+    """
+    if config.bfloat16:
+        agent = dataclasses.replace(agent, cache_dtype=jnp.dtype(jnp.bfloat16))
+    engine = _Engine(agent, score, optimizer, config, constraint)
+    return jax.jit(engine.step, donate_argnums=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Engine:
+    """The parts of a step, in the order in which it takes them."""
+
+    agent: Agent
+    score: ScoreFn
+    optimizer: optax.GradientTransformation
+    config: GRPOConfig
+    constraint: Constraint | None
+
+    def step(self, state: GRPOState, batch: GRPOBatch, fixed: Fixed) -> tuple[GRPOState, dict[str, Array]]:
+        """Rollouts, what they are worth, update."""
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
-        rollout = sample_group(agent, state.params, batch, sample_key, draw)
-        reward, terms, parsed = jax.vmap(jax.vmap(score, in_axes=(0, None)))(rollout.tokens, batch.target)
-        flat = degenerate(reward)
-        learn = Experience(
-            batch=batch,
-            masked_touch=mask_one_stream(batch.features, fixed.noise, mask_key),
-            rollout=rollout,
-            advantage=group_advantage(reward, epsilon=config.epsilon, normalise=config.normalise),
-            weight=prompt_weights(~flat) if config.drop_degenerate else jnp.full(flat.shape, 1 / config.prompts),
-        )
-        grads, parts = objective_gradient(agent, config, state.params, fixed.reference, learn)
-        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, updates)
-        metrics = parts | {f"reward_{name}": jnp.mean(value) for name, value in terms.items()}
-        metrics |= rollout_metrics(rollout, reward, flat, parsed, batch.target)
-        metrics |= {"grad_norm": optax.tree.norm(grads)}
-        return GRPOState(params=params, opt_state=opt_state, step=state.step + 1, key=state.key), metrics
+        control_key = jax.random.fold_in(key, 2)
+        group, control_metrics = self.explore(state.params, batch, fixed, sample_key, control_key)
+        reference = fixed.reference if state.reference is None else state.reference
+        learn = self.experience(state.params, group, fixed, mask_key)
+        params, opt_state, parts = self.update(state, reference, learn)
+        metrics = parts | control_metrics | self.metrics(group, learn)
+        after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
+        return self.refreshed(after), metrics
 
-    return jax.jit(step, donate_argnums=0)
+    def explore(
+        self, params: Params, batch: GRPOBatch, fixed: Fixed, key: Array, control_key: Array
+    ) -> tuple[Group, dict[str, Array]]:
+        """Sample and score; with R_tu also under every control.  Of the candidates the lively groups are kept."""
+        params = at_precision(self.config, params)
+        prompts = encode_prompts(self.agent, params, batch)
+        rollout = sample_prompts(self.agent, params, prompts, key, self._draw(self.config.group))
+        reward, terms, parsed = self._scored(rollout, batch.target)
+        bonus = jnp.zeros_like(reward)
+        metrics: dict[str, Array] = {}
+        if self.config.algorithm.tactile_use is not TactileUse.OFF:
+            bonus, metrics = self.tactile_bonus(params, prompts, batch, parsed, fixed, control_key)
+        if self.config.algorithm.tactile_use is TactileUse.LITERAL:
+            reward = reward + self.config.algorithm.tactile_weight * bonus
+        group = Group(batch, rollout, parsed, reward, terms, bonus)
+        if self.config.algorithm.candidates > 1:
+            rows = livelier_first(self._flat(group), self.config.prompts)
+            group = jax.tree.map(lambda x: x[rows], group)
+        return group, metrics
+
+    def tactile_bonus(
+        self, params: Params, prompts: Prompts, batch: GRPOBatch, parsed: Parsed, fixed: Fixed, key: Array
+    ) -> tuple[Float[Array, "D G"], dict[str, Array]]:
+        """m of R_tu, from rollouts of the same questions without touch, with noise, and shuffled or swapped."""
+        algorithm, keys = self.config.algorithm, jax.random.split(key, 5)
+        scored = jax.vmap(jax.vmap(tactile_use.score, in_axes=(0, None)))
+        own = scored(parsed, batch.target)
+        control, counts = [], []
+        for perturbed, draw_key in zip(controls(algorithm, batch, fixed.noise, keys), keys[2:], strict=True):
+            changed = dataclasses.replace(batch, features=perturbed.features)
+            again = encode_prompts(self.agent, params, changed, prompts.prefix, self.agent.touch_start)
+            said = sample_prompts(self.agent, params, again, draw_key, self._draw(algorithm.controls))
+            control.append(scored(self._scored(said, batch.target)[2], batch.target))
+            counts.append(perturbed.applies)
+        by_prompt, applies = jnp.stack(control, 1), jnp.stack(counts, 1)
+        best = jax.vmap(tactile_use.bar)(by_prompt, applies)
+        margin = algorithm.tactile_margin
+        if algorithm.tactile_use is TactileUse.LITERAL:
+            right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(parsed, batch.target)
+            bonus = jax.vmap(tactile_use.literal, in_axes=(0, 0, 0, None))(own, best, right, margin)
+        else:
+            bonus = jax.vmap(tactile_use.recommended, in_axes=(0, 0, 0, None))(own, best, parsed.formatted, margin)
+        names = ("drop", "noise", "order")
+        return bonus, {
+            "touch_score": jnp.mean(own),
+            **{f"control_{name}": jnp.mean(by_prompt[:, i]) for i, name in enumerate(names)},
+            "tactile_credit_share": jnp.mean(jnp.any(bonus > 0, -1)),
+            "control_missing_share": 1 - jnp.mean(applies),
+            "credit_unearned_share": jnp.mean(jnp.any((bonus > 0) & (own <= 0), -1)),
+        }
+
+    def experience(self, params: Params, group: Group, fixed: Fixed, key: Array) -> Experience:
+        """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
+        algorithm, batch = self.config.algorithm, group.batch
+        advantage = group_advantage(group.reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
+        if algorithm.tactile_use is TactileUse.RECOMMENDED:
+            advantage += added_after(group.bonus, algorithm.tactile_weight)
+        flat = self._flat(group)
+        even = jnp.full(flat.shape, 1 / self.config.prompts)
+        masked_touch, stream = mask_one_stream(batch.features, fixed.noise, key)
+        old = group.rollout.log_prob
+        if algorithm.importance_cap is not None:
+            old = learner_log_probs(self.agent, self.config, params, batch, group.rollout.tokens)
+        return Experience(
+            batch=batch,
+            masked_touch=masked_touch,
+            masked_stream=stream,
+            rollout=group.rollout,
+            old=old,
+            advantage=advantage,
+            weight=prompt_weights(~flat) if algorithm.drop_degenerate else even,
+        )
+
+    def update(
+        self, state: GRPOState, reference: Params, learn: Experience
+    ) -> tuple[Params, optax.OptState, dict[str, Array]]:
+        """μ gradient steps on the same rollouts; the parts are those of the first, `clip_share` that of the last."""
+
+        def once(carry: tuple[Params, optax.OptState], _) -> tuple[tuple[Params, optax.OptState], dict[str, Array]]:
+            params, opt_state = carry
+            grads, parts = self.gradient(params, reference, learn)
+            updates, opt_state = self.optimizer.update(grads, opt_state, params)
+            parts = parts | {"grad_norm": optax.tree.norm(grads)}
+            return (optax.apply_updates(params, updates), opt_state), parts
+
+        start = (state.params, state.opt_state)
+        if self.config.algorithm.updates == 1:
+            (params, opt_state), parts = once(start, None)
+            return params, opt_state, parts
+        (params, opt_state), all_parts = jax.lax.scan(once, start, length=self.config.algorithm.updates)
+        parts = jax.tree.map(lambda x: x[0], all_parts)
+        return params, opt_state, parts | {"clip_share": all_parts["clip_share"][-1]}
+
+    def gradient(self, params: Params, reference: Params, learn: Experience) -> tuple[Params, dict[str, Array]]:
+        """The gradient of −J over as many tokens as the shortest sufficient bucket has."""
+        lengths = (*self.config.buckets, self.config.length)
+        longest = jnp.max(jnp.sum(learn.rollout.mask, -1))
+
+        def over(length: int):
+            cut = lambda x: x[..., :length]
+            short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
+            return lambda p: objective_gradient(self.agent, self.config, p, reference, short)
+
+        if len(lengths) == 1:
+            return over(self.config.length)(params)
+        bucket = jnp.sum(jnp.asarray(lengths) < longest)
+        return jax.lax.switch(bucket, [over(length) for length in lengths], params)
+
+    def refreshed(self, state: GRPOState) -> GRPOState:
+        """The state with the policy as its own reference where the algorithm's period is over."""
+        every = self.config.algorithm.reference_every
+        if every is None:
+            return state
+        if state.reference is None:
+            raise ValueError(f"reference_every is {every}, but the state has no reference; make it with `start_state`")
+        pick = lambda new, old: jnp.where(state.step % every == 0, new, old)
+        return dataclasses.replace(state, reference=jax.tree.map(pick, state.params, state.reference))
+
+    def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
+        """Everything that is logged of a step but the objective's parts."""
+        target = group.batch.target
+        right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
+        metrics = {f"reward_{name}": jnp.mean(value) for name, value in group.terms.items()}
+        metrics |= rollout_metrics(group.rollout, group.reward, self._flat(group), group.parsed, target)
+        metrics |= answer_metrics(group.parsed, target)
+        metrics |= group_metrics(group.reward, learn.advantage, right)
+        metrics |= {"bonus_cancelled_share": self._cancelled(group, learn)}
+        return metrics | touch_metrics(group.batch.features)
+
+    def _cancelled(self, group: Group, learn: Experience) -> Float[Array, ""]:
+        """Share of groups with a tactile bonus whose advantages are those that they would have without it."""
+        algorithm, reward = self.config.algorithm, group.reward
+        if algorithm.tactile_use is TactileUse.LITERAL:
+            reward = reward - algorithm.tactile_weight * group.bonus
+        without = group_advantage(reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
+        moved = jnp.max(jnp.abs(learn.advantage - without), -1)
+        return jnp.mean(jnp.any(group.bonus > 0, -1) & (moved < NO_MOVE))
+
+    def _flat(self, group: Group) -> Bool[Array, "D"]:
+        """Groups that teach nothing: the reward is constant, and the bonus where it counts by itself."""
+        flat = degenerate(group.reward)
+        counts = self.config.algorithm.tactile_use is TactileUse.RECOMMENDED
+        return flat & degenerate(group.bonus) if counts else flat
+
+    def _scored(self, rollout: Rollout, target: Target) -> tuple[Array, dict[str, Array], Parsed]:
+        return jax.vmap(jax.vmap(self.score, in_axes=(0, None)))(rollout.tokens, target)
+
+    def _draw(self, group: int) -> SampleConfig:
+        return SampleConfig(
+            group=group,
+            length=self.config.length,
+            end_ids=self.agent.end_ids,
+            pad_id=self.agent.pad_id,
+            inverse=self.config.inverse_draws,
+            constraint=self.constraint,
+        )
+
+
+def controls(algorithm: Algorithm, batch: GRPOBatch, noise: Float[Array, "K S N D"], keys: Array):
+    """The perturbed touch of R_tu's three controls: dropped, noise, and order.
+
+    Literal: order is a shuffle, which counts where the question is marked as depending on order.  Recommended: where it
+    is not, another object's touch takes its place, which an answer that merely tells noise from touch does not meet.
+    """
+    features = batch.features
+    depends = jnp.zeros(features.stream_mask.shape[0], bool) if batch.ordered is None else batch.ordered
+    shuffled = shuffle_touch(features, keys[1])
+    use = depends & shuffled.applies
+    if algorithm.tactile_use is TactileUse.LITERAL:
+        third = shuffled._replace(applies=use)
+    else:
+        swapped = swap_touch(features, keys[1])
+        choose = lambda a, b: jnp.where(use.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+        third = jax.tree.map(choose, shuffled, swapped)
+    return drop_touch(features), noise_touch(features, noise, keys[0]), third
+
+
+def encode_prompts(
+    agent: Agent, params: Params, batch: GRPOBatch, known: PrefixCache | None = None, start: int = 0
+) -> Prompts:
+    """Prefill each prompt once, or only what follows `start` where `known` holds the rest."""
+    prefill = lambda f, i, m, k: agent.prefill(params, f, i, m, k, start)
+    return Prompts(*jax.vmap(prefill)(batch.features, batch.ids, batch.mask, known))
+
+
+def sample_prompts(agent: Agent, params: Params, prompts: Prompts, key: Array, draw: SampleConfig) -> Rollout:
+    """Draw the completions of encoded prompts."""
+    decode = lambda token, t, past, caches: agent.decode(params, token, t, past, caches)
+    return sample(decode, prompts.first, prompts.prefix, agent.empty_cache(draw.length), key, draw)
 
 
 def sample_group(agent: Agent, params: Params, batch: GRPOBatch, key: Array, draw: SampleConfig) -> Rollout:
     """Prefill each prompt once and draw its completions."""
-    prefill = jax.vmap(agent.prefill, in_axes=(None, 0, 0, 0))
-    first, prefix = prefill(params, batch.features, batch.ids, batch.mask)
-    decode = lambda token, t, past, caches: agent.decode(params, token, t, past, caches)
-    return sample(decode, first, prefix, agent.empty_cache(draw.length), key, draw)
-
-
-def mask_one_stream(features: Features, noise: Float[Array, "K S N D"], key: Array) -> Float[Array, "P S N D"]:
-    """T_mask: in each prompt one present stream, uniformly chosen, becomes an encoded noise draw of its sensor."""
-    p = features.stream_mask.shape[0]
-    stream_key, draw_key = jax.random.split(key)
-    stream = jax.random.categorical(stream_key, jnp.where(features.stream_mask, 0.0, -jnp.inf))
-    draw = jax.random.randint(draw_key, (p,), 0, noise.shape[0])
-    replaced = features.touch.at[jnp.arange(p), stream].set(noise[draw, stream])
-    any_stream = jnp.any(features.stream_mask, -1)[:, None, None, None]
-    return jnp.where(any_stream, replaced, features.touch)
+    return sample_prompts(agent, params, encode_prompts(agent, params, batch), key, draw)
 
 
 def prompt_weights(counts: Bool[Array, "P"]) -> Float[Array, "P"]:
     """Weight of each prompt in a mean over the prompts that count; all 0 when none does."""
     return counts / jnp.maximum(jnp.sum(counts), 1)
-
-
-def rollout_metrics(
-    rollout: Rollout, reward: Float[Array, "P G"], flat: Bool[Array, "P"], parsed: Parsed, target: Target
-) -> dict[str, Array]:
-    """What a researcher watches: reward and its spread, accuracy, parse rate, middle answers, lengths."""
-    asked = target.asked[:, None]
-    label, middle = target.label[:, None], (target.levels[:, None] - 1) // 2
-    ordinal = asked & target.ordinal[:, None]
-    right = (parsed.conclude == label) & (label >= 0)
-    return {
-        "reward": jnp.mean(reward),
-        "reward_std": jnp.mean(jnp.std(reward, -1)),
-        "degenerate_share": jnp.mean(flat),
-        "accuracy": masked.mean(right, jnp.broadcast_to(asked, right.shape)),
-        "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(ordinal, right.shape)),
-        "parse_rate": jnp.mean(parsed.formatted & jnp.all((parsed.conclude >= 0) | ~asked, -1)),
-        "truncated_share": jnp.mean(parsed.truncated),
-        "length": jnp.mean(jnp.sum(rollout.mask, -1)),
-    }

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Rollout
 
 DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[Array, tuple[LayerCache, ...]]]
@@ -21,13 +22,19 @@ DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[A
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SampleConfig:
-    """How completions are drawn: `group` of them per prompt, `length` tokens at most, greedily or at temperature 1."""
+    """How completions are drawn: `group` of them per prompt, `length` tokens at most, greedily or at temperature 1.
+
+    `inverse` draws by the inverse of the distribution function, with one random number a rollout instead of V;
+    `constraint` lets through only tokens from which a formatted answer can still be finished in time.
+    """
 
     group: int
     length: int
     end_ids: tuple[int, ...]
     pad_id: int
     greedy: bool = False
+    inverse: bool = False
+    constraint: Constraint | None = None
 
 
 class _Loop(NamedTuple):
@@ -35,6 +42,7 @@ class _Loop(NamedTuple):
     logits: Float[Array, "P G V"]
     alive: Bool[Array, "P G"]
     caches: tuple[LayerCache, ...]
+    state: Int[Array, "P G"]
     tokens: Int[Array, "T P G"]
     log_prob: Float[Array, "T P G"]
     mask: Bool[Array, "T P G"]
@@ -59,14 +67,15 @@ def sample(
       config: group size, lengths, end and padding ids.
 
     Returns:
-      A `Rollout` [P, G, T]; after the end token ids are `pad_id`, log-probabilities 0 and the mask false.
+      A `Rollout` [P, G, T]; after the end token ids are `pad_id`, log-probabilities 0 and the mask false.  Under a
+      constraint the log-probabilities are still those of the unconstrained policy, which is what the learner scores.
     """
     p, g, t_max = first.shape[0], config.group, config.length
     step = jax.vmap(jax.vmap(decode, in_axes=(0, None, None, 0)), in_axes=(0, None, 0, 0))
     ends = jnp.asarray(config.end_ids)
 
     def body(loop: _Loop) -> _Loop:
-        token = _draw(loop.logits, jax.random.fold_in(key, loop.t), config.greedy)
+        token = _draw(_allowed(loop, config), jax.random.fold_in(key, loop.t), config)
         log_prob = jnp.take_along_axis(jax.nn.log_softmax(loop.logits), token[..., None], -1)[..., 0]
         token = jnp.where(loop.alive, token, config.pad_id)
         logits, caches = step(token, loop.t, prefix, loop.caches)
@@ -75,6 +84,7 @@ def sample(
             logits=logits,
             alive=loop.alive & ~jnp.isin(token, ends),
             caches=caches,
+            state=loop.state if config.constraint is None else config.constraint.advance(loop.state, token),
             tokens=loop.tokens.at[loop.t].set(token),
             log_prob=loop.log_prob.at[loop.t].set(jnp.where(loop.alive, log_prob, 0.0)),
             mask=loop.mask.at[loop.t].set(loop.alive),
@@ -85,6 +95,7 @@ def sample(
         logits=jnp.broadcast_to(first[:, None], (p, g, first.shape[-1])),
         alive=jnp.ones((p, g), bool),
         caches=jax.tree.map(lambda c: jnp.broadcast_to(c, (p, g, *c.shape)), empty),
+        state=jnp.zeros((p, g), jnp.int32),
         tokens=jnp.full((t_max, p, g), config.pad_id, jnp.int32),
         log_prob=jnp.zeros((t_max, p, g)),
         mask=jnp.zeros((t_max, p, g), bool),
@@ -94,7 +105,28 @@ def sample(
     return Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
 
 
-def _draw(logits: Float[Array, "P G V"], key: Array, greedy: bool) -> Int[Array, "P G"]:
-    """Gumbel-max sample, or the most likely token."""
-    noise = 0.0 if greedy else jax.random.gumbel(key, logits.shape)
-    return jnp.argmax(logits + noise, -1).astype(jnp.int32)
+def _allowed(loop: _Loop, config: SampleConfig) -> Float[Array, "P G V"]:
+    """The logits, those of tokens that the constraint forbids at −∞."""
+    if config.constraint is None:
+        return loop.logits
+    return jnp.where(config.constraint.allowed(loop.state, config.length - loop.t), loop.logits, -jnp.inf)
+
+
+def _draw(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) -> Int[Array, "P G"]:
+    """The most likely token, or one drawn from the softmax of the logits."""
+    if config.greedy:
+        return jnp.argmax(logits, -1).astype(jnp.int32)
+    if config.inverse:
+        return inverse_draw(logits, jax.random.uniform(key, logits.shape[:-1]))
+    return jnp.argmax(logits + jax.random.gumbel(key, logits.shape), -1).astype(jnp.int32)
+
+
+def inverse_draw(logits: Float[Array, "*n V"], uniform: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    """Number of words whose cumulative probability does not exceed u: word v with probability softmax(logits)_v.
+
+    The cumulative sum, not 1, is the scale of u, so that rounding never reaches past the last word of any weight.
+    """
+    weight = jnp.exp(logits - jnp.max(logits, -1, keepdims=True))
+    total = jnp.cumsum(weight, -1)
+    drawn = jnp.sum(total <= uniform[..., None] * total[..., -1:], -1)
+    return drawn.astype(jnp.int32)

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.policies.feeds import AnswerFeed, Feed, QuestionFeed, each, question_batch, random_streams, take
+from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
@@ -124,6 +125,14 @@ def test_answers_are_given_for_sft_contacts_alone(answers, data):
     views = {data.store.objects[data.object_ids[i]].view.tobytes() for i in data.parts["sft"]}
     feed = answers(batch_size=5)
     assert {view.tobytes() for _ in range(2) for view in np.asarray(next(feed).touch.view)} <= views
+
+
+def test_what_is_felt_can_be_changed_at_random(answers):
+    plain, changed = (next(answers(augment=augment)) for augment in (None, AugmentConfig(mirror=1)))
+    assert (np.asarray(plain.touch.frames) != np.asarray(changed.touch.frames)).any()
+    np.testing.assert_array_equal(changed.touch.force_n[..., 0], -plain.touch.force_n[..., 0])
+    for name in ("ids", "streams", "tokens", "token_mask"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(changed, name))
 
 
 @pytest.mark.parametrize("kind", ["answers", "questions"])

@@ -1,4 +1,4 @@
-"""Tiny videos and a labels.json in the layout of PhysiCLeAR."""
+"""Tiny videos and pictures, and a labels.json in the layout of PhysiCLeAR."""
 
 import json
 
@@ -43,3 +43,19 @@ def folder(path, *entries):
 
 def labels(path, *entries):
     (path / "labels.json").write_text(json.dumps({"levels": {}, "objects": list(entries)}))
+
+
+def picture(path, level=50, shape=(24, 32)):
+    """A picture, reddish in its upper left quarter on grey `level`, as JPEG or PNG by its name."""
+    image = np.full((*shape, 3), level, np.uint8)
+    image[: shape[0] // 2, : shape[1] // 2] = (30, 30, 220)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+    return path
+
+
+def cut(path):
+    """The same file without its last third, as an interrupted copy leaves it."""
+    data = path.read_bytes()
+    path.write_bytes(data[: 2 * len(data) // 3])
+    return path

@@ -6,7 +6,7 @@ import hypothesis
 import numpy as np
 from hypothesis import strategies as st
 
-from sensors_io.importers.holdout import hold_out
+from sensors_io.importers.holdout import hold_out, split_by_name
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from tests.sensors_io.fakes import card
 
@@ -53,3 +53,11 @@ def test_the_levels_are_shared_out_evenly():
 def test_only_fully_labelled_objects_are_held_out():
     before = [card(n, labels={"hardness": 1}) for n in range(9)]
     assert all(a.split == b.split for a, b in zip(hold_out(before, 0.5), before, strict=True))
+
+
+def test_names_are_split_by_their_digest_alone():
+    names = [f"session_{n}" for n in range(20)]
+    splits = split_by_name(names, val_share=0.1, test_share=0.2)
+    assert sorted(splits.values()) == ["test"] * 4 + ["train"] * 14 + ["val"] * 2
+    assert split_by_name([*reversed(names), names[3]], val_share=0.1, test_share=0.2) == splits
+    assert set(split_by_name(names[:2], val_share=0.1, test_share=0.2).values()) == {"train"}

@@ -7,13 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from sensors_io.importers.physiclear import (
-    ImportSourceError,
-    PhysiclearConfig,
-    Skip,
-    import_physiclear,
-    read_labels,
-)
+from sensors_io.importers.keep import ImportSourceError, Skip
+from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
 from tests.sensors_io.importers.films import entry, film, folder, labels
@@ -30,12 +25,12 @@ def test_videos_become_records(tmp_path):
     )
     seen = []
     report = import_physiclear(source, tmp_path / "out", config=KEEP, progress=lambda *now: seen.append(now))
-    assert report.videos == 5
+    assert report.contacts == 5
     assert report.skipped == report.unlabelled == ()
     assert dict(report.objects) == {"train": 1, "val": 1, "test": 0, "unlabelled": 1}
     assert seen == [(n, 5) for n in range(1, 6)]
     store = RecordStore(tmp_path / "out")
-    assert store.meta.notes["report"]["videos"] == 5
+    assert store.meta.notes["report"]["contacts"] == 5
     assert store.meta.sensors == ("gelsight_mini",)
     assert [(k.object_id, k.trial) for k in store.contacts] == [
         ("ball", 0),
@@ -79,15 +74,15 @@ def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
     (videos / "jar_0.avi").write_bytes(b"")
     film(videos / "stray_0.avi")
     report = import_physiclear(source, tmp_path / "out", config=KEEP)
-    assert report.videos == 3
+    assert report.contacts == 3
     assert set(report.skipped) == {
         Skip(name="ball_0.avi", reason="does not open as a video"),
         Skip(name="ball_2.avi", reason="is listed and absent"),
         Skip(name="jar_0.avi", reason="does not open as a video"),
         Skip(name="cover_0.avi", reason="is not named lid_<trial>"),
         Skip(name="stray_0.avi", reason="is not listed in labels.json"),
-        Skip(name="jar", reason="object without a readable video"),
-        Skip(name="lid", reason="object without a readable video"),
+        Skip(name="jar", reason="object without a readable contact"),
+        Skip(name="lid", reason="object without a readable contact"),
     }
     assert report.unlabelled == (Skip(name="cup", reason="hardness is not annotated"),)
     store = RecordStore(tmp_path / "out")
@@ -130,7 +125,7 @@ class TestNamedErrors:
     def test_no_readable_video(self, tmp_path):
         source = folder(tmp_path / "in", entry("ball", videos=1))
         (source / "videos" / "ball_0.avi").write_bytes(b"broken")
-        with pytest.raises(ImportSourceError, match=r"no video can be read; the first: .*ball_0.avi.*does not open"):
+        with pytest.raises(ImportSourceError, match=r"no contact can be read; the first: .*ball_0.avi.*does not open"):
             self.run(source)
         assert not (tmp_path / "out" / "index.json").exists()
 
@@ -182,7 +177,7 @@ class TestNamedErrors:
 def test_the_real_recordings(tmp_path):
     source = pathlib.Path(os.environ["TOUCHR1_PHYSICLEAR"])
     report = import_physiclear(source, tmp_path / "out", config=PhysiclearConfig(height=60, max_frames=8))
-    assert report.videos == 437
+    assert report.contacts == 437
     assert report.skipped == report.unlabelled == ()
     store = RecordStore(tmp_path / "out")
     objects = {split: {k.object_id for k in map(store.contacts.__getitem__, store.contacts_of_split(split))}

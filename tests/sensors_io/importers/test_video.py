@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from tests.sensors_io.importers.films import film
 
@@ -11,7 +12,7 @@ WHOLE = {"height": 0, "stride": 1, "max_frames": 0}
 
 
 def test_every_frame_is_kept_in_rgb(tmp_path):
-    video = read_video(film(tmp_path / "a.avi", 12), **WHOLE)
+    video = read_video(film(tmp_path / "a.avi", 12), Keep(**WHOLE))
     assert video.frames.shape == (12, 24, 32, 3)
     assert video.frames.dtype == np.uint8
     assert video.index.tolist() == list(range(12))
@@ -33,15 +34,18 @@ def test_every_frame_is_kept_in_rgb(tmp_path):
 )
 def test_frames_are_thinned_as_asked(tmp_path, options, index):
     film(tmp_path / "a.avi", 12)
-    every = read_video(tmp_path / "a.avi", **WHOLE)
-    video = read_video(tmp_path / "a.avi", **WHOLE | options)
+    every = read_video(tmp_path / "a.avi", Keep(**WHOLE))
+    video = read_video(tmp_path / "a.avi", Keep(**WHOLE | options))
     assert video.index.tolist() == index
     np.testing.assert_array_equal(video.frames, every.frames[index])
 
 
 def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
     film(tmp_path / "a.avi", 3)
-    every, small = read_video(tmp_path / "a.avi", **WHOLE), read_video(tmp_path / "a.avi", **WHOLE | {"height": 12})
+    every, small = (
+        read_video(tmp_path / "a.avi", Keep(**WHOLE)),
+        read_video(tmp_path / "a.avi", Keep(**WHOLE | {"height": 12})),
+    )
     assert small.frames.shape == (3, 12, 16, 3)
     assert small.size_px == (24, 32)
     np.testing.assert_allclose(small.frames, every.frames.reshape(3, 12, 2, 16, 2, 3).mean(axis=(2, 4)), atol=0.51)
@@ -51,16 +55,16 @@ def test_broken_files_are_named(tmp_path):
     for name, data in (("empty", b""), ("text", b"no video at all" * 99)):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(VideoError, match="does not open as a video"):
-            read_video(tmp_path / name, **WHOLE)
+            read_video(tmp_path / name, Keep(**WHOLE))
     with pytest.raises(VideoError, match="does not open as a video"):
-        read_video(tmp_path / "absent.avi", **WHOLE)
+        read_video(tmp_path / "absent.avi", Keep(**WHOLE))
 
 
 def test_a_film_cut_short_is_named(tmp_path):
     data = film(tmp_path / "a.avi", 40).read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
     with pytest.raises(VideoError, match=r"is cut off: \d+ of 40 frames|holds no frame|does not open"):
-        read_video(tmp_path / "cut.avi", **WHOLE)
+        read_video(tmp_path / "cut.avi", Keep(**WHOLE))
 
 
 @pytest.mark.parametrize(
@@ -88,4 +92,4 @@ def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, mes
 
     monkeypatch.setattr(cv2, "VideoCapture", Capture)
     with pytest.raises(VideoError, match=message):
-        read_video(tmp_path / "a.avi", **WHOLE)
+        read_video(tmp_path / "a.avi", Keep(**WHOLE))

@@ -5,33 +5,22 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.scenes.adhesion import JKR_ABOVE, Adhesion, adhesive_ramp, plane_modulus_mpa, work_left
+from sensors_io.scenes.adhesion import Adhesion, adhesive_ramp, plane_modulus_mpa, work_left
 from sensors_io.scenes.layer import Layer
 
 GEL_MODULUS = 0.3 / (1 - 0.48**2)
 SOFT = Adhesion(radius_mm=8.0, plane_modulus_mpa=GEL_MODULUS, work_n_per_mm=5e-5)  # 0.05 J/m²
+PULL_OFF_N = 1.5 * np.pi * 5e-5 * 8.0
 STIFF = Adhesion(radius_mm=1e-4, plane_modulus_mpa=1e5, work_n_per_mm=5e-5)
 
 
 def test_a_gel_is_far_in_the_jkr_limit() -> None:
-    assert SOFT.tabor > 100 * JKR_ABOVE
-    assert SOFT.pull_off_n == pytest.approx(1.5 * np.pi * 5e-5 * 8)
+    assert SOFT.tabor > 500  # JKR holds above 5, Johnson & Greenwood 1997
 
 
 def test_a_small_stiff_tip_is_in_the_dmt_limit() -> None:
     assert STIFF.tabor < 0.1
-    assert STIFF.pull_off_n == pytest.approx(2 * np.pi * 5e-5 * 1e-4)
     assert STIFF.hertz_force_n(1e-6) == pytest.approx(1e-6 + 2 * np.pi * 5e-5 * 1e-4)
-
-
-def test_between_the_limits_the_pull_off_lies_between() -> None:
-    radii = np.geomspace(1e-6, 10, 30)
-    factor = [
-        a.pull_off_n / (np.pi * a.work_n_per_mm * a.radius_mm)
-        for a in (dataclasses.replace(STIFF, radius_mm=float(r)) for r in radii)
-    ]
-    assert np.all(np.diff(factor) <= 1e-12)
-    assert factor[0] == pytest.approx(2)
 
 
 def test_tabor_by_hand() -> None:
@@ -48,12 +37,11 @@ def test_jkr_force_and_radius_satisfy_griffith() -> None:
     assert SOFT.hertz_force_n(0.0) == pytest.approx(6 * unit)
 
 
-def test_adhesion_may_be_left_out_of_a_firm_press_only() -> None:
+def test_adhesion_changes_a_light_touch_most() -> None:
     change = [SOFT.relative_change(force) for force in (0.02, 0.2, 2.0, 20.0)]
     assert change == sorted(change, reverse=True)
     assert SOFT.relative_change(2.0) == pytest.approx((SOFT.hertz_force_n(2.0) / 2.0) ** (1 / 3) - 1)
-    assert SOFT.may_be_left_out(2.0, 0.05)
-    assert not SOFT.may_be_left_out(0.05, 0.05)
+    assert change[2] < 0.05 < change[0]
     assert dataclasses.replace(SOFT, work_n_per_mm=0.0).relative_change(0.02) == 0
 
 
@@ -62,8 +50,7 @@ def test_adhesion_may_be_left_out_of_a_firm_press_only() -> None:
 def test_from_the_least_force_on_the_change_is_within_the_tolerance(of: Adhesion, tolerance: float) -> None:
     least = of.least_force_n(tolerance)
     assert of.relative_change(least) == pytest.approx(tolerance)
-    assert of.may_be_left_out(1.01 * least, tolerance)
-    assert not of.may_be_left_out(0.99 * least, tolerance)
+    assert of.relative_change(1.01 * least) < tolerance < of.relative_change(0.99 * least)
 
 
 def test_without_adhesion_no_force_is_too_small() -> None:
@@ -95,7 +82,7 @@ def test_the_ramp_of_a_sphere_becomes_jkr() -> None:
     force, approach = adhesive_ramp(hertz, depth, area, SOFT.work_n_per_mm)
     radius = np.sqrt(area / np.pi)
     stretch = np.sqrt(2 * np.pi * SOFT.work_n_per_mm * radius / GEL_MODULUS)
-    inner = (hertz > 2 * SOFT.pull_off_n) & (depth < 0.499)  # stable; differences are one-sided at the end
+    inner = (hertz > 2 * PULL_OFF_N) & (depth < 0.499)  # stable; differences are one-sided at the end
     np.testing.assert_allclose(approach[inner], (radius**2 / SOFT.radius_mm - stretch)[inner], rtol=2e-3, atol=1e-4)
     np.testing.assert_allclose([SOFT.hertz_force_n(f) for f in force[inner]], hertz[inner], rtol=2e-3)
 
@@ -104,7 +91,7 @@ def test_the_ramp_finds_the_pull_off() -> None:
     depth = np.geomspace(1e-3, 0.2, 4000)
     hertz = 4 / 3 * GEL_MODULUS * np.sqrt(SOFT.radius_mm) * depth**1.5
     force, _ = adhesive_ramp(hertz, depth, np.pi * SOFT.radius_mm * depth, SOFT.work_n_per_mm)
-    assert force.min() == pytest.approx(-SOFT.pull_off_n, rel=1e-3)
+    assert force.min() == pytest.approx(-PULL_OFF_N, rel=1e-3)
 
 
 def test_impossible_input_is_refused() -> None:

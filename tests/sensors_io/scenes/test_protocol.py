@@ -9,9 +9,10 @@ import pytest
 
 from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards, readout
 from sensors_io.scenes import press as press_module
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.schema import SENSORS, Flag, Sequence
+from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
 
 SMALL = SceneConfig(objects=130, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
 
@@ -214,3 +215,21 @@ def _primes(n: int) -> list[int]:
             found.append(p)
             n //= p
     return found
+
+
+def test_fields_that_came_later_leave_the_hash_of_older_records_as_it_was() -> None:
+    """The default's hash is that of the records which were made before there were such fields."""
+    assert config_hash(SceneConfig()) == "4b723b89e461cd0c"
+    changes = ({"past_limit": "flag"}, {"coupled": True}, {"part_share": 0.5}, {"graded_share": 0.5})
+    assert len({config_hash(dataclasses.replace(SMALL, **change)) for change in ({}, *changes)}) == 5
+
+
+def test_objects_may_vary_and_their_sites_do_not() -> None:
+    varied = dataclasses.replace(SMALL, objects=40, part_share=0.5, graded_share=0.5)
+    cards = object_cards(varied)
+    assert all("far_modulus_mpa" in (card.truth or {}) for card in cards)
+    assert any(UNKNOWN in card.labels.values() for card in cards)
+    site = site_of(varied, 0, 0, 0)
+    assert site.solid.variation is None
+    with pytest.raises(ValueError, match=r"graded_share is 0\.6: must be ≤ 1 − part_share = 0\.5"):
+        dataclasses.replace(varied, graded_share=0.6)

@@ -1,6 +1,7 @@
 """The protocol's schedule: balanced, within what objects bear, and blind to the labels."""
 
 import collections
+import dataclasses
 
 import numpy as np
 import pytest
@@ -131,3 +132,17 @@ def test_frames_default_to_the_kind_of_set():
     assert SceneConfig(objects=10, sequences=80).frame_count == 90
     assert SceneConfig(frames=5).frame_count == 5
     assert SceneConfig(objects=1000, sequences=14_700).contact_count == 3675
+
+
+def test_without_replacing_every_press_reaches_the_greatest_force_and_nothing_is_left_out(made, limits):
+    flagged = schedule.protocol(dataclasses.replace(CONFIG, past_limit="flag"), limits, _cell())
+    assert {s.force_n for s in flagged.slots if s.motion == "press"} == {motions.PRESS_FORCE_N}
+    assert flagged.left_out.replaced.sum() == 0
+    np.testing.assert_array_equal(flagged.left_out.asked, made.left_out.asked)
+    np.testing.assert_array_equal(flagged.left_out.past_limit, made.left_out.past_limit)
+    forces = collections.defaultdict(list)
+    for slot in flagged.slots:
+        if slot.motion != "press":
+            forces[slot.object_index].append(slot.force_n)
+    uses = [len(found) for found in forces.values()]
+    assert max(uses) - min(uses) <= 1

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import SceneConfig, history, make_contact, motions, protocol, schedule, strength
+from sensors_io.scenes.draws import draw, site_of
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.scenes.sequence import _light, make_sequence, site_of
+from sensors_io.scenes.sequence import _light, make_sequence
 from sensors_io.schema import SENSORS, Flag
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
@@ -117,9 +118,29 @@ def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold)
     made = make_contact(CONFIG, 0)
     assert tried == [0] * 4 + [1] * 4 + [2] * 4
     assert not any(s.flags.any() for s in made)
-    tried.clear()
-    make_contact(SceneConfig(objects=12), 0)
-    assert tried == [0] * 4
+    for config in (SceneConfig(objects=12), dataclasses.replace(CONFIG, past_limit="flag")):
+        tried.clear()
+        made = make_contact(config, 0)
+        assert tried == [0] * 4
+        assert all(s.flags.any() for s in made)
+
+
+def test_a_draw_is_what_the_sequence_was_made_of(slide):
+    drawn = draw(CONFIG, 5, _slot("slide_x"), TAC3D)
+    assert slide.serial == f"generated-tac3d-{drawn.serial}"
+    np.testing.assert_array_equal(slide.target_force_n, drawn.hand.force_n.astype(np.float32))
+    normal = np.column_stack([np.zeros((40, 2)), -drawn.force_n])
+    np.testing.assert_allclose(slide.force_n[:, 2], drawn.force_sensor.read(normal)[:, 2])
+    assert np.all(drawn.press.path.force_n >= drawn.force_n.astype(np.float32))
+
+
+def test_a_coupled_press_feels_the_spreading_gel_and_an_uncoupled_one_nothing(hold):
+    coupled = make_sequence(dataclasses.replace(CONFIG, coupled=True), 6, _slot("hold", 8.0), TAC3D, 0)
+    np.testing.assert_array_equal(coupled.depth_mm.shape, hold.depth_mm.shape)
+    pressed = hold.target_force_n > 4
+    change = np.abs(coupled.shear_mm - hold.shear_mm)[pressed].max()
+    assert 0.002 < change < 0.5  # above the rounding, below what would be a slide
+    assert np.abs(coupled.force_n[:, :2] - hold.force_n[:, :2]).max() < 0.3  # what spreads evenly pulls nowhere
 
 
 def test_another_attempt_is_another_site():

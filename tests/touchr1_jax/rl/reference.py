@@ -49,3 +49,28 @@ def advantages(reward: np.ndarray, epsilon: float) -> Float:
         if np.ptp(row) > 1e-5:
             out[i] = (row - row.mean()) / (row.std() + epsilon)
     return out
+
+
+def surrogate(kind: str, log_prob, old, mask, advantage, low: float, high: float) -> dict[str, NDArray]:
+    """Value [G, T] of a surrogate, where its clip binds, and d mean_i 1/|o_i| Σ_t value / d log_prob, loop by loop."""
+    value, gradient = np.zeros(log_prob.shape), np.zeros(log_prob.shape)
+    clipped = np.zeros(log_prob.shape, bool)
+    for i, a in enumerate(advantage):
+        n = int(mask[i].sum())
+        for t in range(log_prob.shape[1]):
+            ratio = np.exp(log_prob[i, t] - old[i, t])
+            if kind == "sequence":
+                ratio = np.exp(sum(log_prob[i, u] - old[i, u] for u in range(n)) / n)
+            inside = min(max(ratio, 1 - low), 1 + high)
+            share = 1 / (n * len(advantage)) if mask[i, t] else 0.0
+            if kind == "cispo":
+                value[i, t], clipped[i, t] = inside * a * log_prob[i, t], inside != ratio
+                gradient[i, t] += share * inside * a
+                continue
+            clipped[i, t] = ratio * a > inside * a
+            value[i, t] = inside * a if clipped[i, t] else ratio * a
+            if not clipped[i, t] and kind == "token":
+                gradient[i, t] += share * ratio * a
+            if not clipped[i, t] and kind == "sequence":
+                gradient[i, :n] += share * ratio * a / n
+    return {"value": value, "clipped": clipped, "gradient": gradient}

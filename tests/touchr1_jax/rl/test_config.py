@@ -1,26 +1,50 @@
-"""Presets as they are published and reported."""
+"""Presets as they are published, chosen and reported."""
 
 import dataclasses
 
 import pytest
+import tyro
 
-from touchr1_jax.rl.config import GRPOConfig, preset_name
+from touchr1_jax.rl.config import (
+    Average,
+    Cispo,
+    Dapo,
+    DrGrpo,
+    GRPOConfig,
+    Gspo,
+    Paper,
+    Stable,
+    Surrogate,
+    TactileUse,
+    preset_name,
+)
 
 
 def test_paper_preset():
-    c = GRPOConfig.paper()
-    assert (c.group, c.beta, c.learning_rate, c.kl) == (8, 1e-3, 1e-6, "k3")
-    assert (c.gamma, c.clip_low, c.clip_high, c.epsilon) == (0.01, 0.2, 0.2, 1e-4)
-    assert c.normalise
-    assert not c.drop_degenerate
-    assert not c.grounding_stop_masked
-    assert c.grounding_cap_nat is None
+    c, a = GRPOConfig.paper(), Paper()
+    assert (c.group, a.beta, c.learning_rate, a.kl) == (8, 1e-3, 1e-6, "k3")
+    assert (a.gamma, a.clip_low, a.clip_high, a.epsilon) == (0.01, 0.2, 0.2, 1e-4)
+    assert a.normalise
+    assert not a.drop_degenerate
+    assert not a.grounding_stop_masked
+    assert a.grounding_cap_nat is None
+    assert a.tactile_use is TactileUse.OFF
+    assert (a.surrogate, a.average, a.updates, a.candidates) == (Surrogate.TOKEN, Average.ROLLOUT, 1, 1)
+    assert c.algorithm == a == GRPOConfig().algorithm
 
 
 def test_stable_preset():
-    c = GRPOConfig.stable()
-    assert (c.kl, c.grounding_stop_masked, c.grounding_cap_nat, c.drop_degenerate) == ("exact", True, 1.0, True)
-    assert c.gamma == 0.01
+    a = GRPOConfig.stable().algorithm
+    assert (a.kl, a.grounding_stop_masked, a.grounding_cap_nat, a.drop_degenerate) == ("exact", True, 1.0, True)
+    assert (a.tactile_use, a.gamma) == (TactileUse.RECOMMENDED, 0.01)
+
+
+def test_published_variants():
+    assert (Dapo().clip_low, Dapo().clip_high, Dapo().average, Dapo().beta) == (0.2, 0.28, Average.TOKEN, 0.0)
+    assert (DrGrpo().normalise, DrGrpo().average) == (False, Average.LENGTH)
+    assert (Gspo().surrogate, Gspo().clip_low, Gspo().clip_high) == (Surrogate.SEQUENCE, 3e-4, 4e-4)
+    assert Cispo().surrogate is Surrogate.CISPO
+    assert GRPOConfig(prompts=8, algorithm=Dapo()).drawn == 16
 
 
 def test_micro_batches_must_divide():
@@ -28,7 +52,33 @@ def test_micro_batches_must_divide():
         GRPOConfig(prompts=8, micro_prompts=3)
 
 
-def test_reports_name_the_nearest_preset_and_what_differs():
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"updates": 0}, "updates is 0: must be at least 1"),
+        ({"reference_every": 0}, "reference_every is 0: must be at least 1"),
+        ({"beta": -0.1}, "beta is -0.1: must be ≥ 0"),
+        ({"gamma": float("nan")}, "gamma is nan: must be ≥ 0"),
+        ({"grounding_cap_nat": 0.0}, "grounding_cap_nat is 0.0: must be above 0; None leaves it out"),
+    ],
+)
+def test_bad_settings_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        Paper(**change)
+
+
+def test_reports_name_the_preset_and_what_differs():
     assert preset_name(GRPOConfig.paper()) == "paper"
     assert preset_name(GRPOConfig.stable()) == "stable"
-    assert preset_name(dataclasses.replace(GRPOConfig.stable(), gamma=0.0)) == "stable with gamma=0.0"
+    changed = GRPOConfig(algorithm=Stable(gamma=0.0, tactile_use=TactileUse.OFF), prompts=4)
+    assert preset_name(changed) == "stable with gamma=0.0, tactile_use=off, prompts=4"
+    assert preset_name(GRPOConfig(algorithm=DrGrpo())) == "drgrpo"
+
+
+def test_the_command_line_chooses_a_preset_and_changes_it():
+    default = dataclasses.replace(GRPOConfig.paper(), prompts=4)
+    assert tyro.cli(GRPOConfig, args=[], default=default) == default
+    chosen = tyro.cli(GRPOConfig, args=["--group", "6", "algorithm:stable", "--algorithm.gamma", "0"], default=default)
+    assert chosen == dataclasses.replace(default, group=6, algorithm=Stable(gamma=0.0))
+    variant = tyro.cli(GRPOConfig, args=["algorithm:dr-grpo", "--algorithm.surrogate", "CISPO"], default=default)
+    assert variant.algorithm == DrGrpo(surrogate=Surrogate.CISPO)

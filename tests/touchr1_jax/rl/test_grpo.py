@@ -8,22 +8,17 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl import reference
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import (
-    Fixed,
-    GRPOState,
-    make_grpo_step,
-    mask_one_stream,
-    prompt_weights,
-    rollout_metrics,
-    sample_group,
-)
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.counterfactual import mask_one_stream
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, prompt_weights, sample_group
+from touchr1_jax.rl.metrics import rollout_metrics
 from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.types import Parsed, Rollout, Target
 
 P, G, T, K = 4, 3, 4, 3
 AGENT = tiny.SHALLOW
-CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, beta=0.1, gamma=0.05, drop_degenerate=True)
+ALGORITHM = Paper(beta=0.1, gamma=0.05, drop_degenerate=True)
+CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=ALGORITHM)
 DRAW = SampleConfig(group=G, length=T, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id)
 FIXED = Fixed(
     reference=tiny.shallow_params(1),
@@ -97,7 +92,7 @@ draw = jax.jit(lambda p, b, k: sample_group(AGENT, p, b, k, DRAW))
 def experience_of(before: GRPOState, batch):
     """What the step must have drawn, by the documented use of its key: fold in the step, split for sample and mask."""
     sample_key, mask_key = jax.random.split(jax.random.fold_in(before.key, before.step))
-    return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FIXED.noise, mask_key)
+    return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FIXED.noise, mask_key)[0]
 
 
 group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
@@ -118,12 +113,14 @@ def test_loss_equals_a_float64_reference(run, i):
         ]
     ]
     rollout = jax.tree.map(np.asarray, rollout)
-    advantage = reference.advantages(reward, CONFIG.epsilon)
+    advantage = reference.advantages(reward, ALGORITHM.epsilon)
     terms = reference.terms(*logits, rollout.tokens, rollout.log_prob, rollout.mask, advantage, clip=0.2)
     lively = np.ptp(reward, axis=1) > 1e-5
     assert lively.sum() >= 2
     assert not lively[3]
-    gain = terms["surrogate"][lively].mean() + (CONFIG.gamma * terms["grounding"] - CONFIG.beta * terms["kl"]).mean()
+    gain = (
+        terms["surrogate"][lively].mean() + (ALGORITHM.gamma * terms["grounding"] - ALGORITHM.beta * terms["kl"]).mean()
+    )
     np.testing.assert_allclose(run.metrics[i]["loss"], -gain, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(run.metrics[i]["reward"], reward.mean(), rtol=1e-5)
     np.testing.assert_allclose(run.metrics[i]["degenerate_share"], 1 - lively.mean(), rtol=1e-6)
@@ -136,7 +133,7 @@ def test_update_is_the_gradient_of_the_written_out_objective(run):
     tokens, mask = rollout.tokens, rollout.mask
     reward = np.asarray(jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(tokens, batch.target))
     lively = np.ptp(reward, axis=1) > 1e-5
-    advantage = jnp.asarray(reference.advantages(reward, CONFIG.epsilon))[..., None]
+    advantage = jnp.asarray(reference.advantages(reward, ALGORITHM.epsilon))[..., None]
     per_prompt = lambda x: jnp.mean(jnp.sum(jnp.where(mask, x, 0), -1) / jnp.sum(mask, -1), -1)
 
     def objective(params):
@@ -149,7 +146,7 @@ def test_update_is_the_gradient_of_the_written_out_objective(run):
         learn = jnp.sum(per_prompt(advantage * here) * lively) / lively.sum()
         grounding = per_prompt(jnp.sum(jnp.exp(log_p) * (log_p - log_masked), -1))
         k3 = per_prompt(jnp.exp(log_r) - 1 - log_r)
-        return learn + jnp.mean(CONFIG.gamma * grounding - CONFIG.beta * k3)
+        return learn + jnp.mean(ALGORITHM.gamma * grounding - ALGORITHM.beta * k3)
 
     ascent = jax.jit(jax.grad(objective))(before.params)
     for g, a, b in zip(*map(jax.tree.leaves, (ascent, before.params, run.before[1].params)), strict=True):
@@ -240,9 +237,10 @@ def test_one_present_stream_is_masked_uniformly():
     features = tiny.features(0, 3)
     present = jnp.array([[True, True], [False, True], [False, False]])
     features = jax.tree.map(lambda x: jnp.repeat(x, p, 0), features.replace(stream_mask=present))
-    masked = mask_one_stream(features, FIXED.noise, jax.random.key(0))
+    masked, stream = mask_one_stream(features, FIXED.noise, jax.random.key(0))
     changed = np.asarray(jnp.any(masked != features.touch, (-1, -2))).reshape(3, p, tiny.S)
     np.testing.assert_array_equal(changed[0].sum(-1), 1)
+    np.testing.assert_array_equal(changed[0].argmax(-1), np.asarray(stream)[:p])
     assert abs(changed[0, :, 0].mean() - 0.5) < 5 * 0.5 / p**0.5
     np.testing.assert_array_equal(changed[1], [[False, True]] * p)
     assert not changed[2].any()

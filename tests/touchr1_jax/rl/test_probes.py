@@ -1,4 +1,6 @@
-"""Learning problems with a known answer: a bandit, and one that only touch can solve."""
+"""Learning problems with a known answer: a bandit, one that only touch can solve, one whose credit comes late."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -7,12 +9,13 @@ import optax
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Parsed, Target
 
 P, AGENT = 8, tiny.SHALLOW
-CONFIG = GRPOConfig(prompts=P, group=8, length=2, micro_prompts=8, beta=0.0, gamma=0.0)
+CONFIG = GRPOConfig(prompts=P, group=8, length=2, micro_prompts=8, algorithm=Paper(beta=0.0, gamma=0.0))
 OPTIMIZER = optax.adam(0.02)
 PAYS = jnp.array([10, 17])
 """The token that is paid for each label."""
@@ -54,9 +57,9 @@ def batch_of(pattern: np.ndarray, label: np.ndarray):
 
 def train(step, batch, steps: int) -> jax.Array:
     """Probability [P] of the paid token after some steps."""
-    params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
-    state = GRPOState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0), key=jax.random.key(0))
-    fixed = Fixed(reference=tiny.shallow_params(0, loud=0.2), noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
+    params = tiny.shallow_params(0, loud=0.2)
+    state = start_state(params, OPTIMIZER, jax.random.key(0), CONFIG)
+    fixed = Fixed(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
     for _ in range(steps):
         state, _ = step(state, batch, fixed)
     first, _ = prefill(state.params, batch.features, batch.ids, batch.mask)
@@ -66,16 +69,42 @@ def train(step, batch, steps: int) -> jax.Array:
 def test_bandit_is_solved(step):
     batch = batch_of(np.arange(P) % 2, np.zeros(P, int))
     assert train(step, batch, 0).mean() < 0.2
-    assert train(step, batch, 60).mean() >= 0.99
+    assert train(step, batch, 80).mean() >= 0.99
 
 
 def test_touch_is_read(step):
     """Nothing but the pattern of the streams says which token is paid; without it one half is the best."""
     pattern = np.arange(P) % 2
-    assert train(step, batch_of(pattern, pattern), 120).mean() >= 0.95
+    assert train(step, batch_of(pattern, pattern), 250).mean() >= 0.99
 
 
 def test_touch_problem_cannot_be_solved_blind(step):
     """The control: the same pattern in all prompts leaves only guessing."""
     pattern = np.arange(P) % 2
     assert train(step, batch_of(0 * pattern, pattern), 60).mean() <= 0.6
+
+
+WORDS = np.array([10, 17, 20, 21, 25])
+FEW = dataclasses.replace(AGENT, banned=~np.isin(np.arange(tiny.V), WORDS))
+"""The same policy with five words."""
+
+
+def two_steps(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+    """10 then 17 pays 1 and everything else nothing: the first word earns its credit by what follows it."""
+    paid = (tokens[0] == WORDS[0]) & (tokens[1] == WORDS[1])
+    return paid.astype(jnp.float32), {}, score(tokens, target)[2]
+
+
+def test_credit_reaches_the_first_of_two_steps():
+    """One rollout in about twenty-five is paid at first."""
+    step = make_grpo_step(FEW, two_steps, OPTIMIZER, CONFIG)
+    batch = batch_of(np.zeros(P, int), np.zeros(P, int))
+    params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
+    state = start_state(params, OPTIMIZER, jax.random.key(0), CONFIG)
+    fixed = Fixed(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
+    for _ in range(200):
+        state, _ = step(state, batch, fixed)
+    best = jnp.tile(jnp.asarray(WORDS[:2], jnp.int32), (1, 1))
+    one = jax.tree.map(lambda x: x[0], batch)
+    log_p = jax.nn.log_softmax(FEW.group_logits(state.params, one.features, one.ids, one.mask, best))
+    assert jnp.exp(token_log_probs(log_p, best).sum()) >= 0.99

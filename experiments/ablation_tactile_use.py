@@ -1,0 +1,55 @@
+"""Does paying for answers that controls without touch do not reach make the policy use touch?
+
+    make experiment EXP=ablation_tactile_use [ARGS="--scale smoke"]
+
+Arms of GRPO from one SFT checkpoint per seed, the published reward, the same questions: no such reward, the abstract's
+literal bonus, added to the reward before normalisation, and the recommended one, added to the advantage after it.  Each
+question is also sampled with the touch dropped, with noise, and with another object's touch.
+
+Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
+
+Expected: where all answers of a group are right, the literal bonus is the same for all and cancels
+(`bonus_cancelled_share` above 0), the recommended one does not pay for it either; the curves `touch_score` and
+`control_*` should part further under `recommended` than under `none`.
+"""
+
+import dataclasses
+
+from experiments.grpo.ablation import PUBLISHED, Ablation, run_ablation
+from experiments.policies.stages import SFTConfig
+from experiments.policies.study import StudyConfig
+from experiments.reporting.results import Results
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from sensors_io.scenes import SceneConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper, TactileUse
+
+ABLATION = Ablation(
+    arms=dict.fromkeys(("none", "literal", "recommended"), PUBLISHED),
+    algorithms={
+        "none": Paper(),
+        "literal": Paper(tactile_use=TactileUse.LITERAL),
+        "recommended": Paper(tactile_use=TactileUse.RECOMMENDED, tactile_margin=0.13),
+    },
+    pairs=(("literal", "none"), ("recommended", "none"), ("recommended", "literal")),
+    curves=("reward", "accuracy", "touch_score", "control_drop", "control_noise", "control_order", "entropy"),
+)
+
+
+def run(config: StudyConfig, context: Context) -> Results:
+    """Train and compare the arms."""
+    return run_ablation(ABLATION, config, context)
+
+
+DEFAULT = StudyConfig()
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    seeds=2,
+    scenes=SceneConfig(objects=60, sites=1),
+    sft=SFTConfig(steps=12, batch_size=8),
+    blind=SFTConfig(steps=12, batch_size=8),
+    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
+    grpo_steps=4,
+)
+
+EXPERIMENT = Experiment(name="ablation_tactile_use", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

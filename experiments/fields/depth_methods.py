@@ -1,0 +1,197 @@
+"""Ways from colour to slope and from slope to depth that the package's own are measured against.
+
+The maps: a table of colours, polynomials of colour alone, random Fourier features (a kernel), a small perceptron of
+colour and position (the size of gs_sdk's), and the package's.  All are trained on the same pixels of the same presses
+with the same normals, so that they differ in nothing else.  The integrators: those of gs_sdk and gsrobotics as
+published, and of GelSlim.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from scipy import fft, ndimage
+
+from sensors_io.calibration.fit import fit_map
+from sensors_io.calibration.presses import BallPresses, Touches
+from sensors_io.fields.slopes import SlopeReader, change, colour_powers, to_slopes
+
+Slopes = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""From a picture, uint8 [H, W, 3], to ∂z/∂x and ∂z/∂y, float32 [H, W]."""
+
+BINS = 48
+"""Of the table along each channel, over changes of ±128 grey levels; 135 leave nearly every cell empty."""
+
+FEATURES, WIDTH = 384, 32
+"""Random Fourier features; units of each of the two hidden layers."""
+
+_RIDGE = 1e-3
+_STEPS, _BATCH, _RATE = 1500, 4096, 3e-3
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pixels:
+    """Pixels that maps are trained on: changes [n, 3], positions in −1 … 1 [n, 2], in-plane normals [n, 2]."""
+
+    change: np.ndarray
+    position: np.ndarray
+    normal: np.ndarray
+
+
+def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> Pixels:
+    """Up to 1500 pixels of each contact and 500 of the flat gel far from it."""
+    rng = np.random.default_rng(seed)
+    height, width = presses.shape
+    y, x = np.mgrid[:height, :width].astype(float)
+    place = np.stack([(x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1], -1)
+    parts = []
+    for picture, row in zip(presses.pictures, touches.stacked(), strict=True):
+        seen = np.stack(change(picture, presses.background), -1)
+        away = np.hypot(x - row[0], y - row[1])
+        normal = np.stack([row[0] - x, row[1] - y], -1) * presses.mm_per_px / presses.radius_mm
+        normal[away > row[2]] = 0
+        ball, flat = np.flatnonzero(away < row[2]), np.flatnonzero(away > 2.5 * row[2])
+        index = np.concatenate([rng.permutation(ball)[:1500], rng.permutation(flat)[:500]])
+        parts.append([a.reshape(-1, a.shape[-1])[index] for a in (seen, place, normal)])
+    seen, position, normal = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Pixels(change=seen, position=position, normal=normal)
+
+
+def package_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+    """The package's: polynomial of colour whose constants vary over the picture."""
+    colours, _, _ = fit_map(presses, touches, seed=seed)
+    return SlopeReader(colours, presses.background)
+
+
+def table_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+    """A table of colours, the mean normal of each cell, empty cells taking that of the nearest full one."""
+    pixels = pixels_of(presses, touches, seed)
+    cell = _cells(pixels.change)
+    count = np.bincount(cell, minlength=BINS**3)
+    mean = np.stack([np.bincount(cell, n, BINS**3) for n in pixels.normal.T], -1) / np.maximum(count, 1)[:, None]
+    empty = (count == 0).reshape(BINS, BINS, BINS)
+    nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
+    filled = mean.reshape(BINS, BINS, BINS, 2)[tuple(nearest)].reshape(-1, 2).astype(np.float32)
+
+    def normals(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
+        del place
+        return filled[_cells(seen)]
+
+    return _reader(normals, presses)
+
+
+def colour_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+    """A cubic polynomial of colour, the same at every pixel."""
+    pixels = pixels_of(presses, touches, seed)
+    design = colour_powers(pixels.change.T.astype(np.float64), 3).T
+    weights = _ridge(design, pixels.normal).astype(np.float32)
+    return _reader(lambda seen, place: colour_powers(seen.T, 3).T @ weights, presses)
+
+
+def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+    """Ridge on random Fourier features of a Gaussian kernel over colour and position (Rahimi & Recht 2007)."""
+    pixels, rng = pixels_of(presses, touches, seed), np.random.default_rng(seed)
+    directions = rng.standard_normal((5, FEATURES)) * np.array([1.0, 1.0, 1.0, 0.8, 0.8])[:, None]
+    phases = rng.uniform(0, 2 * np.pi, FEATURES)
+    spread, offset = directions.astype(np.float32), phases.astype(np.float32)
+
+    def features(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
+        return np.cos(np.concatenate([seen, place], -1).astype(np.float32) @ spread + offset)
+
+    weights = _ridge(features(pixels.change, pixels.position).astype(np.float64), pixels.normal).astype(np.float32)
+    return _reader(lambda seen, place: features(seen, place) @ weights, presses)
+
+
+def perceptron_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+    """Two hidden layers of colour and position, by Adam on the squared error of the normal."""
+    pixels = pixels_of(presses, touches, seed)
+    inputs = jnp.asarray(np.concatenate([pixels.change, pixels.position], -1), jnp.float32)
+    targets = jnp.asarray(pixels.normal, jnp.float32)
+    sizes, key = (5, WIDTH, WIDTH, 2), jax.random.key(seed)
+    params = [
+        (jax.random.normal(k, (a, b)) * np.sqrt(2 / a), jnp.zeros(b))
+        for k, a, b in zip(jax.random.split(key, 3), sizes, sizes[1:], strict=False)
+    ]
+    optimizer = optax.adam(optax.cosine_decay_schedule(_RATE, _STEPS))
+
+    def loss(params: list, x: jax.Array, y: jax.Array) -> jax.Array:
+        return jnp.mean((_perceptron(params, x) - y) ** 2)
+
+    def step(carry: tuple, key: jax.Array) -> tuple[tuple, None]:
+        params, state = carry
+        chosen = jax.random.randint(key, (_BATCH,), 0, len(inputs))
+        updates, state = optimizer.update(jax.grad(loss)(params, inputs[chosen], targets[chosen]), state)
+        return (optax.apply_updates(params, updates), state), None
+
+    train = jax.jit(lambda carry, keys: jax.lax.scan(step, carry, keys)[0])
+    params, _ = train((params, optimizer.init(params)), jax.random.split(jax.random.key(seed + 1), _STEPS))
+    infer = jax.jit(lambda x: _perceptron(params, x))
+    return _reader(lambda seen, place: np.asarray(infer(np.concatenate([seen, place], -1))), presses)
+
+
+MAPS: dict[str, Callable[[BallPresses, Touches, int], Slopes]] = {
+    "polynomial, varying": package_map,
+    "polynomial, colour only": colour_map,
+    "colour table": table_map,
+    "kernel features": kernel_map,
+    "perceptron": perceptron_map,
+}
+
+
+def published_poisson(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: float) -> np.ndarray:
+    """Cosine-transform integration with eigenvalues indexed from 1, as gs_sdk and gsrobotics ship it.
+
+    Written anew from what it computes: central differences of the slopes, DCT-II, λ of indices 1 … N, mean 0.
+    """
+    height, width = slope_x.shape
+    source = np.gradient(slope_x, axis=1) + np.gradient(slope_y, axis=0)
+    rows, columns = (2 * np.cos(np.pi * np.arange(1, n + 1) / n) - 2 for n in (height, width))
+    modes = fft.dctn(source, norm="ortho") / (rows[:, None] + columns)
+    return fft.idctn(modes, norm="ortho") * mm_per_px
+
+
+def one_sided_dirichlet(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: float) -> np.ndarray:
+    """Sine-transform integration of one-sided differences, zero at the border, as GelSlim ships it; written anew."""
+    height, width = slope_x.shape
+    source = np.zeros_like(slope_x)
+    source[:-1, 1:] += slope_x[:-1, 1:] - slope_x[:-1, :-1]
+    source[1:, :-1] += slope_y[1:, :-1] - slope_y[:-1, :-1]
+    rows, columns = (2 * np.cos(np.pi * np.arange(1, n - 1) / (n - 1)) - 2 for n in (height, width))
+    depth = np.zeros_like(slope_x)
+    modes = fft.dstn(source[1:-1, 1:-1], type=1, norm="ortho") / (rows[:, None] + columns)
+    depth[1:-1, 1:-1] = fft.idstn(modes, type=1, norm="ortho") * mm_per_px
+    return depth
+
+
+def _reader(normals: Callable[[np.ndarray, np.ndarray], np.ndarray], presses: BallPresses) -> Slopes:
+    height, width = presses.shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    place = np.stack([(x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1], -1).reshape(-1, 2)
+
+    def read(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        seen = np.stack(change(picture, presses.background), -1).reshape(-1, 3)
+        found = normals(seen, place).astype(np.float32).reshape(height, width, 2)
+        return to_slopes(np.ascontiguousarray(found[..., 0]), np.ascontiguousarray(found[..., 1]))
+
+    return read
+
+
+def _cells(seen: np.ndarray) -> np.ndarray:
+    index = np.clip((seen + 2) / 4 * BINS, 0, BINS - 1).astype(np.int64)
+    return (index[:, 0] * BINS + index[:, 1]) * BINS + index[:, 2]
+
+
+def _ridge(design: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    normal = design.T @ design
+    ridge = _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
+    solved: np.ndarray = np.linalg.solve(normal + ridge, design.T @ targets)
+    return solved
+
+
+def _perceptron(params: list, x: jax.Array) -> jax.Array:
+    for weights, bias in params[:-1]:
+        x = jax.nn.relu(x @ weights + bias)
+    return x @ params[-1][0] + params[-1][1]

@@ -1,0 +1,235 @@
+"""The marker panel: how far off is each point, does it drift, does it survive a jump, and what does it cost."""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from experiments.fields.motion_frames import Rest
+from experiments.fields.motion_peers import FOLLOWERS, Make
+from experiments.fields.motion_subjects import FIRST_SEED, JUMP_PX, NOISE_GREY, PEAK_PX, Subject, grey, subject
+from experiments.fields.motion_truth import REST_PICTURES, Film
+from experiments.fields.panel import Panel
+from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
+from experiments.reporting.pareto import Point, speed_against_error
+from experiments.running.timing import interleaved
+
+MAIN = "this, affine"
+LOST_PX = 1.0
+_STEPS = 10  # pictures in which a motion is made, for methods that go from frame to frame
+_DRIFT_PERIOD = 90  # frames of one cycle of the motion
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MarkerConfig:
+    """Motions drawn for each gel besides the published one; frames of the drift test; rounds of timing."""
+
+    motions: int = 4
+    drift_frames: int = 900
+    rounds: int = 15
+
+    def __post_init__(self) -> None:
+        for name in ("motions", "drift_frames", "rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
+
+
+def panel(config: MarkerConfig, rests: Sequence[Rest]) -> Panel:
+    """Errors and speeds of every method on every gel; drift and jump."""
+    subjects = [subject(rest) for rest in rests]
+    seeds = [None, *range(FIRST_SEED, FIRST_SEED + config.motions)]
+    errors = {
+        name: {s.rest.name: errors_of(make, s, PEAK_PX, seeds) for s in subjects} for name, make in FOLLOWERS.items()
+    }
+    milliseconds = {s.rest.name: speeds(s, config.rounds) for s in subjects}
+    drift = {s.rest.name: drift_px(s, config.drift_frames) for s in subjects[:1]}
+    jumps = {s.rest.name: jump(s, seeds) for s in subjects}
+    return Panel(
+        verdict=_verdict(errors, milliseconds, subjects),
+        requirements=_requirements(errors, drift, jumps, subjects),
+        tables=(_error_table(errors, milliseconds, subjects), _event_table(drift, jumps)),
+        pictures=(_picture(errors, milliseconds, subjects[0].rest.name),),
+    )
+
+
+def errors_of(make: Make, of: Subject, peak_px: float, seeds: Sequence[int | None]) -> np.ndarray:
+    """Distance of every point from the truth at the end of every motion, pixels; infinite where a method says lost."""
+    found = []
+    for seed in seeds:
+        motion = of.motion(peak_px, seed)
+        film = Film(of.rest.picture, NOISE_GREY, 0 if seed is None else seed)
+        follow = make(grey(film.at_rest()), of.points_px, of.half_px)
+        for step in range(1, _STEPS + 1):
+            share = step / _STEPS
+            points = follow(grey(film.under(motion.times(share), share)))
+        true = of.points_px + motion.forward(of.points_px)
+        error = np.hypot(*(points - true).T)[of.inside(true)]
+        found.append(np.where(np.isfinite(error), error, np.inf))
+    return np.concatenate(found)
+
+
+def speeds(of: Subject, rounds: int) -> dict[str, float]:
+    """Milliseconds a frame of every method on a picture under motion, median over rounds."""
+    film = Film(of.rest.picture, NOISE_GREY, 1)
+    rest, motion = grey(film.at_rest()), of.motion(PEAK_PX / 2, None)
+    pictures = [grey(film.under(motion.times(s), s)) for s in (0.9, 1.0)]
+    calls = {}
+    for name, make in FOLLOWERS.items():
+        follow = make(rest, of.points_px, of.half_px)
+        calls[name] = functools.partial(_both, follow, pictures)
+        calls[name]()
+    seconds = interleaved(calls, rounds)
+    return {name: 1e3 / len(pictures) * float(np.median(s)) for name, s in seconds.items()}
+
+
+def drift_px(of: Subject, frames: int) -> dict[str, float]:
+    """Median distance of the points from where they lay, after whole cycles of a motion, by method."""
+    names = (MAIN, "this, LK alone", "LK frame to frame")
+    film, motion = Film(of.rest.picture, NOISE_GREY, 2), of.motion(PEAK_PX, None)
+    rest = grey(film.at_rest())
+    follow = {name: FOLLOWERS[name](rest, of.points_px, of.half_px) for name in names}
+    shares = np.sin(2 * np.pi * np.arange(_DRIFT_PERIOD) / _DRIFT_PERIOD)
+    cycle = [film.clean(motion.times(float(share)), abs(float(share))) for share in shares]
+    points = dict.fromkeys(names, of.points_px)
+    for i in range(1, frames + 1):
+        picture = grey(film.exposed(cycle[i % _DRIFT_PERIOD]))
+        points = {name: follow[name](picture) for name in names}
+    true = of.points_px + motion.times(float(shares[frames % _DRIFT_PERIOD])).forward(of.points_px)
+    return {name: float(np.nanmedian(np.hypot(*(points[name] - true).T))) for name in names}
+
+
+def jump(of: Subject, seeds: Sequence[int | None]) -> dict[str, list[float]]:
+    """Share of points that are lost or more than a pixel off after one jump from rest, by method and motion."""
+    shares: dict[str, list[float]] = {name: [] for name in FOLLOWERS}
+    for seed in seeds:
+        motion = of.motion(JUMP_PX, seed)
+        film = Film(of.rest.picture, NOISE_GREY, 3)
+        rest, picture = grey(film.at_rest()), grey(film.under(motion))
+        true = of.points_px + motion.forward(of.points_px)
+        for name, make in FOLLOWERS.items():
+            error = np.hypot(*(make(rest, of.points_px, of.half_px)(picture) - true).T)[of.inside(true)]
+            shares[name].append(float(np.mean(~(error <= LOST_PX))))
+    return shares
+
+
+def _both(follow: object, pictures: list[np.ndarray]) -> None:
+    for picture in pictures:
+        follow(picture)  # type: ignore[operator]
+
+
+def _quantiles(error: np.ndarray) -> tuple[float, float]:
+    return float(np.median(error)), float(np.quantile(error, 0.95, method="lower"))
+
+
+def _pooled(errors: Mapping[str, np.ndarray], subjects: Sequence[Subject]) -> np.ndarray:
+    """Errors on the real gels; on the generated ones where there are none; in pixels of a picture 320 wide."""
+    chosen = [s for s in subjects if s.rest.real] or list(subjects)
+    return np.concatenate([errors[s.rest.name] / s.unit for s in chosen])
+
+
+def _requirements(
+    errors: Mapping[str, Mapping[str, np.ndarray]],
+    drift: Mapping[str, Mapping[str, float]],
+    jumps: Mapping[str, Mapping[str, list[float]]],
+    subjects: Sequence[Subject],
+) -> tuple[Requirement, ...]:
+    median, high = _quantiles(_pooled(errors[MAIN], subjects))
+    (drifted,) = drift.values()
+    published = max(shares[MAIN][0] for shares in jumps.values())
+    return (
+        Requirement(name="marker error, median", measured=median, bound=0.04, better="lower", unit="px"),
+        Requirement(name="marker error, 95th percentile", measured=high, bound=0.11, better="lower", unit="px"),
+        Requirement(name="drift", measured=drifted[MAIN], bound=0.006, better="lower", unit="px"),
+        Requirement(
+            name="28 px jump: markers lost or > 1 px off, worst gel", measured=published, bound=0.0, better="lower"
+        ),
+    )
+
+
+def _verdict(
+    errors: Mapping[str, Mapping[str, np.ndarray]],
+    milliseconds: Mapping[str, Mapping[str, float]],
+    subjects: Sequence[Subject],
+) -> tuple[str, ...]:
+    median, high = _quantiles(_pooled(errors[MAIN], subjects))
+    first = subjects[0].rest.name
+    return (
+        f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px in "
+        f"95 of 100 markers, at {1e3 / milliseconds[first][MAIN]:.0f} Hz on {first}.",
+    )
+
+
+def _error_table(
+    errors: Mapping[str, Mapping[str, np.ndarray]],
+    milliseconds: Mapping[str, Mapping[str, float]],
+    subjects: Sequence[Subject],
+) -> Table:
+    names = [s.rest.name for s in subjects]
+    rows: list[tuple[Cell, ...]] = [
+        (method, *(value for gel in names for value in (*_quantiles(errors[method][gel]), milliseconds[gel][method])))
+        for method in FOLLOWERS
+    ]
+    columns = [
+        column
+        for gel in names
+        for column in (
+            Column(name=f"{gel}: median", unit="px", format=".3f"),
+            Column(name="95 %", unit="px", format=".3f"),
+            Column(name="time", unit="ms", format=".2f"),
+        )
+    ]
+    return Table(
+        title="Markers under known motion",
+        columns=(Column(name="method"), *columns),
+        rows=tuple(rows),
+        note=f"Peak {PEAK_PX:g} px on a picture 320 wide, shading of a contact, noise of {NOISE_GREY:g} grey levels, "
+        f"at rest the mean of {REST_PICTURES} pictures; infinite where a method says that more than 5 % are lost.",
+    )
+
+
+def _event_table(drift: Mapping[str, Mapping[str, float]], jumps: Mapping[str, Mapping[str, list[float]]]) -> Table:
+    (drifted,) = drift.values()
+    rows: list[tuple[Cell, ...]] = [
+        (
+            method,
+            drifted.get(method),
+            *(value for shares in jumps.values() for value in (shares[method][0], float(np.mean(shares[method])))),
+        )
+        for method in FOLLOWERS
+    ]
+    columns = [
+        column
+        for gel in jumps
+        for column in (
+            Column(name=f"{gel}: jump", format=".1%", meaning="markers lost or more than 1 px off, published motion"),
+            Column(name="all motions", format=".1%"),
+        )
+    ]
+    return Table(
+        title=f"Drift, and a jump of {JUMP_PX:g} px in one frame",
+        columns=(
+            Column(name="method"),
+            Column(name=f"drift on {next(iter(drift))}", unit="px", format=".4f"),
+            *columns,
+        ),
+        rows=tuple(rows),
+    )
+
+
+def _picture(
+    errors: Mapping[str, Mapping[str, np.ndarray]], milliseconds: Mapping[str, Mapping[str, float]], gel: str
+) -> Picture:
+    groups: dict[str, list[Point]] = {}
+    for method in FOLLOWERS:
+        median, high = _quantiles(errors[method][gel])
+        if np.isfinite(median):
+            kind = "this package" if method.startswith("this") else method.split(" ")[0].rstrip(",")
+            top = high if np.isfinite(high) else 10 * median
+            groups.setdefault(kind, []).append((method, milliseconds[gel][method], median, top))
+    return Picture(
+        name="fields_markers",
+        title=f"Markers: speed against error, {gel}",
+        caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile.",
+        content=speed_against_error(groups, "error, px", None),
+    )

@@ -1,0 +1,130 @@
+"""Presses, slides and twists on generated gels, with every field known: what acts, what it moves, what is measured."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.tangential import scenes
+from sensors_io.fields.inversion import NodeGrid
+from sensors_io.scenes import drag
+from sensors_io.scenes.sensors import SensorModel
+from sensors_io.scenes.traction import in_series, resultant, shear_displacement
+
+NODES = 20
+"""Rows and columns of the measured fields, as in the records of generated scenes."""
+
+_PER_NODE = 4  # contact pixels along a node's side
+LOST_NODES = 0.004
+"""Share of nodes that a frame cannot read, as in generated scenes."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Slide:
+    """One sequence of F frames on the node grid [F, h, w, …]: what is measured, and the truth behind it.
+
+    Measured: `deformation_mm`, `depth_mm` of the marker plane and `valid`, with the sensor's noise and lost nodes.
+    True: `shear_mm` (the part of the displacement that traction makes), `traction_mpa` on the gel (x, y, z), `force_n`
+    [F, 3] and `moment_nmm` [F, 3].
+    """
+
+    motion: str
+    kind: str
+    deformation_mm: np.ndarray
+    depth_mm: np.ndarray
+    valid: np.ndarray
+    shear_mm: np.ndarray
+    traction_mpa: np.ndarray
+    force_n: np.ndarray
+    moment_nmm: np.ndarray
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Frames [F] in which something pulls along the gel."""
+        return np.linalg.norm(self.shear_mm, axis=-1).max((1, 2)) > 0
+
+
+def node_grid(sensor: SensorModel) -> NodeGrid:
+    """The nodes of a sensor's fields; both displacement and depth are those of its marker plane."""
+    pitch = sensor.window_mm / NODES
+    depth = sensor.marker_depth_mm
+    if depth is None:
+        raise ValueError(f"{sensor.name} has no markers: its lateral field does not exist; choose another sensor")
+    return NodeGrid(shape=(NODES, NODES), pitch_mm=(pitch, pitch), marker_depth_mm=depth, depth_mm=depth)
+
+
+def make_slides(
+    sensor: SensorModel, kinds: tuple[str, ...], motions: tuple[str, ...], frames: int, seed: int
+) -> list[Slide]:
+    """Every motion by one object of every kind.
+
+    Args:
+      sensor: a model with markers.
+      kinds: of `experiments.tangential.scenes.KINDS`.
+      motions: names of the protocol's.
+      frames: of a sequence.
+      seed: of objects and noise.
+    """
+    bench = scenes.make_bench(sensor, NODES * _PER_NODE)
+    made = []
+    for i, (kind, name) in enumerate((k, m) for k in kinds for m in motions):
+        rng = np.random.default_rng([seed, i])
+        true = jax.device_get(_solve(bench, scenes.make_motion(bench, scenes.draw(rng, kind), name, frames)))
+        made.append(_measured(sensor, name, kind, true, rng))
+    return made
+
+
+@jax.jit
+def _solve(bench: scenes.Bench, motion: scenes.Motion) -> dict[str, jax.Array]:
+    """Displacement [F, 3, N, N], its part by traction, load and resultants of every frame."""
+    series = in_series(bench.gel, bench.body, 1.0, motion.modulus_mpa)
+    bodies = drag.Bodies(compliance=series, coupling=None, response=bench.markers)
+
+    def advance(history: drag.History, at: tuple[jax.Array, drag.Step]) -> tuple[drag.History, dict[str, jax.Array]]:
+        pressure, step = at
+        history, frame = drag.advance(history, pressure, motion.friction, step, bodies, bench.x_mm)
+        traction = frame.traction_mpa
+        force, moment = resultant(pressure, traction, bench.x_mm, bench.spacing_mm)
+        sheared = shear_displacement(traction, bench.markers.shear)
+        return history, {
+            "displacement": frame.displacement_mm,
+            "shear": jnp.stack([sheared.real, sheared.imag]),
+            "load": jnp.stack([traction.real, traction.imag, -pressure]),
+            "force": force,
+            "moment": moment,
+        }
+
+    return jax.lax.scan(advance, drag.at_rest(bench.x_mm.shape[0]), (motion.pressure_mpa, motion.step))[1]
+
+
+def _measured(
+    sensor: SensorModel, name: str, kind: str, true: dict[str, np.ndarray], rng: np.random.Generator
+) -> Slide:
+    nodes = {key: _node_means(true[key]) for key in ("displacement", "shear", "load")}
+    noise_mm = np.array([sensor.lateral_noise_mm, sensor.lateral_noise_mm, sensor.depth_noise_mm])
+    seen = nodes["displacement"] + noise_mm * rng.standard_normal(nodes["displacement"].shape)
+    return Slide(
+        motion=name,
+        kind=kind,
+        deformation_mm=seen[..., :2],
+        depth_mm=seen[..., 2],
+        valid=rng.uniform(size=seen.shape[:-1]) >= LOST_NODES,
+        shear_mm=nodes["shear"],
+        traction_mpa=nodes["load"],
+        force_n=true["force"],
+        moment_nmm=true["moment"],
+    )
+
+
+def _node_means(fields: np.ndarray) -> np.ndarray:
+    """Means over the pixels of every node: [F, C, N, N] → [F, h, w, C]."""
+    frames, channels, side, _ = fields.shape
+    cells = side // _PER_NODE
+    blocks = fields.reshape(frames, channels, cells, _PER_NODE, cells, _PER_NODE)
+    return np.moveaxis(blocks.mean((3, 5), dtype=np.float64), 1, -1)
+
+
+cached_slides = functools.lru_cache(maxsize=8)(make_slides)
+"""`make_slides`, computed once for the same arguments within a run."""

@@ -1,0 +1,15 @@
+"""What each part of the chart of fields hands in."""
+
+import dataclasses
+
+from experiments.reporting.findings import Picture, Requirement, Table
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Panel:
+    """Requirements, tables and pictures of one field, and what they say."""
+
+    verdict: tuple[str, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()

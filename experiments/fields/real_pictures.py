@@ -1,0 +1,86 @@
+"""Fields of real pictures, drawn side by side."""
+
+import dataclasses
+import io
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.reporting.charts import LOOK
+
+_DPI = 110
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One picture: change uint8 [H, W, 3], depth [H, W] and contact [H, W], deformation [h, w, 2], flags in words."""
+
+    name: str
+    change: np.ndarray
+    depth_mm: np.ndarray | None
+    contact: np.ndarray
+    deformation_mm: np.ndarray | None
+    flags: str
+
+
+def field_rows(rows: Sequence[Row], mm_per_px: float) -> bytes:
+    """A PNG of one row a picture: change of colour, depth with the outline of the contact, its profile, deformation."""
+    with mpl.rc_context(LOOK):
+        figure = Figure(figsize=(11, 2.2 * len(rows) + 0.3), layout="constrained")
+        for panels, row in zip(figure.subplots(len(rows), 4, squeeze=False), rows, strict=True):
+            _picture(panels[0], row)
+            _depth(figure, panels[1], row, mm_per_px)
+            _profile(panels[2], row, mm_per_px)
+            _deformation(panels[3], row, mm_per_px)
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+        return buffer.getvalue()
+
+
+def _picture(axes: Axes, row: Row) -> None:
+    axes.imshow(row.change)
+    axes.set_title(f"{row.name}\n{row.flags}", fontsize=7, loc="left")
+    axes.set_axis_off()
+
+
+def _depth(figure: Figure, axes: Axes, row: Row, mm_per_px: float) -> None:
+    height, width = row.contact.shape
+    window = (0, width * mm_per_px, height * mm_per_px, 0)
+    if row.depth_mm is None:
+        axes.imshow(row.contact, cmap="Greys", extent=window)
+    else:
+        shown = axes.imshow(row.depth_mm, cmap="cividis", vmin=0, extent=window)
+        figure.colorbar(shown, ax=axes, label="depth, mm")
+    if row.contact.any() and not row.contact.all():
+        axes.contour(
+            *(np.linspace(0, n * mm_per_px, n) for n in (width, height)), row.contact, [0.5], colors="w", linewidths=0.8
+        )
+    axes.grid(False)
+
+
+def _profile(axes: Axes, row: Row, mm_per_px: float) -> None:
+    """Depth along the row and the column of the deepest pixel."""
+    if row.depth_mm is None:
+        axes.set_axis_off()
+        return
+    y, x = np.unravel_index(int(row.depth_mm.argmax()), row.depth_mm.shape)
+    for values, label in ((row.depth_mm[y], "along x"), (row.depth_mm[:, x], "along y")):
+        axes.plot(np.arange(len(values)) * mm_per_px, values, lw=1, label=label)
+    axes.set(xlabel="mm", ylabel="depth, mm")
+    axes.legend(fontsize=7)
+
+
+def _deformation(axes: Axes, row: Row, mm_per_px: float) -> None:
+    if row.deformation_mm is None:
+        axes.text(0.5, 0.5, "no markers:\nrefused", ha="center", va="center", fontsize=8, transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    h, w = row.deformation_mm.shape[:2]
+    height, width = row.contact.shape
+    x, y = ((np.arange(n) + 0.5) / n * side * mm_per_px for n, side in ((w, width), (h, height)))
+    axes.quiver(x, y, row.deformation_mm[..., 0], row.deformation_mm[..., 1], angles="xy", color="#0072b2")
+    axes.invert_yaxis()
+    axes.set_title(f"greatest {np.hypot(*np.moveaxis(row.deformation_mm, -1, 0)).max():.2f} mm", fontsize=7)

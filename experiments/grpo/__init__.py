@@ -1,0 +1,1 @@
+"""Measuring the GRPO engine: benches, failure scenarios, ablations."""

@@ -1,0 +1,197 @@
+"""The job that GRPO engines are timed on: the same decoder, prompts, completions and update for all of them.
+
+8 prompts × 8 rollouts × 64 new tokens, no end token among them; a decoder of the Qwen2 shape with 1.05 million
+parameters (4 layers, width 128, 4 heads over 2 key heads of 32, MLP 512, vocabulary 512, tied embedding) in float32;
+one on-policy update by AdamW with β = .04 to a reference.  The reward of a completion is its share of low token ids.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.types import Params, Parsed, Target
+
+BETA = 0.04
+LEARNING_RATE = 1e-4
+VIEW, TOUCH = 4, 8
+"""Prompt tokens that are embeddings of a view and of the touch of the one sensor; the others are text."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Size:
+    """Prompts, rollouts of each, new tokens, and the decoder."""
+
+    prompts: int = 8
+    group: int = 8
+    length: int = 64
+    vocab_size: int = 512
+    hidden_size: int = 128
+    num_layers: int = 4
+    num_heads: int = 4
+    num_kv_heads: int = 2
+    head_dim: int = 32
+    intermediate_size: int = 512
+
+    @property
+    def decoder(self) -> DecoderConfig:
+        """The decoder's own configuration."""
+        names = {f.name for f in dataclasses.fields(DecoderConfig)}
+        half = self.head_dim // 2
+        sections = (half - 2 * (3 * half // 8), 3 * half // 8, 3 * half // 8)
+        shape = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
+        return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
+
+    def gflop(self, prefix: int, algorithm_beta: float = BETA) -> float:
+        """Multiplications and additions of matrix products that one iteration needs, in 10⁹.
+
+        The prefix once a prompt and pass: sampling, forward and backward (thrice the forward), reference.
+        """
+        c = self
+        weights = c.num_layers * (
+            2 * c.hidden_size * c.num_heads * c.head_dim
+            + 2 * c.hidden_size * c.num_kv_heads * c.head_dim
+            + 3 * c.hidden_size * c.intermediate_size
+        )
+        pair = 2 * c.num_layers * c.num_heads * c.head_dim  # q·k and weights·v of one query and key
+        prompt = prefix * weights + pair * prefix * (prefix + 1) / 2
+        seen = self.length * prefix + self.length * (self.length + 1) / 2
+        completion = self.length * (weights + c.hidden_size * c.vocab_size) + pair * seen
+        passes = 1 + 3 + (algorithm_beta > 0)
+        return 2 * passes * self.prompts * (prompt + self.group * completion) / 1e9
+
+
+class Job:
+    """One iteration as a call: `step()` samples, scores and updates, and returns the metrics."""
+
+    def __init__(self, size: Size, prefix: int, config: GRPOConfig, repeated: bool = False) -> None:
+        if repeated:
+            config = dataclasses.replace(
+                config,
+                prompts=size.prompts * size.group,
+                group=1,
+                micro_prompts=config.micro_prompts * size.group,
+            )
+        self.agent = make_agent(size, prefix)
+        self.batch = make_batch(size, prefix, config.prompts)
+        params = init_decoder(self.agent, self.batch)
+        optimizer = optax.adamw(LEARNING_RATE)
+        self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
+        self._state = start_state(params, optimizer, jax.random.key(0), config)
+        self._step: Any = make_grpo_step(self.agent, low_ids(size.vocab_size), optimizer, config)
+
+    def step(self) -> dict[str, jax.Array]:
+        """One iteration; the state moves on."""
+        self._state, metrics = self._step(self._state, self.batch, self.fixed)
+        return metrics
+
+    @property
+    def state(self) -> GRPOState:
+        """The state after the last iteration."""
+        return self._state
+
+    @property
+    def compilations(self) -> int:
+        """How many programs the steps so far took."""
+        return self._step._cache_size()
+
+
+def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
+    """The step that the job asks for: plain GRPO with a reference, nothing else."""
+    return GRPOConfig(
+        prompts=size.prompts,
+        group=size.group,
+        length=size.length,
+        micro_prompts=micro_prompts,
+        algorithm=Paper(beta=BETA, gamma=0.0),
+        inverse_draws=True,
+    )
+
+
+def make_agent(size: Size, prefix: int) -> Agent:
+    """A policy of the given decoder whose prompts have `prefix` tokens."""
+    policy = Policy(
+        PolicyConfig(
+            tactile=TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1),
+            vision=VisionConfig(),
+            decoder=size.decoder,
+        )
+    )
+    slots = Slots(touch=np.arange(VIEW, VIEW + TOUCH)[None], view=np.arange(VIEW), stream_text=np.full(prefix, -1))
+    banned = np.zeros(size.vocab_size, bool)
+    return Agent(policy=policy, slots=slots, banned=banned, end_ids=(size.vocab_size,), pad_id=0)
+
+
+def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
+    """Random prompts."""
+    rng = np.random.default_rng(seed)
+    normal = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
+    target = Target(
+        asked=jnp.ones((prompts, 1), bool),
+        label=jnp.zeros((prompts, 1), jnp.int32),
+        levels=jnp.full((prompts, 1), 3),
+        ordinal=jnp.ones((prompts, 1), bool),
+        streams=jnp.ones((prompts, 1), bool),
+    )
+    features = Features(
+        touch=normal(prompts, 1, TOUCH, size.hidden_size),
+        touch_time=jnp.tile(jnp.arange(TOUCH) // 2, (prompts, 1, 1)),
+        stream_mask=jnp.ones((prompts, 1), bool),
+        view=normal(prompts, VIEW, size.hidden_size),
+        view_mask=jnp.ones(prompts, bool),
+    )
+    ids = jnp.asarray(rng.integers(0, size.vocab_size, (prompts, prefix)), jnp.int32)
+    return GRPOBatch(features=features, ids=ids, mask=jnp.ones((prompts, prefix), bool), target=target)
+
+
+def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
+    """N(0, .02²) weights and unit scales, drawn in NumPy: compiling an initialisation would count as the job's memory.
+
+    The shapes come from tracing one forward pass.
+    """
+    one = jax.tree.map(lambda x: x[0], batch)
+
+    def forward(module: Policy) -> jax.Array:
+        banned = jnp.asarray(agent.banned)
+        first, prefix = module.prefill(one.features, one.ids, one.mask, agent.slots, banned)
+        return module.completion_logits(one.ids, first, prefix, banned)
+
+    shapes = jax.eval_shape(lambda: agent.policy.init(jax.random.key(0), method=forward))["params"]
+    rng = np.random.default_rng(0)
+
+    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        kind = path[-1].key
+        value = np.ones(leaf.shape) if kind == "scale" else rng.normal(0, 0.02, leaf.shape) * (kind != "bias")
+        return jnp.asarray(value, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def low_ids(vocab_size: int):
+    """Share of token ids in the lower half of the vocabulary, as a `ScoreFn`."""
+
+    def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+        del target
+        nothing = jnp.full(1, -1)
+        parsed = Parsed(
+            perceive=nothing[None],
+            compare=nothing,
+            conclude=nothing,
+            formatted=jnp.array(False),
+            truncated=jnp.array(True),
+            length=jnp.int32(tokens.shape[0]),
+        )
+        return jnp.mean(tokens < vocab_size // 2), {}, parsed
+
+    return score

@@ -1,0 +1,140 @@
+"""What do the fields look like on every sensor whose pictures are published?
+
+    python -m experiments real_sensors --data-dir DIR [--scale smoke]
+
+Each folder of ball presses in DIR is calibrated by itself, with no labels and one setting, and the fields of some of
+its pictures are drawn: change of colour, depth, contact, deformation where the gel has markers.  A folder that cannot be
+calibrated says why.  Four minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
+marker-less Minis calibrate to ten micrometres or so; DIGIT and marker gels are refused depth or flagged, not guessed.
+"""
+
+import dataclasses
+import pathlib
+import time
+
+import numpy as np
+
+from experiments.fields.real_folders import FOLDERS, Folder, read_folder
+from experiments.fields.real_pictures import Row, field_rows
+from experiments.reporting.findings import Cell, Column, Findings, Picture, Table
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
+from sensors_io.calibration.presses import BallPresses
+from sensors_io.fields.extract import Extractor
+from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.schema import Flag
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RealConfig:
+    """What is read.
+
+    Args:
+      data_dir: the folders of recordings.
+      folders: at most so many of them.
+      shown: pictures drawn of each.
+      folds: of the held-out errors.
+    """
+
+    data_dir: pathlib.Path | None = None
+    folders: int = 99
+    shown: int = 5
+    folds: int = 5
+
+
+def run(config: RealConfig, context: Context) -> Findings:
+    """Calibrate each folder, extract, draw."""
+    if config.data_dir is None:
+        raise ValueError("data_dir is None: must be the folder of recordings; give --data-dir")
+    rows, pictures = [], []
+    for folder in [f for f in FOLDERS if (config.data_dir / f.path).is_dir()][: config.folders]:
+        context.say(folder.name)
+        row, picture = study(folder, config.data_dir, config)
+        rows.append(row)
+        pictures.append(picture)
+    if not rows:
+        known = ", ".join(f.path for f in FOLDERS)
+        raise FileNotFoundError(f"data_dir is {config.data_dir}: must hold one of {known}; correct it")
+    made = sum(row[3] is not None for row in rows)
+    return Findings(
+        verdict=(f"{made} of {len(rows)} folders calibrate with one setting; the others say why they do not.",),
+        tables=(_table(rows),),
+        pictures=tuple(pictures),
+    )
+
+
+def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple[Cell, ...], Picture]:
+    """One folder: a row of figures and a picture of fields."""
+    frames, names, background = read_folder(folder, root)
+    made, figures, note = _calibrated(folder, frames, names, background, config.folds)
+    extractor = Extractor(background, folder.mm_per_px, made)
+    chosen = np.linspace(0, len(frames) - 1, min(config.shown, len(frames))).round().astype(int)
+    began = time.perf_counter()
+    fields = extractor.extract(frames)
+    hz = len(frames) / (time.perf_counter() - began)
+    rejected = int(np.count_nonzero(fields.flags & np.uint32(Flag.NO_CONTACT)))
+    row = (folder.name, extractor.evidence.pattern.value, len(frames), *figures, rejected, hz, note)
+    drawn = [_row(fields, frames, background, int(i), names[i]) for i in chosen]
+    picture = Picture(
+        name=folder.name.replace(" ", "-"),
+        title=folder.name,
+        caption="; ".join(extractor.refused) or "Change of colour, depth, contact, deformation.",
+        content=field_rows(drawn, folder.mm_per_px),
+        kind="png",
+    )
+    return row, picture
+
+
+def _calibrated(
+    folder: Folder, frames: np.ndarray, names: tuple[str, ...], background: np.ndarray, folds: int
+) -> tuple[Calibration | None, tuple[Cell, ...], str]:
+    """The folder's own calibration, its held-out figures, and what there is to say."""
+    nothing: tuple[Cell, ...] = (None, None, None)
+    if folder.ball_diameter_mm is None:
+        return None, nothing, "no ball of known diameter"
+    try:
+        presses = BallPresses(
+            pictures=frames, background=background, radius_mm=folder.ball_diameter_mm / 2, mm_per_px=folder.mm_per_px
+        )
+        made, report = calibrate(presses, names, "gelsight_mini", CalibrateConfig(folds=folds))
+    except CalibrationError as refusal:
+        return None, nothing, str(refusal).splitlines()[0]
+    figures = report.errors.figures()
+    keys = ("depth rmse median, um", "radius error median, %", "tip depth median, mm")
+    return made, tuple(figures[key] for key in keys), f"{len(report.left_out)} presses left out"
+
+
+def _row(fields: Fields, frames: np.ndarray, background: np.ndarray, i: int, name: str) -> Row:
+    arrays = {key: None if array is None else array[i] for key, array in fields.arrays().items()}
+    return Row(
+        name=name,
+        change=np.clip(128 + (frames[i].astype(np.int16) - background), 0, 255).astype(np.uint8),
+        depth_mm=arrays["depth_mm"],
+        contact=fields.contact[i],
+        deformation_mm=arrays["deformation_mm"],
+        flags=", ".join(str(f.name).lower() for f in Flag if f & Flag(int(fields.flags[i]))) or "none",
+    )
+
+
+def _table(rows: list[tuple[Cell, ...]]) -> Table:
+    return Table(
+        title="Every folder, calibrated by itself",
+        columns=(
+            Column(name="folder"),
+            Column(name="gel"),
+            Column(name="pictures", format="d"),
+            Column(name="depth rmse", unit="µm", format=".1f", meaning="held out, median over presses"),
+            Column(name="radius error", unit="%", format=".1f"),
+            Column(name="tip depth", unit="mm", format=".2f"),
+            Column(name="flagged as no contact", format="d"),
+            Column(name="all fields", unit="Hz", format=".0f"),
+            Column(name="note"),
+        ),
+        rows=tuple(rows),
+    )
+
+
+EXPERIMENT = Experiment(
+    name="real_sensors", config=RealConfig(), run=run, scales={"smoke": RealConfig(folders=1, shown=3, folds=2)}
+)

@@ -1,0 +1,164 @@
+"""From presses of a ball to a calibration with its held-out error, or a refusal that says what is wrong."""
+
+import dataclasses
+
+import numpy as np
+
+from sensors_io.calibration.circles import Circles, find_circles
+from sensors_io.calibration.fit import Choice, fit_map
+from sensors_io.calibration.presses import BallPresses, Touches
+from sensors_io.calibration.validate import BallErrors, cross_validate
+from sensors_io.fields.contact import ContactConfig, steepest_change
+from sensors_io.fields.types import Calibration, CalibrationError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrateConfig:
+    """What a good set of presses is.
+
+    Args:
+      least_presses: that remain after bad ones are left out.
+      folds: of the held-out errors, by press.
+      most_misfit: share of a press's change that a ball may leave unexplained.
+      most_saturated: share of the contact's pixels with a channel at 255.
+      most_drift: grey levels that a picture may differ from the background by its median, which contact hardly moves.
+      contact_radii: between which the median contact radius must lie, in ball radii.
+      most_depth_um, most_radius: held-out errors beyond which nothing was learnt.
+    """
+
+    least_presses: int = 8
+    folds: int = 5
+    most_misfit: float = 0.7
+    most_saturated: float = 0.2
+    most_drift: float = 40.0
+    contact_radii: tuple[float, float] = (0.15, 0.95)
+    most_depth_um: float = 60.0
+    most_radius: float = 0.25
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LeftOut:
+    """A press that was not used, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CalibrationReport:
+    """What a calibration is made from: presses kept and left out, their touches, what was chosen, held-out errors."""
+
+    kept: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
+    touches: Touches
+    misfit: np.ndarray
+    choice: Choice
+    errors: BallErrors
+
+
+def calibrate(
+    presses: BallPresses, names: tuple[str, ...], sensor: str, config: CalibrateConfig | None = None
+) -> tuple[Calibration, CalibrationReport]:
+    """Find circles, leave bad presses out, fit the map, measure it on held-out presses.
+
+    Args:
+      presses: the pictures.
+      names: of the presses, for the report.
+      sensor: canonical name that the calibration is for.
+      config: limits.
+
+    Raises:
+      CalibrationError: a set that nothing can be learnt from; it says why and what to do.
+    """
+    config = config or CalibrateConfig()
+    bad = {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
+    good = _enough(presses, names, bad, config)
+    circles = find_circles(presses.chosen(good))
+    bad |= {int(good[i]): reason for i, reason in _misfits(presses.chosen(good), circles, config).items()}
+    if len(remaining := _enough(presses, names, bad, config)) < len(good):
+        circles = find_circles(presses.chosen(remaining))
+    kept = presses.chosen(remaining)
+    _check_size(kept, circles.touches, config)
+    colours, touches, choice = fit_map(kept, circles.touches, seed=config.seed, folds=config.folds)
+    errors = cross_validate(kept, sensor, folds=config.folds, seed=config.seed)
+    _check_errors(errors, config)
+    report = CalibrationReport(
+        kept=tuple(names[i] for i in remaining),
+        left_out=tuple(LeftOut(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
+        touches=touches,
+        misfit=circles.misfit,
+        choice=choice,
+        errors=errors,
+    )
+    made_from = {"ball_diameter_mm": 2 * presses.radius_mm, **{f"held-out {k}": v for k, v in errors.figures().items()}}
+    made = Calibration(
+        sensor=sensor, background=presses.background, mm_per_px=presses.mm_per_px, colours=colours, made_from=made_from
+    )
+    return made, report
+
+
+def _unusable(presses: BallPresses, i: int, config: CalibrateConfig) -> str:
+    """Why a picture is no press at all, empty if it may be one."""
+    picture, contact = presses.pictures[i], ContactConfig()
+    drift = float(np.abs(np.median(picture.astype(np.int16) - presses.background, axis=(0, 1))).max())
+    if drift > config.most_drift:
+        return f"differs from the background by {drift:.0f} grey levels everywhere: must be ≤ {config.most_drift:.0f}"
+    steep = steepest_change(picture, presses.background, presses.mm_per_px, contact.smoothing_mm)
+    if steep < contact.steepness:
+        return f"shows no contact: its steepest change is {steep:.0f} grey levels/mm, must be ≥ {contact.steepness:.0f}"
+    return ""
+
+
+def _misfits(presses: BallPresses, circles: Circles, config: CalibrateConfig) -> dict[int, str]:
+    """Presses that no ball explains, or whose contact is saturated."""
+    y, x = np.mgrid[: presses.shape[0], : presses.shape[1]]
+    found = {}
+    for i, (row, misfit) in enumerate(zip(circles.touches.stacked(), circles.misfit, strict=True)):
+        inside = np.hypot(x - row[0], y - row[1]) < row[2]
+        share = float((presses.pictures[i][inside] == 255).any(-1).mean()) if inside.any() else 0.0
+        if not inside.any():
+            found[i] = "has its contact outside the picture"
+        elif misfit > config.most_misfit:
+            found[i] = f"is no ball: {misfit:.0%} of its change stay unexplained, must be ≤ {config.most_misfit:.0%}"
+        elif share > config.most_saturated:
+            found[i] = f"is saturated in {share:.0%} of its contact: must be ≤ {config.most_saturated:.0%}"
+    return found
+
+
+def _enough(presses: BallPresses, names: tuple[str, ...], bad: dict[int, str], config: CalibrateConfig) -> np.ndarray:
+    """Indices of the presses that are left.
+
+    Raises:
+      CalibrationError: too few, with the reasons of those left out.
+    """
+    good = np.array([i for i in range(len(presses)) if i not in bad], np.int64)
+    if len(good) < config.least_presses:
+        reasons = "".join(f"\n  {names[i]} {reason}" for i, reason in sorted(bad.items()))
+        raise CalibrationError(
+            f"{len(good)} of {len(presses)} presses can be used: must be ≥ {config.least_presses}; press the ball "
+            f"{config.least_presses} times or more, all over the window{reasons}"
+        )
+    return good
+
+
+def _check_size(presses: BallPresses, touches: Touches, config: CalibrateConfig) -> None:
+    """A contact nearly as wide as the ball, or a speck, means a wrong diameter or pitch."""
+    share = float(np.median(touches.radius_px)) * presses.mm_per_px / presses.radius_mm
+    low, high = config.contact_radii
+    if not low <= share <= high:
+        raise CalibrationError(
+            f"contact radius is {share:.2f} ball radii (median): must lie in [{low}, {high}]; "
+            f"check --ball-diameter-mm ({2 * presses.radius_mm:g}) and --mm-per-px ({presses.mm_per_px:g})"
+        )
+
+
+def _check_errors(errors: BallErrors, config: CalibrateConfig) -> None:
+    figures = errors.figures()
+    depth, radius = figures["depth rmse median, um"], figures["radius error median, %"]
+    if not (depth <= config.most_depth_um and radius <= 100 * config.most_radius):
+        raise CalibrationError(
+            f"held-out balls come out with a depth error of {depth:.0f} um and a radius error of {radius:.0f} %: must "
+            f"be ≤ {config.most_depth_um:.0f} um and ≤ {100 * config.most_radius:.0f} %; press one rigid ball, keep the "
+            "lamps and the camera's settings as they were, record the background anew"
+        )

@@ -1,0 +1,71 @@
+"""`python -m sensors_io calibrate`."""
+
+import dataclasses
+import pathlib
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from sensors_io.calibration.calibrate import CalibrateConfig, CalibrationReport, calibrate
+from sensors_io.calibration.presses import BallPresses
+from sensors_io.commands.console import OUT
+from sensors_io.fields.sources import Pictures, read_picture, read_pictures
+from sensors_io.fields.types import Calibration
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Calibrate:
+    """Learn a sensor's colours from pictures of a ball pressed into it, with no labelling; says its held-out error.
+
+    Press one rigid ball a dozen times or more, all over the window, and take one picture of the gel at rest.
+    """
+
+    balls: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    """Pictures of presses, or folders or videos of them."""
+    background: pathlib.Path
+    """Picture of the gel at rest."""
+    ball_diameter_mm: float
+    """Of the ball."""
+    mm_per_px: float
+    """Pitch of the pixels."""
+    out: pathlib.Path
+    """File of the calibration."""
+    sensor: str = "gelsight_mini"
+    """Name of the sensor."""
+    config: Annotated[CalibrateConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=CalibrateConfig)
+
+    def run(self) -> int:
+        background = read_picture(self.background)
+        pictures = _without(read_pictures(self.balls, self.sensor), background)
+        presses = BallPresses(
+            pictures=pictures.frames,
+            background=background,
+            radius_mm=self.ball_diameter_mm / 2,
+            mm_per_px=self.mm_per_px,
+        )
+        OUT.print(f"{len(presses)} pictures; finding circles, fitting, leaving out each fifth in turn …")
+        made, report = calibrate(presses, pictures.names, self.sensor, self.config)
+        made.save(self.out)
+        OUT.print(report_table(made, report))
+        OUT.print(f"wrote {self.out}, hash {made.hash}", highlight=False)
+        return 0
+
+
+def report_table(made: Calibration, report: CalibrationReport) -> Table:
+    """What was learnt, how well, and what was left out and why."""
+    table = Table("what", "figure or reason", title=f"calibration of {made.sensor}")
+    table.add_row("presses used", str(len(report.kept)))
+    table.add_row("degree in colour, in position", f"{report.choice.degree}, {report.choice.position_degree}")
+    for name, value in report.errors.figures().items():
+        table.add_row(f"held out: {name}", f"{value:.3g}")
+    for press in report.left_out:
+        table.add_row(f"left out: {press.name}", press.reason)
+    return table
+
+
+def _without(pictures: Pictures, background: np.ndarray) -> Pictures:
+    """The pictures that are not the background itself, which often lies in the same folder."""
+    kept = [i for i, frame in enumerate(pictures.frames) if not np.array_equal(frame, background)]
+    return Pictures(frames=pictures.frames[kept], names=tuple(pictures.names[i] for i in kept))

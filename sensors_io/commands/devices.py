@@ -1,0 +1,43 @@
+"""`python -m sensors_io devices`."""
+
+import dataclasses
+
+from rich.table import Table
+
+from sensors_io.commands.console import OUT
+from sensors_io.devices.errors import DeviceNotFoundError
+from sensors_io.devices.netft import NetFtConfig
+from sensors_io.devices.tac3d import PORT, Tac3dConfig
+from sensors_io.devices.uvc import find_cameras
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Devices:
+    """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T answers."""
+
+    tac3d_port: int = PORT
+    """On which the vendor's program of a Tac3D sends."""
+    netft_host: str = NetFtConfig().host
+    """Address of a Net F/T."""
+    wait_s: float = 1.0
+    """For each of them."""
+
+    def run(self) -> int:
+        table = Table("device", "product", "serial", "at")
+        for camera in find_cameras():
+            table.add_row(
+                "camera", camera.product, camera.serial or "–", f"{camera.node} ({camera.usb_id or 'not USB'})"
+            )
+        tac3d, netft = (
+            Tac3dConfig(port=self.tac3d_port, wait_s=self.wait_s),
+            NetFtConfig(host=self.netft_host, wait_s=self.wait_s),
+        )
+        for name, device in (("tac3d", tac3d.open()), ("netft", netft.open())):
+            try:
+                with device:
+                    identity = device.identity
+                    table.add_row(name, identity.product, identity.serial or "–", identity.where)
+            except DeviceNotFoundError as absent:
+                table.add_row(name, "absent", "–", str(absent))
+        OUT.print(table)
+        return 0

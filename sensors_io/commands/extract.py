@@ -1,0 +1,94 @@
+"""`python -m sensors_io extract`."""
+
+import collections
+import dataclasses
+import io
+import pathlib
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.table import Table
+
+from sensors_io.commands.console import OUT, progress_bar
+from sensors_io.fields.extract import ExtractConfig, Extractor, joined
+from sensors_io.fields.sources import SourceError, read_picture, read_pictures
+from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
+from sensors_io.schema import Flag
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Extract:
+    """Depth, contact, deformation, shear and force of pictures, as arrays over frames in one npz.
+
+    A field that the input cannot carry is left out of the file, said so, and flagged in every frame.
+    """
+
+    inputs: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    """Pictures, folders, videos or records."""
+    background: pathlib.Path
+    """Picture of the gel at rest."""
+    out: pathlib.Path
+    """The npz."""
+    sensor: str = "gelsight_mini"
+    """Name of the sensor; whose frames are taken out of records."""
+    calibration: pathlib.Path | None = None
+    """File that `calibrate` wrote; without it there is neither depth nor shear."""
+    mm_per_px: float | None = None
+    """Pitch of the pixels; the calibration's where there is one."""
+    config: Annotated[ExtractConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ExtractConfig)
+
+    def run(self) -> int:
+        calibration = None if self.calibration is None else Calibration.load(self.calibration)
+        if calibration is not None and calibration.sensor != self.sensor:
+            raise CalibrationError(
+                f"{self.calibration} is for {calibration.sensor!r}, not {self.sensor!r}: must be equal; set --sensor"
+            )
+        extractor = Extractor(read_picture(self.background), self._pitch(calibration), calibration, self.config)
+        pictures = read_pictures(self.inputs, self.sensor)
+        if pictures.frames.shape[1:] != extractor.background.shape:
+            sizes = f"{pictures.frames.shape[1:3]} and {extractor.background.shape[:2]}"
+            raise SourceError(f"pictures and background have sizes {sizes}: must be equal; crop them alike")
+        parts = []
+        with progress_bar("frames") as progress:
+            for i, frame in enumerate(pictures.frames):
+                parts.append(extractor.read(frame))
+                progress(i + 1, len(pictures.frames))
+        fields = joined(parts)
+        write_whole(self.out, encoded(fields, pictures.names, "" if calibration is None else calibration.hash))
+        OUT.print(summary(fields, extractor.refused))
+        OUT.print(f"wrote {self.out}", highlight=False)
+        return 0
+
+    def _pitch(self, calibration: Calibration | None) -> float:
+        if self.mm_per_px is not None:
+            return self.mm_per_px
+        if calibration is None:
+            raise CalibrationError("mm_per_px is not given: must be known without a calibration; set --mm-per-px")
+        return calibration.mm_per_px
+
+
+def encoded(fields: Fields, names: tuple[str, ...], calibration: str) -> bytes:
+    """An npz of the arrays that there are, the names of the frames, the pitches and the hash of the calibration."""
+    arrays = {name: array for name, array in fields.arrays().items() if array is not None}
+    plain = {"names": np.array(names), "mm_per_px": np.float64(fields.mm_per_px), "calibration": np.array(calibration)}
+    if fields.grid_mm is not None:
+        plain["grid_mm"] = np.array(fields.grid_mm)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays, **plain)
+    return buffer.getvalue()
+
+
+def summary(fields: Fields, refused: tuple[str, ...]) -> Table:
+    """What was written, what was refused, frames by flag."""
+    table = Table("what", "figure or reason", title=f"{len(fields)} frames")
+    for name, array in fields.arrays().items():
+        if array is not None and name != "flags":
+            table.add_row(name, f"{array.dtype}{list(array.shape)}")
+    for reason in refused:
+        table.add_row("refused", reason)
+    counts = collections.Counter({flag: int(np.count_nonzero(fields.flags & np.uint32(flag))) for flag in Flag})
+    for flag, count in counts.items():
+        if count:
+            table.add_row(f"flag {str(flag.name).lower()}", str(count))
+    return table

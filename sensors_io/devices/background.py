@@ -1,0 +1,73 @@
+"""The picture of the untouched gel, kept up to date, and how far it has drifted."""
+
+import dataclasses
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Drift:
+    """How far the background has moved since it was first taken, in grey levels of 0..255.
+
+    Args:
+      mean: of the signed difference, per channel [3]: lamps and exposure.
+      rms: over all pixels and channels: also dirt, wear and a gel that was moved.
+    """
+
+    mean: np.ndarray
+    rms: float
+
+
+class Background:
+    """Running mean of untouched frames:  b ← b + (frame − b) / min(n, memory).
+
+    Args:
+      memory: frames after which the mean forgets; four seconds of a Mini by default.
+    """
+
+    def __init__(self, memory: int = 100):
+        if memory < 1:
+            raise ValueError(f"memory is {memory}: must be ≥ 1 frame; raise it")
+        self._memory = memory
+        self._count = 0
+        self._mean: np.ndarray | None = None
+        self._first: np.ndarray | None = None
+
+    @property
+    def frames(self) -> int:
+        """Untouched frames taken in so far."""
+        return self._count
+
+    def offer(self, frame: np.ndarray, *, touched: bool) -> None:
+        """Take a frame [H, W, 3] into the mean, unless something touches the gel.
+
+        Raises:
+          ValueError: a frame of another shape.
+        """
+        if touched:
+            return
+        if self._mean is None:
+            self._mean = frame.astype(np.float32)
+        elif frame.shape != self._mean.shape:
+            raise ValueError(f"frame is {list(frame.shape)}: must be {list(self._mean.shape)}; start a new background")
+        self._count += 1
+        self._mean += (frame - self._mean) / np.float32(min(self._count, self._memory))
+        if self._count == self._memory:
+            self._first = self._mean.copy()
+
+    def picture(self) -> np.ndarray:
+        """The background, uint8 [H, W, 3].
+
+        Raises:
+          ValueError: no untouched frame has come yet.
+        """
+        if self._mean is None:
+            raise ValueError("the background holds no frame: let nothing touch the gel, and wait for one")
+        return np.rint(self._mean).astype(np.uint8)
+
+    def drift(self) -> Drift | None:
+        """How far it has moved since the first `memory` untouched frames; `None` before there were as many."""
+        if self._mean is None or self._first is None:
+            return None
+        moved = self._mean - self._first
+        return Drift(mean=moved.mean((0, 1)), rms=float(np.sqrt(np.mean(moved**2))))

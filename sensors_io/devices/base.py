@@ -1,0 +1,88 @@
+"""The protocol of a device: a context manager with an identity and one blocking read.
+
+A device is used by one thread and knows neither buffers nor threads; `reader.Reader` puts both around it.  The stamp of
+a sample is taken right after the grab, before anything is decoded or resized.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Identity:
+    """Which device this is, and how it is set.
+
+    Args:
+      sensor: canonical name in `schema.SENSORS`, or that of another kind of device, such as "netft".
+      serial: of this unit; empty where it tells none.
+      product: what it calls itself.
+      where: node, address or path it is reached by.
+      settings: as read back after setting, JSON values; stored with every recording.
+      period_s: time between two samples; `None` where unknown.
+      counter_modulus: the counter of its samples runs around at this number; `None` where it never does.
+    """
+
+    sensor: str
+    serial: str = ""
+    product: str = ""
+    where: str = ""
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    period_s: float | None = None
+    counter_modulus: int | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, slots=True)
+class Sample:
+    """What a device gives at one moment.
+
+    Args:
+      host_time_ns: monotonic, right after the grab.
+      device_time_ns: by the device's own clock; `None` where it tells none.
+      index: by the device's own counter; `None` where it has none.
+      frame: uint8 [H, W, 3] RGB, or uint16 [H, W] of a depth camera; `None` of a device without pictures.
+      arrays: anything else, named as in `schema.FRAME_ARRAYS` without the leading N, such as `force_n` [3].
+    """
+
+    host_time_ns: int
+    device_time_ns: int | None = None
+    index: int | None = None
+    frame: np.ndarray | None = None
+    arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+
+class Device(Protocol):
+    """Anything that gives samples."""
+
+    @property
+    def identity(self) -> Identity:
+        """Which device it is; complete once it is open."""
+        ...
+
+    def __enter__(self) -> Self:
+        """Open it; a closed device may be opened again.
+
+        Raises:
+          DeviceNotFoundError: it is absent.
+        """
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close it, also one that was lost."""
+        ...
+
+    def read(self, timeout_s: float) -> Sample:
+        """Wait for the next sample and return it; every sample is returned once, in order.
+
+        Raises:
+          DeviceTimeoutError: none came in time; the next call may succeed.
+          DeviceLostError: it must be closed and opened again.
+          DeviceDataError: a sample broke the protocol and is left out.
+          StreamEndedError: a replay is over.
+        """
+        ...

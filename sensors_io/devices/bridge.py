@@ -1,0 +1,220 @@
+"""Sensors whose SDK must live in another Python: a client of `bridge_server.py`, which runs there.
+
+The vendors pin versions of numpy, OpenCV and Python that exclude each other and this project, so that their code runs
+in a process of its own and only bytes cross.
+"""
+
+import collections
+import dataclasses
+import json
+import os
+import pathlib
+import selectors
+import subprocess
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import IO, Any, Self
+
+import cv2
+import numpy as np
+
+from sensors_io.devices import bridge_server
+from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+
+_SERVER = pathlib.Path(bridge_server.__file__)
+_LARGEST_HEADER = 1 << 16  # bytes: a few names and shapes
+_LARGEST_PAYLOAD = 1 << 28  # bytes: 256 MB, ten times the largest camera frame
+_KINDS = "biuf"  # of arrays: booleans, integers, floats; never Python objects
+_LAST_WORDS = 4096  # bytes of the server's standard error that are kept for a message
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BridgeConfig:
+    """A sensor behind a vendor's SDK.
+
+    Args:
+      sensor: canonical name.
+      python: the interpreter in which the SDK is installed.
+      adapter: "xense", "dmtac", or module:function of your own, see `bridge_server`.
+      serial: of the unit.
+      rate_hz: of its frames; 0 where unknown.
+      wait_s: for the first frame: loading a vendor's network may take long.
+    """
+
+    sensor: str = "xense"
+    python: str = "python3"
+    adapter: str = "xense"
+    serial: str = ""
+    rate_hz: float = 0.0
+    wait_s: float = 60.0
+
+    def open(self) -> "Bridge":
+        """The device, not open yet."""
+        return Bridge(self)
+
+
+def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of one frame.
+
+    Raises:
+      DeviceDataError: a header that is no such JSON, or arrays that do not fill the payload.
+    """
+    try:
+        described = json.loads(header)
+        arrays, start = {}, 0
+        for entry in described["arrays"]:
+            dtype, shape = np.dtype(entry["dtype"]), tuple(int(n) for n in entry["shape"])
+            if dtype.kind not in _KINDS:
+                raise ValueError(f"array {entry['name']} is of type {dtype}")
+            count = int(np.prod(shape))
+            arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
+            start += count * dtype.itemsize
+        int(described["number"]), int(described["stamp_ns"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
+    if start != len(payload):
+        raise DeviceDataError(f"bridge frame has {len(payload)} bytes of arrays where its header tells {start}")
+    return described, arrays
+
+
+def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
+    """Picture in RGB, and the other arrays as the schema has them: float32, a 6-D resultant as force and moment.
+
+    The resultant is taken as Fx Fy Fz (N) Mx My Mz (N mm), which no vendor states: hold it against a known weight.
+    """
+    rest = dict(arrays)
+    picture = rest.pop("frame_bgr", None)
+    resultant = rest.pop("resultant", None)
+    fields = {name: a.astype(np.float32) for name, a in rest.items()}
+    if resultant is not None:
+        six = resultant.astype(np.float32).ravel()
+        fields |= {"force_n": six[:3]} | ({"moment_nmm": six[3:6]} if six.size >= 6 else {})
+    if picture is None:
+        return None, fields
+    picture = np.asarray(picture, np.uint8)
+    code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(picture, code), fields
+
+
+class Bridge:
+    """A vendor's SDK in a process of its own; killed when the device is closed."""
+
+    def __init__(self, config: BridgeConfig):
+        self._config = config
+        self._process: subprocess.Popen[bytes] | None = None
+        self._buffer = bytearray()
+        self._words: collections.deque[bytes] = collections.deque(maxlen=16)
+        self._selector: selectors.BaseSelector | None = None
+        self._first: Sample | None = None
+
+    @property
+    def identity(self) -> Identity:
+        c = self._config
+        period = 1 / c.rate_hz if c.rate_hz > 0 else None
+        return Identity(sensor=c.sensor, serial=c.serial, product=f"{c.adapter} SDK", where=c.python, period_s=period)
+
+    def __enter__(self) -> Self:
+        c = self._config
+        command = [c.python, str(_SERVER), c.adapter, c.serial]
+        try:
+            self._process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL
+            )
+        except OSError as error:
+            raise DeviceNotFoundError(
+                f"{c.sensor}: {c.python} does not start ({error}); name the vendor's Python"
+            ) from error
+        self._buffer.clear()
+        self._words.clear()
+        self._selector = selectors.DefaultSelector()
+        for pipe in self._pipes():
+            os.set_blocking(pipe.fileno(), False)
+            self._selector.register(pipe, selectors.EVENT_READ)
+        try:
+            self._first = self.read(c.wait_s)
+        except (DeviceTimeoutError, DeviceLostError) as error:
+            self._close()
+            raise DeviceNotFoundError(f"{c.sensor} {c.serial or '(any)'} gave no frame: {error}") from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def read(self, timeout_s: float) -> Sample:
+        """The next frame, see `Device.read`."""
+        if self._first is not None:
+            sample, self._first = self._first, None
+            return sample
+        deadline = time.monotonic() + timeout_s
+        while (frame := self._take()) is None:
+            self._fill(deadline, timeout_s)
+        stamp_ns = time.monotonic_ns()
+        described, arrays = unpack(*frame)
+        picture, fields = to_schema(arrays)
+        number, device_ns = int(described["number"]), int(described["stamp_ns"])
+        return Sample(host_time_ns=stamp_ns, device_time_ns=device_ns, index=number, frame=picture, arrays=fields)
+
+    def _take(self) -> tuple[bytes, bytes] | None:
+        """Header and payload of a whole frame in the buffer."""
+        prefix = bridge_server.PREFIX
+        if len(self._buffer) < prefix.size:
+            return None
+        magic, header_size, payload_size = prefix.unpack_from(self._buffer)
+        if magic != bridge_server.MAGIC or header_size > _LARGEST_HEADER or payload_size > _LARGEST_PAYLOAD:
+            raise DeviceLostError(f"{self._config.sensor}: the bridge is out of step ({bytes(self._buffer[:12])!r})")
+        middle, end = prefix.size + header_size, prefix.size + header_size + payload_size
+        if len(self._buffer) < end:
+            return None
+        frame = bytes(self._buffer[prefix.size : middle]), bytes(self._buffer[middle:end])
+        del self._buffer[:end]
+        return frame
+
+    def _fill(self, deadline: float, timeout_s: float) -> None:
+        if self._selector is None or self._process is None:
+            raise DeviceLostError(f"{self._config.sensor} is not open; use it in a with block")
+        ready = self._selector.select(max(0.0, deadline - time.monotonic()))
+        if not ready:
+            raise DeviceTimeoutError(
+                f"{self._config.sensor}: the bridge sent nothing in {timeout_s} s{self._last_words()}"
+            )
+        out, _ = self._pipes()
+        for key, _ in ready:
+            data = os.read(key.fd, 1 << 20)
+            if key.fileobj is not out:
+                self._words.append(data[-_LAST_WORDS:])
+                if not data:
+                    self._selector.unregister(key.fileobj)
+            elif data:
+                self._buffer += data
+            else:
+                raise DeviceLostError(f"{self._config.sensor}: the bridge has ended{self._last_words()}")
+
+    def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
+        process = self._process
+        assert process is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        return process.stdout, process.stderr
+
+    def _last_words(self) -> str:
+        words = b"".join(self._words).decode(errors="replace").strip()
+        return f"; it said: {words[-_LAST_WORDS:]}" if words else ""
+
+    def _close(self) -> None:
+        if self._process is None:
+            return
+        if self._selector is not None:
+            self._selector.close()
+            self._selector = None
+        for pipe in self._pipes():
+            pipe.close()
+        try:
+            self._process.wait(timeout=2)  # its next frame finds the pipe closed and ends it
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None

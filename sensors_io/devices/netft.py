@@ -1,0 +1,230 @@
+"""ATI Net F/T and Ethernet Axia force sensors: raw data transfer (RDT) over UDP.
+
+A command is `>HHI`: 0x1234, command, number of records to send (0 for ever).  A record is `>III6i`: number of the
+record, number of the internal sample, status, then Fx Fy Fz Tx Ty Tz in counts.  Counts per newton and per newton metre
+stand in the calibration, which the sensor tells over TCP: 20 bytes beginning with 1 are answered by `>HBBII6H`: 0x1234,
+unit of force, unit of torque, counts per unit of force, counts per unit of torque, six scales of another protocol.
+(ATI document 9620-05-NET FT, sections 10 and 11; 9610-05-Ethernet Axia, sections 4.8 and 10.)
+"""
+
+import contextlib
+import dataclasses
+import enum
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from sensors_io.clock import NS_PER_S
+from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+
+RDT_PORT = 49152
+TCP_PORT = 49151
+
+COMMAND = struct.Struct(">HHI")
+RECORD = struct.Struct(">III6i")
+CALIBRATION = struct.Struct(">HBBII6H")
+HEADER = 0x1234
+_READ_CALIBRATION = bytes([1]) + bytes(19)
+_STATUS_ERROR = 1 << 31
+_STATUS_RANGE = 1 << 30
+_STATUS_MEANING: Mapping[int, str] = {
+    0: "temperature out of range",
+    1: "supply voltage out of range",
+    2: "broken gauge",
+    27: "gauge out of range",
+    29: "calibration damaged",
+    30: "force or torque out of range",
+}
+
+_FORCE_UNIT_N: Mapping[int, float] = {
+    1: 4.4482216152605, 2: 1.0, 3: 4448.2216152605, 4: 1000.0, 5: 9.80665, 6: 9.80665e-3
+}  # fmt: skip
+_TORQUE_UNIT_NMM: Mapping[int, float] = {
+    1: 112.9848290276, 2: 1355.8179483314, 3: 1000.0, 4: 1.0, 5: 98.0665, 6: 1e6
+}  # fmt: skip
+
+
+class Command(enum.IntEnum):
+    """What the sensor is told."""
+
+    STOP = 0x0000
+    STREAM = 0x0002
+    STREAM_BUFFERED = 0x0003
+    BIAS = 0x0042
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Calibration:
+    """Counts per newton and per newton millimetre."""
+
+    counts_per_n: float
+    counts_per_nmm: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NetFtConfig:
+    """One sensor.
+
+    Args:
+      host: its address.
+      rdt_port, tcp_port: as shipped.
+      rate_hz: of the records, as set on its configuration page; told so that losses can be timed.
+      buffered: several records in one datagram, for rates at which single ones would be lost.
+      wait_s: for its answers, on opening.
+    """
+
+    host: str = "192.168.1.1"
+    rdt_port: int = RDT_PORT
+    tcp_port: int = TCP_PORT
+    rate_hz: float = 1000.0
+    buffered: bool = False
+    wait_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.rate_hz <= 0:
+            raise ValueError(f"rate_hz is {self.rate_hz}: must be > 0; see the sensor's communication page")
+
+    def open(self) -> "NetFt":
+        """The device, not open yet."""
+        return NetFt(self)
+
+
+def parse_calibration(answer: bytes) -> Calibration:
+    """Counts per SI unit from the sensor's answer.
+
+    Raises:
+      DeviceDataError: an answer that is cut off, another header, an unknown unit or no counts.
+    """
+    if len(answer) != CALIBRATION.size:
+        raise DeviceDataError(f"NetFT calibration of {len(answer)} bytes: must have {CALIBRATION.size}")
+    header, force_unit, torque_unit, per_force, per_torque = CALIBRATION.unpack(answer)[:5]
+    if header != HEADER or force_unit not in _FORCE_UNIT_N or torque_unit not in _TORQUE_UNIT_NMM:
+        raise DeviceDataError(f"NetFT calibration {answer.hex()}: header or unit is unknown; set N and N m on its page")
+    if not per_force or not per_torque:
+        raise DeviceDataError(
+            f"NetFT calibration {answer.hex()} gives no counts per unit; choose a calibration on its page"
+        )
+    return Calibration(
+        counts_per_n=per_force / _FORCE_UNIT_N[force_unit], counts_per_nmm=per_torque / _TORQUE_UNIT_NMM[torque_unit]
+    )
+
+
+class NetFt:
+    """A 6-D force sensor; its samples carry `force_n` [3] and `moment_nmm` [3] in its own frame, uncompensated."""
+
+    _RECEIVE_BUFFER = 4 * 1024 * 1024  # bytes: ten seconds at 7 kHz
+
+    def __init__(self, config: NetFtConfig):
+        self._config = config
+        self._socket: socket.socket | None = None
+        self._calibration: Calibration | None = None
+        self._records: deque[tuple[int, bytes]] = deque()
+
+    @property
+    def identity(self) -> Identity:
+        c = self._config
+        counts = {} if self._calibration is None else dataclasses.asdict(self._calibration)
+        where = f"udp://{c.host}:{c.rdt_port}"
+        return Identity(
+            sensor="netft", product="ATI Net F/T", where=where, settings=counts, period_s=1 / c.rate_hz,
+            counter_modulus=2**32,
+        )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        c = self._config
+        try:
+            self._calibration = parse_calibration(self._ask_calibration())
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._RECEIVE_BUFFER)
+            self._socket.connect((c.host, c.rdt_port))
+            self._command(Command.STREAM_BUFFERED if c.buffered else Command.STREAM)
+        except OSError as error:
+            self._close()
+            raise DeviceNotFoundError(
+                f"NetFT at {c.host} does not answer ({error}); look at its power, cable and address"
+            ) from error
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # a sensor that is gone streams no more
+                self._command(Command.STOP)
+        self._close()
+
+    def read(self, timeout_s: float) -> Sample:
+        """The next record, see `Device.read`."""
+        if not self._records:
+            self._receive(timeout_s)
+        stamp_ns, record = self._records.popleft()
+        number, _, status, *counts = RECORD.unpack(record)
+        if status & _STATUS_ERROR and not status & _STATUS_RANGE:
+            raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
+        assert self._calibration is not None
+        values = np.array(counts, np.float64)
+        return Sample(
+            host_time_ns=stamp_ns,
+            device_time_ns=round(number * NS_PER_S / self._config.rate_hz),
+            index=number,
+            arrays={
+                "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),
+                "moment_nmm": (values[3:] / self._calibration.counts_per_nmm).astype(np.float32),
+                "out_of_range": np.array(bool(status & _STATUS_RANGE)),
+            },
+        )
+
+    def take_bias(self) -> None:
+        """Make the sensor take its present load as zero; a bias fitted by `force` leaves a trace in the records."""
+        self._command(Command.BIAS)
+
+    def _receive(self, timeout_s: float) -> None:
+        if self._socket is None:
+            raise DeviceLostError("NetFT is not open; use it in a with block")
+        try:
+            self._socket.settimeout(timeout_s)
+            datagram = self._socket.recv(65_535)
+        except TimeoutError as silence:
+            raise DeviceTimeoutError(f"NetFT at {self._config.host} sent nothing in {timeout_s} s") from silence
+        except OSError as error:
+            raise DeviceLostError(f"NetFT at {self._config.host} is gone ({error})") from error
+        stamp_ns = time.monotonic_ns()
+        count, rest = divmod(len(datagram), RECORD.size)
+        if rest or not count:
+            raise DeviceDataError(f"NetFT datagram of {len(datagram)} bytes: must be records of {RECORD.size}")
+        period_ns = round(NS_PER_S / self._config.rate_hz)
+        for k in range(count):  # those of one datagram were taken one period after the other
+            record = datagram[k * RECORD.size : (k + 1) * RECORD.size]
+            self._records.append((stamp_ns - (count - 1 - k) * period_ns, record))
+
+    def _ask_calibration(self) -> bytes:
+        c = self._config
+        with socket.create_connection((c.host, c.tcp_port), timeout=c.wait_s) as connection:
+            connection.sendall(_READ_CALIBRATION)
+            answer = b""
+            while len(answer) < CALIBRATION.size and (part := connection.recv(CALIBRATION.size - len(answer))):
+                answer += part
+        return answer
+
+    def _command(self, command: Command) -> None:
+        if self._socket is None:
+            raise DeviceLostError("NetFT is not open; use it in a with block")
+        self._socket.send(COMMAND.pack(HEADER, command, 0))
+
+    def _close(self) -> None:
+        self._records.clear()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+def _meaning(status: int) -> str:
+    named = [text for bit, text in _STATUS_MEANING.items() if status >> bit & 1]
+    return ", ".join(named) or "unspecified error"

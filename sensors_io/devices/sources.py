@@ -1,0 +1,220 @@
+"""Recordings to replay: folders of pictures, videos, records, and what the Tac3D software saves."""
+
+import dataclasses
+import functools
+import pathlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from sensors_io.clock import NS_PER_S
+from sensors_io.devices import tac3d
+from sensors_io.devices.base import Identity
+from sensors_io.devices.errors import DeviceNotFoundError
+from sensors_io.records import RecordStore
+from sensors_io.schema import FRAME_ARRAYS, Sequence
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Recorded:
+    """One sample of a recording: its time since the first one, the device's counter, what it holds."""
+
+    time_ns: int
+    index: int | None
+    frame: np.ndarray | None
+    arrays: Mapping[str, np.ndarray]
+
+
+class Source(Protocol):
+    """A recording that can be read from its beginning any number of times."""
+
+    @property
+    def identity(self) -> Identity:
+        """The device that recorded it."""
+        ...
+
+    def samples(self) -> Iterator[Recorded]:
+        """All samples in order; their times rise from 0."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PictureFolder:
+    """All pictures below a folder, in the order of their names.
+
+    Args:
+      path: the folder.
+      rate_hz: at which they are replayed.
+      sensor: whose pictures they are.
+      kept: decoded pictures that are kept for the next round.
+    """
+
+    path: pathlib.Path
+    rate_hz: float = 25.0
+    sensor: str = "gelsight_mini"
+    kept: int = 64
+
+    def __post_init__(self) -> None:
+        _require_rate(self.rate_hz)
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(sensor=self.sensor, product="pictures", where=str(self.path), period_s=1 / self.rate_hz)
+
+    def samples(self) -> Iterator[Recorded]:
+        paths = sorted(p for p in self.path.rglob("*") if p.suffix.lower() in PICTURES)
+        if not paths:
+            raise DeviceNotFoundError(f"{self.path} holds no picture ({', '.join(PICTURES)}); give another folder")
+        for i, path in enumerate(paths):
+            frame = self._read(path)
+            yield Recorded(time_ns=round(i * NS_PER_S / self.rate_hz), index=i, frame=frame, arrays={})
+
+    @functools.cached_property
+    def _read(self) -> Callable[[pathlib.Path], np.ndarray]:
+        return functools.lru_cache(self.kept)(_read_picture)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Video:
+    """The frames of a video file, at its own rate."""
+
+    path: pathlib.Path
+    sensor: str = "gelsight_mini"
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(sensor=self.sensor, product="video", where=str(self.path), period_s=1 / self._rate_hz)
+
+    @functools.cached_property
+    def _rate_hz(self) -> float:
+        capture = self._open()
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        capture.release()
+        _require_rate(rate)
+        return rate
+
+    def samples(self) -> Iterator[Recorded]:
+        capture = self._open()
+        try:
+            count = 0
+            while capture.grab():
+                ok, image = capture.retrieve()
+                if not ok:
+                    break
+                time_ns = round(count * NS_PER_S / self._rate_hz)
+                yield Recorded(time_ns=time_ns, index=count, frame=cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrays={})
+                count += 1
+        finally:
+            capture.release()
+
+    def _open(self) -> cv2.VideoCapture:
+        capture = cv2.VideoCapture(str(self.path))
+        if not capture.isOpened():
+            raise DeviceNotFoundError(f"{self.path} does not open as a video; give another file")
+        return capture
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordedContact:
+    """One sequence of a data set, with all of its arrays.
+
+    Args:
+      path: directory of the records.
+      contact: its number in the data set.
+      sensor: which of the sensors that saw it.
+    """
+
+    path: pathlib.Path
+    contact: int = 0
+    sensor: str = "gelsight_mini"
+
+    @property
+    def identity(self) -> Identity:
+        s = self._sequence
+        period = float(np.median(np.diff(s.host_time_ns))) / NS_PER_S if len(s) > 1 else None
+        return Identity(
+            sensor=s.sensor,
+            serial=s.serial,
+            product="records",
+            where=str(self.path),
+            settings=s.camera,
+            period_s=period,
+        )
+
+    @functools.cached_property
+    def _sequence(self) -> Sequence:
+        contact = RecordStore(self.path, allow_incomplete=True).contact(self.contact)
+        if self.sensor not in contact:
+            raise DeviceNotFoundError(
+                f"{self.path}: contact {self.contact} was seen by {', '.join(contact)}, not {self.sensor!r}; "
+                "name one of these"
+            )
+        return contact[self.sensor]
+
+    def samples(self) -> Iterator[Recorded]:
+        s = self._sequence
+        known = {n: a for n in FRAME_ARRAYS if n not in ("frames", "host_time_ns") and (a := getattr(s, n)) is not None}
+        for i, time in enumerate(s.host_time_ns - s.host_time_ns[0]):
+            frame = None if s.frames is None else s.frames[i]
+            yield Recorded(time_ns=int(time), index=i, frame=frame, arrays={name: a[i] for name, a in known.items()})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tac3dRecording:
+    """What the Tac3D software saves: a folder of .npy files, or the same arrays in one .npz.
+
+    Times are those of the sensor's host, the counter is the sensor's, with its real gaps.
+    """
+
+    path: pathlib.Path
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(sensor="tac3d", serial=self.path.stem, product="Tac3D recording", where=str(self.path))
+
+    def samples(self) -> Iterator[Recorded]:
+        recorded = tac3d.load_recording(self.path)
+        start = recorded.send_time_s[0]
+        for i, index in enumerate(recorded.index):
+            fields = tac3d.to_schema({name: a[i] for name, a in recorded.matrices.items()})
+            time_ns = round((recorded.send_time_s[i] - start) * NS_PER_S)
+            yield Recorded(time_ns=time_ns, index=int(index), frame=None, arrays=fields)
+
+
+def _read_picture(path: pathlib.Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DeviceNotFoundError(f"{path} cannot be decoded as a picture; take it out of the folder")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _require_rate(rate_hz: float) -> None:
+    if not rate_hz > 0:
+        raise ValueError(f"rate_hz is {rate_hz}: must be > 0; give the rate of the recording")
+
+
+def source_of(path: pathlib.Path, *, sensor: str = "gelsight_mini", rate_hz: float = 25.0, contact: int = 0) -> Source:
+    """The recording at a path: records, what the Tac3D software saves, a video, or a folder of pictures.
+
+    Args:
+      path: of a directory or a file.
+      sensor: whose pictures they are, where the recording does not say.
+      rate_hz: of pictures.
+      contact: number of the contact, of records.
+
+    Raises:
+      DeviceNotFoundError: there is nothing that can be replayed.
+    """
+    if not path.exists():
+        raise DeviceNotFoundError(f"{path} does not exist; give a recording")
+    if (path / "index.json").is_file():
+        return RecordedContact(path=path, contact=contact, sensor=sensor)
+    if path.suffix == ".npz" or (path / "index.npy").is_file():
+        return Tac3dRecording(path=path)
+    if path.is_file():
+        return Video(path=path, sensor=sensor)
+    return PictureFolder(path=path, rate_hz=rate_hz, sensor=sensor)

@@ -1,0 +1,135 @@
+"""Where the gel is touched, and whether it is touched at all."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+EDGE_SHARE = 0.5
+"""Of a contact's greatest depth: that at the edge of a ball's contact on a half-space (Hertz), whatever its size."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ContactConfig:
+    """Hysteresis of the contact mask, and what change of the picture makes a contact.
+
+    Args:
+      low_mm, high_mm: an indented region deeper than `low_mm` counts if it reaches `high_mm` somewhere.
+      least_mm2: smaller regions are specks.
+      steepness: grey levels per millimetre that the smoothed change must reach somewhere for a contact.
+      smoothing_mm: standard deviation of that smoothing.
+    """
+
+    low_mm: float = 0.03
+    high_mm: float = 0.06
+    least_mm2: float = 0.05
+    steepness: float = 10.0
+    smoothing_mm: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 < self.low_mm <= self.high_mm:
+            raise ValueError(f"low_mm is {self.low_mm}, high_mm {self.high_mm}: must be 0 < low ≤ high; lower low_mm")
+        for name in ("least_mm2", "steepness", "smoothing_mm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; raise it")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Contacts:
+    """The mask bool [H, W], the number of its separate contacts, whether one meets the border of the picture."""
+
+    mask: np.ndarray
+    count: int
+    at_border: bool
+
+
+def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig | None = None) -> Contacts:
+    """Contact by hysteresis: in each connected region deeper than `low_mm` that reaches `high_mm`,
+
+        the pixels with u ≥ max(low_mm, ½ max u)
+
+    Args:
+      depth_mm: float32 [H, W], 0 where nothing touches.
+      mm_per_px: pitch.
+      config: thresholds.
+    """
+    config = config or ContactConfig()
+    count, labels, stats, _ = cv2.connectedComponentsWithStats((depth_mm > config.low_mm).astype(np.uint8))
+    mask, kept, border = np.zeros(depth_mm.shape, bool), 0, False
+    for label in range(1, count):
+        x, y, w, h, area = stats[label]
+        if area * mm_per_px**2 < config.least_mm2:
+            continue
+        box = np.s_[y : y + h, x : x + w]
+        inside = labels[box] == label
+        peak = float(depth_mm[box][inside].max())
+        if peak < config.high_mm:
+            continue
+        touched = inside & (depth_mm[box] >= EDGE_SHARE * peak)
+        mask[box] |= touched
+        kept += 1
+        border |= _meets_border(touched, (x, y), depth_mm.shape)
+    return Contacts(mask=mask, count=kept, at_border=border)
+
+
+def changed_contacts(
+    picture: np.ndarray, background: np.ndarray, mm_per_px: float, config: ContactConfig | None = None
+) -> Contacts:
+    """Contact where no depth is known: regions about a steep change of colour, by hysteresis on its gradient.
+
+    The gradient of the smoothed change reaches `steepness` somewhere in a region and half of it throughout; holes, such
+    as the even middle of a flat contact, are filled.
+
+    Args:
+      picture, background: uint8 [H, W, 3].
+      mm_per_px: pitch.
+      config: thresholds.
+    """
+    config = config or ContactConfig()
+    steep = cv2.resize(_steepness(picture, background, mm_per_px, config.smoothing_mm), picture.shape[1::-1])
+    outlines, _ = cv2.findContours(
+        (steep > config.steepness / 2).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    mask, kept, border = np.zeros(steep.shape, bool), 0, False
+    for outline in outlines:
+        x, y, w, h = cv2.boundingRect(outline)
+        region = np.zeros((h, w), np.uint8)
+        cv2.drawContours(region, [outline], -1, 1, cv2.FILLED, offset=(-x, -y))
+        inside, box = region.astype(bool), np.s_[y : y + h, x : x + w]
+        if inside.sum() * mm_per_px**2 >= config.least_mm2 and steep[box][inside].max() >= config.steepness:
+            mask[box] |= inside
+            kept += 1
+            border |= _meets_border(inside, (x, y), steep.shape)
+    return Contacts(mask=mask, count=kept, at_border=border)
+
+
+def steepest_change(picture: np.ndarray, background: np.ndarray, mm_per_px: float, smoothing_mm: float = 0.3) -> float:
+    """Greatest gradient of the smoothed change of any channel, grey levels per mm.
+
+    A contact changes colours over the width of its edge; a drift of lamps, gain or gel changes them slowly.
+
+    Args:
+      picture, background: uint8 [H, W, 3].
+      mm_per_px: pitch.
+      smoothing_mm: standard deviation of the Gaussian, which averages the camera's noise away.
+    """
+    return float(_steepness(picture, background, mm_per_px, smoothing_mm).max())
+
+
+def _steepness(picture: np.ndarray, background: np.ndarray, mm_per_px: float, smoothing_mm: float) -> np.ndarray:
+    """Length of the gradient of the smoothed change, grey levels/mm: the greatest of the channels, on coarser pixels."""
+    scale = max(1, round(smoothing_mm / mm_per_px / 2))  # the smoothed change needs no finer pixels
+    difference = cv2.subtract(picture, background, dtype=cv2.CV_32F)
+    height, width = difference.shape[0] // scale, difference.shape[1] // scale
+    small = cv2.resize(difference, (width, height), interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small, (0, 0), smoothing_mm / (mm_per_px * scale))
+    down, across = (np.diff(smooth, axis=axis) / (mm_per_px * scale) for axis in (0, 1))
+    steep: np.ndarray = np.hypot(down[:, :-1], across[:-1]).max(-1)
+    return steep
+
+
+def _meets_border(mask: np.ndarray, corner: tuple[int, int], shape: tuple[int, ...]) -> bool:
+    """Whether a mask that lies at `corner` (x, y) of a picture touches the picture's outermost pixels."""
+    (x, y), (height, width) = corner, mask.shape
+    sides = [mask[0].any() and y == 0, mask[-1].any() and y + height == shape[0]]
+    return bool(any(sides) or (mask[:, 0].any() and x == 0) or (mask[:, -1].any() and x + width == shape[1]))

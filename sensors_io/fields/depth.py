@@ -1,0 +1,90 @@
+"""Picture to depth: slopes, integration, zero level, contact mask."""
+
+import dataclasses
+import functools
+
+import cv2
+import numpy as np
+
+from sensors_io.fields.contact import ContactConfig, Contacts, find_contacts
+from sensors_io.fields.poisson import neumann
+from sensors_io.fields.slopes import SlopeReader
+from sensors_io.fields.types import Calibration
+
+CELL_PX = 8
+"""Side of the cells on which the zero level is fitted: it bends over the whole picture."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ZeroConfig:
+    """How the depth of untouched gel is told.
+
+    Args:
+      steep: slope beyond which a cell belongs to a contact or its rim.
+      margin_mm: around such cells, nothing is taken for untouched: the gel sinks there too.
+      bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant.
+    """
+
+    steep: float = 0.08
+    margin_mm: float = 3.0
+    bent: float = 0.4
+    tilted: float = 0.15
+
+
+class DepthReader:
+    """Reads the depth of one sensor's pictures.
+
+    Args:
+      calibration: of that sensor.
+      zero, contact: settings.
+    """
+
+    def __init__(
+        self, calibration: Calibration, *, zero: ZeroConfig | None = None, contact: ContactConfig | None = None
+    ):
+        self.calibration = calibration
+        self._slopes = SlopeReader(calibration.colours, calibration.background)
+        self._zero = zero or ZeroConfig()
+        self._contact = contact or ContactConfig()
+
+    def __call__(self, picture: np.ndarray) -> tuple[np.ndarray, Contacts]:
+        """Indentation, float32 [H, W] mm, and its contacts, of one picture, uint8 [H, W, 3] RGB."""
+        down_x, down_y = self._slopes(picture)
+        pitch = self.calibration.mm_per_px
+        depth = neumann(down_x, down_y, pitch)
+        depth -= zero_level(depth, np.hypot(down_x, down_y), pitch, self._zero)
+        return depth, find_contacts(depth, pitch, self._contact)
+
+
+def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config: ZeroConfig) -> np.ndarray:
+    """Depth that untouched gel shows, continued under the contact: a quadratic, a plane or a constant by least squares.
+
+    A lamp that warms up, or a gel that settles, tilts and bends the zero level by tens of micrometres.
+
+    Args:
+      depth_mm, slope: float32 [H, W] each; the length of the slopes.
+      mm_per_px: pitch.
+      config: what counts as untouched, and how much of it is needed.
+
+    Returns:
+      float32 [H, W].  Where nothing is untouched, the constant is that of the shallowest twentieth of the cells.
+    """
+    rows, columns = (max(1, n // CELL_PX) for n in depth_mm.shape)
+    coarse, steep = (cv2.resize(a, (columns, rows), interpolation=cv2.INTER_AREA) for a in (depth_mm, slope))
+    cells = 2 * round(config.margin_mm / (mm_per_px * CELL_PX)) + 1
+    reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (cells, cells))
+    still = cv2.dilate((steep > config.steep).astype(np.uint8), reach) == 0
+    share = float(still.mean())
+    degree = 2 if share >= config.bent else 1 if share >= config.tilted else 0
+    if not still.any():
+        still = coarse <= np.quantile(coarse, 0.05)
+    low = np.linalg.lstsq(_powers(rows, columns, degree)[still.ravel()], coarse[still], rcond=None)[0]
+    return (_powers(*depth_mm.shape, degree) @ low.astype(np.float32)).reshape(depth_mm.shape)
+
+
+@functools.lru_cache(maxsize=16)
+def _powers(height: int, width: int, degree: int) -> np.ndarray:
+    """Monomials of x and y in −1 … 1 up to a degree, float32 [H·W, terms]."""
+    x, y = np.meshgrid(*((np.arange(n, dtype=np.float32) + 0.5) / n * 2 - 1 for n in (width, height)))
+    terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack([t.ravel() for t in terms], -1)

@@ -1,0 +1,183 @@
+"""All fields of a sensor's pictures in one call, and flags for what a picture cannot carry."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+
+from sensors_io.fields.compliance import NodeGrid
+from sensors_io.fields.contact import ContactConfig, Contacts, changed_contacts, steepest_change
+from sensors_io.fields.deformation import DeformationReader
+from sensors_io.fields.depth import DepthReader, ZeroConfig
+from sensors_io.fields.evidence import Pattern, examine
+from sensors_io.fields.shear import ShearReader
+from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.quality import QualityConfig, saturated
+from sensors_io.scenes.layer import Layer
+from sensors_io.schema import Flag
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExtractConfig:
+    """Settings of the extraction.
+
+    Args:
+      nodes: of the vector fields along the longer side of the picture.
+      gel: modulus, Poisson ratio and thickness; the modulus scales the forces.
+      marker_depth_mm: of the pattern below the surface.
+      zero, contact, quality: of depth, contact mask and saturation.
+    """
+
+    nodes: int = 24
+    gel: Layer = dataclasses.field(default_factory=lambda: Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5))
+    marker_depth_mm: float = 0.5
+    zero: ZeroConfig = dataclasses.field(default_factory=ZeroConfig)
+    contact: ContactConfig = dataclasses.field(default_factory=ContactConfig)
+    quality: QualityConfig = dataclasses.field(default_factory=QualityConfig)
+
+    def __post_init__(self) -> None:
+        if self.nodes < 4:
+            raise ValueError(f"nodes is {self.nodes}: must be ≥ 4; the inversion needs a grid")
+
+
+class Extractor:
+    """Reads depth, contact, deformation, shear and force of one sensor, frame by frame in the order of time.
+
+    Depth and, with it, shear and force need a calibration; deformation, shear and force need a pattern in the gel.  A
+    field that the input cannot carry is `None`, and every frame is flagged `REFUSED`.
+
+    Args:
+      background: the gel at rest, uint8 [H, W, 3] RGB.
+      mm_per_px: pitch.
+      calibration: of the colours, `None` without one.
+      config: settings.
+
+    Raises:
+      CalibrationError: a calibration of another picture size or pitch.
+    """
+
+    def __init__(
+        self,
+        background: np.ndarray,
+        mm_per_px: float,
+        calibration: Calibration | None = None,
+        config: ExtractConfig | None = None,
+    ):
+        self.background, self.mm_per_px = background, mm_per_px
+        self.config = config or ExtractConfig()
+        self.evidence = examine(cv2.cvtColor(background, cv2.COLOR_RGB2GRAY))
+        self._depth = None if calibration is None else self._depth_reader(calibration)
+        self._deformation = self._shear = None
+        self.grid_mm: tuple[float, float] | None = None
+        if self.evidence.pattern is not Pattern.BARE:
+            self._make_vector_readers()
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """The fields that this sensor cannot carry, and why, one sentence each."""
+        reasons = []
+        if self._depth is None:
+            reasons.append("depth_mm: without a calibration colours tell no slope; make one with `calibrate`")
+        if self._deformation is None:
+            reasons.append(f"deformation_mm, shear_mm: {self.evidence.reason}; use a gel with markers")
+        elif self._shear is None:
+            reasons.append("shear_mm: needs depth_mm, from which the pressure is told")
+        return tuple(reasons)
+
+    def read(self, picture: np.ndarray, gap: bool = False) -> Fields:
+        """Fields of one picture, uint8 [H, W, 3] RGB, as `Fields` of one frame.
+
+        Args:
+          picture: of the same crop as the background.
+          gap: whether frames are missing before it.
+        """
+        depth, contacts = self._touched(picture)
+        found: dict[str, np.ndarray] = {} if depth is None else {"depth_mm": depth}
+        flags = self._flags(picture, contacts)
+        if self._deformation is not None:
+            moved = self._deformation.read(picture, gap)
+            flags |= moved.flags
+            found["deformation_mm"] = moved.displacement_mm
+            if self._shear is not None and depth is not None:
+                found |= self._split(moved.displacement_mm, depth, contacts, moved.valid)
+        return Fields(
+            contact=contacts.mask[None],
+            flags=np.array([flags], np.uint32),
+            mm_per_px=self.mm_per_px,
+            grid_mm=self.grid_mm,
+            **{name: array[None].astype(np.float32) for name, array in found.items()},
+        )
+
+    def extract(self, frames: np.ndarray) -> Fields:
+        """Fields of N pictures, uint8 [N, H, W, 3] RGB, in the order of time."""
+        if frames.ndim != 4 or not len(frames):
+            raise ValueError(f"frames have shape {list(frames.shape)}: must be [N, H, W, 3] with N ≥ 1; stack them")
+        return joined([self.read(frame) for frame in frames])
+
+    def _touched(self, picture: np.ndarray) -> tuple[np.ndarray | None, Contacts]:
+        """Depth where there is a calibration, and contacts by depth, else by colour."""
+        if self._depth is not None:
+            return self._depth(picture)
+        return None, changed_contacts(picture, self.background, self.mm_per_px, self.config.contact)
+
+    def _flags(self, picture: np.ndarray, contacts: Contacts) -> Flag:
+        contact = self.config.contact
+        flags = Flag.REFUSED if self.refused else Flag.NONE
+        steep = steepest_change(picture, self.background, self.mm_per_px, contact.smoothing_mm)
+        if contacts.count == 0 or steep < contact.steepness:
+            flags |= Flag.NO_CONTACT
+        if contacts.at_border:
+            flags |= Flag.BORDER_CONTACT
+        if contacts.count > 1:
+            flags |= Flag.SEVERAL_CONTACTS
+        if saturated(picture[None], self.background, self.config.quality)[0]:
+            flags |= Flag.SATURATED
+        return flags
+
+    def _depth_reader(self, calibration: Calibration) -> DepthReader:
+        """The reader of a calibration, which must fit the pictures; the background is that of the day."""
+        if calibration.background.shape != self.background.shape or calibration.mm_per_px != self.mm_per_px:
+            made = f"{calibration.background.shape[:2]} px of {calibration.mm_per_px} mm"
+            raise CalibrationError(
+                f"calibration is for {made}, the background is {self.background.shape[:2]} px of {self.mm_per_px} mm: "
+                "must be equal; calibrate this camera"
+            )
+        today = dataclasses.replace(calibration, background=self.background)
+        return DepthReader(today, zero=self.config.zero, contact=self.config.contact)
+
+    def _make_vector_readers(self) -> None:
+        """Of deformation, and of shear where there is depth, on a grid of `nodes` along the longer side."""
+        height, width = self.background.shape[:2]
+        shape = tuple(max(4, round(self.config.nodes * n / max(height, width))) for n in (height, width))
+        self.grid_mm = (width / shape[1] * self.mm_per_px, height / shape[0] * self.mm_per_px)
+        self._deformation = DeformationReader(self.background, self.mm_per_px, (shape[0], shape[1]))
+        if self._depth is not None:
+            grid = NodeGrid(
+                shape=(shape[0], shape[1]),
+                pitch_mm=self.grid_mm,
+                marker_depth_mm=self.config.marker_depth_mm,
+                depth_mm=0.0,
+            )
+            self._shear = ShearReader(self.config.gel, grid)
+
+    def _split(
+        self, moved: np.ndarray, depth: np.ndarray, contacts: Contacts, valid: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Shear, traction and force of one frame."""
+        if self._shear is None:
+            raise RuntimeError("the shear reader is missing; make the extractor with a calibration")
+        height, width = moved.shape[:2]
+        coarse = cv2.resize(depth, (width, height), interpolation=cv2.INTER_AREA)
+        touching = cv2.resize(contacts.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
+        found = self._shear.read(moved, coarse, valid, touching)
+        return {"shear_mm": found.shear_mm, "traction_mpa": found.traction_mpa, "force_n": found.force_n}
+
+
+def joined(parts: list[Fields]) -> Fields:
+    """Fields of several runs of frames, one after the other."""
+    first = parts[0]
+    arrays = {
+        name: None if array is None else np.concatenate([part.arrays()[name] for part in parts])
+        for name, array in first.arrays().items()
+    }
+    return dataclasses.replace(first, **arrays)

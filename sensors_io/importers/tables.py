@@ -1,0 +1,40 @@
+"""Comma-separated tables with a header, checked for the columns that an importer needs."""
+
+import csv
+import pathlib
+from collections.abc import Sequence as Seq
+
+from sensors_io.importers.keep import ImportSourceError
+
+
+def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
+    """Rows of a table by column; a short row has empty cells.
+
+    Raises:
+      ImportSourceError: it is absent, is no text, or lacks a column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, restval="")
+            missing = [name for name in columns if name not in (reader.fieldnames or ())]
+            if missing:
+                raise ImportSourceError(
+                    f"{path} has the columns {reader.fieldnames}: must have {', '.join(columns)}; "
+                    "give the published table"
+                )
+            return list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error
+
+
+def read_rows(path: pathlib.Path) -> list[list[str]]:
+    """Rows of a table without a header.
+
+    Raises:
+      ImportSourceError: it is absent or no text.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return [row for row in csv.reader(file) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error

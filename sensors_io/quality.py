@@ -1,0 +1,143 @@
+"""Quality filters: each names one thing that can be wrong with a frame, marks it by a flag, and deletes nothing.
+
+A filter takes what was recorded and returns which frames it would reject, bool [N].  Flags are bits, so a filter that
+is switched off again leaves no trace: `without` takes its bit back.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from sensors_io.schema import Flag, Sequence
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QualityConfig:
+    """Limits of the filters.
+
+    Args:
+      saturated_level: grey level from which a channel counts as saturated.
+      saturated_share: of the pixels, beyond what the gel at rest shows.
+      least_depth_mm: a frame whose field stays above it shows no contact.
+      unstable_n, unstable_window: change of the force between frames of one hold, and frames that it is judged over.
+      gap_periods: time between frames, in median periods.
+    """
+
+    saturated_level: int = 254
+    saturated_share: float = 0.002
+    least_depth_mm: float = 0.03
+    unstable_n: float = 0.5
+    unstable_window: int = 5
+    gap_periods: float = 1.8
+
+    def __post_init__(self) -> None:
+        if not 0 < self.saturated_level <= 255:
+            raise ValueError(f"saturated_level is {self.saturated_level}: must lie in 1..255; choose a grey level")
+        if self.unstable_window < 2:
+            raise ValueError(f"unstable_window is {self.unstable_window}: must be ≥ 2; judge two frames at least")
+        for name in ("saturated_share", "least_depth_mm", "unstable_n"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; raise it")
+        if not self.gap_periods > 1:
+            raise ValueError(f"gap_periods is {self.gap_periods}: must be > 1; a regular frame is one period apart")
+
+
+HOLD = 2
+"""The phase in which the force is meant to stand still, as in `FRAME_ARRAYS`."""
+
+
+def saturated(frames: np.ndarray, background: np.ndarray | None, config: QualityConfig) -> np.ndarray:
+    """Frames of which too many pixels have a channel at its ceiling.
+
+    Args:
+      frames: uint8 [N, H, W, 3].
+      background: uint8 [H, W, 3], whose own bright spots do not count; `None` where there is none.
+      config: ceiling and share.
+    """
+    bright = (frames >= config.saturated_level).any(-1)
+    if background is not None:
+        bright &= ~(background >= config.saturated_level).any(-1)
+    share: np.ndarray = bright.mean((1, 2)) > config.saturated_share
+    return share
+
+
+def untouched(depth_mm: np.ndarray, valid: np.ndarray | None, config: QualityConfig) -> np.ndarray:
+    """Frames without contact, by their depth [N, h, w] where it may be read."""
+    depth = depth_mm if valid is None else np.where(valid, depth_mm, 0)
+    found: np.ndarray = depth.max((1, 2)) < config.least_depth_mm
+    return found
+
+
+def incomplete(*columns: np.ndarray | None) -> np.ndarray:
+    """Rows in which any measured value is not finite; columns [N, …] that are `None` were never measured."""
+    rows = [np.isfinite(c).reshape(len(c), -1).all(1) for c in columns if c is not None]
+    if not rows:
+        raise ValueError("columns are all None: at least one must be measured; give the arrays of the rows")
+    found: np.ndarray = ~np.logical_and.reduce(rows)
+    return found
+
+
+def unstable(force_n: np.ndarray, phase: np.ndarray, config: QualityConfig) -> np.ndarray:
+    """Frames of a hold about which the normal force changes by more than `unstable_n` within the window.
+
+    Args:
+      force_n: float [N, 3].
+      phase: uint8 [N].
+      config: limit and window.
+    """
+    normal = np.asarray(force_n[:, 2], np.float64)
+    before = config.unstable_window // 2
+    padded = np.pad(normal, (before, config.unstable_window - 1 - before), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, config.unstable_window)
+    swing: np.ndarray = np.ptp(windows, axis=1) > config.unstable_n
+    return swing & (phase == HOLD)
+
+
+def time_gap(host_time_ns: np.ndarray, config: QualityConfig) -> np.ndarray:
+    """Frames before which time is missing: more than `gap_periods` median periods since the one before."""
+    steps = np.diff(host_time_ns)
+    late = np.zeros(len(host_time_ns), bool)
+    if len(steps):
+        late[1:] = steps > config.gap_periods * np.median(steps)
+    return late
+
+
+def judge(sequence: Sequence, config: QualityConfig | None = None) -> Mapping[Flag, np.ndarray]:
+    """Every filter that a sequence has the arrays for: flag → frames that it marks, bool [N].
+
+    Contact at the border, several contacts and lost markers need the pictures and a calibration: the extraction of the
+    fields marks them.
+    """
+    config = config or QualityConfig()
+    found = {Flag.TIME_GAP: time_gap(sequence.host_time_ns, config)}
+    if sequence.frames is not None:
+        found[Flag.SATURATED] = saturated(sequence.frames, None, config)
+    if sequence.depth_mm is not None:
+        found[Flag.NO_CONTACT] = untouched(sequence.depth_mm, sequence.valid, config)
+    if sequence.force_n is not None:
+        found[Flag.UNSTABLE_FORCE] = unstable(sequence.force_n, sequence.phase, config)
+    measured = [sequence.force_n, sequence.moment_nmm, sequence.target_force_n]
+    if any(column is not None for column in measured):
+        found[Flag.INCOMPLETE] = incomplete(*measured)
+    return found
+
+
+def judged(sequence: Sequence, config: QualityConfig | None = None) -> Sequence:
+    """The sequence with the flags of the filters alone, in place of those it was recorded with."""
+    blank = np.zeros(len(sequence), np.uint32)
+    return dataclasses.replace(sequence, flags=marked(blank, judge(sequence, config)))
+
+
+def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:
+    """Flags uint32 [N] with the bits of the frames that filters marked."""
+    result = flags.copy()
+    for flag, frames in found.items():
+        result[frames] |= np.uint32(flag)
+    return result
+
+
+def without(flags: np.ndarray, *filters: Flag) -> np.ndarray:
+    """Flags uint32 [N] with the bits of some filters taken back."""
+    bits = np.uint32(sum(filters))
+    return flags & ~bits

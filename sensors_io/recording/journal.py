@@ -1,0 +1,130 @@
+"""An append-only file that a killed process leaves readable up to its last whole entry.
+
+    magic (4 bytes) | size of the body (u32) | crc32 of the body (u32) | body | …
+    body: length of the header (u32) | header (JSON: kind, plain values, type and shape of each array) | arrays
+
+Every entry is one `writev`, after which its bytes belong to the kernel: whatever ends the process, a SIGKILL too, they
+reach the file.  A loss of power may cost what was written since the last `fsync`, at most a second.
+"""
+
+import dataclasses
+import json
+import os
+import pathlib
+import struct
+import time
+import zlib
+from collections.abc import Iterator, Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+_MAGIC = b"TJR1"
+_PREFIX = struct.Struct("<4sII")
+_HEADER_SIZE = struct.Struct("<I")
+_SYNC_EVERY_S = 1.0
+
+
+class JournalError(ValueError):
+    """A file that is no journal, or is damaged before its end."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One entry: its kind, plain values and arrays."""
+
+    kind: str
+    plain: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray]
+
+
+class JournalWriter:
+    """Appends entries to a new file; leaving the block closes it.
+
+    Raises:
+      FileExistsError: the file is there already.
+    """
+
+    def __init__(self, path: pathlib.Path):
+        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        self._synced_s = time.monotonic()
+
+    def append(self, kind: str, plain: Mapping[str, Any], **arrays: np.ndarray) -> None:
+        """Hand one entry to the operating system.
+
+        Raises:
+          OSError: the disk is full; what was written before stays readable.
+        """
+        data = {name: np.asarray(a, order="C") for name, a in arrays.items()}
+        described = [[name, a.dtype.str, list(a.shape)] for name, a in data.items()]
+        header = json.dumps({"kind": kind, "plain": plain, "arrays": described}, allow_nan=False).encode()
+        parts: list[bytes] = [_HEADER_SIZE.pack(len(header)), header, *(a.tobytes() for a in data.values())]
+        checksum = 0
+        for part in parts:
+            checksum = zlib.crc32(part, checksum)
+        size = sum(len(part) for part in parts)
+        self._write([_PREFIX.pack(_MAGIC, size, checksum), *parts])
+        now_s = time.monotonic()
+        if now_s - self._synced_s >= _SYNC_EVERY_S:
+            os.fdatasync(self._file)
+            self._synced_s = now_s
+
+    def close(self) -> None:
+        """Bring everything to the disk."""
+        os.fsync(self._file)
+        os.close(self._file)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write(self, parts: list[bytes]) -> None:
+        size = sum(len(part) for part in parts)
+        written = os.writev(self._file, parts)
+        if written < size:  # a signal or a nearly full disk cut it: the rest, or an error that says why
+            rest = memoryview(b"".join(parts))[written:]
+            while rest:
+                rest = rest[os.write(self._file, rest) :]
+
+
+def read_journal(path: pathlib.Path) -> tuple[list[Entry], int]:
+    """All whole entries, and the number of bytes of a last one that was cut off.
+
+    Raises:
+      JournalError: an entry that is damaged though others follow it.
+    """
+    data = path.read_bytes()
+    whole = list(_entries(path, memoryview(data)))
+    end = whole[-1][1] if whole else 0
+    return [entry for entry, _ in whole], len(data) - end
+
+
+def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[Entry, int]]:
+    start = 0
+    while start + _PREFIX.size <= len(data):
+        magic, size, checksum = _PREFIX.unpack_from(data, start)
+        end = start + _PREFIX.size + size
+        body = data[start + _PREFIX.size : end]
+        if magic != _MAGIC or (end <= len(data) and zlib.crc32(body) != checksum):
+            raise JournalError(f"{path} is damaged at byte {start}: move it away, its contact has to be recorded again")
+        if end > len(data):
+            return
+        yield _decode(body), end
+        start = end
+
+
+def _decode(body: memoryview) -> Entry:
+    (length,) = _HEADER_SIZE.unpack_from(body)
+    start = _HEADER_SIZE.size + length
+    header = json.loads(bytes(body[_HEADER_SIZE.size : start]))
+    arrays = {}
+    for name, kind, shape in header["arrays"]:
+        dtype, count = np.dtype(kind), int(np.prod(shape))
+        arrays[name] = np.frombuffer(body, dtype, count, start).reshape(shape) if count else np.zeros(shape, dtype)
+        start += count * dtype.itemsize
+    return Entry(kind=header["kind"], plain=header["plain"], arrays=arrays)

@@ -1,0 +1,280 @@
+"""Times of several devices on one clock: device stamps mapped to host stamps, lost samples counted, taps compared.
+
+A host stamp is late by whatever the bus and the scheduler took, a device stamp is on time on a clock of its own.  The
+smallest difference of the two seen lately is that of a sample which nothing held up:
+
+    t̂(n) = device(n) + min over the last W seconds of (host − device)
+
+The window makes the minimum follow a clock that runs fast or slow: at a skew of s the error grows to s · W, 0.5 ms at
+50 ppm and 10 s, and no further.  (Zhang, Liu and Xia, INFOCOM 2002, fit a line below the differences; over ten seconds
+that gains less than the delay of the least delayed sample.)
+"""
+
+import collections
+import dataclasses
+
+import numpy as np
+
+from sensors_io.clock import NS_PER_S
+
+_MAD_TO_SIGMA = 1.4826  # of a normal distribution
+
+
+class ClockMap:
+    """Maps the stamps of one device to the host's clock by the running minimum of their difference.
+
+    Args:
+      window_s: how long a difference is remembered.
+    """
+
+    def __init__(self, window_s: float = 10.0):
+        if window_s <= 0:
+            raise ValueError(f"window_s is {window_s}: must be > 0; 10 s suits clocks that differ by 50 ppm")
+        self._window_ns = round(window_s * NS_PER_S)
+        self._rising: collections.deque[tuple[int, int]] = collections.deque()  # (host, difference), both ascending
+        self._last_device_ns: int | None = None
+        self.restarts = 0
+
+    def to_host_ns(self, device_ns: int, host_ns: int) -> int:
+        """When a sample was taken, on the host's clock; never after it arrived.
+
+        Args:
+          device_ns: stamp of the sample on the device's clock; one that goes back says that the device restarted.
+          host_ns: when it arrived; must not decrease from call to call.
+        """
+        if self._last_device_ns is not None and device_ns < self._last_device_ns:
+            self._rising.clear()
+            self.restarts += 1
+        self._last_device_ns = device_ns
+        difference = host_ns - device_ns
+        while self._rising and self._rising[-1][1] >= difference:
+            self._rising.pop()
+        self._rising.append((host_ns, difference))
+        while self._rising[0][0] < host_ns - self._window_ns:
+            self._rising.popleft()
+        return device_ns + self._rising[0][1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Step:
+    """What one sample says about those before it.
+
+    Args:
+      missing: samples that never came between the last one and this; −1 takes back one that was counted in error.
+      duplicate: it was seen before.
+      late: it had been counted as missing.
+      restarted: the device counts from the beginning again, so that its counter does not tell what was lost.
+    """
+
+    missing: int = 0
+    duplicate: bool = False
+    late: bool = False
+    restarted: bool = False
+
+
+_NEXT = Step()
+
+
+class IndexGaps:
+    """Finds lost, repeated and late samples by the device's own counter.
+
+    Args:
+      modulus: the counter runs from 0 to modulus − 1 and around; `None` where it never does.
+    """
+
+    REMEMBERED = 1024
+    """How far back a sample may be late: half a second of a force sensor at 2 kHz, half a minute of a camera."""
+
+    def __init__(self, modulus: int | None = None):
+        self._modulus = modulus
+        self._last: int | None = None
+        self._missing: collections.OrderedDict[int, None] = collections.OrderedDict()
+
+    def step(self, index: int, *, reopened: bool = False) -> Step:
+        """Take the counter of the next sample into account.
+
+        Args:
+          index: the counter.
+          reopened: the device was opened anew since the last sample: a counter that goes back says that it restarted.
+        """
+        if self._last is None:
+            self._last = index
+            return _NEXT
+        ahead = self._ahead(index, self._last)
+        if ahead >= 1:
+            self._remember(self._last + 1, ahead - 1)
+            self._last = index
+            return _NEXT if ahead == 1 else Step(missing=ahead - 1)
+        if ahead and (reopened or -ahead >= self.REMEMBERED):
+            self._missing.clear()
+            self._last = index
+            return Step(restarted=True)
+        if index in self._missing:
+            del self._missing[index]
+            return Step(late=True)
+        return Step(duplicate=True)
+
+    def _ahead(self, index: int, last: int) -> int:
+        if self._modulus is None:
+            return index - last
+        half = self._modulus // 2
+        return (index - last + half) % self._modulus - half
+
+    def _remember(self, first: int, count: int) -> None:
+        for k in range(first + max(0, count - self.REMEMBERED), first + count):
+            self._missing[k if self._modulus is None else k % self._modulus] = None
+        while self._missing and self._ahead(first + count, next(iter(self._missing))) > self.REMEMBERED:
+            self._missing.popitem(last=False)
+
+
+class PeriodGaps:
+    """Estimates the lost samples of a device without a counter from its stamps.
+
+    A loop follows phase φ and period T of the stamps; a sample at t is number k = round((t − φ) / T) after the last:
+
+        e = t − φ − k T,   φ ← φ + k T + e / 8,   T ← T + e / (256 k)
+
+    so that a sample that is more than half a period late counts one as missing, and the next, on time, takes it back.
+
+    Args:
+      period_ns: time between two samples, to 5 %.
+    """
+
+    _PHASE_GAIN = 1 / 8  # of eight samples' error: one late sample hardly moves the phase
+    _PERIOD_GAIN = 1 / 256  # critically damped: a quarter of the square of the phase gain
+    _DRIFT = 0.05
+
+    def __init__(self, period_ns: int):
+        if period_ns <= 0:
+            raise ValueError(f"period_ns is {period_ns}: must be > 0; give 10⁹ over the frame rate")
+        self._nominal_ns = self._period_ns = float(period_ns)
+        self._phase_ns: float | None = None
+
+    def step(self, time_ns: int) -> Step:
+        """Take the stamp of the next sample into account."""
+        if self._phase_ns is None:
+            self._phase_ns = float(time_ns)
+            return _NEXT
+        count = round((time_ns - self._phase_ns) / self._period_ns)
+        error = time_ns - self._phase_ns - count * self._period_ns
+        self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
+        if count == 1:
+            period = self._period_ns + self._PERIOD_GAIN * error
+            self._period_ns = min(
+                max(period, self._nominal_ns * (1 - self._DRIFT)), self._nominal_ns * (1 + self._DRIFT)
+            )
+            return _NEXT
+        return Step(missing=max(count - 1, -1))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Signal:
+    """One number over time that jumps at a tap: a force, or the mean change of a picture.
+
+    Args:
+      time_ns: int64 [N], ascending.
+      value: float [N].
+    """
+
+    time_ns: np.ndarray
+    value: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.time_ns.shape != self.value.shape or self.time_ns.ndim != 1 or len(self.time_ns) < 3:
+            shapes = f"{list(self.time_ns.shape)} and {list(self.value.shape)}"
+            raise ValueError(f"time_ns and value are {shapes}: must be two [N], N ≥ 3; align them")
+        if np.any(np.diff(self.time_ns) <= 0):
+            raise ValueError("time_ns does not increase: sort the samples and drop repeated ones")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TapOffset:
+    """How far the clock of one signal is behind another's.
+
+    Args:
+      seconds: median over the taps of (time in b − time in a).
+      spread_s: standard deviation of one tap's difference, from the median absolute deviation.
+      taps: how many both saw.
+    """
+
+    seconds: float
+    spread_s: float
+    taps: int
+
+
+class TapError(ValueError):
+    """Taps from which no offset can be told."""
+
+
+def tap_offset(a: Signal, b: Signal, *, max_offset_s: float = 0.5, min_taps: int = 3) -> TapOffset:
+    """Compare two clocks by taps that both devices felt.
+
+    A tap is taken at the moment it has risen to half of its peak, between samples by interpolation.  Of all shifts up
+    to `max_offset_s` that bring one tap of a onto one of b, the one that pairs most is kept.
+
+    Args:
+      a, b: the signals, each with a quiet baseline.
+      max_offset_s: taps must be further apart than this.
+      min_taps: fewer common taps are refused.
+
+    Raises:
+      TapError: too few taps in one signal, or in common.
+    """
+    times = [_onsets_s(signal) for signal in (a, b)]
+    for name, found in zip("ab", times, strict=True):
+        if len(found) < min_taps:
+            raise TapError(f"signal {name} shows {len(found)} taps: at least {min_taps} are needed; tap again, harder")
+    epoch = float(a.time_ns[0]) / NS_PER_S
+    ta, tb = (t - epoch for t in times)
+    differences = tb[None, :] - ta[:, None]
+    shifts = differences[np.abs(differences) <= max_offset_s]
+    paired = [_paired(ta, tb, shift) for shift in shifts]
+    best = max(paired, key=len, default=np.zeros(0))
+    if len(best) < min_taps:
+        raise TapError(
+            f"{len(best)} taps agree within {max_offset_s} s: at least {min_taps} must; tap again, irregularly"
+        )
+    middle = float(np.median(best))
+    spread = _MAD_TO_SIGMA * float(np.median(np.abs(best - middle)))
+    return TapOffset(seconds=middle, spread_s=spread, taps=len(best))
+
+
+_PAIRED_S = 0.1  # taps of one shift lie closer than this: three frames of the slowest camera
+
+
+def _paired(ta: np.ndarray, tb: np.ndarray, shift: float) -> np.ndarray:
+    """Differences of the taps that a shift brings together."""
+    nearest = tb[np.abs(tb[None, :] - (ta[:, None] + shift)).argmin(1)]
+    difference = nearest - ta
+    return difference[np.abs(difference - shift) < _PAIRED_S]
+
+
+def _onsets_s(signal: Signal) -> np.ndarray:
+    """When each tap had risen to half of its own peak, seconds.
+
+    A tap begins above half of a strong one (the 99.5th percentile) and ends below a quarter; strong is ten times the
+    noise at least.
+    """
+    value = np.abs(signal.value - np.median(signal.value)).astype(np.float64)
+    strong = float(np.quantile(value, 0.995))
+    if strong <= 10 * _MAD_TO_SIGMA * float(np.median(value)):
+        return np.zeros(0)
+    position = np.arange(len(value))
+    last_high = np.maximum.accumulate(np.where(value > strong / 2, position, -1))
+    last_low = np.maximum.accumulate(np.where(value < strong / 4, position, -1))
+    edges = np.diff((last_high > last_low).astype(np.int8), append=0)
+    starts, ends = np.flatnonzero(edges == 1) + 1, np.flatnonzero(edges == -1) + 1
+    ends = ends[len(ends) - len(starts) :]  # a tap that was under way at the beginning has no onset
+    taps = zip(starts.tolist(), ends.tolist(), strict=True)
+    return np.array([_crossing_s(signal.time_ns, value, start, end) for start, end in taps])
+
+
+def _crossing_s(time_ns: np.ndarray, value: np.ndarray, start: int, end: int) -> float:
+    """When the tap in [start, end) passed half of its peak, by interpolation between two samples."""
+    level = value[start:end].max() / 2
+    above = start + int(np.argmax(value[start:end] >= level))
+    below = above - 1
+    while below > 0 and value[below] >= level:
+        below -= 1
+    share = (level - value[below]) / (value[below + 1] - value[below])
+    return float(time_ns[below] + share * (time_ns[below + 1] - time_ns[below])) / NS_PER_S

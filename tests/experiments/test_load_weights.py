@@ -1,0 +1,80 @@
+"""The measurement of reading weights, shrunken, and the random checkpoints that it reads."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments import load_weights
+from experiments.loading.checkpoints import random_checkpoint, shards
+from experiments.loading.readers import READERS, measure
+from experiments.loading.shapes import SHAPES
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from touchr1_jax.models.load import peak_memory
+
+TINY = SHAPES["tiny"]
+
+
+def test_experiment_runs_shrunken(tmp_path):
+    config = load_weights.LoadWeightsConfig(sizes=("tiny",), compare=("tiny",), scratch=tmp_path, shard_bytes=50_000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(load_weights, "EXPERIMENT", dataclasses.replace(load_weights.EXPERIMENT, config=config))
+        assert main(["load_weights", "--runs-dir", str(tmp_path / "runs")]) == 0
+    (directory,) = (p for p in (tmp_path / "runs" / "load_weights").iterdir() if not p.is_symlink())
+    results = read_json(directory / "results.json")
+    rows = results["tables"][0]["rows"]
+    assert [row[0] for row in rows] == ["tiny, streamed", "tiny, whole first"]
+    assert all(peak >= before > 0 for _, _, peak, _, before, _ in rows)
+    assert not list(tmp_path.glob("weights-*"))  # the checkpoint is gone
+
+
+def test_readers_read_the_same(tmp_path):
+    size = random_checkpoint(tmp_path, TINY, 50_000, seed=1)
+    assert len(list(tmp_path.glob("*.safetensors"))) > 3
+    ours, theirs = (sorted(map(digest, read(tmp_path, TINY))) for read in READERS.values())
+    assert ours == theirs
+    assert json.loads((tmp_path / "model.safetensors.index.json").read_text())["metadata"]["total_size"] == size
+    assert size == sum(x.nbytes for x in READERS["streamed"](tmp_path, TINY)) == load_weights.weight_bytes("tiny")
+
+
+def digest(x: jax.Array) -> tuple[tuple[int, ...], bytes]:
+    return x.shape, np.asarray(x).tobytes()
+
+
+def test_contents_are_small_numbers(tmp_path):
+    random_checkpoint(tmp_path, TINY, 10**9, seed=1)
+    for x in READERS["streamed"](tmp_path, TINY):
+        size = jnp.abs(x.astype(jnp.float32))
+        assert float(size.min()) >= 2**-7
+        assert float(size.max()) < 2**-6
+
+
+def test_no_shard_is_larger_than_said_but_for_single_tensors():
+    for shard in shards(TINY, 20_000):
+        assert len(shard) == 1 or 2 * sum(int(np.prod(s)) for s in shard.values()) <= 20_000
+
+
+def test_a_reader_that_fails_is_said_to_have(tmp_path):
+    with pytest.raises(RuntimeError, match="ended with status 1 and no answer"):
+        measure("streamed", tmp_path, TINY)
+
+
+def test_sizes_must_have_shapes_and_room(tmp_path):
+    with pytest.raises(ValueError, match="must be of tiny, "):
+        load_weights.LoadWeightsConfig(sizes=("70B",))
+    with pytest.raises(ValueError, match="compare of sizes"):
+        load_weights.LoadWeightsConfig(sizes=("3B",), compare=("7B",))
+    with pytest.raises(ValueError, match=r"size 7B takes 16.6 GB of disk and .* of memory"):
+        load_weights.check_room("7B", tmp_path, copies=10**6)
+
+
+def test_peak_memory_is_that_of_the_program_and_not_of_its_parent(tmp_path):
+    """This process has imported more than the reader will, and has held what its child has not."""
+    held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
+    random_checkpoint(tmp_path, TINY, 10**9, seed=1)
+    assert measure("streamed", tmp_path, TINY).before < peak_memory()
+    assert peak_memory() >= held.nbytes

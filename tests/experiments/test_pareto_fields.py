@@ -1,0 +1,59 @@
+"""The depth part of the chart of fields, shrunk, and the peers' faults that it must show."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments import pareto_fields
+from experiments.fields import depth_known
+from experiments.fields.depth_balls import generated_presses
+from experiments.fields.depth_methods import MAPS
+from experiments.running.artifacts import read_json
+from experiments.running.runner import main
+from sensors_io.calibration.circles import find_circles
+
+TINY = dataclasses.replace(pareto_fields.EXPERIMENT.scales["smoke"], rounds=2)
+
+
+def test_the_experiment_runs_and_keeps_its_bounds(tmp_path, monkeypatch):
+    small = dataclasses.replace(pareto_fields.EXPERIMENT, config=TINY)
+    monkeypatch.setattr(pareto_fields, "EXPERIMENT", small)
+    assert main(["pareto_fields", "--runs-dir", str(tmp_path)]) == 0
+    (directory,) = (p for p in (tmp_path / "pareto_fields").iterdir() if not p.is_symlink())
+    results = read_json(directory / "results.json")
+    scale = results["requirements"][0]
+    assert scale["met"], scale
+    assert results["tables"][0]["rows"][0][0] == "this, Neumann"
+
+
+def test_published_integrators_get_the_scale_wrong():
+    """The eigenvalues' index alone makes an error of tens of per cent."""
+    surfaces = depth_known.analytic()
+    worst = {
+        name: max(abs(depth_known.scale_error(f, *s)[0]) for s in surfaces.values())
+        for name, f in depth_known.INTEGRATORS.items()
+    }
+    assert worst["this, Neumann"] < 2
+    assert worst["as gs_sdk and gsrobotics"] > 20
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_every_map_reads_a_press(name):
+    presses = generated_presses(6.31, 8, 0)
+    touches = find_circles(presses).touches
+    slope_x, _ = MAPS[name](presses, touches, 0)(presses.pictures[0])
+    x, y, radius = touches.stacked()[0]
+    rows, columns = np.mgrid[: presses.shape[0], : presses.shape[1]]
+    inner = np.hypot(columns - x, rows - y) < 0.8 * radius
+    expected = (x - columns[inner]) * presses.mm_per_px / presses.radius_mm
+    assert np.corrcoef(slope_x[inner], expected)[0, 1] > 0.9
+
+
+def test_truth_at_known_depth_is_the_indenter():
+    depth, mask = depth_known.depth_data.known_truth("sphere", 0.5, (320, 320))
+    assert depth.max() == pytest.approx(0.5, abs=1e-3)
+    assert depth[mask].min() > 0.1
+    flat, inside = depth_known.depth_data.known_truth("prism", 0.25, (320, 320))
+    assert np.unique(flat).tolist() == [0.25]
+    assert inside.sum() == 71 * 107

@@ -1,0 +1,125 @@
+"""From pictures to a calibration, and what refuses it."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import pytest
+
+from sensors_io.__main__ import main
+from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
+from sensors_io.calibration.presses import BallPresses
+from sensors_io.fields.sources import read_picture
+from sensors_io.fields.types import Calibration, CalibrationError
+from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
+
+CLIPS = pathlib.Path(__file__).parents[2] / "data" / "gelslam"
+MM_PER_PX = 3 * 0.0634
+QUICK = CalibrateConfig(folds=2)
+
+
+@pytest.fixture(scope="module")
+def presses() -> BallPresses:
+    return press_ball(spread_touches(12))
+
+
+def names(presses: BallPresses) -> tuple[str, ...]:
+    return tuple(f"press {i}" for i in range(len(presses)))
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A calibration by the command, from real presses."""
+    out = tmp_path_factory.mktemp("calibration") / "mini.npz"
+    command = ["calibrate", str(CLIPS), "--background", str(CLIPS / "background.png"), "--ball-diameter-mm", "6.31"]
+    assert main([*command, "--mm-per-px", str(MM_PER_PX), "--out", str(out), "--folds", "3"]) == 0
+    return out
+
+
+def test_real_presses_calibrate(real: pathlib.Path) -> None:
+    """14 of them, a third as wide as they were recorded: coarser than the published figures, the same order."""
+    made = Calibration.load(real)
+    assert made.made_from["ball_diameter_mm"] == 6.31
+    assert made.made_from["held-out presses"] == 14
+    assert made.made_from["held-out depth rmse median, um"] < 25
+    assert made.made_from["held-out radius error median, %"] < 12
+
+
+def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    inputs = [str(CLIPS / f"press_{i}.png") for i in (9, 20)] + [str(CLIPS / "background.png")]
+    out = tmp_path / "fields.npz"
+    command = ["extract", *inputs, "--background", str(CLIPS / "background.png"), "--calibration", str(real)]
+    assert main([*command, "--out", str(out)]) == 0
+    with np.load(out) as fields:
+        assert fields["depth_mm"].shape == (3, 80, 106)
+        assert fields["contact"].any((1, 2)).tolist() == [True, True, False]
+        assert (fields["depth_mm"][:2].max((1, 2)) > 0.5).all()
+        assert fields["flags"][2] & 16
+        assert not fields["flags"][:2].astype(int)[0] & 16
+        assert "shear_mm" not in fields.files  # a bare gel carries none
+        assert str(fields["calibration"]) == Calibration.load(real).hash
+
+
+def test_few_presses_are_refused(presses: BallPresses) -> None:
+    few = presses.chosen(np.arange(5))
+    with pytest.raises(CalibrationError, match="5 of 5 presses can be used: must be ≥ 8"):
+        calibrate(few, names(few), "x", QUICK)
+
+
+def test_a_picture_without_contact_is_left_out_and_named(presses: BallPresses) -> None:
+    blank = dataclasses.replace(presses, pictures=np.concatenate([presses.pictures, presses.background[None]]))
+    _, report = calibrate(blank, names(blank), "x", QUICK)
+    assert [(press.name, "shows no contact" in press.reason) for press in report.left_out] == [("press 12", True)]
+    assert len(report.kept) == 12
+
+
+def test_pictures_without_contact_are_refused(presses: BallPresses) -> None:
+    blank = dataclasses.replace(presses, pictures=np.repeat(presses.background[None], 10, 0))
+    with pytest.raises(CalibrationError, match=r"0 of 10 presses can be used[\s\S]*press 3 shows no contact"):
+        calibrate(blank, names(blank), "x", QUICK)
+
+
+def test_a_ball_smaller_than_its_contact_is_refused(presses: BallPresses) -> None:
+    wrong = dataclasses.replace(presses, radius_mm=1.2)
+    with pytest.raises(CalibrationError, match=r"--ball-diameter-mm|is no ball|come out"):
+        calibrate(wrong, names(wrong), "x", QUICK)
+
+
+def test_saturated_presses_are_left_out(presses: BallPresses) -> None:
+    bright = np.clip(presses.pictures.astype(int) * 8 - 770, 0, 255).astype(np.uint8)
+    washed = dataclasses.replace(presses, pictures=bright)
+    with pytest.raises(CalibrationError, match=r"saturated|no ball|everywhere"):
+        calibrate(washed, names(washed), "x", QUICK)
+
+
+def test_other_light_than_the_background_is_refused(presses: BallPresses) -> None:
+    dark = dataclasses.replace(presses, background=presses.background - np.uint8(60))
+    with pytest.raises(CalibrationError, match="differs from the background by 60 grey levels everywhere"):
+        calibrate(dark, names(dark), "x", QUICK)
+
+
+def test_the_command_says_in_one_line_what_is_missing(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture) -> None:
+    command = ["calibrate", str(tmp_path), "--background", str(CLIPS / "background.png"), "--ball-diameter-mm", "6"]
+    assert main([*command, "--mm-per-px", "0.1", "--out", str(tmp_path / "out.npz")]) == 1
+    assert "holds no picture" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_a_changed_calibration_is_refused(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    with np.load(real) as file:
+        arrays = dict(file)
+    arrays["weights"] = arrays["weights"] * 2
+    np.savez(tmp_path / "changed.npz", **arrays)
+    with pytest.raises(CalibrationError, match="was changed"):
+        Calibration.load(tmp_path / "changed.npz")
+    (tmp_path / "text.npz").write_text("no zip")
+    with pytest.raises(CalibrationError, match="is no calibration"):
+        Calibration.load(tmp_path / "text.npz")
+
+
+def test_a_calibration_survives_the_disk(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    made = Calibration.load(real)
+    made.save(tmp_path / "copy.npz")
+    assert Calibration.load(tmp_path / "copy.npz").hash == made.hash
+    assert [p.name for p in tmp_path.iterdir()] == ["copy.npz"]
+    np.testing.assert_array_equal(made.background, read_picture(CLIPS / "background.png"))

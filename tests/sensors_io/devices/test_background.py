@@ -1,0 +1,36 @@
+"""The background follows untouched frames, and says how far it has gone."""
+
+import numpy as np
+import pytest
+
+from sensors_io.devices.background import Background
+
+
+def grey(level):
+    return np.full((2, 3, 3), level, np.uint8)
+
+
+def test_the_mean_of_untouched_frames_and_its_drift():
+    background = Background(memory=4)
+    for level, touched in [(100, False), (200, True), (102, False), (104, False), (106, False)]:
+        background.offer(grey(level), touched=touched)
+    assert background.frames == 4
+    assert np.all(background.picture() == 103)
+    assert background.drift().rms == 0
+    for _ in range(60):
+        background.offer(grey(113), touched=False)
+    np.testing.assert_allclose(background.drift().mean, 10, atol=0.01)
+    assert background.drift().rms == pytest.approx(10, abs=0.01)
+
+
+def test_an_empty_background_has_no_picture_and_no_drift():
+    background = Background()
+    background.offer(grey(5), touched=True)
+    assert background.drift() is None
+    with pytest.raises(ValueError, match="holds no frame"):
+        background.picture()
+    background.offer(grey(5), touched=False)
+    with pytest.raises(ValueError, match=r"must be \[2, 3, 3\]"):
+        background.offer(np.zeros((4, 4, 3), np.uint8), touched=False)
+    with pytest.raises(ValueError, match="memory is 0"):
+        Background(0)

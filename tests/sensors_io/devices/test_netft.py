@@ -1,0 +1,117 @@
+"""A Net F/T made of two sockets: calibration over TCP, records over UDP."""
+
+import contextlib
+import socket
+import threading
+
+import numpy as np
+import pytest
+
+from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.devices.netft import CALIBRATION, COMMAND, HEADER, RECORD, Command, NetFtConfig, parse_calibration
+
+NEWTONS = CALIBRATION.pack(HEADER, 2, 3, 1_000_000, 1_000_000, *[1] * 6)
+
+
+@contextlib.contextmanager
+def sensor(datagrams, calibration=NEWTONS):
+    """A fake sensor: its ports, and the commands that it was sent."""
+    with socket.create_server(("127.0.0.1", 0)) as tcp, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        udp.bind(("127.0.0.1", 0))
+        udp.settimeout(5)
+        tcp.settimeout(5)
+        commands = []
+
+        def serve():
+            connection, _ = tcp.accept()
+            with connection:
+                assert connection.recv(64) == bytes([1]) + bytes(19)
+                connection.sendall(calibration)
+            if len(calibration) != CALIBRATION.size or calibration[2] == 9:
+                return
+            data, client = udp.recvfrom(64)
+            commands.append(COMMAND.unpack(data))
+            for datagram in datagrams:
+                udp.sendto(datagram, client)
+            while commands[-1][1] != Command.STOP:
+                commands.append(COMMAND.unpack(udp.recv(64)))
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            yield (
+                NetFtConfig(host="127.0.0.1", rdt_port=udp.getsockname()[1], tcp_port=tcp.getsockname()[1], wait_s=5.0),
+                commands,
+            )
+        finally:
+            thread.join()
+
+
+def record(number, *counts, status=0):
+    return RECORD.pack(number, 10 * number, status, *counts)
+
+
+def test_counts_become_newtons_and_newton_millimetres():
+    loaded = record(5, 1_000_000, -2_000_000, -7_500_000, 1_000, 0, -2_000_000)
+    with sensor([loaded]) as (config, commands), config.open() as device:
+        sample = device.read(5.0)
+        device.take_bias()
+        assert device.identity.settings["counts_per_nmm"] == 1000
+        assert device.identity.counter_modulus == 2**32
+    np.testing.assert_allclose(sample.arrays["force_n"], [1, -2, -7.5])
+    np.testing.assert_allclose(sample.arrays["moment_nmm"], [1, 0, -2000])
+    assert (sample.index, sample.device_time_ns) == (5, 5_000_000)
+    assert commands == [(HEADER, Command.STREAM, 0), (HEADER, Command.BIAS, 0), (HEADER, Command.STOP, 0)]
+
+
+def test_buffered_records_are_spread_over_their_periods():
+    whole = b"".join(record(k, 0, 0, 0, 0, 0, 0) for k in range(40))
+    with sensor([whole]) as (config, _), config.open() as device:
+        samples = [device.read(5.0) for _ in range(40)]
+    assert [s.index for s in samples] == list(range(40))
+    assert np.all(np.diff([s.host_time_ns for s in samples]) == 1_000_000)
+
+
+def test_status_and_damage_are_told():
+    out_of_range = record(1, 0, 0, 0, 0, 0, 0, status=0xC000_0000)
+    broken = record(2, 0, 0, 0, 0, 0, 0, status=0x8000_0004)
+    with sensor([out_of_range, broken, b"\0" * 35]) as (config, _), config.open() as device:
+        assert device.read(5.0).arrays["out_of_range"]
+        with pytest.raises(DeviceDataError, match="broken gauge"):
+            device.read(5.0)
+        with pytest.raises(DeviceDataError, match="35 bytes: must be records of 36"):
+            device.read(5.0)
+        with pytest.raises(DeviceTimeoutError, match="sent nothing"):
+            device.read(0.01)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (NEWTONS[:10], "of 10 bytes: must have 24"),
+        (CALIBRATION.pack(HEADER, 9, 3, 1, 1, *[1] * 6), "header or unit is unknown"),
+        (CALIBRATION.pack(7, 2, 3, 1, 1, *[1] * 6), "header or unit is unknown"),
+        (CALIBRATION.pack(HEADER, 2, 3, 0, 1, *[1] * 6), "no counts per unit"),
+    ],
+)
+def test_damaged_calibrations_are_refused(answer, message):
+    with pytest.raises(DeviceDataError, match=message):
+        parse_calibration(answer)
+
+
+def test_pounds_are_converted():
+    found = parse_calibration(CALIBRATION.pack(HEADER, 1, 1, 1000, 1000, *[1] * 6))
+    assert found.counts_per_n == pytest.approx(1000 / 4.4482216)
+    assert found.counts_per_nmm == pytest.approx(1000 / 112.98483)
+
+
+def test_an_absent_sensor_is_named():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    config = NetFtConfig(host="127.0.0.1", tcp_port=port, wait_s=0.5)
+    with pytest.raises(DeviceNotFoundError, match="does not answer"), config.open():
+        pass
+    with pytest.raises(DeviceLostError, match="not open"):
+        config.open().read(0.1)
+    with pytest.raises(ValueError, match="rate_hz is 0"):
+        NetFtConfig(rate_hz=0)

@@ -1,0 +1,221 @@
+"""Three ways to read, and books that balance."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from sensors_io.clock import JumpingClock, MonotonicClock
+from sensors_io.devices.base import Identity
+from sensors_io.devices.errors import (
+    DeviceDataError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    OverloadWarning,
+    StaleFrameError,
+    StreamEndedError,
+)
+from sensors_io.devices.intake import Intake
+from sensors_io.devices.reader import Pump, Reader, ReaderConfig
+from sensors_io.devices.replay import Disconnect, Faults, Replay
+from tests.sensors_io.devices.fakes import MS, Ramp, Scripted, sample
+
+
+def pumped(device, capacity=100, clock=None, **config):
+    """Everything that a device gives, pumped without a thread."""
+    clock = clock or JumpingClock()
+    intake = Intake(capacity=capacity, clock=clock)
+    pump = Pump(device, intake, ReaderConfig(capacity=capacity, **config), clock, threading.Event())
+    pump.open()
+    while pump.step():
+        pass
+    return intake
+
+
+def drain(intake):
+    got = []
+    while intake.counts.waiting:
+        got.append(intake.next(0.0))
+    return got
+
+
+def indices(reader):
+    """Counters of all samples up to the end of the stream."""
+    while True:
+        try:
+            yield reader.next(5.0).index
+        except StreamEndedError:
+            return
+
+
+def test_next_gives_all_samples_in_order_and_then_the_reason_of_the_end():
+    intake = pumped(Scripted([sample(i) for i in range(5)]))
+    assert [s.index for s in drain(intake)] == [0, 1, 2, 3, 4]
+    with pytest.raises(StreamEndedError):
+        intake.next(0.0)
+    assert intake.counts.unaccounted == 0
+
+
+def test_an_overflowing_ring_counts_what_it_overwrites_and_says_so():
+    intake = pumped(Scripted([sample(i) for i in range(10)]), capacity=4)
+    assert intake.overloaded
+    with pytest.warns(OverloadWarning, match="6 samples were overwritten"):
+        assert intake.next(0.0).index == 6
+    assert [s.index for s in drain(intake)] == [7, 8, 9]
+    counts = intake.counts
+    assert (counts.arrived, counts.delivered, counts.overwritten, counts.unaccounted) == (10, 4, 6, 0)
+
+
+def test_latest_refuses_an_old_sample_and_names_its_age():
+    clock = JumpingClock()
+    intake = Intake(capacity=4, clock=clock)
+    with pytest.raises(StaleFrameError, match="no sample has arrived"):
+        intake.latest(1.0)
+    intake.offer(sample(0, time_ms=0))
+    clock.sleep_until(300 * MS)
+    assert intake.latest(0.5).index == 0
+    with pytest.raises(StaleFrameError, match=r"0\.300 s old: at most 0\.1 s"):
+        intake.latest(0.1)
+
+
+def test_fresh_waits_for_a_sample_grabbed_after_the_call():
+    clock = MonotonicClock()
+    intake = Intake(capacity=4, clock=clock)
+    intake.offer(sample(0, time_ms=clock.now_ns() // MS))
+    later = threading.Timer(0.05, lambda: intake.offer(sample(1, time_ms=clock.now_ns() // MS + 1)))
+    later.start()
+    assert intake.fresh(5.0).index == 1
+    later.join()
+    time.sleep(0.005)
+    with pytest.raises(DeviceTimeoutError):
+        intake.fresh(0.01)
+
+
+def test_losses_by_the_counter():
+    """Two missing, one of them late, one duplicate, one broken."""
+    script = [sample(0), sample(1), sample(1), sample(4), sample(3), DeviceDataError("torn"), sample(5)]
+    counts = pumped(Scripted(script)).counts
+    assert (counts.missing, counts.late, counts.duplicates, counts.broken) == (1, 1, 1, 1)
+    assert counts.unaccounted == 0
+
+
+def test_without_a_counter_the_same_picture_is_a_duplicate_and_the_period_tells_losses():
+    noise = np.random.default_rng(0).integers(0, 256, (5, 4, 4, 3), dtype=np.uint8)
+    script = [sample(time_ms=t, frame=noise[k].copy()) for t, k in [(0, 0), (10, 1), (20, 1), (20, 2), (50, 3)]]
+    intake = pumped(Scripted(script, period_s=0.01))
+    assert (intake.counts.duplicates, intake.counts.missing) == (1, 2)
+    assert len(drain(intake)) == 4
+
+
+def test_a_lost_device_is_opened_again_with_growing_waits():
+    device = Scripted([sample(0), DeviceLostError("unplugged"), sample(7), sample(8)], refusals=4)
+    clock = JumpingClock()
+    counts = pumped(device, clock=clock, first_wait_s=0.1, longest_wait_s=0.4).counts
+    assert clock.now_ns() == 1500 * MS  # 0.1 + 0.2 + 0.4 + 0.4 + 0.4
+    assert (counts.disconnects, counts.reconnects, counts.missing, counts.missing_away) == (1, 1, 6, 6)
+    assert device.opened == 2
+
+
+def test_a_device_that_stays_away_ends_the_stream_with_a_reason():
+    intake = pumped(Scripted([DeviceLostError("x"), sample(1)], refusals=1000), give_up_after_s=10)
+    with pytest.raises(DeviceLostError, match=r"given up after .* absent"):
+        intake.next(0.0)
+
+
+def test_a_silent_device_is_taken_as_lost():
+    silence = DeviceTimeoutError("silence")
+
+    class Slow(Scripted):
+        def read(self, timeout_s):
+            clock.sleep_until(clock.now_ns() + round(timeout_s * 1e9))
+            return super().read(timeout_s)
+
+    clock = JumpingClock()
+    counts = pumped(Slow([silence, silence, silence, sample(3)]), clock=clock, timeout_s=0.5, lost_after_s=1.2).counts
+    assert (counts.timeouts, counts.disconnects, counts.reconnects) == (3, 1, 1)
+
+
+def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock():
+    script = [sample(4, 40), sample(5, 50), DeviceLostError("x"), sample(0, 110), sample(1, 120)]
+    counts = pumped(Scripted(script, period_s=0.01)).counts
+    assert (counts.restarts, counts.missing, counts.missing_away) == (1, 5, 5)
+
+
+def test_device_stamps_are_mapped_to_the_hosts_clock():
+    script = [sample(i, time_ms=1000 + 10 * i + late, device_time_ns=10 * i * MS) for i, late in enumerate((4, 0, 9))]
+    times = [s.host_time_ns // MS for s in drain(pumped(Scripted(script)))]
+    assert times == [1004, 1010, 1020]
+
+
+FAULTS = Faults(
+    drop_share=0.02,
+    duplicate_share=0.01,
+    jitter_s=0.002,
+    disconnects=(Disconnect(at_s=3, for_s=1.0), Disconnect(at_s=7, for_s=0.2)),
+    seed=4,
+)
+
+
+@pytest.mark.parametrize("capacity", [5000, 7])
+def test_every_injected_fault_is_counted(capacity):
+    clock = JumpingClock()
+    replay = Replay(Ramp(50), seconds=20, faults=FAULTS, clock=clock)
+    intake = pumped(replay, capacity=capacity, clock=clock)
+    truth, counts = replay.truth, intake.counts
+    assert truth.produced == 2000 == truth.given + truth.dropped + truth.away
+    assert counts.missing == truth.dropped + truth.away - truth.unseen
+    assert counts.duplicates == truth.duplicated > 0
+    assert counts.disconnects == counts.reconnects == truth.disconnects == 2
+    assert counts.arrived == truth.given + truth.duplicated
+    assert counts.missing_away >= truth.away
+    assert counts.unaccounted == 0
+
+
+def test_a_thread_reads_all_and_a_block_left_early_stops_it():
+    clock = JumpingClock()
+    replay = Replay(Ramp(200), faults=Faults(drop_share=0.1, seed=1), clock=clock)
+    with Reader(replay, config=ReaderConfig(capacity=1000), clock=clock) as reader:
+        assert reader.identity.serial == "ramp"
+        got = list(indices(reader))
+    assert got == sorted(got)
+    assert len(got) == replay.truth.given == reader.counts.delivered
+
+    with Reader(Replay(Ramp(10**6, rate_hz=1000.0))) as reader:
+        assert reader.fresh(5.0).index >= 0
+        assert reader.latest(1.0) is not None
+        began = time.monotonic()
+    assert time.monotonic() - began < 2
+    assert not [t for t in threading.enumerate() if t.name.startswith("reader-")]
+
+
+def test_an_absent_device_is_told_on_entering():
+    class Absent(Scripted):
+        def __enter__(self):
+            raise DeviceNotFoundError("GelSight Mini R0B-1234 is not connected; plug it in")
+
+    with pytest.raises(DeviceNotFoundError, match="plug it in"), Reader(Absent([])):
+        pass
+
+
+def test_a_bug_in_a_driver_reaches_the_reader():
+    with Reader(Scripted([sample(0), ZeroDivisionError("bug")])) as reader:
+        assert reader.next(5.0).index == 0
+        with pytest.raises(DeviceLostError, match="ZeroDivisionError") as failed:
+            reader.next(5.0)
+    assert isinstance(failed.value.__cause__, ZeroDivisionError)
+
+
+@pytest.mark.parametrize("field", ["capacity", "timeout_s", "give_up_after_s"])
+def test_configs_are_checked(field):
+    with pytest.raises(ValueError, match=f"{field} is 0: must be > 0"):
+        ReaderConfig(**{field: 0})
+
+
+def test_reopening_forgets_nothing_of_the_first_identity():
+    intake = Intake(capacity=4, clock=JumpingClock())
+    intake.opened(Identity(sensor="netft", counter_modulus=8))
+    for index in (6, 7, 0, 2):
+        intake.offer(sample(index))
+    assert intake.counts.missing == 1

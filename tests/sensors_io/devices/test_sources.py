@@ -1,0 +1,103 @@
+"""Folders, videos, records and scenes replayed as devices."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.clock import JumpingClock
+from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
+from sensors_io.devices.replay import Disconnect, Faults, Replay, ReplayConfig
+from sensors_io.devices.scene import SceneDeviceConfig, SceneSource
+from sensors_io.scenes import SceneConfig
+from tests.sensors_io import fakes as records
+from tests.sensors_io.devices.fakes import Ramp
+
+
+def everything(device):
+    samples = []
+    with device:
+        while True:
+            try:
+                samples.append(device.read(10.0))
+            except StreamEndedError:
+                return samples
+
+
+def test_a_folder_of_pictures_at_its_rate(tmp_path):
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((4, 5, 3), (n, 0, 0), np.uint8))
+    (tmp_path / "notes.txt").write_text("no picture")
+    samples = everything(ReplayConfig(path=tmp_path, rate_hz=50).open(JumpingClock()))
+    assert [s.frame[0, 0].tolist() for s in samples] == [[0, 0, n] for n in range(3)]
+    assert [s.host_time_ns for s in samples] == [0, 20_000_000, 40_000_000]
+    again = everything(ReplayConfig(path=tmp_path, rate_hz=50, seconds=0.2).open(JumpingClock()))
+    assert [s.index for s in again] == list(range(10))
+    assert [s.frame[0, 0, 2] for s in again] == [n % 3 for n in range(10)]
+
+
+def test_a_video_at_its_own_rate(tmp_path):
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (16, 12))
+    for n in range(4):
+        writer.write(np.full((12, 16, 3), 40 * n, np.uint8))
+    writer.release()
+    samples = everything(ReplayConfig(path=path).open(JumpingClock()))
+    assert [int(s.frame[0, 0, 0]) for s in samples] == [0, 40, 80, 120]
+    assert samples[3].host_time_ns == 150_000_000
+
+
+def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
+    records.write(tmp_path, 2)
+    samples = everything(ReplayConfig(path=tmp_path, contact=1, sensor="xense").open(JumpingClock()))
+    made = records.sequence(0, "xense", trial=1)
+    assert len(samples) == 12
+    np.testing.assert_array_equal(samples[5].frame, made.frames[5])
+    np.testing.assert_allclose(samples[5].arrays["force_n"], made.force_n[5], atol=1e-3)
+    with pytest.raises(DeviceNotFoundError, match="not 'dmtac'"):
+        ReplayConfig(path=tmp_path, sensor="dmtac").open(JumpingClock()).__enter__().read(1.0)
+
+
+def test_a_generated_sensor_is_a_device():
+    scenes = SceneConfig(objects=1, sites=1, frames=3, contact_grid=32)
+    device = SceneDeviceConfig(sensor="tac3d", scenes=scenes).open(JumpingClock())
+    samples = everything(device)
+    assert len(samples) == 3
+    assert samples[0].frame is None
+    assert samples[2].arrays["force_n"][2] < samples[0].arrays["force_n"][2] < 0
+    assert round((samples[2].host_time_ns - samples[1].host_time_ns) / 1e5) == 327
+    with pytest.raises(ValueError, match="sensor is 'digit'"):
+        SceneSource(sensor="digit")
+
+
+def test_nothing_to_replay_is_named(tmp_path):
+    with pytest.raises(DeviceNotFoundError, match="holds no picture"):
+        everything(ReplayConfig(path=tmp_path).open(JumpingClock()))
+    with pytest.raises(DeviceNotFoundError, match="does not exist"):
+        ReplayConfig(path=tmp_path / "x").open()
+    (tmp_path / "a.avi").write_bytes(b"broken")
+    with pytest.raises(DeviceNotFoundError, match="does not open as a video"):
+        everything(ReplayConfig(path=tmp_path / "a.avi").open(JumpingClock()))
+    (tmp_path / "b.png").write_bytes(b"broken")
+    with pytest.raises(DeviceNotFoundError, match="cannot be decoded"):
+        everything(ReplayConfig(path=tmp_path).open(JumpingClock()))
+
+
+@pytest.mark.parametrize(
+    ("faults", "message"),
+    [
+        ({"drop_share": 1.0}, "drop_share is 1.0"),
+        ({"jitter_s": -1.0}, "jitter_s is -1.0"),
+        ({"disconnects": (Disconnect(at_s=5, for_s=2), Disconnect(at_s=6, for_s=1))}, "ascending and apart"),
+    ],
+)
+def test_faults_are_checked(faults, message):
+    with pytest.raises(ValueError, match=message):
+        Faults(**faults)
+
+
+def test_the_same_seed_gives_the_same_faults():
+    given = [
+        [s.index for s in everything(Replay(Ramp(200), faults=Faults(drop_share=0.2, seed=k), clock=JumpingClock()))]
+        for k in (1, 1, 2)
+    ]
+    assert given[0] == given[1] != given[2]

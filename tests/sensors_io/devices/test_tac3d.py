@@ -1,0 +1,240 @@
+"""Tac3D datagrams: layouts in both styles, packets in any order, damaged input, the vendor's signs."""
+
+import socket
+import struct
+
+import numpy as np
+import pytest
+
+from sensors_io.devices import tac3d
+from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.devices.sources import Tac3dRecording
+
+NAMES = {"3D_Displacements": (400, 3), "3D_Forces": (400, 3), "3D_ResultantForce": (1, 3), "3D_ResultantMoment": (1, 3)}
+
+
+def matrices(seed=0):
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(size=shape) for name, shape in NAMES.items()}
+
+
+def layout(arrays, *, index=10, serial="AD2-0065L", style="flow", time_s=12.5):
+    lines, offset = [], 0
+    for name, a in arrays.items():
+        pairs = {
+            "name": name, "type": "mat", "dtype": "f64", "width": a.shape[1], "height": a.shape[0],
+            "offset": offset, "length": a.nbytes,
+        }  # fmt: skip
+        offset += a.nbytes
+        if style == "flow":
+            lines.append("  - {" + ", ".join(f"{k}: {v}" for k, v in pairs.items()) + "}")
+        else:
+            lines.append("- " + "\n  ".join(f"{k}: {v}" for k, v in pairs.items()))
+    head = f'index: {index}\nSN: {serial}\ntimestamp: {time_s}\nmsg: ""\ndata:\n'
+    return (head + "\n".join(lines)).encode()
+
+
+def datagrams(arrays, *, number=1, packets=3, **rest):
+    """One message as datagrams; its data in equal parts."""
+    data = b"".join(a.tobytes() for a in arrays.values())
+    size = -(-len(data) // packets)
+    parts = [layout(arrays, **rest), *(data[k : k + size] for k in range(0, len(data), size))]
+    return [struct.pack("=IHH", number, packets, k) + part for k, part in enumerate(parts)]
+
+
+@pytest.mark.parametrize("style", ["flow", "block"])
+def test_arrays_come_out_as_they_went_in(style):
+    arrays = matrices()
+    decoder, assembler = tac3d.Decoder(), tac3d.Assembler()
+    for index in (10, 11):
+        wholes = [assembler.add(d) for d in datagrams(arrays, number=index, index=index, style=style)]
+        assert wholes[:-1] == [None] * 3
+        message = decoder.decode(*wholes[-1])
+        assert (message.index, message.serial, message.send_time_s, message.note) == (index, "AD2-0065L", 12.5, "")
+        for name, a in arrays.items():
+            np.testing.assert_array_equal(message.matrices[name], a)
+    assert len(decoder._layouts) == 1
+
+
+def test_a_layout_of_another_shape_is_learnt_anew():
+    decoder = tac3d.Decoder()
+    for arrays in (matrices(), {"3D_ResultantForce": np.ones((1, 3))}):
+        data = b"".join(a.tobytes() for a in arrays.values())
+        assert decoder.decode(layout(arrays), data).matrices.keys() == arrays.keys()
+
+
+def test_packets_may_come_in_any_order_twice_and_between_those_of_other_messages():
+    a, b = (datagrams(matrices(k), number=k) for k in (1, 2))
+    assembler = tac3d.Assembler()
+    order = [a[3], b[0], a[0], a[0], b[3], a[2], b[1]]
+    assert [assembler.add(d) for d in order] == [None] * 7
+    assert assembler.add(a[1]) is not None
+    layout_b, data_b = assembler.add(b[2])
+    np.testing.assert_array_equal(
+        tac3d.Decoder().decode(layout_b, data_b).matrices["3D_Forces"], matrices(2)["3D_Forces"]
+    )
+
+
+def test_what_is_never_completed_is_counted_and_forgotten():
+    assembler = tac3d.Assembler()
+    for number in range(40):
+        assembler.add(datagrams(matrices(), number=number)[0])
+    assert assembler.incomplete == 32
+    assert len(assembler._parts) == 8
+
+
+@pytest.mark.parametrize(
+    ("datagram", "message"),
+    [
+        (b"\0" * 5, "5 bytes: its header alone has 8"),
+        (struct.pack("=IHH", 1, 0, 0), "misnumbered"),
+        (struct.pack("=IHH", 1, 3, 4), "misnumbered"),
+        (struct.pack("=IHH", 1, 60_000, 4), "misnumbered"),
+    ],
+)
+def test_damaged_datagrams_are_refused(datagram, message):
+    with pytest.raises(DeviceDataError, match=message):
+        tac3d.Assembler().add(datagram)
+
+
+GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
+
+
+@pytest.mark.parametrize(
+    ("bad", "data", "message"),
+    [
+        (b"index: 3\nSN: x\n", b"", "no `data:` list"),
+        (GOOD, b"\0" * 23, "ends at byte 24 of 23"),
+        (GOOD.replace(b"f64", b"f16"), b"\0" * 24, "cannot be read"),
+        (GOOD.replace(b"height: 1", b"height: 7"), b"\0" * 24, "are not 24 bytes"),
+        (GOOD.replace(b"offset: 0", b"offset: -8"), b"\0" * 24, "are not 24 bytes at -8"),
+        (GOOD.replace(b"width: 3", b"width: x"), b"\0" * 24, "cannot be read"),
+        (GOOD.replace(b"index: 10", b"index: ten"), b"\0" * 24, "lacks a readable index"),
+        (b"index: 1\nSN: x\ntimestamp: 2\ndata:\n", b"", "lists no array"),
+        (b"index: 1\nSN: x\ntimestamp: 2\ndata: \xff\n", b"", "lists no array"),
+    ],
+)
+def test_damaged_layouts_are_refused(bad, data, message):
+    with pytest.raises(DeviceDataError, match=message):
+        tac3d.Decoder().decode(bad, data)
+
+
+def pushed(force, move):
+    """A message in which everything moves by `move` mm and the gel is loaded with `force` N."""
+    return {
+        "3D_Displacements": np.tile(np.array(move, float), (400, 1)),
+        "3D_ResultantForce": np.array([force], float),
+        "3D_ResultantMoment": np.zeros((1, 3)),
+    }
+
+
+def test_a_known_push_has_the_schemas_signs():
+    """Pressed by 2 N and dragged to +x: Fz < 0, depth > 0, deformation along +x; point 0 (+x, +y) is bottom right."""
+    arrays = pushed([0.5, 0.0, -2.0], [0.3, 0.1, -0.7])
+    arrays["3D_Displacements"][0] = [9, 8, -7]
+    fields = tac3d.to_schema(arrays)
+    assert fields["force_n"].tolist() == [0.5, 0.0, -2.0]
+    np.testing.assert_allclose(fields["depth_mm"][0, 0], 0.7, rtol=1e-6)
+    np.testing.assert_allclose(fields["deformation_mm"][0, 0], [0.3, 0.1], rtol=1e-6)
+    assert fields["deformation_mm"][19, 19].tolist() == [9, 8]
+    assert all(a.dtype == np.float32 for a in fields.values())
+
+
+def test_a_recording_is_read_from_a_folder_and_from_an_archive(tmp_path):
+    arrays = {
+        "index": np.array([3, 4, 7]),
+        "sendTimestamp": np.array([1.0, 1.03, 1.13]),
+        "3D_Displacements": np.zeros((3, 400, 3)),
+        "3D_ResultantForce": np.ones((3, 1, 3)),
+    }
+    (tmp_path / "AD2-1").mkdir()
+    for name, a in arrays.items():
+        np.save(tmp_path / "AD2-1" / f"{name}.npy", a)
+    np.savez(tmp_path / "AD2-1.npz", **arrays)
+    for path in (tmp_path / "AD2-1", tmp_path / "AD2-1.npz"):
+        source = Tac3dRecording(path=path)
+        samples = list(source.samples())
+        assert [s.index for s in samples] == [3, 4, 7]
+        assert [round(s.time_ns / 1e6) for s in samples] == [0, 30, 130]
+        assert samples[0].arrays["force_n"].tolist() == [1, 1, 1]
+        assert source.identity.serial == "AD2-1"
+
+
+def test_an_incomplete_recording_is_refused(tmp_path):
+    with pytest.raises(DeviceNotFoundError, match="neither a folder"):
+        tac3d.load_recording(tmp_path / "nowhere")
+    np.savez(tmp_path / "a.npz", index=np.arange(3))
+    with pytest.raises(DeviceDataError, match="sendTimestamp must be among them"):
+        tac3d.load_recording(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", index=np.arange(3), sendTimestamp=np.arange(2.0))
+    with pytest.raises(DeviceDataError, match="one length"):
+        tac3d.load_recording(tmp_path / "b.npz")
+
+
+@pytest.fixture
+def vendor():
+    """A socket that sends to a free port, and that port."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        sender.settimeout(5)
+        sender.connect(("127.0.0.1", port))
+        yield sender, port
+
+
+def listening(port, **rest):
+    """An open device whose first message is on its way before it waits for it."""
+    return tac3d.Tac3dConfig(port=port, wait_s=5.0, **rest).open()
+
+
+def test_a_sensor_is_heard_and_told_its_zero(vendor):
+    import threading
+
+    sender, port = vendor
+    done = threading.Event()
+
+    def send():
+        number = 0
+        while not done.is_set():
+            for serial in ("HDL1-7", "AD2-0065L"):
+                number += 1
+                for d in datagrams(pushed([0, 0, -1], [0, 0, -0.1]), number=number, index=number, serial=serial):
+                    try:
+                        sender.send(d)
+                    except ConnectionRefusedError:
+                        continue  # nobody listens yet
+            done.wait(0.01)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        with listening(port, serial="AD2-0065L") as sensor:
+            samples = [sensor.read(5.0) for _ in range(3)]
+            assert [s.index % 2 for s in samples] == [0, 0, 0]
+            assert sensor.identity.serial == "AD2-0065L"
+            assert samples[0].device_time_ns == 12_500_000_000
+            sensor.take_zero()
+            assert sender.recv(10) == b"$C"
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_silence_and_a_taken_port_are_named(vendor):
+    _, port = vendor
+    with (
+        pytest.raises(DeviceNotFoundError, match="nothing heard on port"),
+        tac3d.Tac3dConfig(port=port, wait_s=0.05).open(),
+    ):
+        pass
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        with pytest.raises(DeviceNotFoundError, match="cannot be listened on"), listening(port):
+            pass
+    with pytest.raises(DeviceLostError, match="not open"):
+        listening(port).read(0.1)
+    with pytest.raises(DeviceLostError, match="not open"):
+        listening(port).take_zero()
+    assert issubclass(DeviceTimeoutError, RuntimeError)

@@ -1,0 +1,171 @@
+"""UVC cameras on a made-up /sys, with a fake in place of cv2.VideoCapture."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, SettingRefusedWarning
+from sensors_io.devices.uvc import CameraInfo, Lock, Uvc, UvcConfig, find_cameras
+
+
+def plug(root, number, *, index="0", usb=None, name="camera"):
+    """A node as the kernel shows it: video4linux/videoN with a link to the USB interface below its device."""
+    node = root / "class" / f"video{number}"
+    node.mkdir(parents=True)
+    (node / "index").write_text(f"{index}\n")
+    (node / "name").write_text(f"{name}\n")
+    if usb is not None:
+        device = root / "usb" / usb["serial"]
+        (device / "1.0").mkdir(parents=True, exist_ok=True)
+        for key, value in usb.items():
+            (device / key).write_text(f"{value}\n")
+        (node / "device").symlink_to(device / "1.0")
+
+
+MINI = {"serial": "2D8XYK21", "product": "GelSight Mini R0B 2D8X-YK21", "idVendor": "0c45", "idProduct": "636d"}
+
+
+def test_cameras_are_listed_without_metadata_nodes(tmp_path):
+    plug(tmp_path, 10, usb=MINI | {"serial": "other"})
+    plug(tmp_path, 0, usb=MINI)
+    plug(tmp_path, 1, index="1", usb=MINI)
+    plug(tmp_path, 2, name="built in")
+    found = find_cameras(tmp_path / "class")
+    assert [c.node for c in found] == ["/dev/video0", "/dev/video2", "/dev/video10"]
+    assert found[0] == CameraInfo(
+        node="/dev/video0", product="GelSight Mini R0B 2D8X-YK21", serial="2D8XYK21", usb_id="0c45:636d"
+    )
+    assert (found[1].product, found[1].serial, found[1].usb_id) == ("built in", "", "")
+    assert find_cameras(tmp_path / "nowhere") == ()
+
+
+CAMERAS = (
+    CameraInfo(node="/dev/video0", product="GelSight Mini R0B 2D8X-YK21", serial="2D8XYK21", usb_id="0c45:636d"),
+    CameraInfo(node="/dev/video2", product="GelSight Mini R0B 28B4-Z1A7", serial="28B4Z1A7", usb_id="0c45:636d"),
+)
+
+
+def test_a_camera_is_chosen_by_serial_product_or_explicit_index():
+    assert UvcConfig(serial="28B4Z1A7").choose(CAMERAS) is CAMERAS[1]
+    assert UvcConfig(product="2D8X-YK21").choose(CAMERAS) is CAMERAS[0]
+    assert UvcConfig(index=7).choose(CAMERAS).node == "/dev/video7"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (UvcConfig(product="GelSight Mini"), "several cameras answer to it"),
+        (UvcConfig(serial="nope"), "no camera answers to it; there are: /dev/video0"),
+    ],
+)
+def test_an_ambiguous_or_absent_camera_is_named(config, message):
+    with pytest.raises(DeviceNotFoundError, match=message):
+        config.choose(CAMERAS)
+    with pytest.raises(DeviceNotFoundError, match="there are: none"):
+        UvcConfig(serial="nope").choose(())
+
+
+class FakeCapture:
+    """Settings that stick unless they are in `refuses`; frames that count."""
+
+    def __init__(self, frames=3, refuses=(), opens=True, size=(6, 8)):
+        self.left, self.refuses, self.opens = frames, refuses, opens
+        self.settings = {cv2.CAP_PROP_FRAME_WIDTH: size[1], cv2.CAP_PROP_FRAME_HEIGHT: size[0], cv2.CAP_PROP_FPS: 25.0}
+        self.count, self.released = 0, False
+
+    def isOpened(self):
+        return self.opens
+
+    def grab(self):
+        self.count += 1
+        return self.count <= self.left
+
+    def retrieve(self):
+        image = np.zeros((6, 8, 3), np.uint8)
+        image[..., 0] = self.count  # blue
+        return True, image
+
+    def get(self, prop):
+        return 40.0 * self.count if prop == cv2.CAP_PROP_POS_MSEC else self.settings.get(prop, 0.0)
+
+    def set(self, prop, value):
+        if prop in self.refuses:
+            return False
+        self.settings[prop] = value
+        return True
+
+    def release(self):
+        self.released = True
+
+
+def camera(capture, **config):
+    return Uvc(UvcConfig(serial="2D8XYK21", **config), find=lambda: CAMERAS, capture=lambda node: capture)
+
+
+def test_frames_come_in_rgb_with_both_stamps_and_the_identity_is_complete():
+    capture = FakeCapture()
+    with camera(capture, lock=Lock(exposure=150, gain=2, white_balance_k=4600)) as device:
+        first, second = device.read(1.0), device.read(1.0)
+        assert first.frame[0, 0].tolist() == [0, 0, 1]
+        assert (first.device_time_ns, second.device_time_ns) == (40_000_000, 80_000_000)
+        assert first.host_time_ns <= second.host_time_ns
+        identity = device.identity
+    assert (identity.serial, identity.where, identity.period_s) == ("2D8XYK21", "/dev/video0", 0.04)
+    assert identity.settings["exposure"] == 150
+    assert identity.settings["exposure_locked"]
+    assert identity.settings["white_balance_k"] == 4600
+    assert capture.released
+
+
+def test_frames_are_cropped_and_shrunk_after_the_stamp():
+    with camera(FakeCapture(), border_share=0.25, frame_width=2, frame_height=2) as device:
+        assert device.read(1.0).frame.shape == (2, 2, 3)
+
+
+def test_a_refused_setting_is_stored_and_warned_of():
+    capture = FakeCapture(refuses=(cv2.CAP_PROP_AUTO_EXPOSURE, cv2.CAP_PROP_GAIN))
+    with pytest.warns(SettingRefusedWarning, match=r"exposure is 150, asked for 150; gain is 0, asked for 3"):
+        device = camera(capture, lock=Lock(exposure=150, gain=3)).__enter__()
+    settings = device.identity.settings
+    assert [settings[f"{name}_locked"] for name in ("exposure", "gain", "focus")] == [False, False, True]
+    device.__exit__(None, None, None)
+
+
+def test_a_camera_that_stops_is_lost_and_may_be_opened_again():
+    device = camera(FakeCapture(frames=1))
+    with device:
+        device.read(1.0)
+        with pytest.raises(DeviceLostError, match="gives no more frames"):
+            device.read(1.0)
+    with pytest.raises(DeviceLostError, match="not open"):
+        device.read(1.0)
+
+
+def test_a_camera_that_waits_too_long_is_a_timeout():
+    with camera(FakeCapture(frames=0)) as device, pytest.raises(DeviceTimeoutError):
+        device.read(0.0)
+
+
+def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
+    with pytest.raises(DeviceNotFoundError, match="does not open"):
+        camera(FakeCapture(opens=False)).__enter__()
+
+    class Fixed(FakeCapture):
+        def set(self, prop, value):
+            return prop not in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT) and super().set(prop, value)
+
+    with pytest.raises(DeviceNotFoundError, match="no mode of 640×480, it offers 8×6"):
+        camera(Fixed(), width=640, height=480).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"border_share": 0.5}, "border_share is 0.5"),
+        ({"pixel_format": "MJPEG"}, "must have four letters"),
+        ({"frame_width": 4}, "must both be given"),
+    ],
+)
+def test_configs_are_checked(changes, message):
+    with pytest.raises(ValueError, match=message):
+        UvcConfig(**changes)

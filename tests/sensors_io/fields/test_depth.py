@@ -1,0 +1,97 @@
+"""Zero level and contact mask, by surfaces that are known; failed contact, by real pictures."""
+
+import pathlib
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.calibration.presses import indentation
+from sensors_io.fields.contact import ContactConfig, changed_contacts, find_contacts, steepest_change
+from sensors_io.fields.depth import ZeroConfig, zero_level
+from sensors_io.fields.sources import read_picture
+
+PITCH = 0.0634
+DATA = pathlib.Path(__file__).parents[2] / "data"
+
+
+def pressed(x_0: float, y_0: float, contact_mm: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and length of the slopes under a ball of 3 mm radius, mm and mm/mm, float32 [240, 320]."""
+    y, x = np.mgrid[:240, :320].astype(float)
+    depth, d_x, d_y = indentation((x - x_0) * PITCH, (y - y_0) * PITCH, contact_mm, 3.0)
+    return depth.astype(np.float32), np.hypot(d_x, d_y).astype(np.float32)
+
+
+def test_a_tilted_and_bent_zero_is_taken_out() -> None:
+    depth, slope = pressed(160, 120)
+    y, x = np.mgrid[-1:1:240j, -1:1:320j]
+    drift = 0.05 + 0.03 * x - 0.02 * y + 0.04 * x**2 + 0.02 * x * y
+    clean = depth - zero_level(depth, slope, PITCH, ZeroConfig())
+    found = depth + drift.astype(np.float32)
+    found -= zero_level(found, slope, PITCH, ZeroConfig())
+    np.testing.assert_allclose(found, clean, atol=2e-3)
+
+
+def test_untouched_gel_is_zero() -> None:
+    tilted = np.linspace(-1, 1, 320)[None].repeat(240, 0)
+    tilt = (0.02 * tilted + 0.1).astype(np.float32)
+    assert np.abs(tilt - zero_level(tilt, np.zeros_like(tilt), PITCH, ZeroConfig())).max() < 1e-4
+
+
+def test_a_contact_that_fills_the_window_takes_its_shallowest_part_for_zero() -> None:
+    depth = np.tile(np.linspace(0.2, 1.0, 320, dtype=np.float32), (240, 1))
+    level = zero_level(depth, np.ones_like(depth), PITCH, ZeroConfig())
+    assert np.ptp(level) < 1e-6
+    assert level[0, 0] == pytest.approx(0.22, abs=0.02)
+
+
+@pytest.mark.parametrize("contact_mm", [0.8, 1.5, 2.0])
+def test_the_mask_is_the_contact(contact_mm: float) -> None:
+    """At half the greatest depth, which is Hertz's edge."""
+    depth, _ = pressed(160, 120, contact_mm)
+    found = find_contacts(depth, PITCH)
+    assert found.count == 1
+    assert not found.at_border
+    assert np.sqrt(found.mask.sum() / np.pi) * PITCH == pytest.approx(contact_mm, rel=0.05)
+
+
+def test_two_contacts_are_two_and_a_contact_at_the_border_is_there() -> None:
+    both = np.maximum(pressed(80, 120, 0.8)[0] - 0.1, pressed(240, 120, 0.8)[0] - 0.1)
+    assert find_contacts(both, PITCH).count == 2
+    assert find_contacts(pressed(5, 120)[0], PITCH).at_border
+
+
+def test_hysteresis_keeps_no_shallow_region_and_no_speck() -> None:
+    config = ContactConfig(low_mm=0.03, high_mm=0.06)
+    shallow = np.zeros((240, 320), np.float32)
+    shallow[50:90, 50:90] = 0.05
+    assert find_contacts(shallow, PITCH, config).count == 0
+    shallow[60, 60] = 0.07
+    assert find_contacts(shallow, PITCH, config).mask.sum() == 1600
+    speck = np.zeros((240, 320), np.float32)
+    speck[3, 3] = 1.0
+    assert not find_contacts(speck, PITCH, config).mask.any()
+
+
+@pytest.mark.parametrize(("folder", "press", "pitch"), [("gelslam", "press_9", 0.1902), ("FOTS", "press_20", 0.2043)])
+def test_real_contacts_are_contacts_and_drift_is_none(folder: str, press: str, pitch: float) -> None:
+    background = read_picture(DATA / folder / "background.png")
+    config = ContactConfig()
+    assert steepest_change(read_picture(DATA / folder / f"{press}.png"), background, pitch) > config.steepness
+    y, x = np.mgrid[-1 : 1 : background.shape[0] * 1j, -1 : 1 : background.shape[1] * 1j]
+    drift = np.clip(background + 10 * np.exp(-(x**2 + y**2) / 0.3)[..., None], 0, 255).astype(np.uint8)
+    assert steepest_change(drift, background, pitch) < config.steepness
+    assert changed_contacts(drift, background, pitch).count == 0
+
+
+def test_contact_by_colour_is_where_the_ball_is() -> None:
+    background = read_picture(DATA / "gelslam" / "background.png")
+    found = changed_contacts(read_picture(DATA / "gelslam" / "press_9.png"), background, 0.1902)
+    y, x = cv2.moments(found.mask.astype(np.uint8))["m01"], cv2.moments(found.mask.astype(np.uint8))["m10"]
+    assert found.count == 1
+    assert (x / found.mask.sum(), y / found.mask.sum()) == pytest.approx((222 / 3, 137 / 3), abs=3)
+
+
+def test_thresholds_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ValueError, match="must be 0 < low ≤ high"):
+        ContactConfig(low_mm=0.2, high_mm=0.1)

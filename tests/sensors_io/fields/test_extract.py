@@ -1,0 +1,132 @@
+"""All fields at once: what a bare gel, a marker gel and a wrong input give."""
+
+import dataclasses
+import pathlib
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.fields.evidence import Pattern
+from sensors_io.fields.extract import ExtractConfig, Extractor, joined
+from sensors_io.fields.slopes import ColourMap
+from sensors_io.fields.sources import SourceError, read_pictures
+from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.schema import Flag, SchemaError
+
+SHAPE = (160, 214)
+
+
+def bare() -> np.ndarray:
+    return np.full((*SHAPE, 3), 120, np.uint8)
+
+
+def dotted(shift: float = 0.0) -> np.ndarray:
+    """A grid of dots, moved along x."""
+    picture = np.full((*SHAPE, 3), 160, np.uint8)
+    for y in range(14, SHAPE[0] - 8, 18):
+        for x in range(14, SHAPE[1] - 8, 18):
+            centre = (round((x + shift) * 16), y * 16)
+            cv2.circle(picture, centre, 3 * 16, (30, 30, 30), -1, cv2.LINE_AA, shift=4)
+    return cv2.GaussianBlur(picture, (0, 0), 0.8)
+
+
+def touched(background: np.ndarray) -> np.ndarray:
+    """A bump of light at the centre, odd in x as a slope is."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    dx, dy = (x - 107) / 14, (y - 80) / 14
+    shade = 90 * dx * np.exp(-(dx**2 + dy**2) / 2)
+    return np.clip(background + shade[..., None] * np.array([1.0, 0.3, -0.7]), 0, 255).astype(np.uint8)
+
+
+def calibration(background: np.ndarray, mm_per_px: float = 0.1) -> Calibration:
+    """Red is a slope along x: n_x = −d_red."""
+    weights = np.zeros((1, 3, 2), np.float32)
+    weights[0, 0, 0] = -0.4
+    return Calibration(
+        sensor="x",
+        background=background,
+        mm_per_px=mm_per_px,
+        colours=ColourMap(weights=weights, degree=1, position_degree=0),
+        made_from={},
+    )
+
+
+def test_a_bare_gel_gives_depth_and_is_refused_shear() -> None:
+    extractor = Extractor(bare(), 0.1, calibration(bare()))
+    fields = extractor.extract(np.stack([bare(), touched(bare())]))
+    assert fields.depth_mm is not None
+    assert fields.depth_mm.shape == fields.contact.shape == (2, *SHAPE)
+    assert fields.deformation_mm is None
+    assert fields.shear_mm is None
+    assert (fields.flags & np.uint32(Flag.REFUSED)).all()
+    assert [bool(f & Flag.NO_CONTACT) for f in fields.flags.tolist()] == [True, False]
+    assert "deformation_mm, shear_mm" in extractor.refused[0]
+
+
+def test_a_marker_gel_without_calibration_gives_its_motion_and_is_refused_depth() -> None:
+    extractor = Extractor(dotted(), 0.1)
+    assert extractor.evidence.pattern is Pattern.MARKERS
+    fields = extractor.extract(np.stack([dotted(), dotted(1.0)]))
+    assert fields.depth_mm is None
+    assert fields.shear_mm is None
+    assert fields.deformation_mm is not None
+    moved = fields.deformation_mm[1]
+    np.testing.assert_allclose(np.median(moved[..., 0]), 0.1, atol=0.01)
+    np.testing.assert_allclose(np.median(moved[..., 1]), 0.0, atol=0.01)
+    assert fields.grid_mm is not None
+    height, width = moved.shape[:2]
+    np.testing.assert_allclose(
+        [fields.grid_mm[0] * width, fields.grid_mm[1] * height], [0.1 * SHAPE[1], 0.1 * SHAPE[0]], rtol=1e-6
+    )
+
+
+def test_a_marker_gel_with_calibration_gives_everything() -> None:
+    extractor = Extractor(dotted(), 0.1, calibration(dotted()), ExtractConfig(nodes=12))
+    assert extractor.refused == ()
+    fields = extractor.read(dotted(0.5))
+    assert fields.shear_mm is not None
+    assert fields.traction_mpa is not None
+    assert fields.force_n is not None
+    assert fields.shear_mm.shape == fields.deformation_mm.shape  # type: ignore[union-attr]
+
+
+def test_a_calibration_of_another_camera_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="must be equal; calibrate this camera"):
+        Extractor(bare(), 0.2, calibration(bare(), 0.1))
+
+
+def test_frames_are_joined_in_order() -> None:
+    extractor = Extractor(bare(), 0.1, calibration(bare()))
+    one, two = extractor.read(bare()), extractor.read(touched(bare()))
+    both = joined([one, two])
+    np.testing.assert_array_equal(both.contact[1], two.contact[0])
+    assert len(both) == 2
+
+
+def test_fields_of_wrong_shapes_are_refused() -> None:
+    contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
+    with pytest.raises(SchemaError, match="depth_mm"):
+        Fields(contact=contact, flags=flags, mm_per_px=0.1, depth_mm=np.zeros((2, 4, 6), np.float32))
+    with pytest.raises(SchemaError, match="grid_mm is None"):
+        Fields(contact=contact, flags=flags, mm_per_px=0.1, shear_mm=np.zeros((2, 3, 3, 2), np.float32))
+    assert dataclasses.replace(Fields(contact=contact, flags=flags, mm_per_px=0.1)).depth_mm is None
+
+
+def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path) -> None:
+    for name, side in (("2", 8), ("10", 8)):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((side, side, 3), int(name), np.uint8))
+    found = read_pictures([tmp_path], "x")
+    assert found.names == ("2.png", "10.png")
+    assert found.frames[:, 0, 0, 0].tolist() == [2, 10]
+    cv2.imwrite(str(tmp_path / "3.png"), np.zeros((9, 8, 3), np.uint8))
+    with pytest.raises(SourceError, match="different sizes"):
+        read_pictures([tmp_path], "x")
+
+
+def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "a.png").write_text("no picture")
+    with pytest.raises(SourceError, match="cannot be read as a picture"):
+        read_pictures([tmp_path], "x")
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_pictures([tmp_path / "none.png"], "x")

@@ -1,0 +1,40 @@
+"""The Helmholtz–Hodge decomposition of fields whose parts are known."""
+
+import numpy as np
+import pytest
+
+from sensors_io.fields.helmholtz import decompose
+
+PITCH = (0.5, 0.4)
+Y, X = np.mgrid[-20:21, -24:25] * np.array(PITCH[::-1])[:, None, None]
+BELL = np.exp(-(X**2 + Y**2) / (2 * 2.0**2))
+SPREAD = np.stack([X, Y], -1) * BELL[..., None]  # the gradient of −4 BELL
+TWIST = np.stack([-Y, X], -1) * BELL[..., None]
+INNER = (slice(4, -4), slice(4, -4))
+
+
+def relative(field, true):
+    return np.linalg.norm((field - true)[INNER]) / np.linalg.norm(true[INNER])
+
+
+def test_spread_is_a_gradient():
+    parts = decompose(SPREAD, PITCH)
+    assert relative(parts.gradient, SPREAD) < 0.06
+    assert np.linalg.norm(parts.shear[INNER]) < 0.06 * np.linalg.norm(SPREAD[INNER])
+
+
+def test_twist_is_shear():
+    parts = decompose(TWIST, PITCH)
+    assert relative(parts.rotation, TWIST) < 0.06
+    assert relative(parts.shear, TWIST) < 0.06
+
+
+@pytest.mark.parametrize("field", [np.ones_like(SPREAD), np.stack([X, -Y], -1)], ids=["translation", "pure shear"])
+def test_what_flows_through_the_border_is_harmonic(field):
+    np.testing.assert_allclose(decompose(field, PITCH).harmonic, field, atol=1e-9)
+
+
+def test_the_parts_add_up():
+    field = SPREAD + 0.3 * TWIST + 0.2
+    parts = decompose(field, PITCH)
+    np.testing.assert_allclose(parts.gradient + parts.rotation + parts.harmonic, field, atol=1e-12)

@@ -1,0 +1,154 @@
+"""The compliance matrix against the scenes' spectra, the inversion against loads that are known."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sensors_io.fields.compliance import NodeGrid, compliance_matrix, total_force, total_moment
+from sensors_io.fields.inversion import InverseConfig, LayerInverse
+from sensors_io.fields.shear import ShearReader
+from sensors_io.scenes.layer import Layer
+from sensors_io.scenes.traction import displacement, make_response
+
+GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=3.5)
+SIDE, PITCH = 16, 1.0
+GRID = NodeGrid(shape=(SIDE, SIDE), pitch_mm=(PITCH, PITCH), marker_depth_mm=0.3, depth_mm=0.3)
+CONFIG = InverseConfig(lateral_noise_mm=0.008, depth_noise_mm=0.015)
+
+
+def load(centre=(7.0, 8.0), radius=4.0):
+    """A Hertzian pressure and a traction of 0.4 of it along x, 0.2 against y; [h, w, 3] on the gel, MPa."""
+    y, x = np.mgrid[:SIDE, :SIDE] * PITCH
+    pressure = 0.15 * np.sqrt(np.maximum(1 - ((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / radius**2, 0))
+    return np.stack([0.4 * pressure, -0.2 * pressure, -pressure], -1)
+
+
+def moved(traction, depth_mm=0.3):
+    """The scenes' own displacement of the marker plane [h, w, 3]."""
+    response = make_response(GEL, 96, PITCH, depth_mm)
+    along, depth = displacement(
+        jnp.asarray(-traction[..., 2]), jnp.asarray(traction[..., 0] + 1j * traction[..., 1]), response
+    )
+    return np.stack([along.real, along.imag, depth], -1).astype(np.float64)
+
+
+def stacked(field):
+    """[h, w, 3] on the gel → (τ_x, τ_y, p) of all nodes."""
+    return np.concatenate([field[..., 0].ravel(), field[..., 1].ravel(), -field[..., 2].ravel()])
+
+
+@pytest.fixture(scope="module")
+def inverse():
+    return LayerInverse(GEL, GRID, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    rng = np.random.default_rng(0)
+    return moved(load()) + np.array([0.008, 0.008, 0.015]) * rng.standard_normal((SIDE, SIDE, 3))
+
+
+def test_the_matrix_is_the_scenes_response():
+    found = (compliance_matrix(GEL, GRID) @ stacked(load())).reshape(3, SIDE, SIDE)
+    np.testing.assert_allclose(np.moveaxis(found, 0, -1), moved(load()), atol=5e-4)
+
+
+def test_the_matrix_is_symmetric_at_the_surface():
+    """Maxwell and Betti: what a force here does there, it does there here; u_z and p point into the gel."""
+    surface = NodeGrid(shape=(6, 8), pitch_mm=(1.0, 0.7), marker_depth_mm=0.0, depth_mm=0.0)
+    matrix = compliance_matrix(GEL, surface)
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-9 * np.abs(matrix).max())
+
+
+def test_rows_and_columns_may_differ_in_number_and_pitch():
+    square = NodeGrid(shape=(4, 4), pitch_mm=(0.5, 1.0), marker_depth_mm=0.2, depth_mm=0.0)
+    turned = NodeGrid(shape=(4, 4), pitch_mm=(1.0, 0.5), marker_depth_mm=0.2, depth_mm=0.0)
+    a, b = (compliance_matrix(GEL, g).reshape(3, 4, 4, 3, 4, 4) for g in (square, turned))
+    swap = [1, 0, 2]
+    np.testing.assert_allclose(a[swap][:, :, :, swap].transpose(0, 2, 1, 3, 5, 4), b, atol=1e-9)
+
+
+def test_pressing_nodes_alone_carry_the_load(inverse, noisy):
+    found = inverse.contact(noisy[..., :2], noisy[..., 2])
+    true = total_force(load(), GRID.pitch_mm)
+    np.testing.assert_allclose(total_force(found.traction_mpa, GRID.pitch_mm), true, atol=0.06 * abs(true[2]))
+    assert np.all(found.traction_mpa[..., 2] <= 0)
+    assert np.all(found.traction_mpa[0] == 0)
+
+
+def test_shear_is_what_the_traction_makes(inverse, noisy):
+    traction = load() * [1, 1, 0]
+    true = moved(traction)[..., :2]
+    found = inverse.contact(noisy[..., :2], noisy[..., 2])
+    rms = lambda field: np.sqrt((field**2).sum(-1).mean())
+    assert rms(found.by_traction_mm - true) < 0.06 * rms(true)
+    assert rms(noisy[..., :2] - found.by_pressure_mm - true) < 0.013
+    linear = inverse.linear(noisy[..., :2], noisy[..., 2])
+    assert rms(found.by_traction_mm - true) < rms(linear.by_traction_mm - true)
+
+
+def test_without_noise_the_linear_solution_explains_the_displacement(inverse):
+    exact = moved(load())
+    found = inverse.linear(exact[..., :2], exact[..., 2])
+    explained = found.by_pressure_mm + found.by_traction_mm
+    np.testing.assert_allclose(explained, exact[..., :2], atol=0.004)
+
+
+def test_more_noise_asks_for_more_weight(inverse):
+    rng, exact = np.random.default_rng(1), moved(load())
+    weights = []
+    for factor in (0.1, 1.0, 10.0):
+        seen = exact + factor * np.array([0.008, 0.008, 0.015]) * rng.standard_normal(exact.shape)
+        weights.append(inverse.linear(seen[..., :2], seen[..., 2]).weight)
+    assert weights[0] < weights[1] < weights[2]
+
+
+def test_the_modulus_scales_the_load_and_nothing_else(noisy):
+    stiff = LayerInverse(Layer(modulus_mpa=0.6, poisson=0.48, thickness_mm=3.5), GRID, CONFIG)
+    soft = LayerInverse(GEL, GRID, CONFIG)
+    a, b = (i.contact(noisy[..., :2], noisy[..., 2]) for i in (stiff, soft))
+    np.testing.assert_allclose(a.traction_mpa, 2 * b.traction_mpa, atol=2e-4)
+    np.testing.assert_allclose(a.by_traction_mm, b.by_traction_mm, atol=1e-4)
+
+
+def test_nothing_touches_nothing_acts(inverse):
+    found = inverse.contact(np.zeros((SIDE, SIDE, 2)), np.zeros((SIDE, SIDE)), np.zeros((SIDE, SIDE), bool))
+    assert not found.traction_mpa.any()
+
+
+def test_unread_nodes_are_filled(noisy):
+    reader = ShearReader(GEL, GRID, CONFIG)
+    valid = np.random.default_rng(2).uniform(size=(SIDE, SIDE)) > 0.05
+    broken = np.where(valid[..., None], noisy, 0)
+    whole, part = (reader.read(f[..., :2], f[..., 2], v) for f, v in ((noisy, None), (broken, valid)))
+    assert np.abs(part.force_n - whole.force_n).max() < 0.03 * abs(whole.force_n[2])
+
+
+def test_magnification_is_undone(noisy):
+    y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
+    seen = noisy[..., :2] + noisy[..., 2:] / 25.0 * np.stack([x, y], -1)
+    plain = ShearReader(GEL, GRID, CONFIG).read(noisy[..., :2], noisy[..., 2])
+    undone = ShearReader(GEL, GRID, CONFIG, camera_mm=25.0).read(seen, noisy[..., 2])
+    np.testing.assert_allclose(undone.shear_mm, plain.shear_mm, atol=1e-5)
+
+
+def test_totals_by_hand():
+    """1 MPa on one node of 2 mm × 3 mm, at x = 2 mm, y = −3 mm from the centre: 6 N."""
+    field = np.zeros((3, 3, 3))
+    field[0, 2] = [1.0, 0.5, -2.0]
+    np.testing.assert_allclose(total_force(field, (2.0, 3.0)), [6, 3, -12])
+    # r × f = (y f_z, −x f_z, x f_y − y f_x)
+    np.testing.assert_allclose(total_moment(field, (2.0, 3.0)), [36, 24, 2 * 3 + 3 * 6])
+
+
+def test_bad_input_is_named(inverse):
+    with pytest.raises(ValueError, match=r"must be \[16, 16, 2\]"):
+        inverse.linear(np.zeros((8, 8, 2)), np.zeros((8, 8)))
+    with pytest.raises(ValueError, match="fill unread nodes"):
+        inverse.linear(np.full((SIDE, SIDE, 2), np.nan), np.zeros((SIDE, SIDE)))
+    with pytest.raises(ValueError, match="lateral_noise_mm is 0"):
+        InverseConfig(lateral_noise_mm=0)
+    with pytest.raises(ValueError, match="depth_mm is 9"):
+        LayerInverse(GEL, NodeGrid(shape=(4, 4), pitch_mm=(1, 1), marker_depth_mm=9.0, depth_mm=0.0))
+    with pytest.raises(ValueError, match="camera_mm is 0"):
+        ShearReader(GEL, GRID, camera_mm=0.0)

@@ -1,0 +1,86 @@
+"""Dots are found where they were drawn, and judged."""
+
+import numpy as np
+import pytest
+
+from sensors_io.fields.evidence import LEAST_CONTRAST, LEAST_COUNT, LEAST_TEXTURE, Pattern, examine, texture_of
+from sensors_io.fields.markers import find_markers, inside
+from tests.sensors_io.fields import gels
+
+
+@pytest.mark.parametrize("radius", [2.5, 4.0, 6.0])
+def test_every_dot_is_found_to_a_tenth_of_a_pixel(radius):
+    points = gels.lattice(24)
+    found = find_markers(gels.exposed(gels.dots(points, radius)))
+    apart = np.hypot(*(points[:, None] - found.points_px[None]).transpose(2, 0, 1))
+    assert len(found) == len(points)
+    assert apart.min(1).max() < 0.15
+    assert found.pitch_px == pytest.approx(24, abs=0.2)
+    assert found.radius_px == pytest.approx(radius, rel=0.35)
+
+
+def test_contrast_is_that_of_the_dots():
+    found = find_markers(gels.dots(gels.lattice(24), 5.0, contrast=60.0))
+    assert found.contrast == pytest.approx(60, rel=0.15)
+
+
+def test_missing_dots_cost_themselves_only():
+    points = gels.lattice(24)
+    kept = np.delete(points, [3, 11, 12, 20], axis=0)
+    found = find_markers(gels.exposed(gels.dots(kept)))
+    apart = np.hypot(*(kept[:, None] - found.points_px[None]).transpose(2, 0, 1))
+    assert len(found) == len(kept)
+    assert apart.min(1).max() < 0.15
+
+
+def test_nothing_is_found_on_a_flat_picture():
+    assert find_markers(np.full(gels.SIDE, 100, np.uint8)) is None
+
+
+def test_inside_leaves_a_margin():
+    points = np.array([[0, 0], [5, 5], [194, 154], [195, 154]], np.float32)
+    assert inside(points, gels.SIDE, 5).tolist() == [False, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("picture", "pattern"),
+    [
+        (gels.dots(gels.lattice()), Pattern.MARKERS),
+        (gels.speckle(), Pattern.DENSE),
+        (gels.skin(), Pattern.BARE),
+        (gels.loaded(), Pattern.BARE),
+        (gels.dots(gels.lattice(), contrast=8.0), Pattern.BARE),
+        (gels.dots(gels.lattice()[:5]), Pattern.BARE),
+    ],
+    ids=["dots", "speckle", "skin", "under a load", "faint dots", "few dots"],
+)
+def test_gels_are_told_apart(picture, pattern):
+    assert examine(gels.exposed(picture)).pattern is pattern
+
+
+def test_dots_by_chance_are_no_markers():
+    points = np.random.default_rng(1).uniform(15, 145, (40, 2))
+    assert examine(gels.exposed(gels.dots(points))).pattern is not Pattern.MARKERS
+
+
+def test_the_reason_names_what_is_missing():
+    few = examine(gels.exposed(gels.dots(gels.lattice(60)), noise=0.0)).reason
+    faint = examine(gels.exposed(gels.dots(gels.lattice(), contrast=8.0))).reason
+    assert f"dots, must be ≥ {LEAST_COUNT}" in few
+    assert f"must be ≥ {LEAST_CONTRAST}" in faint
+    assert f"must be ≥ {LEAST_TEXTURE}" in faint
+
+
+def test_texture_is_the_weaker_direction():
+    """Stripes have a gradient across them and none along."""
+    x = np.arange(gels.SIDE[1])
+    stripes = np.broadcast_to(128 + 50 * np.sin(2 * np.pi * x / 8), gels.SIDE)
+    assert texture_of(stripes.astype(np.float32)) < 1e-3
+    assert texture_of(gels.speckle().astype(np.float32)) > 3
+
+
+def test_texture_scales_with_contrast():
+    pattern = gels.speckle() - 128
+    assert texture_of((128 + pattern / 2).astype(np.float32)) == pytest.approx(
+        texture_of((128 + pattern).astype(np.float32)) / 2, rel=1e-4
+    )

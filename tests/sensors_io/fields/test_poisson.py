@@ -1,0 +1,65 @@
+"""Integration by closed forms and by the sparse least-squares problem that it stands for."""
+
+import numpy as np
+import pytest
+from scipy import sparse
+from scipy.sparse import linalg
+
+from sensors_io.fields.poisson import dirichlet, neumann
+
+PITCH = 0.0634
+
+
+def bump(x_0: float, y_0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A Gaussian 0.5 mm deep and 1.5 mm wide with its slopes."""
+    y, x = np.mgrid[:240, :320].astype(float)
+    dx, dy = (x - x_0) * PITCH, (y - y_0) * PITCH
+    z = 0.5 * np.exp(-(dx**2 + dy**2) / (2 * 1.5**2))
+    return z, -dx / 1.5**2 * z, -dy / 1.5**2 * z
+
+
+@pytest.mark.parametrize("at", [(160, 120), (5, 120), (310, 4)])
+def test_scale_is_right_at_centre_border_and_corner(at: tuple[float, float]) -> None:
+    z, g_x, g_y = bump(*at)
+    found = neumann(g_x.astype(np.float32), g_y.astype(np.float32), PITCH)
+    found = found - found[z < 1e-3].mean() + z[z < 1e-3].mean()
+    scale = (found * z).sum() / (z**2).sum()
+    assert scale == pytest.approx(1, abs=2e-3)
+    assert np.abs(found - z).max() < 2e-3
+
+
+def test_it_solves_the_least_squares_problem() -> None:
+    """Random slopes, which no surface has, tell the boundary condition from every other."""
+    rng = np.random.default_rng(0)
+    h, w = 7, 9
+    g_x, g_y = rng.standard_normal((2, h, w))
+    step = lambda n: sparse.diags([-np.ones(n), np.ones(n)], [0, 1], (n - 1, n))
+    rows = sparse.vstack([sparse.kron(sparse.eye(h), step(w)), sparse.kron(step(h), sparse.eye(w))])
+    right = np.concatenate([(g_x[:, 1:] + g_x[:, :-1]).ravel(), (g_y[1:] + g_y[:-1]).ravel()]) / 2 * PITCH
+    wanted = linalg.lsqr(rows, right, atol=1e-14, btol=1e-14)[0].reshape(h, w)
+    np.testing.assert_allclose(neumann(g_x, g_y, PITCH), wanted - wanted.mean(), atol=1e-10)
+
+
+def test_a_plane_is_exact_and_its_mean_is_zero() -> None:
+    flat = np.zeros((20, 30))
+    found = neumann(flat + 0.2, flat - 0.1, 0.5)
+    y, x = np.mgrid[:20, :30]
+    np.testing.assert_allclose(found, 0.1 * (x - 14.5) - 0.05 * (y - 9.5), atol=1e-10)
+
+
+def test_a_fixed_border_gives_zero_there_and_the_bump_inside() -> None:
+    z, g_x, g_y = bump(160, 120)
+    found = dirichlet(g_x, g_y, PITCH)
+    assert not found[0].any()
+    assert not found[:, -1].any()
+    np.testing.assert_allclose(found, z, atol=2e-3)
+
+
+def test_float32_stays_float32() -> None:
+    flat = np.zeros((8, 8), np.float32)
+    assert neumann(flat, flat, 1.0).dtype == np.float32
+
+
+def test_unequal_slopes_are_refused() -> None:
+    with pytest.raises(ValueError, match="must be one shape"):
+        neumann(np.zeros((8, 8)), np.zeros((8, 9)), 1.0)

@@ -1,0 +1,59 @@
+"""Ridge regression of force: recovers a linear law, reports an error that is honest, refuses what it cannot fit."""
+
+import numpy as np
+import pytest
+
+from sensors_io.fields.total_force import ForceFitError, fit
+
+RNG = np.random.default_rng(0)
+LAW = RNG.normal(0, 1, (60, 3))
+FIELDS = RNG.normal(0, 0.1, (200, 10, 6))
+FORCE = FIELDS.reshape(200, 60) @ LAW + [1, 2, -5]
+
+
+def test_a_linear_law_is_found():
+    model = fit(FIELDS, FORCE)
+    assert model.held_out_rmse.max() < 1e-3
+    new = RNG.normal(0, 0.1, (5, 10, 6))
+    np.testing.assert_allclose(model.predict(new), new.reshape(5, 60) @ LAW + [1, 2, -5], atol=1e-2)
+
+
+def test_the_reported_error_is_that_on_new_frames():
+    noisy = FORCE + RNG.normal(0, 0.2, FORCE.shape)
+    model = fit(FIELDS, noisy)
+    new = RNG.normal(0, 0.1, (400, 10, 6))
+    error = model.predict(new) - new.reshape(400, 60) @ LAW - [1, 2, -5]
+    achieved = np.sqrt(0.2**2 + (error**2).mean(0))
+    np.testing.assert_allclose(model.held_out_rmse, achieved, rtol=0.3)
+
+
+def test_a_contact_that_changes_is_told_by_the_held_out_error():
+    """The second half obeys another law: blocks that straddle no contact would have hidden it."""
+    changed = FORCE.copy()
+    changed[100:] = FIELDS[100:].reshape(100, 60) @ LAW[::-1]
+    assert fit(FIELDS, changed).held_out_rmse.min() > 0.5
+
+
+def test_noise_alone_predicts_the_mean():
+    model = fit(FIELDS, RNG.normal(0, 1, (200, 3)))
+    assert model.held_out_rmse.max() < 1.25
+
+
+@pytest.mark.parametrize(
+    ("fields", "force", "blocks", "match"),
+    [
+        (FIELDS, FORCE[:10], 5, "one per frame"),
+        (FIELDS, FORCE, 2, "blocks is 2"),
+        (FIELDS[:30], FORCE[:30], 5, "record more"),
+        (FIELDS, np.full_like(FORCE, np.nan), 5, "drop incomplete"),
+        (FIELDS, np.ones_like(FORCE), 5, "press while recording"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(fields, force, blocks, match):
+    with pytest.raises(ForceFitError, match=match):
+        fit(fields, force, blocks=blocks)
+
+
+def test_fields_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="must have 60"):
+        fit(FIELDS, FORCE).predict(np.zeros((3, 5)))

@@ -1,0 +1,139 @@
+"""Dots are followed through known motion; what cannot be followed is flagged."""
+
+import numpy as np
+import pytest
+
+from sensors_io.fields.deformation import DeformationReader, NoPatternError
+from sensors_io.fields.patches import Patches
+from sensors_io.fields.tracking import Tracker, TrackingConfig
+from sensors_io.schema import Flag
+from tests.sensors_io.fields import gels
+
+POINTS = gels.lattice()
+REST = gels.exposed(gels.dots(POINTS))
+INNER = (POINTS > 12).all(1) & (POINTS[:, 0] < 188) & (POINTS[:, 1] < 148)
+
+
+def moved(points, peak):
+    """A contact that shears and spreads the gel."""
+    away = (points - [95, 75]) / 45
+    bell = np.exp(-(away**2).sum(1) / 2)[:, None]
+    return points + peak * bell * (np.array([0.8, -0.4]) + 0.3 * away)
+
+
+def follow(peak, tracker, seed=1):
+    return tracker.track(gels.exposed(gels.dots(moved(POINTS, peak)), seed=seed))
+
+
+@pytest.fixture
+def tracker():
+    return Tracker(REST, POINTS[INNER], 7)
+
+
+@pytest.mark.parametrize("peak", [0.0, 0.3, 3.0, 7.0])
+def test_points_are_found_to_a_tenth_of_a_pixel(tracker, peak):
+    found = follow(peak, tracker)
+    error = np.hypot(*(found.points_px - moved(POINTS, peak)[INNER]).T)
+    assert found.found.all()
+    assert np.median(error) < 0.05
+    assert error.max() < 0.25
+
+
+def test_nothing_drifts(tracker):
+    for i in range(60):
+        follow(6 * np.sin(i / 5), tracker, seed=i)
+    error = np.hypot(*(follow(0.0, tracker, seed=99).points_px - POINTS[INNER]).T)
+    assert np.median(error) < 0.03
+
+
+def test_a_jump_past_half_a_pitch_is_caught(tracker):
+    """Half a pitch is 10 px: from rest, Lucas–Kanade takes some dots for their neighbours."""
+    found = follow(18.0, tracker)
+    error = np.hypot(*(found.points_px - moved(POINTS, 18.0)[INNER]).T)
+    assert found.reseeded
+    assert np.sum(found.found & (error > 1)) == 0
+    assert found.found.mean() > 0.9
+
+
+def test_lost_dots_are_flagged_placed_and_found_again(tracker):
+    gone = np.flatnonzero(INNER)[[10, 11, 25]]
+    peak = 4.0
+    picture = gels.exposed(gels.dots(np.delete(moved(POINTS, peak), gone, axis=0)), seed=2)
+    found = tracker.track(picture)
+    lost = np.isin(np.flatnonzero(INNER), gone)
+    error = np.hypot(*(found.points_px - moved(POINTS, peak)[INNER]).T)
+    assert np.array_equal(~found.found, lost)
+    assert error[lost].max() < 1.0
+    assert follow(peak, tracker).found.all()
+
+
+def test_a_black_picture_finds_nothing_and_the_next_one_everything(tracker):
+    assert not tracker.track(np.zeros_like(REST)).found.any()
+    assert follow(2.0, tracker).found.all()
+
+
+def test_wrong_pictures_are_refused(tracker):
+    with pytest.raises(ValueError, match=r"must be uint8\[160, 200\]"):
+        tracker.track(REST[:-1])
+    with pytest.raises(ValueError, match="must lie inside the picture"):
+        Patches(REST, np.array([[3.0, 50.0]]), 7)
+    with pytest.raises(ValueError, match="back_px is 0"):
+        TrackingConfig(back_px=0)
+
+
+def test_light_does_not_move_the_points(tracker):
+    """Gain, offset and a slope of brightness are fitted beside the motion; Lucas–Kanade alone follows the light."""
+    plain = Tracker(REST, POINTS[INNER], 7, TrackingConfig(affine=False))
+    picture = gels.exposed(0.7 * gels.dots(POINTS) + 0.3 * np.arange(200))
+    errors = [np.hypot(*(t.track(picture).points_px - POINTS[INNER]).T) for t in (tracker, plain)]
+    assert errors[0].max() < 0.08
+    assert errors[0].mean() < 0.7 * errors[1].mean()
+
+
+def test_a_field_in_millimetres():
+    reader = DeformationReader(gels.rgb(REST), mm_per_px=0.1, shape=(16, 20))
+    shifted = gels.exposed(gels.dots(POINTS + np.array([2.0, -1.0])))
+    read = reader.read(gels.rgb(shifted))
+    assert read.flags == Flag.NONE
+    assert read.valid.all()
+    np.testing.assert_allclose(read.displacement_mm, np.broadcast_to([0.2, -0.1], (16, 20, 2)), atol=0.008)
+
+
+def test_every_pixel_when_no_shape_is_given():
+    reader = DeformationReader(gels.rgb(REST), mm_per_px=0.1)
+    read = reader.read(gels.rgb(gels.exposed(gels.dots(moved(POINTS, 5.0)))))
+    y, x = np.mgrid[30:130, 40:160]
+    pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
+    true = 0.1 * (moved(pixels, 5.0) - pixels)
+    assert read.displacement_mm.shape == (160, 200, 2)
+    assert np.hypot(*(read.displacement_mm[30:130, 40:160].reshape(-1, 2) - true).T).mean() < 0.008
+
+
+def test_lost_markers_flag_the_frame_and_their_nodes():
+    reader = DeformationReader(gels.rgb(REST), mm_per_px=0.1, shape=(16, 20))
+    left = gels.exposed(gels.dots(POINTS[POINTS[:, 0] < 100]))
+    read = reader.read(gels.rgb(left))
+    assert read.flags == Flag.MARKER_LOSS
+    assert read.valid[:, :8].all()
+    assert not read.valid[:, 15:].any()
+
+
+def test_a_dense_pattern_is_read_too():
+    rest = gels.speckle()
+    reader = DeformationReader(gels.rgb(gels.exposed(rest)), mm_per_px=0.1, shape=(16, 20))
+    read = reader.read(gels.rgb(gels.exposed(np.roll(rest, (3, -2), (0, 1)), seed=1)))
+    inner = read.displacement_mm[2:-2, 2:-2]
+    np.testing.assert_allclose(inner, np.broadcast_to([-0.2, 0.3], inner.shape), atol=0.01)
+
+
+@pytest.mark.parametrize("rest", [gels.skin(), gels.loaded()], ids=["at rest", "under a load"])
+def test_a_bare_gel_is_refused(rest):
+    with pytest.raises(NoPatternError, match="neither dots nor a dense pattern"):
+        DeformationReader(gels.rgb(gels.exposed(rest)), mm_per_px=0.1)
+
+
+def test_pictures_must_be_rgb_of_known_scale():
+    with pytest.raises(ValueError, match="convert it to RGB"):
+        DeformationReader(REST, mm_per_px=0.1)
+    with pytest.raises(ValueError, match="mm_per_px is 0"):
+        DeformationReader(gels.rgb(REST), mm_per_px=0.0)

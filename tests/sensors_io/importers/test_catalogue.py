@@ -1,0 +1,157 @@
+"""The common import: everything listed is stored or reported, whatever stops it in between."""
+
+import dataclasses
+import functools
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, import_catalogue
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Skip, UnreadableError
+from sensors_io.records import RecordsExistError, RecordStore
+from sensors_io.schema import ATTRIBUTES, ContactKey
+from tests.sensors_io import fakes
+from tests.sensors_io.importers.films import picture
+
+
+def take(n, key):
+    """Contact n; every third one loses a frame, every seventh cannot be read."""
+    if n % 7 == 6:
+        raise UnreadableError("is broken")
+    lost = (Skip(name=f"frame of {n}", reason="is cut off"),) if n % 3 == 2 else ()
+    sequence = fakes.sequence(0, key=key, frames=np.full((12, 16, 20, 3), n % 256, np.uint8))
+    return Taken(sequences=(sequence,), left_out=lost)
+
+
+def catalogue(count=9, view=None):
+    contacts = []
+    for n in range(count):
+        key = ContactKey(object_id=f"object_{n // 3}", site=0, motion="free", trial=n % 3)
+        contacts.append(Listed(key=key, name=f"contact {n}", read=functools.partial(take, n, key), view=view))
+    cards = {f"object_{n}": fakes.card(n, view=None, view_depth_mm=None) for n in range(-(-count // 3))}
+    return Catalogue(
+        source="fake",
+        licence="none",
+        sensors=("gelsight_mini",),
+        annotated=ATTRIBUTES[:1],
+        cards=cards,
+        contacts=tuple(contacts),
+        skipped=(Skip(name="stray", reason="is not listed"),),
+        config={},
+        identity="c0ffee",
+    )
+
+
+def test_what_is_left_out_is_reported(tmp_path):
+    report = import_catalogue(catalogue(), tmp_path)
+    assert report.contacts == 8
+    assert dict(report.objects) == {"train": 2, "val": 1, "test": 0, "unlabelled": 0}
+    assert [skip.name for skip in report.skipped] == ["stray", "contact 6", "frame of 2", "frame of 5", "frame of 8"]
+    assert report.unannotated == ATTRIBUTES[1:]
+    store = RecordStore(tmp_path)
+    assert len(store) == 8
+    assert store.meta.notes["report"]["skipped"] == [dataclasses.asdict(skip) for skip in report.skipped]
+
+
+def test_an_object_without_a_readable_contact_is_reported(tmp_path):
+    listing = catalogue(7)  # contact 6 is the only one of object_2
+    report = import_catalogue(listing, tmp_path)
+    assert Skip(name="object_2", reason="object without a readable contact") in report.skipped
+    assert set(RecordStore(tmp_path).objects) == {"object_0", "object_1"}
+
+
+@pytest.mark.parametrize("stop", [1, 2, 5, 6, 7, 9])
+def test_an_interrupted_import_reports_as_if_it_had_not_been(tmp_path, stop):
+    def interrupt(done, total):
+        if done == stop:
+            raise KeyboardInterrupt
+
+    whole = import_catalogue(catalogue(), tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt):
+        import_catalogue(catalogue(), tmp_path / "parts", progress=interrupt)
+    assert import_catalogue(catalogue(), tmp_path / "parts") == whole
+    assert import_catalogue(catalogue(), tmp_path / "parts") == whole  # a finished one is kept
+    assert RecordStore(tmp_path / "parts").contacts == RecordStore(tmp_path / "whole").contacts
+
+
+def test_a_killed_import_goes_on(tmp_path):
+    """SIGKILL after 100 of 150 contacts, of which the first shard of 64 is published."""
+    program = f"""
+        import os, signal, pathlib
+        from sensors_io.importers.catalogue import import_catalogue
+        from tests.sensors_io.importers.test_catalogue import catalogue
+        stop = lambda done, total: os.kill(os.getpid(), signal.SIGKILL) if done == 100 else None
+        import_catalogue(catalogue(150), pathlib.Path({str(tmp_path / "parts")!r}), progress=stop)
+    """
+    child = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=os.getcwd(), check=False)
+    assert child.returncode == -signal.SIGKILL
+    assert len(RecordStore(tmp_path / "parts", allow_incomplete=True)) == 64
+    whole = import_catalogue(catalogue(150), tmp_path / "whole")
+    assert import_catalogue(catalogue(150), tmp_path / "parts") == whole
+    stores = [RecordStore(tmp_path / name) for name in ("parts", "whole")]
+    assert stores[0].contacts == stores[1].contacts
+    for i in (0, 63, 64, 100, len(stores[0]) - 1):
+        a, b = (store.contact(i)["gelsight_mini"].frames for store in stores)
+        np.testing.assert_array_equal(a, b)
+
+
+def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
+    listing = catalogue(7)
+    broken = dataclasses.replace(listing, contacts=listing.contacts[6:], skipped=())
+    with pytest.raises(ImportSourceError, match=r"fake: no contact can be read; the first: .*contact 6.*is broken"):
+        import_catalogue(broken, tmp_path)
+    assert not (tmp_path / "index.json").exists()
+
+
+def test_other_records_are_not_touched(tmp_path):
+    import_catalogue(catalogue(), tmp_path)
+    with pytest.raises(RecordsExistError, match="was made by config 'c0ffee', not 'abcd'"):
+        import_catalogue(dataclasses.replace(catalogue(), identity="abcd"), tmp_path)
+
+
+def test_the_view_of_the_first_contact_is_stored(tmp_path):
+    path = picture(tmp_path / "in" / "view.png", shape=(480, 640))
+    import_catalogue(catalogue(3, view=path), tmp_path / "out")
+    assert RecordStore(tmp_path / "out").objects["object_0"].view.shape == (240, 320, 3)
+    path.write_bytes(b"broken")
+    report = import_catalogue(catalogue(3, view=path), tmp_path / "again")
+    assert Skip(name="view.png", reason="view does not open as a picture") in report.skipped
+    assert RecordStore(tmp_path / "again").objects["object_0"].view is None
+
+
+def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
+    def now(config=Keep()):  # noqa: B008
+        return fingerprint(tmp_path, [tmp_path / "a", tmp_path / "gone"], config, [tmp_path / "list"])
+
+    (tmp_path / "a").write_bytes(b"1")
+    (tmp_path / "list").write_bytes(b"x")
+    first = now()
+    assert now() == first
+    assert now(Keep(height=0)) != first
+    assert now(ImportConfig()) != first
+    (tmp_path / "list").write_bytes(b"y")
+    second = now()
+    (tmp_path / "a").write_bytes(b"22")
+    third = now()
+    (tmp_path / "gone").write_bytes(b"")
+    assert len({first, second, third, now()}) == 4
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"val_share": -0.1}, "val_share is -0.1: must lie in 0"),
+        ({"test_share": 1.0}, "test_share is 1.0: must lie in 0"),
+        ({"val_share": 0.5, "test_share": 0.5}, "must be < 1; keep some for training"),
+        ({"stride": 0}, "stride is 0: must be ≥ 1; raise it"),
+        ({"height": -1}, "height is -1: must be ≥ 0"),
+    ],
+)
+def test_bad_options_are_named(bad, message):
+    with pytest.raises(ImportSourceError, match=message):
+        ImportConfig(**bad)

@@ -1,0 +1,105 @@
+"""FeelAnyForce: pictures with forces; the sign of pressing is inferred from a push, or told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce, pressing_sign
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.records import RecordStore
+from sensors_io.schema import Flag
+from tests.sensors_io.importers.films import picture
+
+KEEP = FeelAnyForceConfig(height=0, max_frames=0, val_share=0, test_share=0)
+HEAD = "tactile,depth,FT\n"
+
+
+def row(root, ms, reading, indenter="sphere", write=True):
+    name = f"records/{indenter}/tactile/{ms}.png"
+    if write:
+        picture(root / name, ms % 200)
+    return f"{name},records/{indenter}/depth/{ms}.npy,{reading}\n"
+
+
+def write(root, *rows):
+    root.mkdir(exist_ok=True)
+    (root / "20250414.csv").write_text(HEAD + "".join(rows))
+    return root
+
+
+def imported(source, out, config=KEEP):
+    return import_catalogue(list_feelanyforce(source, config), out), RecordStore(out)
+
+
+@pytest.mark.parametrize(("pushes", "sign"), [("4.5", -1), ("-4.5", 1)])
+def test_a_known_push_presses_whatever_sign_the_file_has(tmp_path, pushes, sign):
+    """1 N along x and 4.5 N of pressing, as a sensor says that measures the push or its reaction."""
+    root = tmp_path / "in"
+    source = write(root, row(root, 1000, "0 0 0.1 0 0 0"), row(root, 2500, f"1 0 {pushes} 0 0 0.2"))
+    _, store = imported(source, tmp_path / "out")
+    sequence = store.contact(0)["gelsight_mini"]
+    np.testing.assert_allclose(sequence.force_n, [[0, 0, sign * 0.1], [sign, 0, -4.5]], atol=1e-3)
+    assert sequence.host_time_ns.tolist() == [1_000_000_000, 2_500_000_000]
+    assert sequence.moment_nmm is None
+
+
+def test_the_sign_can_be_told_and_is_left_alone_without_a_push(tmp_path):
+    assert pressing_sign([0.15, -0.1], "infer") == 1
+    assert pressing_sign([0.1, 9.0, -2.0], "infer") == -1
+    assert pressing_sign([9.0], "negative") == 1
+    assert pressing_sign([-9.0], "positive") == -1
+
+
+def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
+    root = tmp_path / "in"
+    rows = [
+        row(root, 1000, "0 0 -3 0 0 0"),
+        row(root, 2000, "", write=False),
+        row(root, 3000, "0 0 -3 0 0"),
+        row(root, 4000, "0 0 nan 0 0 0"),
+        row(root, 5000, "0 0 -3 0 0 0", write=False),
+        "records/sphere/tactile/background.png,,0 0 0 0 0 0\n",
+        row(root, 6000, "0 0 -2 0 0 0"),
+    ]
+    report, store = imported(write(root, *rows), tmp_path / "out")
+    assert {skip.name: skip.reason for skip in report.skipped} == {
+        "20250414.csv, line 3": "has no six readings, and its picture is absent",
+        "20250414.csv, line 4": "has no six readings",
+        "20250414.csv, line 5": "has no six readings",
+        "tactile/5000.png": "is absent",
+        "20250414.csv, line 7": "names no <indenter>/tactile/<ms>.png",
+    }
+    sequence = store.contact(0)["gelsight_mini"]
+    assert sequence.force_n[:, 2].tolist() == [-3, 0, 0, -2]
+    assert sequence.flags.tolist() == [0, int(Flag.INCOMPLETE), int(Flag.INCOMPLETE), int(Flag.TIME_GAP)]
+
+
+def test_a_table_is_cut_into_pieces_and_nothing_is_lost(tmp_path):
+    root = tmp_path / "in"
+    rows = [row(root, 1000 * n, f"0 0 -{n} 0 0 0", "cube" if n % 2 else "ball") for n in range(1, 8)]
+    report, store = imported(write(root, *rows), tmp_path / "out", dataclasses.replace(KEEP, max_frames=3))
+    assert report.contacts == 3
+    pieces = {(k.object_id, k.trial): store.contact(i)["gelsight_mini"] for i, k in enumerate(store.contacts)}
+    forces = {key: sequence.force_n[:, 2].tolist() for key, sequence in pieces.items()}
+    assert forces == {("cube", 0): [-1, -3, -5], ("cube", 1): [-7], ("ball", 0): [-2, -4, -6]}
+
+
+def test_pictures_beside_the_table_are_found(tmp_path):
+    root = tmp_path / "in"
+    source = write(root, row(root, 1000, "0 0 -3 0 0 0", write=False))
+    picture(source / "tactile" / "1000.png", 40)
+    _, store = imported(source, tmp_path / "out")
+    assert store.contacts[0].object_id == "sphere"
+
+
+def test_wrong_directories_and_tables_are_named(tmp_path):
+    with pytest.raises(ImportSourceError, match=r"expected <table>.csv with the columns tactile, depth, FT"):
+        list_feelanyforce(tmp_path, KEEP)
+    (tmp_path / "a.csv").write_text("tactile,force\n")
+    with pytest.raises(ImportSourceError, match="must have tactile, FT"):
+        list_feelanyforce(tmp_path, KEEP)
+    (tmp_path / "a.csv").write_text(HEAD + "x,,\n")
+    with pytest.raises(ImportSourceError, match="no row with a picture and six readings"):
+        list_feelanyforce(tmp_path, KEEP)

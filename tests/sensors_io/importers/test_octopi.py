@@ -1,0 +1,93 @@
+"""Octopi-1.5 samples: ratings become thirds, numbers become times, everything else is refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.keep import ImportSourceError, Keep, Skip
+from sensors_io.importers.octopi import level_of, list_octopi
+from sensors_io.records import RecordStore
+from sensors_io.schema import UNKNOWN, Flag
+from tests.sensors_io.importers.films import cut, picture
+
+KEEP = Keep(height=0, max_frames=0)
+POTATO = {
+    "object_id": "physiclear_potato",
+    "object": "an unpeeled, raw potato",
+    "properties": {"hardness": 7.67, "roughness": 6.33},
+    "exploratory_procedure": "pressing",
+    "split": "train",
+}
+
+
+def sample(root, name, data, numbers=(3, 4, 7)):
+    for n in numbers:
+        picture(root / name / "tactile" / f"{n:010d}.jpg", 20 * n)
+    (root / name).mkdir(parents=True, exist_ok=True)
+    (root / name / "data.json").write_text(json.dumps(data) if isinstance(data, dict) else data)
+
+
+@pytest.fixture
+def source(tmp_path):
+    root = tmp_path / "samples"
+    sample(root, "physiclear_2", POTATO | {"exploratory_procedure": "sliding"})
+    sample(root, "physiclear_10", POTATO)
+    sample(root, "objectfolder_0", {"object_id": "objectfolder_1", "object": "a spoon", "split": "train"})
+    return root
+
+
+def test_samples_become_records(source, tmp_path):
+    report = import_catalogue(list_octopi(source, KEEP), tmp_path / "out")
+    assert (report.contacts, report.skipped, report.unlabelled) == (3, (), ())
+    assert report.unannotated == ("protrusion", "material")
+    store = RecordStore(tmp_path / "out")
+    assert [(k.object_id, k.motion, k.trial) for k in store.contacts] == [
+        ("objectfolder_1", "free", 0),
+        ("potato", "free", 0),
+        ("potato", "press", 0),
+    ]
+    card = store.objects["potato"]
+    assert (card.split, card.label_row().tolist()) == ("train", [2, 1, UNKNOWN, UNKNOWN])
+    assert card.truth == {"hardness_rating_of_10": 7.67, "roughness_rating_of_10": 6.33}
+    assert store.objects["objectfolder_1"].split == "unlabelled"
+    sequence = store.contact(2)["gelsight_mini"]
+    assert sequence.frames.shape == (3, 24, 32, 3)
+    np.testing.assert_allclose(sequence.host_time_ns, np.array([2, 3, 6]) / 30 * 1e9, atol=1)
+    assert sequence.camera["exploratory_procedure"] == "pressing"
+    assert sequence.force_n is None
+
+
+def test_a_cut_picture_is_left_out_and_marked(source, tmp_path):
+    cut(source / "physiclear_2" / "tactile" / "0000000004.jpg")
+    report = import_catalogue(list_octopi(source, KEEP), tmp_path / "out")
+    assert report.skipped == (Skip(name="tactile/0000000004.jpg", reason="is cut off"),)
+    assert RecordStore(tmp_path / "out").contact(1)["gelsight_mini"].flags.tolist() == [0, int(Flag.TIME_GAP)]
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        ("{", "data.json: "),
+        ({"object": "nothing"}, "data.json: 'object_id'"),
+        (POTATO | {"split": "dev"}, "split is 'dev'"),
+        (POTATO | {"properties": {"hardness": 11}}, "rating is 11.0: must lie in 0..10"),
+        (POTATO | {"properties": {"hardness": 1.0}}, "contradicts an earlier sample of potato"),
+    ],
+)
+def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
+    sample(source, "physiclear_99", data)
+    catalogue = list_octopi(source, KEEP)
+    assert len(catalogue.contacts) == 3
+    assert [skip.name for skip in catalogue.skipped] == ["physiclear_99"]
+    assert reason in catalogue.skipped[0].reason
+
+
+def test_ratings_are_cut_into_thirds():
+    assert [level_of(r) for r in (0, 3.33, 3.34, 6.66, 6.67, 10)] == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_wrong_directory_says_what_was_expected(tmp_path):
+    with pytest.raises(ImportSourceError, match=r"holds none: expected <sample>/data.json and <sample>/tactile"):
+        list_octopi(tmp_path, KEEP)

@@ -1,0 +1,89 @@
+"""Pictures are read whole or left out by name, and what they leave behind is marked as a gap."""
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.keep import Keep
+from sensors_io.importers.pictures import PictureError, natural, nominal_ns, numbered, read_picture, read_pictures
+from tests.sensors_io.importers.films import cut, picture
+
+WHOLE = Keep(height=0, max_frames=0)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_colours_are_rgb(tmp_path, name):
+    image = read_picture(picture(tmp_path / name))
+    assert image.shape == (24, 32, 3)
+    red, green, blue = image[2, 2].astype(int)
+    assert red > 200 > 80 > max(green, blue)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_a_picture_that_was_cut_off_is_refused(tmp_path, name):
+    with pytest.raises(PictureError, match="is cut off"):
+        read_picture(cut(picture(tmp_path / name)))
+
+
+def test_what_is_no_picture_is_refused(tmp_path):
+    with pytest.raises(PictureError, match="is absent"):
+        read_picture(tmp_path / "a.png")
+    for data in (b"", b"text"):
+        (tmp_path / "a.png").write_bytes(data)
+        with pytest.raises(PictureError, match="does not open as a picture"):
+            read_picture(tmp_path / "a.png")
+
+
+def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
+    paths = [picture(tmp_path / "f" / f"{n}.png", 20 * n) for n in range(6)]
+    cut(paths[1])
+    paths[2].unlink()
+    picture(paths[4], shape=(10, 32))
+    pictures = read_pictures(paths, np.arange(6), WHOLE)
+    assert pictures.index.tolist() == [0, 3, 5]
+    assert pictures.after_loss().tolist() == [False, True, True]
+    assert [(skip.name, skip.reason) for skip in pictures.left_out] == [
+        ("f/1.png", "is cut off"),
+        ("f/2.png", "is absent"),
+        ("f/4.png", "has (10, 32) pixels, those before it (24, 32)"),
+    ]
+    np.testing.assert_array_equal(pictures.frames[:, 20, 20, 0], [0, 60, 100])
+
+
+def test_pictures_are_shrunk_and_chosen_by_position(tmp_path):
+    paths = [picture(tmp_path / f"{n}.png", 20 * n) for n in range(6)]
+    pictures = read_pictures(paths, np.array([1, 4]), Keep(height=12))
+    assert pictures.frames.shape == (2, 12, 16, 3)
+    assert pictures.size_px == (24, 32)
+    np.testing.assert_array_equal(pictures.frames[:, 10, 10, 0], [20, 80])
+
+
+def test_no_readable_picture_is_an_error(tmp_path):
+    with pytest.raises(PictureError, match=r"holds no picture that can be read; the first: .*x.png is absent"):
+        read_pictures([tmp_path / "x.png"], np.arange(1), WHOLE)
+
+
+def test_names_are_ordered_by_their_numbers(tmp_path):
+    for n in (10, 9, 100):
+        picture(tmp_path / f"frame_{n}.png")
+    (tmp_path / "notes.txt").touch()
+    assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
+    assert numbered(tmp_path / "absent") == []
+    assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
+
+
+def test_frame_numbers_are_times_at_a_rate():
+    assert nominal_ns(np.array([0, 3, 30]), 30.0).tolist() == [0, 100_000_000, 1_000_000_000]
+
+
+@pytest.mark.parametrize(
+    ("keep", "total", "positions", "pieces"),
+    [
+        (Keep(), 3, [0, 1, 2], [[0, 1, 2]]),
+        (Keep(stride=2, max_frames=2), 9, [0, 8], [[0, 2], [4, 6], [8]]),
+        (Keep(max_frames=0), 4, [0, 1, 2, 3], [[0, 1, 2, 3]]),
+        (Keep(), 0, [], []),
+    ],
+)
+def test_frames_are_thinned_or_cut_into_pieces(keep, total, positions, pieces):
+    assert keep.positions(total).tolist() == positions
+    assert [piece.tolist() for piece in keep.pieces(total)] == pieces

@@ -1,0 +1,125 @@
+"""Tac3D recordings: the grid is turned into image order, signs are kept, the counter's gaps are flagged."""
+
+import os
+import pathlib
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.keep import ImportSourceError, Shares
+from sensors_io.importers.tac3d import SIDE, list_tac3d
+from sensors_io.records import RecordStore
+from sensors_io.schema import Flag
+from tests.sensors_io.importers.films import cut
+
+ALL_TRAIN = Shares(val_share=0, test_share=0)
+
+
+def recording(*, index=(7, 8, 11), **changes):
+    """A press of 0.8 mm and 5 N at rest point x = 3, y = −4 mm that drags it 0.2 mm to +x; points as the vendor's."""
+    n = len(index)
+    y, x = np.meshgrid(np.linspace(10, -10, SIDE), np.linspace(10, -10, SIDE), indexing="ij")
+    rest = np.stack([x, y, np.full_like(x, 9.0)], -1).reshape(-1, 3)
+    pressed = np.argmin(np.hypot(rest[:, 0] - 3, rest[:, 1] + 4))
+    moved = np.zeros((n, SIDE * SIDE, 3))
+    moved[1:, pressed] = (0.2, 0, -0.8)
+    force = np.zeros((n, 1, 3))
+    force[1:, 0] = (1.0, 0.0, -5.0)
+    moment = np.cross([3.0, -4.0, 0.0], force)
+    return {
+        "3D_Positions": rest + moved,
+        "3D_Displacements": moved,
+        "3D_ResultantForce": force,
+        "3D_ResultantMoment": moment,
+        "index": np.array(index, np.int64),
+        "sendTimestamp": 68.0 + 0.03 * np.arange(n),
+    } | changes
+
+
+def write(folder, name="example_1_AD2-0065L", **changes):
+    folder.mkdir(exist_ok=True)
+    arrays = {key: value for key, value in recording(**changes).items() if value is not None}
+    np.savez(folder / f"{name}.npz", **arrays)
+    return folder
+
+
+def imported(source, out):
+    return import_catalogue(list_tac3d(source, ALL_TRAIN), out), RecordStore(out)
+
+
+def test_a_known_push_lies_where_and_as_it_was_made(tmp_path):
+    _, store = imported(write(tmp_path / "in"), tmp_path / "out")
+    sequence = store.contact(0)["tac3d"]
+    row, column = np.unravel_index(sequence.depth_mm[1].argmax(), (SIDE, SIDE))
+    axis = np.linspace(-10, 10, SIDE)  # x rises with the column, y with the row
+    assert axis[column] == pytest.approx(3, abs=0.6)
+    assert axis[row] == pytest.approx(-4, abs=0.6)
+    assert sequence.depth_mm[1, row, column] == pytest.approx(0.8, abs=1e-3)
+    np.testing.assert_allclose(sequence.deformation_mm[1, row, column], [0.2, 0], atol=1e-3)
+    np.testing.assert_allclose(sequence.force_n[1], [1, 0, -5], atol=1e-3)
+    np.testing.assert_allclose(sequence.moment_nmm[1], [20, 15, 4], atol=1e-2)  # r × F
+    assert sequence.frames is None
+    assert sequence.serial == "AD2-0065L"
+
+
+def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
+    _, store = imported(write(tmp_path / "in", index=(7, 8, 11, 12, 20)), tmp_path / "out")
+    sequence = store.contact(0)["tac3d"]
+    assert np.flatnonzero(sequence.flags & int(Flag.TIME_GAP)).tolist() == [2, 4]
+    assert sequence.camera["missing_frames"] == 9
+
+
+def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
+    write(tmp_path / "in", "a_S1")
+    write(tmp_path / "in", "b_S2", recvTimestamp=np.array([0.04, 0.07, 0.52]))
+    write(tmp_path / "in", "c_S3", recvTimestamp=np.array([0.04, 0.03, 0.52]))
+    report, store = imported(tmp_path / "in", tmp_path / "out")
+    sent, received = (store.contact(i)["tac3d"] for i in range(2))
+    np.testing.assert_array_equal(sent.host_time_ns, sent.device_time_ns)
+    assert received.host_time_ns.tolist() == [40_000_000, 70_000_000, 520_000_000]
+    np.testing.assert_array_equal(received.force_time_ns, received.device_time_ns)
+    assert report.skipped[0].reason == "has receive times that run backwards"
+
+
+def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
+    arrays = recording()
+    arrays["3D_ResultantForce"][1, 0, 2] = np.nan
+    report, store = imported(write(tmp_path / "in", **arrays), tmp_path / "out")
+    assert [skip.name for skip in report.skipped] == ["example_1_AD2-0065L.npz, frame 1"]
+    sequence = store.contact(0)["tac3d"]
+    assert len(sequence) == 2
+    assert sequence.flags.tolist() == [0, int(Flag.TIME_GAP)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"3D_ResultantMoment": None}, "lacks 3D_ResultantMoment"),
+        ({"3D_Positions": np.zeros((3, 400, 2))}, r"3D_Positions has shape \(3, 400, 2\): must be \(3, 400, 3\)"),
+        ({"3D_Positions": recording()["3D_Positions"][:, ::-1]}, "points in another order"),
+        ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "no frame of finite values"),
+    ],
+)
+def test_another_layout_is_refused(tmp_path, changes, reason):
+    with pytest.raises(ImportSourceError, match=reason):
+        imported(write(tmp_path / "in", **changes), tmp_path / "out")
+
+
+def test_damage_and_a_wrong_directory_are_named(tmp_path):
+    source = write(tmp_path / "in")
+    cut(source / "example_1_AD2-0065L.npz")
+    with pytest.raises(ImportSourceError, match="is damaged"):
+        imported(source, tmp_path / "out")
+    with pytest.raises(ImportSourceError, match=r"expected <name>_<serial>.npz"):
+        list_tac3d(tmp_path, ALL_TRAIN)
+
+
+@pytest.mark.skipif("TOUCHR1_TAC3D" not in os.environ, reason="TOUCHR1_TAC3D does not name the vendor's recordings")
+def test_the_real_recordings(tmp_path):
+    _, store = imported(pathlib.Path(os.environ["TOUCHR1_TAC3D"]), tmp_path)
+    missing = {k.object_id: store.contact(i)["tac3d"].camera["missing_frames"] for i, k in enumerate(store.contacts)}
+    assert missing == {"example_1_AD2-0065L": 9, "example_2_HDL1-GWH0021": 61}
+    hardest = store.contact(0)["tac3d"].force_n[:, 2].argmin()
+    assert store.contact(0)["tac3d"].force_n[hardest, 2] == pytest.approx(-7.694, abs=1e-3)
+    assert store.contact(0)["tac3d"].depth_mm[hardest].max() == pytest.approx(1.344, abs=1e-3)

@@ -1,0 +1,101 @@
+"""Touch and Go: runs of frames are touches, classes are materials, sessions stay whole."""
+
+import numpy as np
+import pytest
+
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.touch_and_go import list_touch_and_go, touches
+from sensors_io.records import RecordStore
+from sensors_io.schema import MATERIALS, UNKNOWN, Flag
+from tests.sensors_io.importers.films import picture
+
+KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
+FIRST, SECOND = "20220318_021048", "20220318_022003"
+
+
+def frames(root, session, numbers):
+    for n in numbers:
+        picture(root / "dataset" / session / "gelsight_frame" / f"{n:010d}.jpg", n % 200)
+        picture(root / "dataset" / session / "video_frame" / f"{n:010d}.jpg", 7, shape=(12, 16))
+
+
+def lines(session, numbers, kind):
+    return [f"{session}/{n:010d}.jpg,{kind}" for n in numbers]
+
+
+@pytest.fixture
+def source(tmp_path):
+    root = tmp_path / "touch_and_go"
+    frames(root, FIRST, [5, 6, 7, 60, 61])
+    frames(root, SECOND, [1, 2])
+    listed = lines(FIRST, [7, 5, 6], 9) + lines(FIRST, [60, 61], 12) + lines(SECOND, [1, 2], 3)
+    (root / "label.txt").write_text("\n".join(listed) + "\n")
+    return root
+
+
+def test_touches_become_records(source, tmp_path):
+    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
+    assert (report.contacts, report.skipped) == (3, ())
+    store = RecordStore(tmp_path / "out")
+    assert [k.object_id for k in store.contacts] == [f"{FIRST}-natural_fabric", f"{FIRST}-tree", f"{SECOND}-wood"]
+    materials = [MATERIALS[store.objects[k.object_id].labels["material"]] for k in store.contacts]
+    assert materials == ["fabric", "other", "wood"]
+    card = store.objects[f"{FIRST}-natural_fabric"]
+    assert card.label_row().tolist()[:3] == [UNKNOWN] * 3
+    assert card.view.shape == (240, 320, 3)
+    assert card.view[-1, -1, 0] < 20
+    sequence = store.contact(0)["gelsight"]
+    np.testing.assert_allclose(sequence.host_time_ns, np.array([5, 6, 7]) / 30 * 1e9, atol=1)
+    assert not sequence.flags.any()
+
+
+def test_recorded_times_are_used_where_they_are(source, tmp_path):
+    np.save(source / "dataset" / FIRST / "time2.npy", 1647.0 + np.arange(62) ** 2 / 100)
+    np.save(source / "dataset" / SECOND / "time2.npy", np.arange(2.0))
+    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
+    store = RecordStore(tmp_path / "out")
+    sequence = store.contact(0)["gelsight"]
+    np.testing.assert_allclose(sequence.host_time_ns, [250_000_000, 360_000_000, 490_000_000], atol=100)
+    assert sequence.camera["clock"] == "time2.npy"
+    assert "time2.npy has 2 times and frame 2 is listed" in {skip.reason for skip in report.skipped}
+
+
+def test_lines_and_frames_that_say_nothing_certain_are_skipped(source, tmp_path):
+    bad = [f"{FIRST}/61.jpg,3", f"{FIRST}/0000000061.jpg,20", f"{FIRST}/0000000005.jpg,2", "nonsense"]
+    (source / "train.txt").write_text("\n".join(bad))
+    (source / "dataset" / FIRST / "gelsight_frame" / "0000000006.jpg").unlink()
+    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
+    assert set(report.skipped) == {
+        *(
+            Skip(name=f"train.txt: {b}", reason="is no <session>/<10 digits>.jpg,<class>")
+            for b in (bad[0], bad[1], bad[3])
+        ),
+        Skip(name=f"{FIRST}/0000000005.jpg", reason="is listed with several classes"),
+        Skip(name="gelsight_frame/0000000006.jpg", reason="is absent"),
+    }
+    assert RecordStore(tmp_path / "out").contact(0)["gelsight"].flags.tolist() == [int(Flag.TIME_GAP)]
+
+
+def test_a_pause_a_class_or_a_session_ends_a_touch():
+    classes = {("a", 1): 0, ("a", 2): 0, ("a", 17): 0, ("a", 33): 0, ("a", 34): 1, ("b", 35): 1}
+    assert touches(classes) == [("a", 0, [1, 2, 17]), ("a", 0, [33]), ("a", 1, [34]), ("b", 1, [35])]
+
+
+def test_sessions_are_not_torn_apart(tmp_path):
+    listed = [line for d in range(10) for kind in (1, 2) for line in lines(f"2022010{d}_000000", [kind], kind)]
+    (tmp_path / "label.txt").write_text("\n".join(listed))
+    catalogue = list_touch_and_go(tmp_path, ImportConfig(val_share=0.2, test_share=0.3))
+    splits = {}
+    for card in catalogue.cards.values():
+        splits.setdefault(card.object_id[:15], set()).add(card.split)
+    assert all(len(found) == 1 for found in splits.values())
+    assert sorted(min(found) for found in splits.values()) == ["test"] * 3 + ["train"] * 5 + ["val"] * 2
+
+
+def test_a_wrong_directory_says_what_was_expected(tmp_path):
+    with pytest.raises(ImportSourceError, match=r"expected one of label.txt, .* and dataset/<session>/gelsight_frame"):
+        list_touch_and_go(tmp_path, KEEP)
+    (tmp_path / "label.txt").write_text("")
+    with pytest.raises(ImportSourceError, match=r"label.txt names no frame: expected lines <session>"):
+        list_touch_and_go(tmp_path, KEEP)

@@ -1,0 +1,77 @@
+"""TVL/HCT: pairs of a trajectory are one sequence, and swapped folders are turned round."""
+
+import pytest
+
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.tvl import list_tvl
+from sensors_io.records import RecordStore
+from tests.sensors_io.importers.films import cut, picture
+
+KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
+DIGIT, WEBCAM = (320, 240), (90, 160)
+HEAD = "url,tactile,tactile_background,caption\n"
+
+
+def pair(root, trajectory, name, level, swapped=False):
+    """One pair of pictures and its row."""
+    shapes = (WEBCAM, DIGIT) if swapped else (DIGIT, WEBCAM)
+    picture(root / trajectory / "tactile" / name, level, shapes[0])
+    picture(root / trajectory / "vision" / name, level, shapes[1])
+    return f'{trajectory}/vision/{name},{trajectory}/tactile/{name},{trajectory}/tactile/0.png,"smooth, hard"\n'
+
+
+@pytest.fixture
+def source(tmp_path):
+    root = tmp_path / "hct" / "data1"
+    rows = [pair(root, "0-1702507215.6", f"{n}-0.02.png", n) for n in (10, 9, 11)]
+    rows += [pair(root, "1-1702507300.1", f"{n}-0.02.png", n, swapped=True) for n in (3, 4)]
+    (root / "train.csv").write_text(HEAD + "".join(rows[1:]))
+    (root / "test.csv").write_text(HEAD + rows[0])
+    return tmp_path / "hct"
+
+
+def test_trajectories_become_records(source, tmp_path):
+    report = import_catalogue(list_tvl(source, KEEP), tmp_path / "out")
+    assert (report.contacts, report.skipped) == (2, ())
+    assert len(report.unannotated) == 4
+    store = RecordStore(tmp_path / "out")
+    assert {k.object_id for k in store.contacts} == {"data1-0-1702507215.6", "data1-1-1702507300.1"}
+    whole, swapped = sorted((store.contact(i)["digit"] for i in range(2)), key=lambda s: s.key.object_id)
+    assert whole.frames[:, -1, -1, 0].tolist() == [9, 10, 11]
+    assert whole.camera["captioned_by"] == ["GPT-4V", "people", "GPT-4V"]
+    assert whole.camera["captions"] == ["smooth, hard"] * 3
+    assert swapped.frames.shape == (2, *DIGIT, 3)
+    assert (whole.camera["turned_round"], swapped.camera["turned_round"]) == (0, 2)
+    for card in store.objects.values():
+        assert card.view.shape == (240, 427, 3)
+
+
+def test_one_part_alone_and_a_cut_picture(source, tmp_path):
+    cut(source / "data1" / "0-1702507215.6" / "tactile" / "10-0.02.png")
+    report = import_catalogue(list_tvl(source / "data1", KEEP), tmp_path / "out")
+    assert report.skipped == (Skip(name="tactile/10-0.02.png", reason="is cut off"),)
+    assert {k.object_id for k in RecordStore(tmp_path / "out").contacts} == {"0-1702507215.6", "1-1702507300.1"}
+
+
+def test_a_row_that_leads_elsewhere_is_skipped(source):
+    with (source / "data1" / "train.csv").open("a") as file:
+        file.write("../a/b,../a/b,,x\nshort\na/vision/b.jpg,a/tactile/b.jpg,,x\n")
+    catalogue = list_tvl(source, KEEP)
+    reason = "is no <trajectory>/{tactile,vision}/<i>-<gap>.jpg"
+    assert [(skip.name, skip.reason) for skip in catalogue.skipped] == [
+        ("data1/train.csv: ../a/b", reason),
+        ("data1/train.csv: ", reason),
+        ("data1/train.csv: a/tactile/b.jpg", reason),
+    ]
+
+
+def test_wrong_directories_and_tables_are_named(source, tmp_path):
+    with pytest.raises(ImportSourceError, match=r"expected train.csv or test.csv, in it or in data1"):
+        list_tvl(tmp_path, KEEP)
+    (source / "data1" / "train.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ImportSourceError, match=r"train.csv has the columns \['a', 'b'\]: must have url, tactile"):
+        list_tvl(source, KEEP)
+    (source / "data1" / "train.csv").write_bytes(b"\xff\xfe\xff")
+    with pytest.raises(ImportSourceError, match=r"train.csv cannot be read"):
+        list_tvl(source, KEEP)

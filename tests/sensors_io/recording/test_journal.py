@@ -1,0 +1,46 @@
+"""A journal cut off anywhere is readable up to there; one damaged inside is refused."""
+
+import numpy as np
+import pytest
+
+from sensors_io.recording.journal import JournalError, JournalWriter, read_journal
+
+
+@pytest.fixture
+def journal(tmp_path):
+    path = tmp_path / "a.journal"
+    with JournalWriter(path) as writer:
+        for n in range(4):
+            writer.append("frame", {"n": n}, frame=np.full((2, 3), n, np.uint8), empty=np.zeros((0, 3)))
+    return path
+
+
+def test_entries_come_back(journal):
+    entries, torn = read_journal(journal)
+    assert torn == 0
+    assert [e.plain["n"] for e in entries] == [0, 1, 2, 3]
+    assert entries[2].arrays["frame"].tolist() == [[2] * 3] * 2
+    assert entries[2].arrays["empty"].shape == (0, 3)
+
+
+def test_every_cut_keeps_all_whole_entries(journal):
+    data = journal.read_bytes()
+    each = len(data) // 4
+    for size in range(len(data)):
+        journal.write_bytes(data[:size])
+        entries, torn = read_journal(journal)
+        assert len(entries) == size // each
+        assert torn == size % each
+
+
+def test_damage_inside_is_refused(journal):
+    data = bytearray(journal.read_bytes())
+    data[30] ^= 1
+    journal.write_bytes(data)
+    with pytest.raises(JournalError, match="damaged at byte 0"):
+        read_journal(journal)
+
+
+def test_a_journal_is_never_overwritten(journal):
+    with pytest.raises(FileExistsError), JournalWriter(journal):
+        pass

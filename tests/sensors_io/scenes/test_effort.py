@@ -1,0 +1,71 @@
+"""The effort of a sequence, and the generator that is asked for an error."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sensors_io import codec
+from sensors_io.scenes import SceneConfig, config_hash, effort, protocol
+from sensors_io.scenes.draws import draw
+from sensors_io.scenes.sensors import TAC3D
+from sensors_io.scenes.sequence import make_sequence
+from sensors_io.schema import Flag
+
+CONFIG = SceneConfig(objects=2, sites=1, frames=3, max_force_n=4.0)
+ORDER = 2  # Tac3D, which has no picture to render
+
+
+def _drawn(config=CONFIG, index=0):
+    return draw(config, index, protocol.slot(config, index), ORDER)
+
+
+def _choose(error, index=0):
+    made = _drawn(index=index)
+    return effort.choose(error, made.press, made.unit.modulus_factor, made.sensor)
+
+
+def _cost(chosen):
+    (setting,) = [s for s in effort.menu(TAC3D) if (s.grid, s.tolerance) == (chosen.grid, chosen.tolerance)]
+    return setting.cost
+
+
+def test_less_error_takes_more_effort():
+    costs = [_cost(_choose(error)) for error in (0.5, 0.1, 0.03)]
+    assert costs == sorted(costs)
+
+
+def test_what_cannot_be_met_is_said():
+    assert _choose(0.9).met
+    assert not _choose(1e-4).met
+
+
+def test_where_nothing_touches_the_least_effort_will_do():
+    made = _drawn()
+    path = dataclasses.replace(made.press.path, force_n=np.zeros(3, np.float32))
+    press = dataclasses.replace(made.press, path=path)
+    chosen = effort.choose(0.01, press, made.unit.modulus_factor, made.sensor)
+    assert (chosen.grid, chosen.met) == (effort.GRIDS[0], True)
+
+
+def test_records_say_on_which_grid_they_were_solved():
+    asking = dataclasses.replace(CONFIG, error=1e-4)
+    made = make_sequence(asking, 0, protocol.slot(asking, 0), ORDER, 0)
+    chosen = _choose(1e-4)
+    np.testing.assert_array_equal(made.contact_grid, np.full(3, chosen.grid, np.uint16))
+    assert np.all(made.flags & Flag.ERROR_UNMET)
+    again = codec.decode_sequence(codec.encode_sequence(made))
+    np.testing.assert_array_equal(again.contact_grid, made.contact_grid)
+
+
+def test_without_an_error_nothing_changes():
+    made = make_sequence(CONFIG, 0, protocol.slot(CONFIG, 0), ORDER, 0)
+    assert made.contact_grid is None
+    assert not np.any(made.flags & Flag.ERROR_UNMET)
+    assert config_hash(CONFIG) != config_hash(dataclasses.replace(CONFIG, error=0.05))
+
+
+@pytest.mark.parametrize("error", [0.0, 1.5])
+def test_an_error_out_of_range_is_refused(error):
+    with pytest.raises(ValueError, match=r"error is .*must lie in \(0, 1\]"):
+        SceneConfig(error=error)

@@ -1,0 +1,81 @@
+"""Each filter by hand values; flags that can be taken back."""
+
+import numpy as np
+import pytest
+
+from sensors_io import quality
+from sensors_io.quality import QualityConfig
+from sensors_io.schema import ContactKey, Flag, Sequence
+
+CONFIG = QualityConfig()
+
+
+def test_saturation_counts_pixels_beyond_the_background() -> None:
+    frames = np.zeros((2, 10, 10, 3), np.uint8)
+    frames[1, :5, :5, 2] = 255
+    background = np.zeros((10, 10, 3), np.uint8)
+    assert quality.saturated(frames, background, CONFIG).tolist() == [False, True]
+    assert quality.saturated(frames, frames[1], CONFIG).tolist() == [False, False]
+
+
+def test_rows_with_a_gap_in_any_column_are_incomplete() -> None:
+    force = np.array([[0, 0, -1.0], [0, np.nan, -1], [0, 0, -1]])
+    moment = np.array([[0, 0, 0.0], [0, 0, 0], [np.inf, 0, 0]])
+    assert quality.incomplete(force, None, moment).tolist() == [False, True, True]
+    with pytest.raises(ValueError, match="all None"):
+        quality.incomplete(None)
+
+
+def test_force_that_swings_in_a_hold_is_unstable_elsewhere_not() -> None:
+    force = np.zeros((12, 3))
+    force[6:, 2] = -2.0
+    hold, load = np.full(12, 2, np.uint8), np.full(12, 1, np.uint8)
+    assert np.flatnonzero(quality.unstable(force, hold, CONFIG)).tolist() == [4, 5, 6, 7]
+    assert not quality.unstable(force, load, CONFIG).any()
+
+
+def test_a_gap_marks_the_frame_after_it() -> None:
+    time = np.array([0, 10, 20, 50, 60], np.int64)
+    assert quality.time_gap(time, CONFIG).tolist() == [False, False, False, True, False]
+    assert not quality.time_gap(time[:1], CONFIG).any()
+
+
+def test_untouched_frames_are_judged_where_depth_is_valid() -> None:
+    depth, valid = np.zeros((2, 3, 3), np.float32), np.ones((2, 3, 3), bool)
+    depth[:, 1, 1], valid[1, 1, 1] = 0.5, False
+    assert quality.untouched(depth, valid, CONFIG).tolist() == [False, True]
+    assert quality.untouched(depth, None, CONFIG).tolist() == [False, False]
+
+
+def test_marks_can_be_taken_back() -> None:
+    flags = np.array([0, int(Flag.TIME_GAP)], np.uint32)
+    both = quality.marked(flags, {Flag.SATURATED: np.array([True, True])})
+    assert both.tolist() == [4, 4 | 128]
+    np.testing.assert_array_equal(quality.without(both, Flag.SATURATED), flags)
+    assert flags.tolist() == [0, 128]
+
+
+def test_a_sequence_is_judged_by_what_it_holds() -> None:
+    sequence = Sequence(
+        key=ContactKey(object_id="a", site=0, motion="press", trial=0),
+        sensor="tac3d",
+        depth_mm=np.zeros((3, 4, 4), np.float32),
+        deformation_mm=np.zeros((3, 4, 4, 2), np.float32),
+        force_n=np.array([[0, 0, -1], [0, 0, np.nan], [0, 0, -1]], np.float32),
+        host_time_ns=np.array([0, 10, 50], np.int64),
+        phase=np.zeros(3, np.uint8),
+        flags=np.zeros(3, np.uint32),
+    )
+    found = quality.judge(sequence)
+    assert set(found) == {Flag.TIME_GAP, Flag.NO_CONTACT, Flag.UNSTABLE_FORCE, Flag.INCOMPLETE}
+    assert found[Flag.NO_CONTACT].all()
+    assert found[Flag.INCOMPLETE].tolist() == [False, True, False]
+    again = quality.judged(sequence)
+    assert again.flags[1] == int(Flag.NO_CONTACT | Flag.INCOMPLETE)
+    assert not sequence.flags.any()
+
+
+@pytest.mark.parametrize("wrong", [{"unstable_window": 1}, {"gap_periods": 1.0}, {"saturated_level": 0}])
+def test_limits_that_mean_nothing_are_refused(wrong: dict) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is"):
+        QualityConfig(**wrong)

@@ -1,0 +1,127 @@
+"""Clocks, counters and taps against known truth."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sensors_io.clock import JumpingClock
+from sensors_io.sync import ClockMap, IndexGaps, PeriodGaps, Signal, TapError, tap_offset
+
+MS = 1_000_000
+
+
+def test_the_least_delayed_sample_sets_the_clock():
+    """Delays 5, 0, 7, 3 ms: from the second on every stamp is exact."""
+    clock = ClockMap(window_s=10)
+    device = [0, 10 * MS, 20 * MS, 30 * MS]
+    delay = [5 * MS, 0, 7 * MS, 3 * MS]
+    mapped = [clock.to_host_ns(d, d + 1000 * MS + late) for d, late in zip(device, delay, strict=True)]
+    assert mapped == [1005 * MS, 1010 * MS, 1020 * MS, 1030 * MS]
+
+
+@pytest.mark.parametrize("skew", [-5e-5, 5e-5])
+def test_a_skewed_clock_is_followed_within_skew_times_window(skew):
+    """An hour at 50 ppm, where the minimum of all differences would be 180 ms off."""
+    clock, rng = ClockMap(window_s=10), np.random.default_rng(0)
+    true = np.arange(0, 3600 * 25) * 40 * MS
+    arrival = np.maximum.accumulate(true + (rng.exponential(3, len(true)) * MS).astype(np.int64))
+    device = np.round(true * (1 + skew)).astype(np.int64)
+    mapped = np.array([clock.to_host_ns(int(d), int(h)) for d, h in zip(device, arrival, strict=True)])
+    assert np.all(mapped <= arrival)
+    late = (mapped - true)[1000:]
+    assert np.abs(late).max() <= 0.5 * MS + 3 * MS / 50  # the least of 250 exponential delays
+
+
+def test_a_restarted_device_clock_starts_anew():
+    clock = ClockMap()
+    clock.to_host_ns(10_000 * MS, 0)
+    assert clock.to_host_ns(5 * MS, 20 * MS) == 20 * MS
+    assert clock.restarts == 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60), st.sampled_from([None, 256]))
+def test_drops_and_duplicates_of_a_counter_are_all_found(plan, modulus):
+    """Each entry: how many are dropped before a sample, and whether it comes twice."""
+    gaps, index, missing, duplicates = IndexGaps(modulus), 250, 0, 0
+    gaps.step(index)
+    for dropped, twice in plan:
+        index += dropped + 1
+        for _ in range(1 + twice):
+            step = gaps.step(index if modulus is None else index % modulus)
+            missing += step.missing
+            duplicates += step.duplicate
+    assert missing == sum(dropped for dropped, _ in plan)
+    assert duplicates == sum(twice for _, twice in plan)
+
+
+def test_a_late_sample_is_told_from_a_duplicate_and_a_restart():
+    gaps = IndexGaps()
+    steps = [gaps.step(i) for i in (5000, 5001, 5004, 5002, 5002, 5005, 7)]
+    assert [s.missing for s in steps] == [0, 0, 2, 0, 0, 0, 0]
+    assert steps[3].late
+    assert steps[4].duplicate
+    assert steps[6].restarted
+    assert not any(s.restarted for s in steps[:6])
+
+
+def test_after_reopening_a_small_step_back_is_a_restart():
+    gaps = IndexGaps()
+    assert [gaps.step(i) for i in (3, 4)][-1].missing == 0
+    assert gaps.step(0, reopened=True).restarted
+    assert gaps.step(1).missing == 0
+
+
+def test_periods_count_what_is_missing_and_take_back_what_was_late():
+    gaps = PeriodGaps(10 * MS)
+    times = [0, 10, 20, 50, 60, 76, 80, 90]  # two lost before 50; 70 comes 6 ms late
+    assert [gaps.step(t * MS).missing for t in times] == [0, 0, 0, 2, 0, 1, -1, 0]
+
+
+def test_the_estimated_losses_follow_a_rate_that_is_2_percent_off():
+    gaps, rng = PeriodGaps(10 * MS), np.random.default_rng(1)
+    kept = rng.random(20_000) >= 0.02
+    kept[[0, -1]] = True
+    time = (np.arange(20_000) * 10.2 + rng.exponential(1.0, 20_000))[kept]
+    found = sum(gaps.step(int(t * MS)).missing for t in time)
+    assert abs(found - np.sum(~kept)) <= 4
+
+
+def taps(shift_s, rate_hz, seed=0, count=6):
+    """A signal with `count` taps at irregular times, seen `shift_s` late at some rate, with noise of 1 % of a tap."""
+    at = np.cumsum([1.0, 1.3, 0.9, 1.7, 1.1, 1.45][:count]) + shift_s
+    time = np.arange(0, 10, 1 / rate_hz)
+    rise = 0.02  # s
+    value = sum(np.clip((time - t) / rise, 0, 1) * np.exp(-np.clip(time - t - rise, 0, None) / 0.05) for t in at)
+    value = value + 0.01 * np.random.default_rng(seed).standard_normal(len(time))
+    return Signal(time_ns=np.round(time * 1e9).astype(np.int64), value=value)
+
+
+@pytest.mark.parametrize("shift", [-0.2, 0.0, 0.037])
+def test_taps_tell_the_offset_of_two_clocks(shift):
+    found = tap_offset(taps(0.0, 1000), taps(shift, 120, seed=1))
+    assert found.taps == 6
+    assert found.seconds == pytest.approx(shift, abs=0.003)
+    assert found.spread_s < 0.005
+
+
+def test_too_few_taps_are_refused():
+    with pytest.raises(TapError, match="signal b shows 2 taps"):
+        tap_offset(taps(0, 1000), taps(0, 1000, count=2))
+    quiet = Signal(time_ns=np.arange(1000) * MS, value=np.random.default_rng(0).standard_normal(1000))
+    with pytest.raises(TapError, match="signal a shows 0 taps"):
+        tap_offset(quiet, taps(0, 1000))
+
+
+def test_signals_are_checked():
+    with pytest.raises(ValueError, match="does not increase"):
+        Signal(time_ns=np.zeros(4, np.int64), value=np.zeros(4))
+    with pytest.raises(ValueError, match="must be two"):
+        Signal(time_ns=np.arange(4), value=np.zeros(5))
+
+
+def test_a_jumping_clock_only_moves_forward():
+    clock = JumpingClock(5)
+    clock.sleep_until(20)
+    clock.sleep_until(10)
+    assert clock.now_ns() == 20

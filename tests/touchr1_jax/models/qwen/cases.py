@@ -1,0 +1,168 @@
+"""A Qwen2.5-VL of 0.2 million parameters and prompts for it, all by formula: what golden arrays and tests share.
+
+Nothing here imports JAX or PyTorch, so that both sides compute from the same numbers.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+GOLDEN = Path(__file__).resolve().parents[3] / "data" / "qwen" / "golden.npz"
+VOCAB, VISION_START, VISION_END, IMAGE, VIDEO = 96, 90, 91, 92, 93
+MERGE, PATCH_PX, PATCH_FRAMES = 2, 4, 2
+PIXELS = 3 * PATCH_FRAMES * PATCH_PX**2
+
+
+def config_json(*, window_px: int = 16, tied: bool = True) -> dict[str, Any]:
+    """A `config.json` in the published layout."""
+    return {
+        "architectures": ["Qwen2_5_VLForConditionalGeneration"],
+        "model_type": "qwen2_5_vl",
+        "hidden_act": "silu",
+        "hidden_size": 64,
+        "intermediate_size": 80,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 4,
+        "num_key_value_heads": 2,
+        "max_position_embeddings": 512,
+        "rms_norm_eps": 1e-6,
+        "rope_theta": 1e6,
+        "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
+        "tie_word_embeddings": tied,
+        "use_sliding_window": False,
+        "vocab_size": VOCAB,
+        "vision_start_token_id": VISION_START,
+        "vision_end_token_id": VISION_END,
+        "image_token_id": IMAGE,
+        "video_token_id": VIDEO,
+        "vision_config": {
+            "depth": 4,
+            "hidden_act": "silu",
+            "hidden_size": 32,
+            "intermediate_size": 44,
+            "num_heads": 2,
+            "in_chans": 3,
+            "out_hidden_size": 64,
+            "patch_size": PATCH_PX,
+            "spatial_merge_size": MERGE,
+            "temporal_patch_size": PATCH_FRAMES,
+            "window_size": window_px,
+            "fullatt_block_indexes": [1, 3],
+            "tokens_per_second": 2,
+        },
+    }
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A picture of so many patches."""
+
+    rows: int
+    columns: int
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Video:
+    """A video of so many steps and patches."""
+
+    steps: int
+    rows: int
+    columns: int
+    seconds_per_step: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """One prompt for one model; a number among its parts is so many words.
+
+    `ids_as_reference` says that transformers ≥ 5 counts the positions as the released model did, which it does but for
+    videos that last longer than they are wide.
+    """
+
+    parts: tuple[int | Picture | Video, ...]
+    window_px: int = 16
+    tied: bool = True
+    ids_as_reference: bool = True
+
+    def config(self) -> dict[str, Any]:
+        return config_json(window_px=self.window_px, tied=self.tied)
+
+    def seen(self) -> list[Picture | Video]:
+        return [part for part in self.parts if not isinstance(part, int)]
+
+
+CASES: Mapping[str, Case] = {
+    "text": Case(parts=(24,)),
+    "text_untied": Case(parts=(24,), tied=False),
+    "image": Case(parts=(5, Picture(rows=10, columns=14), 6)),
+    "image_window_24": Case(parts=(5, Picture(rows=10, columns=14), 6), window_px=24),
+    "image_window_32": Case(parts=(3, Picture(rows=8, columns=16), 4), window_px=32),
+    "video": Case(parts=(4, Video(steps=3, rows=8, columns=6, seconds_per_step=0.5), 5)),
+    "video_fast": Case(parts=(4, Video(steps=4, rows=4, columns=6, seconds_per_step=0.2), 5), window_px=24),
+    "video_long": Case(
+        parts=(4, Video(steps=4, rows=4, columns=6, seconds_per_step=1.0), 5), ids_as_reference=False, tied=False
+    ),
+    "mixed": Case(
+        parts=(
+            3,
+            Picture(rows=4, columns=6),
+            2,
+            Video(steps=2, rows=6, columns=4, seconds_per_step=1.0),
+            1,
+            Picture(rows=2, columns=2),
+            5,
+        )
+    ),
+}
+
+
+def steps(part: Picture | Video) -> int:
+    return part.steps if isinstance(part, Video) else 1
+
+
+def tokens(part: Picture | Video) -> int:
+    return steps(part) * part.rows * part.columns // MERGE**2
+
+
+def prompt_ids(case: Case) -> np.ndarray:
+    """Words by formula; what is seen stands between its two marks."""
+    ids: list[int] = []
+    for i, part in enumerate(case.parts):
+        if isinstance(part, int):
+            ids += [int(w) for w in uniform(f"words {i}", (part,)) * VISION_START]
+        else:
+            pad = VIDEO if isinstance(part, Video) else IMAGE
+            ids += [VISION_START, *[pad] * tokens(part), VISION_END]
+    return np.array(ids)
+
+
+def patches(name: str, part: Picture | Video) -> np.ndarray:
+    """Normalised pixels of one picture or video, float32 [n, pixel]."""
+    n = steps(part) * part.rows * part.columns
+    return (4 * uniform(f"pixels {name}", (n, PIXELS)) - 2).astype(np.float32)
+
+
+def picture_pixels() -> np.ndarray:
+    """A picture of 75 × 60 px with smooth shades, edges and noise, uint8."""
+    y, x = np.mgrid[:75, :60]
+    shade = np.stack([120 + 100 * np.sin(x / 9), 2.0 * y + x, 255.0 * ((x // 8 + y // 8) % 2)], -1)
+    return np.clip(shade + 40 * (uniform("picture", (75, 60, 3)) - 0.5), 0, 255).astype(np.uint8)
+
+
+def tensor(key: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A weight by its key without prefix: about the size of a trained one, so that attention is not uniform."""
+    x = 2 * uniform(key, shape) - 1
+    if len(shape) == 1:
+        return (0.3 * x + ("norm" in key or "ln_q" in key)).astype(np.float32)
+    fan_in = 1 if "embed_tokens" in key else int(np.prod(shape[1:]))
+    return (x * np.sqrt(6 / fan_in)).astype(np.float32)
+
+
+def uniform(name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers in [0, 1) that depend on a name alone; raw bits, the one stream that NumPy promises to keep."""
+    raw = np.random.PCG64(zlib.crc32(name.encode())).random_raw(int(np.prod(shape)))
+    return (raw >> np.uint64(11)).astype(np.float64).reshape(shape) * 2.0**-53

@@ -1,0 +1,128 @@
+"""Configs as published and as newer libraries nest them, and what is refused."""
+
+import dataclasses
+import json
+
+import pytest
+
+from tests.touchr1_jax.models.qwen.cases import config_json
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, parse_config, read_config, released
+
+SEVEN_B = {
+    "model_type": "qwen2_5_vl",
+    "image_token_id": 151655,
+    "video_token_id": 151656,
+    "vision_start_token_id": 151652,
+    "vision_end_token_id": 151653,
+    "hidden_act": "silu",
+    "hidden_size": 3584,
+    "intermediate_size": 18944,
+    "num_attention_heads": 28,
+    "num_hidden_layers": 28,
+    "num_key_value_heads": 4,
+    "rms_norm_eps": 1e-06,
+    "rope_theta": 1000000.0,
+    "rope_scaling": {"type": "mrope", "mrope_section": [16, 24, 24]},
+    "sliding_window": 32768,
+    "use_sliding_window": False,
+    "tie_word_embeddings": False,
+    "vocab_size": 152064,
+    "vision_config": {
+        "depth": 32,
+        "hidden_act": "silu",
+        "hidden_size": 1280,
+        "intermediate_size": 3420,
+        "num_heads": 16,
+        "in_chans": 3,
+        "out_hidden_size": 3584,
+        "patch_size": 14,
+        "spatial_merge_size": 2,
+        "window_size": 112,
+        "fullatt_block_indexes": [7, 15, 23, 31],
+        "tokens_per_second": 2,
+        "temporal_patch_size": 2,
+    },
+}
+"""The fields of the released 7B's file that matter."""
+
+TEXT = ("vocab_size", "hidden_size", "intermediate_size", "num_hidden_layers", "num_attention_heads")
+TEXT += ("num_key_value_heads", "hidden_act", "rms_norm_eps", "use_sliding_window", "tie_word_embeddings")
+
+
+def nested(flat: dict, **changes) -> dict:
+    """The same config as transformers ≥ 5 writes it."""
+    text = {name: flat[name] for name in TEXT}
+    text["rope_parameters"] = {"rope_type": "default", "rope_theta": flat["rope_theta"], **flat["rope_scaling"]}
+    vision = {k: v for k, v in flat["vision_config"].items() if k != "in_chans"} | {"in_channels": 3}
+    rest = {k: v for k, v in flat.items() if k not in (*TEXT, "rope_theta", "rope_scaling", "vision_config")}
+    return rest | {"text_config": text | changes, "vision_config": vision}
+
+
+def test_released_config_is_read():
+    assert parse_config(SEVEN_B) == released("7B")
+
+
+@pytest.mark.parametrize("flat", [SEVEN_B, config_json(), config_json(tied=False)])
+def test_nested_config_is_the_flat_one(flat):
+    assert parse_config(nested(flat)) == parse_config(flat)
+
+
+def test_directory_is_read(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(SEVEN_B))
+    assert read_config(tmp_path) == released("7B")
+
+
+def test_missing_and_broken_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"config\.json is no file"):
+        read_config(tmp_path)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ValueError, match="is no JSON"):
+        read_config(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model_type": "qwen2_vl"}, "model_type is 'qwen2_vl': must be 'qwen2_5_vl'"),
+        ({"hidden_act": "gelu"}, "hidden_act is 'gelu': must be 'silu'"),
+        ({"use_sliding_window": True}, "use_sliding_window is true"),
+        ({"hidden_size": 3585}, "hidden_size 3585 must be a multiple of num_attention_heads 28"),
+        ({"rope_scaling": {"type": "yarn", "mrope_section": [16, 24, 24]}}, r"rope_scaling.type is \['yarn'\]"),
+        ({"rope_scaling": {"type": "mrope", "mrope_section": [32, 32]}}, r"mrope_section is \[32, 32\]: must be three"),
+        ({"rope_scaling": {"type": "mrope"}}, "lacks rope_scaling.mrope_section"),
+        ({"num_key_value_heads": 5}, "num_heads 28 must be a multiple of num_kv_heads 5"),
+        ({"image_token_id": 151656}, "must be four different ids"),
+        ({"video_token_id": 152064}, "must be four different ids below vocab_size 152064"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"out_hidden_size": 8}}, "out_size 8 must equal"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"in_chans": 1}}, "vision_config.in_chans is 1: must be 3"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"window_size": 100}}, "window_px 100 must be a multiple"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"num_heads": 7}}, "must be a multiple of 4"),
+    ],
+)
+def test_what_is_not_computed_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        parse_config(SEVEN_B | change)
+
+
+@pytest.mark.parametrize("field", [*TEXT[:8], "rope_theta", "rope_scaling", "image_token_id", "vision_config"])
+def test_missing_field_is_named(field):
+    with pytest.raises(ValueError, match=rf"config\.json lacks {field}"):
+        parse_config({k: v for k, v in SEVEN_B.items() if k != field})
+
+
+def test_missing_nested_field_is_named_in_full():
+    broken = nested(SEVEN_B)
+    del broken["text_config"]["num_hidden_layers"]
+    with pytest.raises(ValueError, match=r"lacks text_config\.num_hidden_layers"):
+        parse_config(broken)
+
+
+def test_unknown_size_is_refused():
+    with pytest.raises(ValueError, match="size is '14B': must be one of 3B, 7B"):
+        released("14B")
+
+
+def test_configs_shrink_by_replacement():
+    small = dataclasses.replace(released("7B").vision, depth=2, full_layers=(1,))
+    assert isinstance(small, QwenVisionConfig)
+    assert isinstance(dataclasses.replace(released("7B"), vision=small), QwenConfig)

@@ -1,0 +1,216 @@
+"""A policy on Qwen2.5-VL: it is that model where nothing is touched, and both stages train it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.models.qwen import small_policy
+from tests.touchr1_jax.models.qwen.small_policy import AGENT, CONFIG, LAYOUT, POLICY, SLOTS, TOKENIZER, VIEW_TOKENS
+from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, init_adapters, over_base
+from touchr1_jax.models.policy import prompt_mask, prompt_positions
+from touchr1_jax.models.qwen.geometry import Grid
+from touchr1_jax.models.qwen.model import Inputs, QwenVL
+from touchr1_jax.models.qwen.pictures import PixelBudget, patchify, resize
+from touchr1_jax.models.qwen.policy import QwenViewConfig, qwen_agent, with_pretrained
+from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
+from touchr1_jax.rl.config import Algorithm, GRPOConfig
+from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
+from touchr1_jax.types import Parsed, Target
+
+P, G, T = 2, 2, 3
+WRITABLE = np.flatnonzero(~TOKENIZER.banned)
+LORA = LoraConfig(rank=4, alpha=8.0)
+
+
+@pytest.fixture(scope="module")
+def batch() -> GRPOBatch:
+    touch = jax.tree.map(jnp.asarray, tiny.touch_batch(0, P))
+    return GRPOBatch(
+        features=jax.jit(lambda p, b: AGENT.encode(p, b))(small_policy.params(), touch),
+        ids=jnp.asarray(LAYOUT.ids[:P]),
+        mask=jnp.asarray(LAYOUT.mask[:P]),
+        target=tiny.target(np.arange(P), np.arange(P)),
+    )
+
+
+group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+
+
+def completions(*shape: int) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(0).choice(WRITABLE, shape), jnp.int32)
+
+
+def test_view_fills_its_tokens(batch):
+    assert VIEW_TOKENS == LAYOUT.view.size == 4
+    assert batch.features.view.shape == (P, VIEW_TOKENS, CONFIG.decoder.hidden_size)
+
+
+def test_positions_are_those_of_the_model(batch):
+    """Block by block: words, the view, and each stream at its integer frame indices."""
+    features = jax.tree.map(lambda x: x[1], batch.features)
+    mask = np.asarray(prompt_mask(features, batch.mask[1], SLOTS))
+    place = jax.jit(lambda time, mask: prompt_positions(time, mask, SLOTS, POLICY.config.vision.grid))
+    ours = place(features.touch_time, jnp.asarray(mask))
+    names = [int((LAYOUT.stream_text == s).sum()) - 2 for s in range(tiny.S)]
+    before, streams = LAYOUT.view[0], []
+    for s, name in enumerate(names):
+        steps = np.unique(features.touch_time[s])
+        streams += [1 + name + 1, tactile(steps, tiny.N // len(steps))]
+    question = mask[LAYOUT.touch[-1, -1] + 1 :].sum()
+    runs = [int(before), picture(Grid(1, 4, 4), 2), *streams, int(question)]
+    np.testing.assert_array_equal(ours[:, mask], position_ids(runs))
+
+
+def test_untouched_policy_is_the_model(batch):
+    """Without streams, the logits of a completion are those of `QwenVL` on the same conversation with a picture."""
+    params, features = small_policy.params(), batch.features
+    blind = features.replace(stream_mask=jnp.zeros_like(features.stream_mask))
+    tokens = completions(P, G, T)
+    ours = group_logits(params, blind, batch.ids, batch.mask, tokens)[1, 0]
+    mask = np.asarray(prompt_mask(jax.tree.map(lambda x: x[1], blind), batch.mask[1], SLOTS))
+    ids = np.concatenate([np.asarray(batch.ids[1])[mask], tokens[1, 0]])
+    after = len(ids) - LAYOUT.view[-1] - 1
+    view = resize(tiny.touch_batch(0, P).view[1], 16, 16)
+    inputs = Inputs(
+        ids=jnp.asarray(ids),
+        positions=jnp.asarray(position_ids([int(LAYOUT.view[0]), picture(Grid(1, 4, 4), 2), int(after)])),
+        slots=jnp.asarray(LAYOUT.view),
+        patches=patchify(view[None], CONFIG.vision),
+    )
+    model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
+    whole = jax.jit(lambda p, x: QwenVL(CONFIG).apply({"params": p}, x, (Grid(1, 4, 4),)))(model, inputs)
+    theirs = whole[-T - 1 : -1, WRITABLE]
+    np.testing.assert_allclose(ours[:, WRITABLE], theirs, rtol=0, atol=1e-5 * float(jnp.abs(theirs).max()))
+
+
+@pytest.mark.parametrize("what", ["touch", "view", "time"])
+def test_what_is_felt_and_seen_reaches_the_logits(batch, what):
+    f = batch.features
+    changed = {
+        "touch": f.replace(touch=f.touch.at[:, 1].add(1.0)),
+        "view": f.replace(view=f.view + 1.0),
+        "time": f.replace(touch_time=f.touch_time * 2),
+    }[what]
+    args = (batch.ids, batch.mask, completions(P, G, T))
+    before = group_logits(small_policy.params(), f, *args)
+    assert float(jnp.abs(group_logits(small_policy.params(), changed, *args) - before).max()) > 1e-3
+
+
+def test_absent_view_takes_its_marks_along(batch):
+    f = jax.tree.map(lambda x: x[0], batch.features)
+    gone = prompt_mask(f.replace(view_mask=jnp.array(False)), batch.mask[0], SLOTS)
+    lost = np.flatnonzero(np.asarray(prompt_mask(f, batch.mask[0], SLOTS)) & ~np.asarray(gone))
+    np.testing.assert_array_equal(lost, [LAYOUT.view[0] - 1, *LAYOUT.view, LAYOUT.view[-1] + 1])
+
+
+def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+    """Share of tokens that are the label modulo 3."""
+    right = jnp.mean(tokens % 3 == jnp.max(target.label))
+    level = jnp.where(target.asked, tokens[0] % 3, -1)
+    parsed = Parsed(
+        perceive=jnp.tile(level, (tiny.S, 1)),
+        compare=level,
+        conclude=level,
+        formatted=tokens[0] > 20,
+        truncated=jnp.all(tokens != TOKENIZER.end_ids[0]),
+        length=jnp.sum(tokens > 1),
+    )
+    return right, {"right": right}, parsed
+
+
+def test_one_grpo_step(batch):
+    """With adapters on a frozen decoder: finite, on policy, at the reference, and every layer moves."""
+    base = {"decoder": small_policy.params()["decoder"]}
+    start = Trainable(adapters=init_adapters(jax.random.key(0), base, LORA), towers={})
+    optimizer = optax.adam(1e-3)
+    algorithm = Algorithm(beta=0.1, gamma=0.05)
+    config = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=1, algorithm=algorithm)
+    noise = jax.random.normal(jax.random.key(1), (3, *batch.features.touch.shape[1:]))
+    state = start_state(start, optimizer, jax.random.key(0), config)
+    step = over_base(adapt(AGENT, base, LORA), lambda agent: make_grpo_step(agent, score, optimizer, config))
+    after, metrics = step(base, state, batch, Fixed(start, noise))
+    assert all(np.isfinite(x) for x in metrics.values())
+    assert metrics["clip_share"] == 0
+    assert metrics["kl"] == pytest.approx(0, abs=1e-6)
+    assert metrics["grounding"] > 0
+    layers = jax.tree.leaves(after.params.adapters, is_leaf=lambda x: isinstance(x, Adapter))
+    assert len(layers) == len(LORA.layers)
+    assert all(bool((layer.b != 0).any()) for layer in layers)
+
+
+def sft_batch() -> SFTBatch:
+    """One question about each of P contacts."""
+    return SFTBatch(
+        touch=jax.tree.map(jnp.asarray, tiny.touch_batch(0, P)),
+        ids=jnp.asarray(LAYOUT.ids[:P, None]),
+        mask=jnp.asarray(LAYOUT.mask[:P, None]),
+        streams=jnp.ones((P, 1, tiny.S), bool),
+        tokens=completions(P, 1, T),
+        token_mask=jnp.ones((P, 1, T), bool),
+    )
+
+
+def test_sft_with_adapters_and_a_whole_tactile_encoder():
+    """What was pretrained stands still, an argument of the step; adapters and tactile encoder learn the answers."""
+    params = small_policy.params()
+    frozen = {name: x for name, x in params.items() if name in ("decoder", "vision")}
+    towers = {name: x for name, x in params.items() if name not in frozen}
+    start = Trainable(adapters=init_adapters(jax.random.key(0), frozen, LORA), towers=towers)
+    optimizer = optax.adam(2e-2)
+    state = SFTState(params=jax.tree.map(jnp.copy, start), opt_state=optimizer.init(start), step=jnp.int32(0))
+    step = over_base(adapt(AGENT, frozen, LORA), lambda agent: make_sft_step(agent, optimizer))
+    kept, batch, losses = jax.tree.map(jnp.copy, frozen), sft_batch(), []
+    for _ in range(12):
+        state, metrics = step(frozen, state, batch)
+        losses.append(float(metrics["loss"]))
+    assert losses[-1] < 0.5 * losses[0]
+    assert step._cache_size() == 1
+    jax.tree.map(np.testing.assert_array_equal, frozen, kept)
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), state.params, start)
+    assert all(jax.tree.leaves(moved))
+
+
+def test_half_precision_decodes_as_the_learner_scores(batch):
+    """Keys and values of a bfloat16 decoder are bfloat16; both ways agree to its rounding."""
+    half = jax.tree.map(lambda x: (0.5 * x).astype(jnp.bfloat16), {"decoder": small_policy.params()["decoder"]})
+    agent, tokens = qwen_agent(POLICY, LAYOUT, TOKENIZER), completions(1, 2)
+    features = jax.tree.map(lambda x: x[0], batch.features)
+
+    @jax.jit
+    def both(params):
+        first, prefix = agent.prefill(params, features, batch.ids[0], batch.mask[0])
+        step, caches = agent.decode(params, tokens[0, 0], jnp.int32(0), prefix, agent.empty_cache(T))
+        return step, caches, agent.completion_logits(params, tokens, first, prefix)[0, 1]
+
+    step, caches, scored = both(half)
+    assert caches[0].k.dtype == caches[0].v.dtype == jnp.bfloat16
+    assert step.dtype == jnp.float32
+    np.testing.assert_allclose(step[WRITABLE], scored[WRITABLE], atol=0.02 * float(jnp.abs(scored[WRITABLE]).max()))
+
+
+def test_pretrained_towers_replace_fresh_ones():
+    params = small_policy.params()
+    model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
+    doubled = jax.tree.map(lambda x: 2 * x, model)
+    joined = with_pretrained(params, doubled)
+    assert joined["tactile"] is params["tactile"]
+    np.testing.assert_array_equal(joined["decoder"]["norm"]["scale"], 2 * params["decoder"]["norm"]["scale"])
+    with pytest.raises(ValueError, match="pretrained has other shapes"):
+        with_pretrained(params, {**doubled, "decoder": {}})
+
+
+def test_view_sizes_are_checked():
+    view = QwenViewConfig(tower_config=CONFIG.vision, height_px=33, width_px=15, budget=PixelBudget(least=64, most=512))
+    assert (view.size, view.grid, view.tokens) == ((32, 16), 2, 8)
+    with pytest.raises(ValueError, match="out_size 24 must be the decoder's hidden_size, 25"):
+        view.tower(25)
+    other = dataclasses.replace(tiny.touch_batch(0, P), view=np.zeros((P, 8, 8, 3), np.uint8))
+    with pytest.raises(ValueError, match="view is 8×8 px, the config says 16×16"):
+        jax.eval_shape(lambda b: AGENT.encode(small_policy.params(), b), other)

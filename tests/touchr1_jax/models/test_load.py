@@ -1,0 +1,136 @@
+"""The command that reads a checkpoint, and what it refuses."""
+
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax.models.qwen import cases, chats, tiny, words
+from touchr1_jax.models.load import Load, load_checkpoint
+from touchr1_jax.models.qwen.config import parse_config
+from touchr1_jax.models.qwen.model import QwenVL
+from touchr1_jax.models.qwen.pictures import PixelBudget
+from touchr1_jax.models.qwen.prompts import Film, prepare
+from touchr1_jax.text.chat import Media, Message
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+
+FIELDS = {
+    "vision_start_token_id": "<|vision_start|>",
+    "vision_end_token_id": "<|vision_end|>",
+    "image_token_id": "<|image_pad|>",
+    "video_token_id": "<|video_pad|>",
+}
+
+
+PICTURES = {"min_pixels": 64, "max_pixels": 4096, "patch_size": 4, "temporal_patch_size": 2, "merge_size": 2}
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """A whole checkpoint, whose table has more rows than its tokenizer has words, as Qwen's."""
+    ids = words.write(tmp_path / "tokenizer.json", TOUCH_LANGUAGE)
+    config = cases.config_json() | {"vocab_size": 512} | {field: ids[mark] for field, mark in FIELDS.items()}
+    tiny.write_weights(tmp_path, parse_config(config))
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "preprocessor_config.json").write_text(json.dumps(PICTURES))
+    shutil.copy(chats.TEMPLATE, tmp_path)
+    return tmp_path
+
+
+def test_everything_of_a_directory_is_read(directory):
+    found = load_checkpoint(directory, jnp.float32)
+    assert found.config.decoder.vocab_size == found.tokenizer.vocab_size == 512
+    assert found.tokenizer.decode(found.tokenizer.encode("not so hard é 触")) == "not so hard é 触"
+    assert found.tokenizer.banned[-1]  # a row without a word
+    assert found.budget == PixelBudget(least=64, most=4096)
+    table = cases.tensor("text.embed_tokens.weight", (512, 64))
+    np.testing.assert_array_equal(found.params["decoder"]["embedding"]["embedding"], table)
+
+
+def test_command_says_what_it_found(directory, capsys):
+    assert Load(directory=directory).run() == 0
+    said = capsys.readouterr().out
+    count = sum(x.size for x in jax.tree.leaves(load_checkpoint(directory).params))
+    assert f"{count:,} parameters" in said
+    assert "2 layers of 64, 4 heads over 2, 512 tokens, head tied" in said
+    assert "windows of 16 px, none in (1, 3)" in said
+
+
+def test_command_names_the_misfit_and_fails(directory, capsys):
+    config = json.loads((directory / "config.json").read_text()) | {"num_hidden_layers": 1}
+    (directory / "config.json").write_text(json.dumps(config))
+    assert Load(directory=directory).run() == 1
+    assert "extra: model.layers.1.mlp.down_proj.weight" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "file", ["config.json", "tokenizer.json", "chat_template.jinja", "model.safetensors", "preprocessor_config.json"]
+)
+def test_every_file_is_needed(directory, file):
+    (directory / file).unlink()
+    with pytest.raises(FileNotFoundError):
+        load_checkpoint(directory)
+
+
+def test_ids_must_be_those_of_the_tokenizer(directory):
+    config = json.loads((directory / "config.json").read_text()) | {"video_token_id": 3}
+    (directory / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"video_token_id is 3 in config\.json and \[\d+\] in tokenizer\.json"):
+        load_checkpoint(directory)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"patch_size": 14}, "patch_size is 14: must be 4"),
+        ({"image_mean": [0.5, 0.5, 0.5]}, "image_mean is .*: must be"),
+        ({"max_pixels": None}, "names neither min_pixels and max_pixels nor"),
+    ],
+)
+def test_picture_settings_must_be_those_computed(directory, change, message):
+    settings = PICTURES | change
+    (directory / "preprocessor_config.json").write_text(json.dumps(settings))
+    with pytest.raises(ValueError, match=message):
+        load_checkpoint(directory)
+
+
+def test_newer_picture_settings_are_read(directory):
+    settings = {"size": {"shortest_edge": 100, "longest_edge": 200}, "min_pixels": None, "patch_size": None}
+    (directory / "preprocessor_config.json").write_text(json.dumps(settings))
+    assert load_checkpoint(directory).budget == PixelBudget(least=100, most=200)
+
+
+def test_conversation_runs_through_the_loaded_model(directory):
+    """A picture and a video of three frames: their tokens stand between their marks, and both reach the logits."""
+    found, rng = load_checkpoint(directory, jnp.float32), np.random.default_rng(0)
+    message = Message(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, "hard"))
+    picture = rng.integers(0, 256, (17, 25, 3), dtype=np.uint8)
+    film = Film(rng.integers(0, 256, (3, 16, 16, 3), dtype=np.uint8), 4.0)
+
+    forward = jax.jit(lambda p, x, grids: QwenVL(found.config).apply({"params": p}, x, grids), static_argnums=2)
+
+    def logits(picture, film):
+        inputs, grids = prepare(
+            [message],
+            found.tokenizer,
+            found.config,
+            pictures=[picture],
+            videos=[film],
+            picture_budget=found.budget,
+            video_budget=found.budget,
+        )
+        return inputs, grids, forward(found.params, inputs, grids)
+
+    inputs, grids, before = logits(picture, film)
+    assert grids == ((1, 4, 6), (2, 4, 4))
+    kinds = np.asarray(inputs.ids)[np.asarray(inputs.slots)]
+    np.testing.assert_array_equal(kinds, [found.config.image_id] * 6 + [found.config.video_id] * 8)
+    video = np.asarray(inputs.positions)[:, np.asarray(inputs.slots)[6:]]
+    np.testing.assert_array_equal(video[0] - video[0, 0], [0] * 4 + [1] * 4)  # half a second, two ids a second
+    assert jnp.abs(logits(255 - picture, film)[2] - before)[-1].max() > 1e-3
+    assert jnp.abs(logits(picture, film._replace(frames=255 - film.frames))[2] - before)[-1].max() > 1e-3
+    with pytest.raises(ValueError, match="the text has more of them"):
+        prepare([message], found.tokenizer, found.config, pictures=[picture])

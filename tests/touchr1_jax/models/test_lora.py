@@ -1,0 +1,144 @@
+"""Adapters: nothing at first, the merged parameters afterwards, and a base that stands still."""
+
+import dataclasses
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax import tiny
+from touchr1_jax.models.layers import GatedMLP
+from touchr1_jax.models.lm import Decoder
+from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapted, init_adapters, merge
+
+LORA = LoraConfig(rank=3, alpha=6.0)
+MLP = LoraConfig(rank=3, layers=("gate", "up", "down"))
+AGENT = tiny.SHALLOW
+L = 5
+
+
+@pytest.fixture(scope="module")
+def base():
+    return {**tiny.params(), **tiny.shallow_params()}
+
+
+def loud(adapters):
+    """Adapters that change much."""
+    rng = np.random.default_rng(1)
+    draw = lambda x: jnp.asarray(rng.normal(0, 0.3, x.shape), jnp.float32)
+    return jax.tree.map(draw, adapters)
+
+
+def states(params):
+    """Hidden states of a prompt of the decoder alone."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(L, tiny.CONFIG.decoder.hidden_size)), jnp.float32)
+    decoder = Decoder(AGENT.policy.config.decoder)
+    positions = jnp.tile(jnp.arange(L), (3, 1))
+    return decoder.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
+
+
+def logits(agent, params):
+    batch, tokens = tiny.question_batch(1, 1), tiny.completions(0, 1, 2, 4)
+    forward = jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0))
+    return jax.jit(forward)(params, batch.features, batch.ids, batch.mask, tokens)
+
+
+def test_a_dense_layer_by_hand():
+    """x W + (α/r) (x A) B with one input, one output, rank 1 and α = 2."""
+    base = {"decoder": {"q_proj": {"kernel": jnp.array([[5.0]])}}}
+    adapters = {"decoder": {"q_proj": Adapter(a=jnp.array([[3.0]]), b=jnp.array([[7.0]]))}}
+    merged = merge(base, adapters, LoraConfig(rank=1, alpha=2.0))
+    assert merged["decoder"]["q_proj"]["kernel"] == 5 + 2 * 3 * 7
+    assert base["decoder"]["q_proj"]["kernel"] == 5
+
+
+def test_fresh_adapters_change_nothing():
+    """Not a bit, operation by operation; a compiler may round otherwise."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(L, 6)), jnp.float32)
+    base = GatedMLP(5).init(jax.random.key(0), x)["params"]
+    adapters = init_adapters(jax.random.key(1), {"decoder": base}, MLP)["decoder"]
+    before = GatedMLP(5).apply({"params": base}, x)
+    with adapted(adapters, MLP):
+        np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
+    with adapted(loud(adapters), MLP):
+        assert (GatedMLP(5).apply({"params": base}, x) != before).all()
+    np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
+
+
+def test_adapters_have_the_shapes_of_their_layers(base):
+    layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["layers_0"]
+    c = AGENT.policy.config.decoder
+    assert set(layer) == {"q_proj", "k_proj", "v_proj", "o_proj", "mlp"}
+    assert layer["k_proj"].a.shape == (c.hidden_size, 3)
+    assert layer["k_proj"].b.shape == (3, c.num_kv_heads * c.head_dim)
+    bound = 1 / np.sqrt(c.intermediate_size)
+    a = layer["mlp"]["down"].a
+    assert 0.8 * bound < float(jnp.abs(a).max()) <= bound
+
+
+def test_merged_parameters_compute_the_same(base):
+    """Prompt, completion and their gradients by both ways; far from the base."""
+    adapters = loud(init_adapters(jax.random.key(0), base, LORA))
+    agent = adapt(AGENT, base, LORA)
+    ours = logits(agent, Trainable(adapters=adapters, towers={}))
+    theirs = logits(AGENT, merge(base, adapters, LORA))
+    assert float(jnp.abs(ours - logits(AGENT, base)).max()) > 0.5
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-5 * float(jnp.abs(theirs[..., tiny.WRITABLE]).max()))
+
+
+def test_gradients_are_those_through_the_merged_parameters(base):
+    decoder = {"decoder": base["decoder"]}
+    inner = loud(init_adapters(jax.random.key(0), decoder, LORA))["decoder"]
+
+    def ours(adapters):
+        with adapted(adapters, LORA):
+            return jnp.sum(jnp.sin(states(base["decoder"])))
+
+    theirs = lambda adapters: jnp.sum(jnp.sin(states(merge(base["decoder"], adapters, LORA))))
+    for a, b in zip(*(jax.tree.leaves(jax.jit(jax.grad(f))(inner)) for f in (ours, theirs)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
+
+
+def test_only_named_layers_of_named_towers_are_adapted(base):
+    config = dataclasses.replace(LORA, layers=("v_proj",))
+    assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/layers_0/v_proj"}
+    config = dataclasses.replace(LORA, layers=("qkv", "out"), towers=("tactile", "vision"))
+    assert {path.split("/")[0] for path in paths(init_adapters(jax.random.key(0), base, config))} == {
+        "tactile",
+        "vision",
+    }
+
+
+def paths(adapters) -> set[str]:
+    return {"/".join(path) for path in flax.traverse_util.flatten_dict(adapters)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layers": ("q_proj", "query")}, r"layers \['query'\] have no dense layer"),
+        ({"towers": ("decoder", "nose")}, r"towers \['nose'\] have no dense layer"),
+    ],
+)
+def test_layers_must_exist(base, change, message):
+    with pytest.raises(ValueError, match=message):
+        init_adapters(jax.random.key(0), base, dataclasses.replace(LORA, **change))
+
+
+def test_rank_must_be_positive():
+    with pytest.raises(ValueError, match="rank is 0: must be at least 1"):
+        LoraConfig(rank=0)
+
+
+def test_foreign_adapters_are_not_merged(base):
+    foreign = {"decoder": {"layers_9": {"q_proj": Adapter(a=jnp.ones((1, 1)), b=jnp.ones((1, 1)))}}}
+    with pytest.raises(ValueError, match="belong to no layer of the base"):
+        merge(base, foreign, LORA)
+
+
+def test_half_precision_base_stays_so(base):
+    half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), {"decoder": base["decoder"]})
+    merged = merge(half, init_adapters(jax.random.key(0), half, LORA), LORA)
+    jax.tree.map(np.testing.assert_array_equal, merged, half)

@@ -1,0 +1,82 @@
+"""Every alarm fires on its failure, with the number that fired, and is silent on a healthy run."""
+
+import pytest
+
+from touchr1_jax.rl.alarms import RULES, WINDOW, Watch
+
+HEALTHY = {
+    "labels_level_0": 20.0,
+    "labels_level_1": 20.0,
+    "labels_level_2": 20.0,
+    "middle_rate": 0.4,
+    "echo_share": 0.8,
+    "accuracy": 0.7,
+    "grounding": 0.1,
+    "control_drop": 0.4,
+    "control_noise": 0.4,
+    "control_order": 0.45,
+    "touch_score": 0.75,
+    "tactile_credit_share": 0.6,
+    "credit_unearned_share": 0.0,
+    "bonus_cancelled_share": 0.0,
+    "degenerate_share": 0.2,
+    "kl_peak": 2.0,
+    "entropy": 0.5,
+    "perturbed_stream_0": 4.0,
+    "perturbed_stream_1": 4.0,
+    "grounding_stream_0": 0.2,
+    "grounding_stream_1": 0.05,
+    "static_time_share": 0.0,
+    "gamed_share": 0.05,
+}
+FAILURES = [
+    ("F1", {"middle_rate": 0.9}, 0.9 - 1 / 3),
+    ("F2", {"echo_share": 1.0, "accuracy": 0.33}, 0.67),
+    ("F3", {"grounding": 3.0}, 3.0),
+    ("F4", {"control_noise": 0.1, "control_order": 0.7}, 0.6),
+    ("F5", {"bonus_cancelled_share": 0.3}, 0.3),
+    ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
+    ("F6", {"credit_unearned_share": 0.2}, 0.2),
+    ("F7", {"degenerate_share": 0.9}, 0.9),
+    ("F8", {"kl_peak": 50.0}, 50.0),
+    ("F9", {"entropy": 0.01}, 0.02),
+    ("F9", {"entropy": 2.5}, 2.0),
+    ("F10", {"grounding_stream_1": 0.0}, 0.0),
+    ("F12", {"static_time_share": 1.0}, 1.0),
+    ("F13", {"gamed_share": 0.5}, 0.5),
+]
+
+
+def fired(change: dict[str, float]) -> dict[str, float]:
+    """Alarms of a run that was healthy for one window and then failed for one."""
+    watch = Watch()
+    for _ in range(WINDOW):
+        assert watch.see(HEALTHY) == []
+    for _ in range(WINDOW):
+        alarms = watch.see(HEALTHY | change)
+    return {a.code: a.value for a in alarms}
+
+
+@pytest.mark.parametrize(("code", "change", "value"), FAILURES)
+def test_each_failure_fires_its_alarm_alone(code, change, value):
+    assert fired(change) == {code: pytest.approx(value)}
+
+
+def test_all_codes_are_covered():
+    codes = {f"F{k}" for k in (*range(1, 11), 12, 13)}
+    assert {rule.code for rule in RULES} == codes == {code for code, _, _ in FAILURES}
+
+
+def test_a_low_entropy_of_right_answers_is_no_collapse():
+    assert fired({"entropy": 0.01, "accuracy": 0.99}) == {}
+
+
+def test_a_run_without_controls_has_no_alarm_of_them():
+    watch = Watch()
+    plain = {name: value for name, value in HEALTHY.items() if not name.startswith(("control", "tactile", "touch"))}
+    assert all(watch.see(plain) == [] for _ in range(2 * WINDOW))
+
+
+def test_an_alarm_says_what_fired():
+    (alarm,) = (a for a in [RULES[6].alarm(HEALTHY | {"degenerate_share": 0.9}, HEALTHY)] if a)
+    assert str(alarm) == "alarm F7: most groups teach nothing (0.9, bound 0.5)"

@@ -1,0 +1,151 @@
+"""Whole steps under other algorithms and options: what each must change, and what none may."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl.test_grpo import AGENT, FIXED, P, score
+from touchr1_jax.rl.config import Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable, TactileUse
+from touchr1_jax.rl.grpo import make_grpo_step, start_state
+
+G, T = 3, 6
+OPTIMIZER = optax.sgd(0.05)
+SIZES = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2)
+
+
+def take(config: GRPOConfig, steps: int = 1, prompts: int = P, **kwargs):
+    """State and metrics after some steps on one batch."""
+    step = make_grpo_step(AGENT, score, OPTIMIZER, config, **kwargs)
+    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config)
+    batch = tiny.question_batch(1, prompts).replace(ordered=jnp.arange(prompts) % 2 == 0)
+    for _ in range(steps):
+        state, metrics = step(state, batch, FIXED)
+    return state, jax.device_get(metrics)
+
+
+def of(algorithm, **changes) -> GRPOConfig:
+    return dataclasses.replace(SIZES, algorithm=algorithm, **changes)
+
+
+def moved(state) -> float:
+    leaves = zip(*map(jax.tree.leaves, (state.params, tiny.shallow_params(0))), strict=True)
+    return sum(float(jnp.abs(a - b).sum()) for a, b in leaves)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return take(of(Paper()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", [DrGrpo(), Gspo(), Cispo()], ids=lambda a: type(a).__name__)
+def test_published_variants_take_a_finite_step_of_their_own(plain, algorithm):
+    state, metrics = take(of(algorithm))
+    assert all(np.isfinite(v) for v in metrics.values())
+    assert moved(state) > 0
+    assert abs(moved(state) - moved(plain[0])) > 1e-4
+    assert metrics["reward"] == plain[1]["reward"]  # the same rollouts
+    assert metrics["kl"] == 0  # β is 0: the reference is not even run
+
+
+@pytest.mark.slow
+def test_dynamic_sampling_learns_from_groups_that_differ():
+    """Half of the candidates ask for material, whose reward is the same for all."""
+    config = of(Dapo(), prompts=2, micro_prompts=2)
+    _, metrics = take(config, prompts=config.drawn)
+    assert config.drawn == 4
+    _, all_of_them = take(of(Dapo(candidates=1)))
+    assert all_of_them["degenerate_share"] >= 0.25
+    assert metrics["degenerate_share"] <= max(0, all_of_them["degenerate_share"] - 0.25)
+
+
+@pytest.mark.slow
+def test_inner_updates_leave_the_sampler_behind():
+    state, metrics = take(of(Paper(updates=3, clip_low=1e-3, clip_high=1e-3)))
+    one, first = take(of(Paper(clip_low=1e-3, clip_high=1e-3)))
+    assert first["clip_share"] == 0
+    assert metrics["clip_share"] > 0
+    assert metrics["loss"] == pytest.approx(float(first["loss"]), rel=1e-5)
+    assert moved(state) > moved(one)
+
+
+@pytest.mark.slow
+def test_importance_weights_of_an_exact_sampler_are_one(plain):
+    _, metrics = take(of(Paper(importance_cap=2.0)))
+    for name in ("loss", "grad_norm", "kl"):
+        np.testing.assert_allclose(metrics[name], plain[1][name], rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_reference_is_refreshed_on_time():
+    config = of(Paper(reference_every=2, beta=0.1))
+    state, _ = take(config, 1)
+    np.testing.assert_array_equal(*(jax.tree.leaves(x)[0] for x in (state.reference, tiny.shallow_params(0))))
+    state, _ = take(config, 2)
+    for a, b in zip(*map(jax.tree.leaves, (state.reference, state.params)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_state_without_a_reference_cannot_refresh_it():
+    config = of(Paper(reference_every=2))
+    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), of(Paper()))
+    step = make_grpo_step(AGENT, score, OPTIMIZER, config)
+    with pytest.raises(ValueError, match="the state has no reference; make it with `start_state`"):
+        step(state, tiny.question_batch(1, P), FIXED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("buckets", [(2,), (3, 5)])
+def test_buckets_change_nothing_but_the_time(buckets):
+    """Rollouts that end early, by banning all words but the end and one more."""
+    agent = dataclasses.replace(AGENT, banned=~np.isin(np.arange(tiny.V), [1, 10]))
+    found = []
+    for config in (of(Paper()), of(Paper(), buckets=buckets)):
+        step = make_grpo_step(agent, score, OPTIMIZER, config)
+        state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(2), config)
+        found.append(step(state, tiny.question_batch(1, P), FIXED))
+    (whole, a), (cut, b) = found
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], rtol=1e-4, atol=1e-6, err_msg=name)
+    for x, y in zip(*map(jax.tree.leaves, (whole.params, cut.params)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
+
+
+def test_buckets_must_ascend_below_the_length():
+    with pytest.raises(ValueError, match=r"buckets is \(6, 3\): must ascend"):
+        of(Paper(), buckets=(6, 3))
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [Stable(), pytest.param(Paper(tactile_use=TactileUse.LITERAL), marks=pytest.mark.slow)],
+    ids=["stable", "literal"],
+)
+def test_tactile_use_samples_the_controls(algorithm):
+    state, metrics = take(of(algorithm))
+    assert {"touch_score", "control_drop", "control_noise", "control_order", "tactile_credit_share"} <= set(metrics)
+    assert all(np.isfinite(v) for v in metrics.values())
+    assert 0 <= metrics["control_noise"] <= 1
+    assert metrics["credit_unearned_share"] == 0
+    missing = 0.0 if isinstance(algorithm, Stable) else 1 / 6  # the literal shuffle counts for every other prompt
+    assert metrics["control_missing_share"] == pytest.approx(missing)
+    assert moved(state) > 0
+
+
+@pytest.mark.slow
+def test_the_entropy_bonus_raises_entropy():
+    _, before = take(of(Paper(entropy_weight=0.0, beta=0.0, gamma=0.0)), 4)
+    _, after = take(of(Paper(entropy_weight=1.0, beta=0.0, gamma=0.0)), 4)
+    assert after["entropy"] > before["entropy"] + 1e-3
+
+
+def test_grounding_of_every_stream_is_logged(plain):
+    metrics = plain[1]
+    assert sum(metrics[f"perturbed_stream_{s}"] for s in range(tiny.S)) == P
+    present = [s for s in range(tiny.S) if metrics[f"perturbed_stream_{s}"]]
+    assert all(metrics[f"grounding_stream_{s}"] > 1e-3 for s in present)

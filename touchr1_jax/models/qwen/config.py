@@ -1,0 +1,250 @@
+"""Shapes of Qwen2.5-VL: the published sizes, and any other from a checkpoint's `config.json`."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from touchr1_jax.models.lm import DecoderConfig
+
+CONFIG_FILE = "config.json"
+COLOURS = 3
+"""Channels of a picture."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QwenVisionConfig:
+    """Shape of the vision tower; the defaults are the published one, which differs between sizes in its exit alone.
+
+    A patch is `patch_px`² pixels of `patch_frames` frames; `merge`² patches become one token of `out_size` channels.
+    Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.  A second of
+    video is `tokens_per_second` steps of the time id.
+
+    Raises:
+      ValueError: heads that do not divide the width or cannot turn in two axes, or a window that is no whole number of
+        merged patches.
+    """
+
+    out_size: int
+    depth: int = 32
+    hidden_size: int = 1280
+    num_heads: int = 16
+    intermediate_size: int = 3420
+    patch_px: int = 14
+    patch_frames: int = 2
+    merge: int = 2
+    window_px: int = 112
+    full_layers: tuple[int, ...] = (7, 15, 23, 31)
+    tokens_per_second: int = 2
+
+    def __post_init__(self) -> None:
+        if self.hidden_size % (4 * self.num_heads):
+            raise ValueError(
+                f"vision hidden_size {self.hidden_size} must be a multiple of 4 · num_heads = {4 * self.num_heads}: "
+                "a head turns by row and by column"
+            )
+        if self.window_px % self.cell_px:
+            raise ValueError(
+                f"window_px {self.window_px} must be a multiple of patch_px · merge = {self.cell_px}: a window holds "
+                "whole tokens"
+            )
+
+    @property
+    def cell_px(self) -> int:
+        """Side of the square that becomes one token, pixels."""
+        return self.patch_px * self.merge
+
+    @property
+    def patch_size(self) -> int:
+        """Numbers in one patch: channel, frame, row, column."""
+        return COLOURS * self.patch_frames * self.patch_px**2
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QwenConfig:
+    """Both towers, and the ids of the tokens that stand for what is seen.
+
+    Raises:
+      ValueError: vision tokens as wide as no token of the decoder, or ids outside the vocabulary or used twice.
+    """
+
+    decoder: DecoderConfig
+    vision: QwenVisionConfig
+    vision_start_id: int = 151652
+    vision_end_id: int = 151653
+    image_id: int = 151655
+    video_id: int = 151656
+
+    def __post_init__(self) -> None:
+        if self.vision.out_size != self.decoder.hidden_size:
+            raise ValueError(
+                f"vision out_size {self.vision.out_size} must equal the decoder's hidden_size "
+                f"{self.decoder.hidden_size}: vision tokens stand among text tokens"
+            )
+        ids = (self.vision_start_id, self.vision_end_id, self.image_id, self.video_id)
+        if len(set(ids)) < len(ids) or not all(0 <= i < self.decoder.vocab_size for i in ids):
+            raise ValueError(
+                f"vision_start_id, vision_end_id, image_id, video_id are {ids}: must be four different ids below "
+                f"vocab_size {self.decoder.vocab_size}"
+            )
+
+
+RELEASED: Mapping[str, DecoderConfig] = {
+    "3B": DecoderConfig(
+        vocab_size=151936,
+        hidden_size=2048,
+        num_layers=36,
+        num_heads=16,
+        num_kv_heads=2,
+        head_dim=128,
+        intermediate_size=11008,
+        mrope_section=(16, 24, 24),
+        rope_theta=1e6,
+        tie_embedding=True,
+    ),
+    "7B": DecoderConfig(
+        vocab_size=152064,
+        hidden_size=3584,
+        num_layers=28,
+        num_heads=28,
+        num_kv_heads=4,
+        head_dim=128,
+        intermediate_size=18944,
+        mrope_section=(16, 24, 24),
+        rope_theta=1e6,
+        tie_embedding=False,
+    ),
+}
+"""Decoders of the released checkpoints (arXiv 2502.13923, table 1)."""
+
+
+def released(size: str) -> QwenConfig:
+    """Shape of a released checkpoint, one of `RELEASED`.
+
+    Raises:
+      ValueError: another size.
+    """
+    if size not in RELEASED:
+        raise ValueError(f"size is {size!r}: must be one of {', '.join(RELEASED)}; read others with read_config")
+    decoder = RELEASED[size]
+    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
+
+
+def read_config(directory: str | Path) -> QwenConfig:
+    """Configuration of the checkpoint in a directory.
+
+    Raises:
+      FileNotFoundError: there is no `config.json`.
+      ValueError: as `parse_config`, or no JSON.
+    """
+    path = Path(directory) / CONFIG_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file: must be the config.json of a checkpoint; correct the directory")
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is no JSON: {error}; fetch it again") from error
+    return parse_config(found)
+
+
+def parse_config(found: Mapping[str, Any]) -> QwenConfig:
+    """Configuration from the contents of a `config.json`, flat as published or nested as newer libraries write it.
+
+    Raises:
+      ValueError: a field that is missing or that asks for what these modules do not compute.
+    """
+    _require("model_type", found, "qwen2_5_vl")
+    text = _Fields(found["text_config"], "text_config.") if "text_config" in found else _Fields(found, "")
+    root, vision = _Fields(found, ""), _Fields(_Fields(found, "")["vision_config"], "vision_config.")
+    return QwenConfig(
+        decoder=_decoder(text, tied=_is_tied(found)),
+        vision=_vision(vision),
+        vision_start_id=root["vision_start_token_id"],
+        vision_end_id=root["vision_end_token_id"],
+        image_id=root["image_token_id"],
+        video_id=root["video_token_id"],
+    )
+
+
+class _Fields:
+    """A part of a `config.json` whose missing fields are named in full."""
+
+    def __init__(self, found: Mapping[str, Any], prefix: str) -> None:
+        self.found, self.prefix = found, prefix
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self.found:
+            raise ValueError(f"config.json lacks {self.prefix}{name}, without which the model has no shape; add it")
+        return self.found[name]
+
+
+def _decoder(text: _Fields, *, tied: bool) -> DecoderConfig:
+    _require("hidden_act", text.found, "silu", text.prefix)
+    if text.found.get("use_sliding_window"):
+        raise ValueError(f"{text.prefix}use_sliding_window is true: only full attention is computed; set it to false")
+    theta, sections = _rope(text)
+    hidden, heads = text["hidden_size"], text["num_attention_heads"]
+    if hidden % heads:
+        raise ValueError(f"{text.prefix}hidden_size {hidden} must be a multiple of num_attention_heads {heads}")
+    return DecoderConfig(
+        vocab_size=text["vocab_size"],
+        hidden_size=hidden,
+        num_layers=text["num_hidden_layers"],
+        num_heads=heads,
+        num_kv_heads=text["num_key_value_heads"],
+        head_dim=hidden // heads,
+        intermediate_size=text["intermediate_size"],
+        mrope_section=sections,
+        rope_theta=float(theta),
+        norm_epsilon=text["rms_norm_eps"],
+        tie_embedding=tied,
+    )
+
+
+def _rope(text: _Fields) -> tuple[float, tuple[int, int, int]]:
+    """Base and sections of the rotary positions: `rope_theta` beside `rope_scaling`, or both in `rope_parameters`."""
+    name = "rope_parameters" if "rope_parameters" in text.found else "rope_scaling"
+    rope = _Fields(text[name], f"{text.prefix}{name}.")
+    kinds = {rope.found[k] for k in ("type", "rope_type") if k in rope.found}
+    if not kinds <= {"mrope", "default"}:
+        raise ValueError(
+            f"{rope.prefix}type is {sorted(kinds)}: must be 'mrope' or 'default'; nothing else is computed"
+        )
+    theta = rope.found["rope_theta"] if "rope_theta" in rope.found else text["rope_theta"]
+    sections = tuple(rope["mrope_section"])
+    if len(sections) != 3:
+        raise ValueError(f"{rope.prefix}mrope_section is {list(sections)}: must be three, for time, row and column")
+    return theta, sections
+
+
+def _vision(vision: _Fields) -> QwenVisionConfig:
+    _require("hidden_act", vision.found, "silu", vision.prefix)
+    channels = "in_channels" if "in_channels" in vision.found else "in_chans"
+    _require(channels, vision.found, COLOURS, vision.prefix)
+    return QwenVisionConfig(
+        out_size=vision["out_hidden_size"],
+        depth=vision["depth"],
+        hidden_size=vision["hidden_size"],
+        num_heads=vision["num_heads"],
+        intermediate_size=vision["intermediate_size"],
+        patch_px=vision["patch_size"],
+        patch_frames=vision["temporal_patch_size"],
+        merge=vision["spatial_merge_size"],
+        window_px=vision["window_size"],
+        full_layers=tuple(vision["fullatt_block_indexes"]),
+        tokens_per_second=vision["tokens_per_second"],
+    )
+
+
+def _is_tied(found: Mapping[str, Any]) -> bool:
+    """Whether the head is the embedding table; a flag in either place says so, and none says no, as in transformers."""
+    parts = [found, found.get("text_config", {})]
+    return any(part.get("tie_word_embeddings", False) for part in parts)
+
+
+def _require(name: str, found: Mapping[str, Any], value: Any, prefix: str = "") -> None:
+    if name not in found:
+        raise ValueError(f"config.json lacks {prefix}{name}: must be {value!r}; add it")
+    if found[name] != value:
+        raise ValueError(f"{prefix}{name} is {found[name]!r}: must be {value!r}; another architecture cannot be read")

@@ -1,0 +1,153 @@
+"""Pixels as the vision tower wants them: sizes in whole tokens, bicubic resizing, normalised patches."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Real, UInt8
+
+from touchr1_jax.models.qwen.config import COLOURS, QwenVisionConfig
+from touchr1_jax.models.qwen.geometry import Grid
+
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+"""Mean and spread of pixels in [0, 1] on CLIP's training data (Radford et al. 2021), per channel."""
+
+PREPROCESSOR_FILE = "preprocessor_config.json"
+MAX_ASPECT = 200
+"""Longest side over shortest, beyond which the released processor refuses a picture."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PixelBudget:
+    """Fewest and most pixels that a picture may have after resizing."""
+
+    least: int
+    most: int
+
+
+PICTURE_BUDGET = PixelBudget(least=28 * 28 * 4, most=28 * 28 * 1280)
+VIDEO_BUDGET = PixelBudget(least=28 * 28 * 128, most=28 * 28 * 768)
+"""Budgets of a picture and of one frame of a video, those of transformers' processors; a checkpoint may name others."""
+
+
+def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
+    """Budget of pictures from a checkpoint's `preprocessor_config.json`; the rest of it must be what is computed here.
+
+    Args:
+      directory: the checkpoint's.
+      config: sizes of patches.
+
+    Raises:
+      FileNotFoundError: the checkpoint has none.
+      ValueError: sizes of patches that are not the config's, another normalisation, or no budget.
+    """
+    path = directory / PREPROCESSOR_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is no file: must be the picture settings of a checkpoint; fetch it")
+    written = json.loads(path.read_text(encoding="utf-8"))
+    found = {field: value for field, value in written.items() if value is not None}  # newer files list what is unset
+    expected = {
+        "patch_size": config.patch_px,
+        "temporal_patch_size": config.patch_frames,
+        "merge_size": config.merge,
+        "image_mean": list(CLIP_MEAN),
+        "image_std": list(CLIP_STD),
+    }
+    for field, value in expected.items():
+        if found.get(field, value) != value:
+            raise ValueError(f"{path}: {field} is {found[field]}: must be {value}; take all files from one checkpoint")
+    size = found.get("size", {})
+    least = found.get("min_pixels", size.get("shortest_edge"))
+    most = found.get("max_pixels", size.get("longest_edge"))
+    if least is None or most is None:
+        raise ValueError(f"{path} names neither min_pixels and max_pixels nor a size with both edges; add them")
+    return PixelBudget(least=least, most=most)
+
+
+def fitting_size(height: int, width: int, cell_px: int, budget: PixelBudget) -> tuple[int, int]:
+    """Height and width in whole tokens within a budget, at nearly the same aspect (`smart_resize` of Qwen2-VL).
+
+    Args:
+      height, width: pixels.
+      cell_px: side of one token, pixels.
+      budget: bounds on height · width.
+
+    Raises:
+      ValueError: a picture without pixels, or too long and thin.
+    """
+    if min(height, width) < 1 or max(height, width) > MAX_ASPECT * min(height, width):
+        raise ValueError(f"picture is {height}×{width} px: sides must be ≥ 1 and differ ≤ {MAX_ASPECT}-fold; crop it")
+    tokens_high, tokens_wide = round(height / cell_px), round(width / cell_px)
+    pixels = tokens_high * tokens_wide * cell_px**2
+    if pixels > budget.most:
+        shrink = math.sqrt(height * width / budget.most) * cell_px
+        tokens_high, tokens_wide = max(1, math.floor(height / shrink)), max(1, math.floor(width / shrink))
+    elif pixels < budget.least:
+        grow = math.sqrt(budget.least / (height * width)) / cell_px
+        tokens_high, tokens_wide = math.ceil(height * grow), math.ceil(width * grow)
+    return tokens_high * cell_px, tokens_wide * cell_px
+
+
+def resize(frames: UInt8[Array | np.ndarray, "*n H W 3"], height: int, width: int) -> Float[Array, "*n h w 3"]:
+    """Bicubic resizing with antialiasing, columns first, rounded to whole levels 0..255 after each axis.
+
+    So do the released processor and Pillow, of which new versions take whichever axis is cheaper first.
+
+    Args:
+      frames: pictures.
+      height, width: wanted, pixels.
+    """
+    *lead, h, _, c = frames.shape
+    x = jnp.asarray(frames).astype(jnp.float32)
+    for shape in ((*lead, h, width, c), (*lead, height, width, c)):
+        if x.shape != shape:
+            x = jnp.clip(jnp.round(jax.image.resize(x, shape, "cubic", antialias=True)), 0, 255)
+    return x
+
+
+def patchify(
+    frames: Real[Array | np.ndarray, "*n F H W 3"], config: QwenVisionConfig
+) -> Float[Array, "*n patch pixel"]:
+    """Cut normalised frames into patches (channel, frame, row, column), merged square by merged square.
+
+    A picture is one frame; a last step that lacks frames repeats the last.
+
+    Args:
+      frames: levels 0..255, sides in multiples of `cell_px`.
+      config: sizes of patches.
+
+    Raises:
+      ValueError: other sides.
+    """
+    grid = grid_of(frames.shape[-4:], config)
+    *lead, f, _, _, _ = frames.shape
+    x = jnp.asarray(frames).astype(jnp.float32) / 255.0
+    x = (x - np.array(CLIP_MEAN, np.float32)) / np.array(CLIP_STD, np.float32)
+    missing = grid.steps * config.patch_frames - f
+    x = jnp.concatenate([x, jnp.repeat(x[..., -1:, :, :, :], missing, -4)], -4)
+    m, p = config.merge, config.patch_px
+    x = x.reshape(*lead, grid.steps, config.patch_frames, grid.rows // m, m, p, grid.columns // m, m, p, COLOURS)
+    # (step, frame, R, r, y, C, c, x, colour) → (step, R, C, r, c, colour, frame, y, x)
+    n = len(lead)
+    x = x.transpose(*range(n), *(n + i for i in (0, 2, 5, 3, 6, 8, 1, 4, 7)))
+    return x.reshape(*lead, grid.patches, config.patch_size)
+
+
+def grid_of(shape: tuple[int, ...], config: QwenVisionConfig) -> Grid:
+    """Grid of frames of the given (frames, height, width, channels).
+
+    Raises:
+      ValueError: no frame, or sides that are no multiples of `cell_px`.
+    """
+    f, h, w, _ = shape
+    if f < 1 or min(h, w) < 1 or h % config.cell_px or w % config.cell_px:
+        raise ValueError(
+            f"frames are {f} of {h}×{w} px: must be at least one, with sides in multiples of {config.cell_px} px; "
+            "resize them to fitting_size"
+        )
+    return Grid(math.ceil(f / config.patch_frames), h // config.patch_px, w // config.patch_px)

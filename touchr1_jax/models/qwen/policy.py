@@ -1,0 +1,118 @@
+"""A policy on a pretrained Qwen2.5-VL: its vision tower for the view, its decoder, and a tactile encoder of our own.
+
+The tactile tokens stand in the prompt where those of a video would, with integer frame indices as time ids.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy import Policy, PolicyConfig, Slots
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.geometry import Grid
+from touchr1_jax.models.qwen.pictures import PICTURE_BUDGET, PixelBudget, fitting_size, patchify, resize
+from touchr1_jax.models.qwen.vision import QwenVision
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.text.template import PromptLayout
+from touchr1_jax.text.tokenizer import Tokenizer
+from touchr1_jax.types import Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class QwenViewConfig:
+    """The vision tower and the size of the pictures that it is shown, pixels; they are resized within `budget`."""
+
+    tower_config: QwenVisionConfig
+    height_px: int = 64
+    width_px: int = 64
+    budget: PixelBudget = PICTURE_BUDGET
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width after resizing, pixels."""
+        return fitting_size(self.height_px, self.width_px, self.tower_config.cell_px, self.budget)
+
+    @property
+    def grid(self) -> int:
+        """Tokens in one row of the view."""
+        return self.size[1] // self.tower_config.cell_px
+
+    @property
+    def tokens(self) -> int:
+        """Tokens of a view."""
+        return self.grid * self.size[0] // self.tower_config.cell_px
+
+    def tower(self, out_width: int) -> nn.Module:
+        """The module that `Policy` builds."""
+        if out_width != self.tower_config.out_size:
+            raise ValueError(f"out_size {self.tower_config.out_size} must be the decoder's hidden_size, {out_width}")
+        return QwenView(self)
+
+
+class QwenView(nn.Module):
+    """f(view) → tokens of the decoder's width, row by row: resized, cut into patches, through the vision tower."""
+
+    config: QwenViewConfig
+
+    def setup(self) -> None:
+        self.tower = QwenVision(self.config.tower_config)
+
+    def __call__(self, view: UInt8[Array, "P H W 3"]) -> Float[Array, "P token D"]:
+        """Encode P pictures, none of which sees another.
+
+        Raises:
+          ValueError: pictures of another size than configured.
+        """
+        c = self.config
+        if view.shape[1:3] != (c.height_px, c.width_px):
+            raise ValueError(
+                f"view is {view.shape[1]}×{view.shape[2]} px, the config says {c.height_px}×{c.width_px}: correct it"
+            )
+        height, width = c.size
+        patches = patchify(resize(view, height, width)[:, None], c.tower_config)
+        grid = Grid(1, height // c.tower_config.patch_px, width // c.tower_config.patch_px)
+        tokens = self.tower(patches.reshape(-1, c.tower_config.patch_size), (grid,) * view.shape[0])
+        return tokens.reshape(view.shape[0], c.tokens, -1)
+
+
+def qwen_policy(
+    config: QwenConfig,
+    tactile: TactileViTConfig,
+    view_px: tuple[int, int] = (64, 64),
+    budget: PixelBudget = PICTURE_BUDGET,
+) -> Policy:
+    """The policy; `view_px` is the height and width of the pictures in its batches."""
+    view = QwenViewConfig(tower_config=config.vision, height_px=view_px[0], width_px=view_px[1], budget=budget)
+    return Policy(PolicyConfig(tactile=tactile, vision=view, decoder=config.decoder))
+
+
+def qwen_agent(
+    policy: Policy, layout: PromptLayout, tokenizer: Tokenizer, cache_dtype: jnp.dtype | type = jnp.bfloat16
+) -> Agent:
+    """The agent that SFT and GRPO train; `cache_dtype` is the type of the decoder's parameters."""
+    return Agent(
+        policy=policy,
+        slots=Slots(layout.touch, layout.view, layout.stream_text),
+        banned=tokenizer.banned,
+        end_ids=tokenizer.end_ids,
+        pad_id=tokenizer.pad_id,
+        cache_dtype=jnp.dtype(cache_dtype),
+    )
+
+
+def with_pretrained(params: Params, pretrained: Params) -> Params:
+    """Fresh parameters of a policy with vision tower and decoder replaced by those of `QwenVL`.
+
+    Raises:
+      ValueError: towers of other shapes.
+    """
+    replaced = {**params, "vision": {"tower": pretrained["vision"]}, "decoder": pretrained["decoder"]}
+    shapes = lambda tree: jax.tree.map(lambda x: np.shape(x), tree)
+    if shapes(replaced) != shapes(params):
+        raise ValueError("pretrained has other shapes than the policy's towers; build the policy from its config")
+    return replaced

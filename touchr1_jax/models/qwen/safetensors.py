@@ -1,0 +1,113 @@
+"""The safetensors file format, read tensor by tensor into memory of its own, and written as it comes.
+
+A file is a little-endian uint64 n, n bytes of JSON {name: {dtype, shape, data_offsets}} and the tensors' bytes in
+row-major order, offsets counted from the end of the JSON.  The published library maps files into memory, where the
+pages of a shard of several gigabytes count as long as it is open; here one tensor at a time is read and let go.
+"""
+
+import json
+import os
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+DTYPES: Mapping[str, np.dtype] = {
+    "F32": np.dtype(np.float32),
+    "F16": np.dtype(np.float16),
+    "BF16": np.dtype(jnp.bfloat16),
+}
+"""Types of tensors that can be weights, by the format's names."""
+
+METADATA = "__metadata__"
+MAX_HEADER = 100_000_000
+"""Longest header, bytes; the format forbids more, and a file of another format would seem to ask for exabytes."""
+
+
+class Entry(NamedTuple):
+    """Where a tensor lies: its type by the format's name, its shape, its bytes from `start` to `end` of the file."""
+
+    path: Path
+    dtype: str
+    shape: tuple[int, ...]
+    start: int
+    end: int
+
+
+def read_header(path: Path) -> dict[str, Entry]:
+    """What tensors a file holds.
+
+    Raises:
+      ValueError: not this format, cut off, or an entry that contradicts itself.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        prefix = file.read(8)
+        length = struct.unpack("<Q", prefix)[0] if len(prefix) == 8 else MAX_HEADER + 1
+        if length > min(MAX_HEADER, size - 8):
+            raise ValueError(f"{path} is no safetensors file or was cut off: its header does not fit; fetch it again")
+        try:
+            header = json.loads(file.read(length))
+        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}: the header is no JSON ({error}); fetch it again") from error
+    tensors = {name: x for name, x in header.items() if name != METADATA}
+    return {name: _entry(path, name, x, 8 + length, size) for name, x in tensors.items()}
+
+
+def read_tensor(entry: Entry) -> np.ndarray:
+    """One tensor, read into fresh memory.
+
+    Raises:
+      ValueError: the file got shorter since its header was read.
+    """
+    dtype = DTYPES[entry.dtype]
+    with entry.path.open("rb") as file:
+        data = np.fromfile(file, dtype, (entry.end - entry.start) // dtype.itemsize, offset=entry.start)
+    if data.nbytes != entry.end - entry.start:
+        raise ValueError(f"{entry.path} ends inside a tensor, {data.nbytes} bytes of {entry.end - entry.start}")
+    return data.reshape(entry.shape)
+
+
+def write_file(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
+    """Write tensors to a file, whole or not at all.
+
+    Raises:
+      ValueError: a tensor of a type that no weight has.
+    """
+    names = {dtype: name for name, dtype in DTYPES.items()}
+    header, end = {}, 0
+    for name, x in tensors.items():
+        if x.dtype not in names:
+            raise ValueError(f"{name} is {x.dtype}: must be one of {', '.join(map(str, names))}; cast it")
+        header[name] = {"dtype": names[x.dtype], "shape": x.shape, "data_offsets": (end, end + x.nbytes)}
+        end += x.nbytes
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)  # tensors start at a multiple of 8, as the format recommends
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(struct.pack("<Q", len(text)) + text)
+        for x in tensors.values():
+            np.ascontiguousarray(x).tofile(file)
+    os.replace(partial, path)
+
+
+def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int) -> Entry:
+    """One entry of a header whose tensors start at byte `body`, held against its own shape and the file."""
+    fields = {"dtype", "shape", "data_offsets"} - found.keys()
+    if fields:
+        raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")
+    start, end = (body + offset for offset in found["data_offsets"])
+    entry = Entry(path, found["dtype"], tuple(found["shape"]), start, end)
+    if entry.dtype in DTYPES:
+        needed = DTYPES[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
+        if entry.end - entry.start != needed:
+            raise ValueError(
+                f"{entry.path}: {name} has {entry.end - entry.start} bytes, its type and shape need {needed}; "
+                "fetch the file again"
+            )
+    if entry.end > size:
+        raise ValueError(f"{entry.path} was cut off: {name} ends at byte {entry.end} of {size}; fetch it again")
+    return entry

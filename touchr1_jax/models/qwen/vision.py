@@ -1,0 +1,88 @@
+"""Vision tower of Qwen2.5-VL: patches of any pictures and videos, windowed attention, 2 × 2 merger."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from touchr1_jax.models.layers import GatedMLP, RMSNorm, Rotation, rotate
+from touchr1_jax.models.qwen.config import QwenVisionConfig
+from touchr1_jax.models.qwen.geometry import Geometry, Grid, Groups, geometry
+
+ROPE_THETA = 1e4
+"""Base of the tower's rotary angles, the same in every released checkpoint and named in none."""
+
+
+class QwenVision(nn.Module):
+    """f(patches) → one token per merged patch, in the given order (arXiv 2502.13923, §2.1.1).
+
+    Parameters fix the precision: the patches are cast to the type of the first kernel.
+    """
+
+    config: QwenVisionConfig
+
+    @nn.compact
+    def __call__(self, patches: Float[Array, "n pixel"], grids: tuple[Grid, ...]) -> Float[Array, "token D"]:
+        """Encode all pictures and videos together; none sees another.
+
+        Args:
+          patches: normalised pixels of each patch (channel, frame, row, column), merged square by merged square.
+          grids: static; which patches are whose, in order.
+
+        Raises:
+          ValueError: patches that are not those of the grids, or as `geometry`.
+        """
+        c = self.config
+        expected = (sum(g.patches for g in grids), c.patch_size)
+        if patches.shape != expected:
+            raise ValueError(
+                f"patches are {patches.shape}, grids {tuple(map(tuple, grids))} have {expected}; match them"
+            )
+        place = geometry(grids, c)
+        kernel = self.param("patch_embed", nn.initializers.lecun_normal(), (c.patch_size, c.hidden_size))
+        x = patches[place.order].astype(kernel.dtype) @ kernel
+        rotation = axial_rotation(place, c.hidden_size // c.num_heads)
+        for i in range(c.depth):
+            groups = place.frames if i in c.full_layers else place.windows
+            x = VisionBlock(c, name=f"blocks_{i}")(x, rotation, groups)
+        x = RMSNorm(name="merger_norm")(x).reshape(-1, c.merge**2 * c.hidden_size)
+        x = nn.gelu(nn.Dense(x.shape[-1], name="merger_in")(x), approximate=False)
+        return nn.Dense(c.out_size, name="merger_out")(x)[place.token_order]
+
+
+class VisionBlock(nn.Module):
+    """Pre-norm transformer layer whose patches attend inside their group."""
+
+    config: QwenVisionConfig
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "n D"], rotation: Rotation, groups: Groups) -> Float[Array, "n D"]:
+        c = self.config
+        qkv = nn.Dense(3 * c.hidden_size, name="qkv")(RMSNorm(name="norm1")(x))
+        q, k, v = jnp.split(qkv.reshape(x.shape[0], 3 * c.num_heads, -1), 3, 1)
+        turn = lambda y: rotate(y.astype(jnp.float32), rotation).astype(y.dtype)  # angles are never rounded to bf16
+        x = x + nn.Dense(c.hidden_size, name="proj")(attend_within(turn(q), turn(k), v, groups))
+        return x + GatedMLP(c.intermediate_size, use_bias=True, name="mlp")(RMSNorm(name="norm2")(x))
+
+
+def attend_within(
+    q: Float[Array, "n H d"], k: Float[Array, "n H d"], v: Float[Array, "n H d"], groups: Groups
+) -> Float[Array, "n H*d"]:
+    """Full attention inside each group, softmax(q kᵀ/√d) v, softmax in float32; the groups are one batch."""
+    shape = (*groups.patch.shape, *q.shape[1:])
+    gather = lambda y: y.reshape(shape) if groups.even else y[groups.patch]
+    length = None if groups.even else jnp.asarray(groups.length, jnp.int32)
+    mixed = jax.nn.dot_product_attention(gather(q), gather(k), gather(v), key_value_seq_lengths=length)
+    flat = mixed.reshape(-1, q.shape[1] * q.shape[2])
+    return flat if groups.even else flat[groups.back]
+
+
+def axial_rotation(place: Geometry, head_dim: int) -> Rotation:
+    """Rotary angles of each patch: the first half of a head's frequencies turn by row, the other by column.
+
+    Frequency j of an axis is θ^(−4j/d), j < d/4 (Qwen2-VL, arXiv 2409.12191, §2.1).
+    """
+    frequency = ROPE_THETA ** (-np.arange(0, head_dim, 4, dtype=np.float64) / head_dim)
+    angle = np.concatenate([place.row[:, None] * frequency, place.column[:, None] * frequency], -1)
+    return Rotation(jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32))

@@ -1,0 +1,152 @@
+"""Published weights into parameters and back, tensor by tensor.
+
+The shapes that `abstract_params` gives are compared with the headers of all files before a single tensor is read, and
+everything that does not fit is named in one error.
+"""
+
+import functools
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import flax.traverse_util
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from touchr1_jax.models.qwen import names, safetensors
+from touchr1_jax.models.qwen.config import QwenConfig
+from touchr1_jax.models.qwen.names import canonical, published, sources
+from touchr1_jax.types import Params
+
+SINGLE = "model.safetensors"
+INDEX = "model.safetensors.index.json"
+SHOWN = 12
+"""How many misfits an error lists before it counts the rest."""
+
+
+def load_params(
+    directory: str | Path, config: QwenConfig, dtype: jnp.dtype | type = jnp.bfloat16, device: jax.Device | None = None
+) -> Params:
+    """Parameters of `QwenVL` from the safetensors files of a directory.
+
+    One tensor at a time is read, cast and laid out, the largest first, while little else is held: the host never holds
+    more than the parameters placed on it and two copies of a small one.
+
+    Args:
+      directory: `model.safetensors`, or `model.safetensors.index.json` with its shards.
+      config: shapes that are expected.
+      dtype: type of all parameters.
+      device: where they are placed; JAX's default without one.
+
+    Raises:
+      FileNotFoundError: no weights, or a shard that is missing.
+      ValueError: a file that is no safetensors file, or keys that are missing, extra, double, of the wrong shape or of
+        a type that no weight has; all of them are listed.
+    """
+    entries = find_tensors(Path(directory))
+    wanted = sources(config)
+    misfits = compare(entries, {s.key: s.shape for s in wanted.values()})
+    if misfits:
+        more = f"\n  … and {len(misfits) - SHOWN} more" if len(misfits) > SHOWN else ""
+        listed = "".join(f"\n  {line}" for line in misfits[:SHOWN])
+        raise ValueError(
+            f"{directory} does not hold the tensors that its config asks for:{listed}{more}\n"
+            "fetch the files again, or read them with the config.json that belongs to them"
+        )
+    place = functools.partial(_place, dtype=jnp.dtype(dtype), device=device)
+    by_size = sorted(wanted.items(), key=lambda item: -math.prod(item[1].shape))
+    loaded = {path: place(entries[s.key], turned=s.turned) for path, s in by_size}
+    return flax.traverse_util.unflatten_dict(loaded)
+
+
+def find_tensors(directory: Path) -> dict[str, safetensors.Entry]:
+    """All tensors of a checkpoint by key without prefix.
+
+    Raises:
+      FileNotFoundError: no weights, or a shard that is missing.
+      ValueError: an index that contradicts its shards, or two keys that mean the same tensor.
+    """
+    found: dict[str, safetensors.Entry] = {}
+    for name, entry in _raw_tensors(directory).items():
+        if canonical(name) in found:
+            raise ValueError(f"{entry.path}: {name} is there twice, under an old and a new name; delete one file")
+        found[canonical(name)] = entry
+    return found
+
+
+def compare(entries: Mapping[str, safetensors.Entry], wanted: Mapping[str, tuple[int, ...]]) -> list[str]:
+    """What does not fit, one line each, by published keys: missing, extra, shape, type."""
+    missing = [f"missing: {published(key)} {shape}" for key, shape in wanted.items() if key not in entries]
+    strangers = [(published(key), entry) for key, entry in entries.items() if key not in wanted]
+    extra = [f"extra: {key} {entry.shape} in {entry.path.name}" for key, entry in strangers]
+    shared = [(published(key), entries[key], shape) for key, shape in wanted.items() if key in entries]
+    shapes = [
+        f"shape: {key} is {entry.shape}, expected {shape}" for key, entry, shape in shared if entry.shape != shape
+    ]
+    types = [
+        f"type: {key} is {entry.dtype}, expected one of {', '.join(safetensors.DTYPES)}"
+        for key, entry, _ in shared
+        if entry.dtype not in safetensors.DTYPES
+    ]
+    return missing + extra + shapes + types
+
+
+def save_params(path: Path, params: Params, config: QwenConfig) -> None:
+    """Write parameters to one file with the published keys, in their own type.
+
+    Raises:
+      ValueError: a tree that is not that of the config.
+    """
+    flat = flax.traverse_util.flatten_dict(params)
+    wanted = sources(config)
+    if flat.keys() != wanted.keys():
+        differ = sorted("/".join(p) for p in flat.keys() ^ wanted.keys())
+        raise ValueError(f"params and config differ in {', '.join(differ[:SHOWN])}; save with the config of the params")
+    safetensors.write_file(path, {published(s.key): names.write(np.asarray(flat[p]), s) for p, s in wanted.items()})
+
+
+def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
+    """All tensors by the keys that the files have."""
+    index = directory / INDEX
+    if not index.is_file():
+        single = directory / SINGLE
+        if not single.is_file():
+            raise FileNotFoundError(
+                f"{directory} holds neither {SINGLE} nor {INDEX}: no weights; correct the directory"
+            )
+        return safetensors.read_header(single)
+    try:
+        place = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
+    except (json.JSONDecodeError, KeyError) as error:
+        raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
+    entries: dict[str, safetensors.Entry] = {}
+    for shard in sorted(set(place.values())):
+        if not (directory / shard).is_file():
+            raise FileNotFoundError(f"{directory / shard} is named by {INDEX} and is not there; fetch it")
+        header = safetensors.read_header(directory / shard)
+        twice = sorted(entries.keys() & header.keys())
+        if twice:
+            raise ValueError(f"{directory / shard} holds {twice[0]}, as another shard does; delete one of them")
+        entries |= header
+    lost = sorted(name for name in place.keys() | entries.keys() if place.get(name) != _file_of(name, entries))
+    if lost:
+        raise ValueError(f"{index} and its shards differ in {', '.join(lost[:SHOWN])}; fetch them again")
+    return entries
+
+
+def _file_of(name: str, entries: Mapping[str, safetensors.Entry]) -> str | None:
+    return entries[name].path.name if name in entries else None
+
+
+def _place(entry: safetensors.Entry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None) -> Array:
+    """One parameter on its device; waits for it, so that no two tensors are on their way at once."""
+    raw = jax.device_put(safetensors.read_tensor(entry), device)
+    return jax.block_until_ready(_lay_out(raw, turned, dtype))
+
+
+@functools.partial(jax.jit, static_argnames=("turned", "dtype"))
+def _lay_out(raw: Array, turned: bool, dtype: jnp.dtype) -> Array:
+    return names.read(raw, turned).astype(dtype)

@@ -1,0 +1,244 @@
+"""Alarms: what goes wrong in reinforcement from touch, each seen in the metrics of a run by one small function.
+
+A function gets the means over the last and over the first `WINDOW` steps and returns the number that fired, or `None`.
+The codes F1 … F13 number known failures; F11, the collapse of latent prediction, belongs to another stage.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Callable, Mapping
+
+WINDOW = 20
+"""Steps that a mean is over: with 8 prompts of 8 rollouts a share has then a standard error below .02."""
+
+Metrics = Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Alarm:
+    """A failure that was seen: its code, what it means, the number that fired and the bound that it passed."""
+
+    code: str
+    meaning: str
+    value: float
+    bound: float
+
+    def __str__(self) -> str:
+        return f"alarm {self.code}: {self.meaning} ({self.value:.3g}, bound {self.bound:g})"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rule:
+    """One alarm: `check` returns what lies beyond `bound`; `reason` says why the bound is there."""
+
+    code: str
+    meaning: str
+    bound: float
+    reason: str
+    check: Callable[[Metrics, Metrics], float | None]
+    below: bool = False
+    """Whether it fires below the bound instead of above."""
+
+    def alarm(self, now: Metrics, start: Metrics) -> Alarm | None:
+        """The alarm, if it fires; metrics that a run does not log raise none."""
+        value = self.check(now, start)
+        if value is None or (value >= self.bound if self.below else value <= self.bound):
+            return None
+        return Alarm(code=self.code, meaning=self.meaning, value=value, bound=self.bound)
+
+
+def middle_excess(now: Metrics, start: Metrics) -> float | None:
+    """F1: share of middle answers above the share of middle labels."""
+    del start
+    labels = [now[f"labels_level_{k}"] for k in range(3)]
+    return None if not sum(labels) else now["middle_rate"] - labels[1] / sum(labels)
+
+
+def echo_excess(now: Metrics, start: Metrics) -> float | None:
+    """F2: how much oftener all slots agree than the answer is right."""
+    del start
+    return now["echo_share"] - now["accuracy"]
+
+
+def grounding_size(now: Metrics, start: Metrics) -> float | None:
+    """F3: mean grounding of a token, nat."""
+    del start
+    return now["grounding"]
+
+
+def swap_blindness(now: Metrics, start: Metrics) -> float | None:
+    """F4: how much more noise costs than another object's touch; needs the controls of R_tu."""
+    del start
+    return now["control_order"] - now["control_noise"] if "control_noise" in now else None
+
+
+def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
+    """F5: share of groups that earned the tactile bonus and whose advantages it left as they were."""
+    del start
+    return now["bonus_cancelled_share"]
+
+
+def unearned_credit(now: Metrics, start: Metrics) -> float | None:
+    """F6: share of groups with tactile credit, while touch is no better than the best control on average."""
+    del start
+    if "tactile_credit_share" not in now:
+        return None
+    lead = now["touch_score"] - max(now[f"control_{c}"] for c in ("drop", "noise", "order"))
+    return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= 0 else 0.0)
+
+
+def idle_groups(now: Metrics, start: Metrics) -> float | None:
+    """F7: share of groups of equal rewards."""
+    del start
+    return now["degenerate_share"]
+
+
+def heavy_tail(now: Metrics, start: Metrics) -> float | None:
+    """F8: the largest reference KL of a token, nat."""
+    del start
+    return now["kl_peak"]
+
+
+def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
+    """F9: entropy over that of the beginning, while answers are still wrong."""
+    return now["entropy"] / max(start["entropy"], 1e-6) if now["accuracy"] < 0.95 else None
+
+
+def entropy_growth(now: Metrics, start: Metrics) -> float | None:
+    """F9: entropy above that of the beginning, nat."""
+    return now["entropy"] - start["entropy"]
+
+
+def forgotten_stream(now: Metrics, start: Metrics) -> float | None:
+    """F10: smallest grounding of a stream over the largest, among streams that were perturbed."""
+    del start
+    streams = [n.removeprefix("perturbed_stream_") for n in now if n.startswith("perturbed_stream_") and now[n] > 0]
+    sizes = [now[f"grounding_stream_{s}"] for s in streams]
+    return min(sizes) / max(sizes) if sizes and max(sizes) > 0 else None
+
+
+def frozen_time(now: Metrics, start: Metrics) -> float | None:
+    """F12: share of streams whose steps all have one time id."""
+    del start
+    return now["static_time_share"]
+
+
+def gamed_answers(now: Metrics, start: Metrics) -> float | None:
+    """F13: share of answers that name levels and cannot be read."""
+    del start
+    return now["gamed_share"]
+
+
+RULES: tuple[Rule, ...] = (
+    Rule(
+        code="F1",
+        meaning="answers drift to the middle level",
+        bound=0.25,
+        reason="a policy 60 % right whose errors are all one level inwards says 'middle' .27 too often at most",
+        check=middle_excess,
+    ),
+    Rule(
+        code="F2",
+        meaning="slots echo each other instead of reporting",
+        bound=0.4,
+        reason="a constant echo on three uniform levels exceeds its accuracy by .67, a good policy by its error rate",
+        check=echo_excess,
+    ),
+    Rule(
+        code="F3",
+        meaning="grounding grows without bound",
+        bound=1.0,
+        reason="1 nat a token over a whole answer: every word is e times likelier with touch than with noise",
+        check=grounding_size,
+    ),
+    Rule(
+        code="F4",
+        meaning="noise is detected, but another object's touch passes",
+        bound=0.25,
+        reason="a policy that reads touch loses as much by another object's touch, up to chance agreement of ⅓",
+        check=swap_blindness,
+    ),
+    Rule(
+        code="F5",
+        meaning="the tactile bonus cancels within groups",
+        bound=0.05,
+        reason="a bonus that acts moves advantages, but where all of a group earn the same; one group in twenty may",
+        check=cancelled_bonus,
+    ),
+    Rule(
+        code="F6",
+        meaning="tactile credit without a tactile lead",
+        bound=0.12,
+        reason="the false-credit rate that R_tu is designed for",
+        check=unearned_credit,
+    ),
+    Rule(
+        code="F7",
+        meaning="most groups teach nothing",
+        bound=0.5,
+        reason="half of the rollouts are then spent for nothing",
+        check=idle_groups,
+    ),
+    Rule(
+        code="F8",
+        meaning="single tokens dominate the reference KL",
+        bound=10.0,
+        reason="k3 of a word e^2.4 times rarer under the policy than under the reference; its gradient grows as fast",
+        check=heavy_tail,
+    ),
+    Rule(
+        code="F9",
+        meaning="entropy collapses before the answers are right",
+        bound=0.05,
+        reason="a twentieth of the first entropy leaves a group of eight with one text",
+        check=entropy_collapse,
+        below=True,
+    ),
+    Rule(
+        code="F9",
+        meaning="entropy blows up",
+        bound=1.0,
+        reason="1 nat more a token: e times as many words in play as the supervised policy had",
+        check=entropy_growth,
+    ),
+    Rule(
+        code="F10",
+        meaning="a stream has no influence on the answer",
+        bound=1e-3,
+        reason="rounding gives a stream that is never attended to less than a thousandth of another's effect",
+        check=forgotten_stream,
+        below=True,
+    ),
+    Rule(
+        code="F12",
+        meaning="time ids stand still, so that a shuffle tests nothing",
+        bound=0.01,
+        reason="recorded frames have different indices; only a cast or a unit error makes them equal",
+        check=frozen_time,
+    ),
+    Rule(
+        code="F13",
+        meaning="answers name levels where they cannot be read",
+        bound=0.2,
+        reason="a supervised policy writes one such answer in twenty; four times as many are a strategy",
+        check=gamed_answers,
+    ),
+)
+
+
+class Watch:
+    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the means of the first."""
+
+    def __init__(self) -> None:
+        self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
+        self._start: Metrics | None = None
+
+    def see(self, metrics: Metrics) -> list[Alarm]:
+        """The alarms after one more step, from the end of the first window on."""
+        self._last.append(metrics)
+        if len(self._last) < WINDOW:
+            return []
+        now = {name: sum(m[name] for m in self._last) / WINDOW for name in metrics}
+        self._start = now if self._start is None else self._start
+        start = self._start
+        return [alarm for rule in RULES if (alarm := rule.alarm(now, start)) is not None]

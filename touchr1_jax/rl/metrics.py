@@ -1,0 +1,79 @@
+"""What a researcher watches at every step: reward and its spread, accuracy, parse rate, agreement, lengths, touch."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from touchr1_jax import masked
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rl.advantages import degenerate
+from touchr1_jax.types import Parsed, Rollout, Target
+
+
+def rollout_metrics(
+    rollout: Rollout, reward: Float[Array, "P G"], flat: Bool[Array, "P"], parsed: Parsed, target: Target
+) -> dict[str, Array]:
+    """Means over all rollouts; `middle_rate` over ordinal questions, `agreement` over formatted answers."""
+    asked = target.asked[:, None]
+    label, middle = target.label[:, None], (target.levels[:, None] - 1) // 2
+    ordinal = asked & target.ordinal[:, None]
+    right = (parsed.conclude == label) & (label >= 0)
+    return {
+        "reward": jnp.mean(reward),
+        "reward_std": jnp.mean(jnp.std(reward, -1)),
+        "degenerate_share": jnp.mean(flat),
+        "accuracy": masked.mean(right, jnp.broadcast_to(asked, right.shape)),
+        "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(ordinal, right.shape)),
+        "parse_rate": jnp.mean(parsed.formatted & jnp.all((parsed.conclude >= 0) | ~asked, -1)),
+        "truncated_share": jnp.mean(parsed.truncated),
+        "length": jnp.mean(jnp.sum(rollout.mask, -1)),
+    }
+
+
+def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
+    """How the answers are spread: accuracy of each level, the commonest answer, and slots that all say the same.
+
+    `right_level_k` is the share right of ordinal questions whose label is k, `labels_level_k` how many there were;
+    `mode_share` the share of the commonest level among ordinal answers, `label_mode_share` among their labels;
+    `echo_share` how often every slot of a formatted answer holds one and the same level; `gamed_share` how often an
+    answer that names levels is not formatted or names several in its conclusion.
+    """
+    asked = jnp.broadcast_to((target.asked & target.ordinal)[:, None], parsed.conclude.shape)
+    label = jnp.broadcast_to(target.label[:, None], asked.shape)
+    right = parsed.conclude == label
+    levels = range(3)
+    by_level = {k: asked & (label == k) for k in levels}
+    said = jnp.stack([masked.mean(parsed.conclude == k, asked & (parsed.conclude >= 0)) for k in levels])
+    truth = jnp.stack([masked.mean(label == k, asked & (label >= 0)) for k in levels])
+    same = jnp.all((parsed.perceive == parsed.compare[..., None, :]) | ~target.streams[:, None, :, None], -2)
+    same &= (parsed.compare == parsed.conclude) & (parsed.conclude >= 0)
+    named = jnp.any(parsed.perceive >= 0, (-1, -2)) | jnp.any(parsed.compare >= 0, -1)
+    unread = ~parsed.formatted | ~jnp.any((parsed.conclude >= 0) & target.asked[:, None], -1)
+    return {
+        **{f"right_level_{k}": masked.mean(right, by_level[k]) for k in levels},
+        **{f"labels_level_{k}": jnp.sum(by_level[k]).astype(jnp.float32) for k in levels},
+        "mode_share": jnp.max(said),
+        "label_mode_share": jnp.max(truth),
+        "echo_share": masked.mean(same, asked & parsed.formatted[..., None]),
+        "gamed_share": jnp.mean(named & unread),
+    }
+
+
+def group_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"], right: Bool[Array, "P G"]):
+    """Size of the advantages, and how much of their spread separates right answers that earned the same."""
+    lively = ~degenerate(reward)
+    return {
+        "advantage_abs": jnp.mean(jnp.abs(advantage)),
+        "advantage_peak": jnp.max(jnp.abs(advantage)),
+        "all_right_share": jnp.mean(jnp.all(right, -1)),
+        "none_right_share": jnp.mean(~jnp.any(right, -1)),
+        "lively_groups": jnp.sum(lively).astype(jnp.float32),
+    }
+
+
+def touch_metrics(features: Features) -> dict[str, Array]:
+    """`static_time_share`: streams that are there and have several steps, all with one time id."""
+    time, there = features.touch_time, features.touch_time >= 0
+    several = features.stream_mask & (jnp.sum(there, -1) > 1)
+    low = masked.minimum(time, there, -1, empty=0.0)
+    high = masked.maximum(time, there, -1, empty=0.0)
+    return {"static_time_share": masked.mean(low == high, several)}
