@@ -29,7 +29,7 @@ TOUCHR1_LAYERS = (
 SENSORS_LAYERS = (
     {"schema"},
     {"clock"},
-    {"sync", "force"},
+    {"sync", "taps", "force"},
     {"deltas"},
     {"quality"},
     {"codec"},

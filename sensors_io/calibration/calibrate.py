@@ -159,6 +159,6 @@ def _check_errors(errors: BallErrors, config: CalibrateConfig) -> None:
     if not (depth <= config.most_depth_um and radius <= 100 * config.most_radius):
         raise CalibrationError(
             f"held-out balls come out with a depth error of {depth:.0f} um and a radius error of {radius:.0f} %: must "
-            f"be ≤ {config.most_depth_um:.0f} um and ≤ {100 * config.most_radius:.0f} %; press one rigid ball, keep the "
-            "lamps and the camera's settings as they were, record the background anew"
+            f"be ≤ {config.most_depth_um:.0f} um and ≤ {100 * config.most_radius:.0f} %; press one rigid ball, keep "
+            "the lamps and the camera's settings as they were, record the background anew"
         )

@@ -92,7 +92,7 @@ class _Small:
         background = shrink(presses.background, self.factor)
         changes = np.stack([shrink(p, self.factor) - background for p in presses.pictures])
         self.changes = changes - np.median(changes, axis=(1, 2), keepdims=True)
-        self.shape = background.shape[:2]
+        self.shape = (background.shape[0], background.shape[1])
         self.y, self.x = np.mgrid[: self.shape[0], : self.shape[1]].astype(float)
         self.places = legendre(*self.shape, max(SCHEDULE))
 

@@ -200,7 +200,9 @@ def _fold_error(grams: list[Gram], order: np.ndarray, fold: int, folds: int, tri
 
 def _solve(grams: list[Gram], choice: Choice) -> np.ndarray:
     terms = _kept(choice.degree, choice.position_degree)
-    normal = sum(g[0] for g in grams)[np.ix_(terms, terms)]
+    left = sum((gram[0] for gram in grams), start=np.zeros_like(grams[0][0]))
+    right = sum((gram[1] for gram in grams), start=np.zeros_like(grams[0][1]))
+    normal = left[np.ix_(terms, terms)]
     ridge = choice.ridge * np.trace(normal) / len(normal)
-    solved: np.ndarray = np.linalg.solve(normal + ridge * np.eye(len(normal)), sum(g[1] for g in grams)[terms])
+    solved: np.ndarray = np.linalg.solve(normal + ridge * np.eye(len(normal)), right[terms])
     return solved

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices import tac3d
+from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.records import RecordStore
@@ -177,10 +177,10 @@ class Tac3dRecording:
         return Identity(sensor="tac3d", serial=self.path.stem, product="Tac3D recording", where=str(self.path))
 
     def samples(self) -> Iterator[Recorded]:
-        recorded = tac3d.load_recording(self.path)
+        recorded = tac3d_messages.load_recording(self.path)
         start = recorded.send_time_s[0]
         for i, index in enumerate(recorded.index):
-            fields = tac3d.to_schema({name: a[i] for name, a in recorded.matrices.items()})
+            fields = tac3d_messages.to_schema({name: a[i] for name, a in recorded.matrices.items()})
             time_ns = round((recorded.send_time_s[i] - start) * NS_PER_S)
             yield Recorded(time_ns=time_ns, index=int(index), frame=None, arrays=fields)
 

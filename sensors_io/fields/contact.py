@@ -117,7 +117,7 @@ def steepest_change(picture: np.ndarray, background: np.ndarray, mm_per_px: floa
 
 
 def _steepness(picture: np.ndarray, background: np.ndarray, mm_per_px: float, smoothing_mm: float) -> np.ndarray:
-    """Length of the gradient of the smoothed change, grey levels/mm: the greatest of the channels, on coarser pixels."""
+    """Length of the gradient of the smoothed change, grey levels/mm: the greatest of the channels, coarser pixels."""
     scale = max(1, round(smoothing_mm / mm_per_px / 2))  # the smoothed change needs no finer pixels
     difference = cv2.subtract(picture, background, dtype=cv2.CV_32F)
     height, width = difference.shape[0] // scale, difference.shape[1] // scale

@@ -1,6 +1,7 @@
 """All fields of a sensor's pictures in one call, and flags for what a picture cannot carry."""
 
 import dataclasses
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,7 +68,8 @@ class Extractor:
         self.config = config or ExtractConfig()
         self.evidence = examine(cv2.cvtColor(background, cv2.COLOR_RGB2GRAY))
         self._depth = None if calibration is None else self._depth_reader(calibration)
-        self._deformation = self._shear = None
+        self._deformation: DeformationReader | None = None
+        self._shear: ShearReader | None = None
         self.grid_mm: tuple[float, float] | None = None
         if self.evidence.pattern is not Pattern.BARE:
             self._make_vector_readers()
@@ -176,7 +178,7 @@ class Extractor:
 def joined(parts: list[Fields]) -> Fields:
     """Fields of several runs of frames, one after the other."""
     first = parts[0]
-    arrays = {
+    arrays: dict[str, Any] = {
         name: None if array is None else np.concatenate([part.arrays()[name] for part in parts])
         for name, array in first.arrays().items()
     }

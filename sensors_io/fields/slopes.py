@@ -93,7 +93,7 @@ def change(picture: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, ...
         raise ValueError(f"picture and background have shapes {sizes}: must be equal; use the camera's calibration")
     difference = cv2.subtract(picture, background, dtype=cv2.CV_32F)
     smooth = cv2.GaussianBlur(difference, (5, 5), SMOOTHING_PX, borderType=cv2.BORDER_REPLICATE)
-    return tuple(cv2.split(cv2.multiply(smooth, (1 / COLOUR_SCALE,) * 4)))
+    return tuple(cv2.split(smooth * np.float32(1 / COLOUR_SCALE)))
 
 
 def to_slopes(n_x: np.ndarray, n_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

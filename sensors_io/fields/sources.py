@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 
+from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from sensors_io.index import INDEX
 from sensors_io.records import RecordStore
@@ -70,7 +71,7 @@ def _read(path: pathlib.Path, sensor: str) -> Iterator[tuple[str, np.ndarray]]:
         yield from ((str(file.relative_to(path)), read_picture(file)) for file in files)
     elif path.suffix.lower() in VIDEOS:
         try:
-            video = read_video(path, height=0, stride=1, max_frames=0)
+            video = read_video(path, Keep(height=0, stride=1, max_frames=0))
         except VideoError as error:
             raise SourceError(f"{path} {error}; convert or replace it") from error
         yield from ((f"{path.name}#{i}", frame) for i, frame in zip(video.index, video.frames, strict=True))

@@ -172,7 +172,7 @@ class Tracker:
         """The start that leaves most points whole, of those grown from every large piece of two fields: the present
         one and that of dense flow.
         """
-        flow = self._flow.calc(self._reference, picture, None)
+        flow = self._flow.calc(self._reference, picture, None)  # type: ignore[call-overload]
         at_points = cv2.remap(flow, self._start[:, :1], self._start[:, 1:], cv2.INTER_LINEAR)[:, 0]
         fields = ((points, found), self._forth(picture, self._start + at_points))
         grown = [g for field in fields for g in self._grown(picture, *field)]

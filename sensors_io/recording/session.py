@@ -19,18 +19,14 @@ from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
-from sensors_io.recording.assemble import assemble
+from sensors_io.recording.book import Book, Report
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, FreeCoach, Phase, Stage, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.schema import ContactKey, ObjectCard
-
-ATTEMPTS = 16
-"""Of one contact: trial = level · ATTEMPTS + attempt."""
+from sensors_io.schema import ContactKey
 
 _JOURNALS = ".journals"
 _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
-_PER_SHARD = 19  # contacts: those of one site by protocol
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -88,15 +84,6 @@ class Status:
     newest: Sample | None
 
 
-@dataclasses.dataclass(kw_only=True)
-class Report:
-    """What a session did: contacts written, those recovered from journals of a killed one, those asked for again."""
-
-    contacts: int = 0
-    recovered: int = 0
-    incomplete: int = 0
-
-
 def record_session(
     out: pathlib.Path,
     config: SessionConfig,
@@ -127,13 +114,13 @@ def record_session(
     report = Report()
     with RecordWriter(out, meta=meta, resume=True) as writer:
         journals.mkdir(exist_ok=True)
-        book = _Book(writer, journals, report)
+        book = Book(writer, journals, report)
         book.add_object(config.object_id)
         book.recover()
         session = _Session(config, tactile, force, show, stop, book)
         try:
             for stage in _stages(config):
-                while not stop() and (key := book.wanted(config, stage)) is not None:
+                while not stop() and (key := book.wanted(config.object_id, config.site, stage)) is not None:
                     session.contact(stage, key)
         finally:
             book.publish()
@@ -142,67 +129,6 @@ def record_session(
 
 def _stages(config: SessionConfig) -> tuple[Stage, ...]:
     return (Stage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
-
-
-class _Book:
-    """The records and the journals beside them."""
-
-    def __init__(self, writer: RecordWriter, journals: pathlib.Path, report: Report):
-        self._writer, self._journals, self._report = writer, journals, report
-        self._incomplete: list[list[Any]] = list(writer.notes.get("incomplete", []))
-        self._unpublished: list[pathlib.Path] = []
-
-    def add_object(self, object_id: str) -> None:
-        if object_id not in self._writer.objects_done:
-            self._writer.write_object(
-                ObjectCard(object_id=object_id, split="unlabelled", labels={}, annotator="nobody yet")
-            )
-
-    def recover(self) -> None:
-        """Bring journals that a killed session left into the records."""
-        for path in sorted(self._journals.glob("*.journal")):
-            self._report.recovered += self.store(path) is not None
-
-    def wanted(self, config: SessionConfig, stage: Stage) -> ContactKey | None:
-        """Identity of the next attempt at a stage; `None` once it is complete or has been tried `ATTEMPTS` times."""
-        for attempt in range(ATTEMPTS):
-            trial = stage.level * ATTEMPTS + attempt
-            key = ContactKey(object_id=config.object_id, site=config.site, motion=stage.motion, trial=trial)
-            if key not in self._writer:
-                return key
-            if _plain(key) not in self._incomplete:
-                return None
-        return None
-
-    def path(self, key: ContactKey) -> pathlib.Path:
-        return self._journals / f"{key.object_id}-{key.site}-{key.motion}-{key.trial}.journal"
-
-    def store(self, path: pathlib.Path) -> bool | None:
-        """Write a journal's contact; whether it was complete, `None` if there was nothing in it."""
-        found = assemble(path)
-        if found is None:
-            path.unlink()
-            return None
-        self._unpublished.append(path)
-        key = found.sequence.key
-        if key not in self._writer:  # else it was published, and its journal not yet deleted
-            self.add_object(key.object_id)
-            self._writer.write_contact([found.sequence])
-            self._report.contacts += 1
-            if not found.complete:
-                self._report.incomplete += 1
-                self._incomplete.append(_plain(key))
-                self._writer.note(incomplete=self._incomplete)
-        if len(self._unpublished) >= _PER_SHARD:
-            self.publish()
-        return found.complete
-
-    def publish(self) -> None:
-        """Make everything visible; only then are its journals deleted."""
-        self._writer.publish()
-        for path in self._unpublished:
-            path.unlink()
-        self._unpublished.clear()
 
 
 class _Session:
@@ -215,7 +141,7 @@ class _Session:
         force: Feed | None,
         show: Callable[[Status], None],
         stop: Callable[[], bool],
-        book: _Book,
+        book: Book,
     ):
         self._config, self._tactile, self._force = config, tactile, force
         self._show, self._stop, self._book = show, stop, book
@@ -323,7 +249,3 @@ class _Session:
             drift=self._background.drift(),
             newest=newest[-1] if newest else None,
         )
-
-
-def _plain(key: ContactKey) -> list[Any]:
-    return [key.object_id, key.site, key.motion, key.trial]
