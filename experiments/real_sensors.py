@@ -3,8 +3,8 @@
     python -m experiments real_sensors --data-dir DIR [--scale smoke]
 
 Each folder of ball presses in DIR is calibrated by itself, with no labels and one setting, and the fields of some of
-its pictures are drawn: change of colour, depth, contact, deformation where the gel has markers.  A folder that cannot be
-calibrated says why.  Four minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
+its pictures are drawn: change of colour, depth, contact, deformation where the gel has markers.  A folder that cannot
+be calibrated says why.  Four minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
 marker-less Minis calibrate to ten micrometres or so; DIGIT and marker gels are refused depth or flagged, not guessed.
 """
 
@@ -77,7 +77,7 @@ def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple
     row = (folder.name, extractor.evidence.pattern.value, len(frames), *figures, rejected, hz, note)
     drawn = [_row(fields, frames, background, int(i), names[i]) for i in chosen]
     picture = Picture(
-        name=folder.name.replace(" ", "-"),
+        name=folder.name.replace(",", "").replace(" ", "-"),
         title=folder.name,
         caption="; ".join(extractor.refused) or "Change of colour, depth, contact, deformation.",
         content=field_rows(drawn, folder.mm_per_px),

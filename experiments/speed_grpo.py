@@ -34,6 +34,10 @@ from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from experiments.running.timing import interleaved
 from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.text.parser import compile_parser
+from touchr1_jax.text.template import prompt_words
+from touchr1_jax.text.tokenizer import word_level
 from touchr1_jax.training.compilation import keep_compilations
 
 LIMITS_S = {64: 0.55, 512: 1.3}
@@ -78,11 +82,12 @@ def run(config: SpeedConfig, context: Context) -> Findings:
             alone[prefix] = in_own_process(time_alone, config, prefix, Path(cache))
             context.say(f"prefix {prefix}: {np.median(alone[prefix].seconds):.3f} s")
     side_by_side = {prefix: compare(config, prefix) for prefix in config.compared}
+    parser_s = parser_seconds(config.size)
     flat = steps_stay_flat(config)
     context.say(f"{config.flat_steps} steps: {flat}")
     return Findings(
         verdict=verdict(alone, side_by_side),
-        requirements=requirements(alone, flat),
+        requirements=requirements(alone, flat, parser_s),
         tables=(alone_table(config, alone, first), compare_table(side_by_side)),
         settings={"beta": BETA, "micro_prompts": config.micro_prompts, "devices": str(jax.devices())},
         data={"flat": flat},
@@ -138,11 +143,22 @@ def compare(config: SpeedConfig, prefix: int) -> dict[str, np.ndarray]:
         "bfloat16": dataclasses.replace(plain, bfloat16=True),
     }
     jobs = {name: Job(config.size, prefix, variant) for name, variant in variants.items()}
+    jobs["host reward"] = Job(config.size, prefix, plain, host=True)
     jobs["repeated prefix"] = Job(config.size, prefix, plain, repeated=True)
     for job in jobs.values():
         for _ in range(2):
             jax.block_until_ready(job.step())
     return interleaved({name: job.step for name, job in jobs.items()}, max(2, config.rounds // 2))
+
+
+def parser_seconds(size: Size, rounds: int = 20) -> float:
+    """Median time to parse all completions of one iteration, random words of the touch language."""
+    tokenizer = word_level(TOUCH_LANGUAGE, prompt_words())
+    parse = jax.jit(jax.vmap(jax.vmap(compile_parser(TOUCH_LANGUAGE, tokenizer))))
+    shape = (size.prompts, size.group, size.length)
+    tokens = jnp.asarray(np.random.default_rng(0).integers(0, tokenizer.vocab_size, shape), jnp.int32)
+    jax.block_until_ready(parse(tokens))
+    return float(np.median(interleaved({"parse": lambda: parse(tokens)}, rounds)["parse"]))
 
 
 def steps_stay_flat(config: SpeedConfig) -> dict[str, float]:
@@ -159,7 +175,7 @@ def steps_stay_flat(config: SpeedConfig) -> dict[str, float]:
     return {"drift": drift, "grown_mb": grown / 1024, "programs": float(job.compilations)}
 
 
-def requirements(alone: Mapping[int, Alone], flat: Mapping[str, float]) -> tuple[Requirement, ...]:
+def requirements(alone: Mapping[int, Alone], flat: Mapping[str, float], parser_s: float) -> tuple[Requirement, ...]:
     """The bounds on time, memory, compilations and drift."""
     bounds = [
         Requirement(
@@ -174,6 +190,7 @@ def requirements(alone: Mapping[int, Alone], flat: Mapping[str, float]) -> tuple
         if prefix in alone
     ]
     peak = max(a.peak_gb for a in alone.values())
+    shortest = min(float(np.median(a.seconds)) for a in alone.values())
     programs = max(a.programs for a in alone.values())
     return (
         *bounds,
@@ -185,6 +202,7 @@ def requirements(alone: Mapping[int, Alone], flat: Mapping[str, float]) -> tuple
             unit="GB",
             note="of processes that read their programs from the compilation cache",
         ),
+        Requirement(name="parser's share of an iteration", measured=parser_s / shortest, bound=0.02, better="lower"),
         Requirement(name="programs for one shape", measured=programs, bound=1, better="lower"),
         Requirement(name="time of late steps over early ones", measured=flat["drift"], bound=1.1, better="lower"),
         Requirement(name="memory that many steps add", measured=flat["grown_mb"], bound=16, better="lower", unit="MB"),

@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.running.timing import interleaved
 from sensors_io.clock import NS_PER_S, JumpingClock
-from sensors_io.devices import tac3d
+from sensors_io.devices import tac3d_messages
 from sensors_io.devices.intake import Counts, Intake
 from sensors_io.devices.reader import Pump, ReaderConfig
 from sensors_io.devices.replay import Replay
@@ -50,7 +50,7 @@ class Checked:
 
 def check(path: pathlib.Path) -> Checked:
     """Replay a recording through a reader in compressed time, and hold its books against the arrays."""
-    truth = tac3d.load_recording(path)
+    truth = tac3d_messages.load_recording(path)
     clock = JumpingClock()
     intake = Intake(capacity=len(truth.index) + 1, clock=clock)
     pump = Pump(Replay(Tac3dRecording(path=path), clock=clock), intake, ReaderConfig(), clock, threading.Event())
@@ -73,7 +73,7 @@ def check(path: pathlib.Path) -> Checked:
     )
 
 
-def _lateness_s(recording: tac3d.Recording) -> np.ndarray:
+def _lateness_s(recording: tac3d_messages.Recording) -> np.ndarray:
     """How much later messages arrived than the running minimum says they were sent, median and largest."""
     if recording.receive_time_s is None:
         return np.full(2, np.nan)
@@ -93,7 +93,7 @@ def message(path: pathlib.Path | None) -> list[bytes]:
         arrays |= {name: rng.normal(size=(1, 3)) for name in ("3D_ResultantForce", "3D_ResultantMoment")}
         index, time_s = 10, 12.345
     else:
-        recording = tac3d.load_recording(path)
+        recording = tac3d_messages.load_recording(path)
         k = len(recording.index) // 2
         arrays = {name: np.ascontiguousarray(a[k], np.float64) for name, a in recording.matrices.items()}
         index, time_s = int(recording.index[k]), float(recording.send_time_s[k])
@@ -111,13 +111,13 @@ def message(path: pathlib.Path | None) -> list[bytes]:
 def decode_ms(packets: list[bytes], rounds: int, repeats: int = 20) -> dict[str, np.ndarray]:
     """Time of one message by every way, ms [rounds]: decoding alone, from the packets, as samples, by YAML."""
     whole = _joined(packets)
-    decoder = tac3d.Decoder()
+    decoder = tac3d_messages.Decoder()
     calls: dict[str, Callable[[], Any]] = {
         "cached layout": lambda: decoder.decode(*whole),
-        "cached layout, packets joined, schema's arrays": lambda: tac3d.to_schema(
+        "cached layout, packets joined, schema's arrays": lambda: tac3d_messages.to_schema(
             decoder.decode(*_joined(packets)).matrices
         ),
-        "layout parsed each time": lambda: tac3d.Decoder().decode(*whole),
+        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(*whole),
     }
     if YAML:
         calls[BY_YAML] = _by_yaml(*whole)
@@ -136,7 +136,7 @@ def decode_ms(packets: list[bytes], rounds: int, repeats: int = 20) -> dict[str,
 
 
 def _joined(packets: list[bytes]) -> tuple[bytes, bytes]:
-    assembler = tac3d.Assembler()
+    assembler = tac3d_messages.Assembler()
     found = [whole for packet in packets if (whole := assembler.add(packet)) is not None]
     return found[0]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.fields.depth_methods import MAPS, Slopes
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Column, Picture, Requirement, Table
+from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
 from experiments.reporting.pareto import speed_against_error
 from experiments.running.timing import interleaved
 from sensors_io.calibration.circles import align_circles, find_circles
@@ -132,7 +132,7 @@ def ball_requirements(
 
 def map_table(errors: dict[str, BallErrors], ms: dict[str, float], name: str, folds: int) -> Table:
     """One row a map."""
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for kind, error in errors.items():
         figures = error.figures()
         rows.append((kind, *(figures[key] for key in _SCORES), ms[kind]))
@@ -171,7 +171,8 @@ def map_picture(errors: dict[str, BallErrors], ms: dict[str, float], name: str) 
 
 def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: str) -> Panel:
     """A calibration made with one ball, scored on balls of other diameters."""
-    rows, requirements = [], []
+    rows: list[tuple[Cell, ...]] = []
+    requirements: list[Requirement] = []
     for name, presses in others.items():
         circles = find_circles(presses)
         figures = score_presses(made, presses, circles.touches.stacked()).figures()

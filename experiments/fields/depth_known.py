@@ -9,7 +9,7 @@ from experiments.fields import depth_data
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import one_sided_dirichlet, published_poisson
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Column, Requirement, Table
+from experiments.reporting.findings import Cell, Column, Requirement, Table
 from experiments.running.timing import interleaved
 from sensors_io import quality
 from sensors_io.fields.contact import ContactConfig, steepest_change
@@ -75,7 +75,9 @@ def poisson_panel(rounds: int) -> Panel:
     for name in surfaces:
         columns += [Column(name=f"scale, {name}", unit="%", format="+.2f"), Column(name="rmse", unit="µm")]
     columns.append(Column(name="time a frame", unit="ms", format=".2f"))
-    rows = [(name, *(v for pair in pairs for v in pair), ms[name]) for name, pairs in errors.items()]
+    rows: list[tuple[Cell, ...]] = []
+    for name, pairs in errors.items():
+        rows.append((name, *(value for pair in pairs for value in pair), ms[name]))
     return Panel(
         verdict=(f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.",),
         requirements=(

@@ -53,7 +53,7 @@ def _draw(
     scale: ScalarMappable,
 ) -> None:
     low, high = scale.get_clim()
-    axes.imshow(np.clip(error, low, high), norm=scale.norm, cmap=scale.cmap, aspect="auto")
+    axes.imshow(np.clip(error, low, high), norm=LogNorm(low, high), cmap=scale.cmap, aspect="auto")
     y, x = np.nonzero(flagged)
     axes.plot(x, y, "x", color="black", ms=6)
     for row, (_, levels) in enumerate(stresses):

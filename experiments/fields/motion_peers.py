@@ -64,7 +64,7 @@ def dense_inverse_search(preset: int) -> Make:
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
         del half_px
         flow = cv2.DISOpticalFlow.create(preset)
-        return lambda grey: points + read(flow.calc(rest, grey, None), points)
+        return lambda grey: points + read(flow.calc(rest, grey, None), points)  # type: ignore[call-overload]
 
     return make
 

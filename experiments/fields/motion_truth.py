@@ -74,7 +74,7 @@ def pressed(shape: tuple[int, ...], peak_px: float, rng: np.random.Generator | N
     if rng is not None:
         drawn = rng.normal(0, 1, 8) * (0.6, 0.3, 0.3, 0.6, 0.3, 0.3, 0.1, 0.1)
         bump, drift = tuple(map(float, drawn[:6])), (float(drawn[6]), float(drawn[7]))  # type: ignore[assignment]
-        centre, share = tuple(rng.uniform(0.35, 0.65, 2)), float(rng.uniform(0.18, 0.3))  # type: ignore[assignment]
+        centre, share = tuple(rng.uniform(0.35, 0.65, 2)), float(rng.uniform(0.18, 0.3))
     raw = Motion(
         centre_px=(centre[0] * width, centre[1] * height),
         width_px=share * min(height, width),
@@ -106,7 +106,7 @@ class Film:
     def at_rest(self) -> np.ndarray:
         """The unmoved gel, the mean of some pictures as a background is recorded, RGB uint8."""
         pictures = [self.exposed(self._rest) for _ in range(REST_PICTURES)]
-        return np.round(np.mean(pictures, 0)).astype(np.uint8)
+        return np.asarray(np.round(np.mean(pictures, 0)), np.uint8)
 
     def under(self, motion: Motion, light: float = 1.0, exposure: float = 1.0) -> np.ndarray:
         """The gel under a motion, RGB uint8.

@@ -21,6 +21,7 @@ from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 
 BETA = 0.04
@@ -73,9 +74,29 @@ class Size:
 
 
 class Job:
-    """One iteration as a call: `step()` samples, scores and updates, and returns the metrics."""
+    """One iteration as a call: `step()` samples, scores and updates, and returns the metrics.
 
-    def __init__(self, size: Size, prefix: int, config: GRPOConfig, repeated: bool = False) -> None:
+    Args:
+      size: the decoder and the numbers of prompts, rollouts and tokens.
+      prefix: prompt tokens.
+      config: the step.
+      repeated: encode the prefix for every rollout: as many prompts of one rollout each.
+      host: compute the reward in Python.
+      learning_rate: AdamW's.
+      seed: of the prompts and of the sampling.
+    """
+
+    def __init__(
+        self,
+        size: Size,
+        prefix: int,
+        config: GRPOConfig,
+        *,
+        repeated: bool = False,
+        host: bool = False,
+        learning_rate: float = LEARNING_RATE,
+        seed: int = 0,
+    ) -> None:
         if repeated:
             config = dataclasses.replace(
                 config,
@@ -84,12 +105,13 @@ class Job:
                 micro_prompts=config.micro_prompts * size.group,
             )
         self.agent = make_agent(size, prefix)
-        self.batch = make_batch(size, prefix, config.prompts)
+        self.batch = make_batch(size, prefix, config.drawn, seed)
         params = init_decoder(self.agent, self.batch)
-        optimizer = optax.adamw(LEARNING_RATE)
+        optimizer = optax.adamw(learning_rate)
         self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
-        self._state = start_state(params, optimizer, jax.random.key(0), config)
-        self._step: Any = make_grpo_step(self.agent, low_ids(size.vocab_size), optimizer, config)
+        self._state = start_state(params, optimizer, jax.random.key(seed), config)
+        score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
+        self._step: Any = make_grpo_step(self.agent, score, optimizer, config)
 
     def step(self) -> dict[str, jax.Array]:
         """One iteration; the state moves on."""
@@ -178,20 +200,34 @@ def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-def low_ids(vocab_size: int):
-    """Share of token ids in the lower half of the vocabulary, as a `ScoreFn`."""
+def low_ids(vocab_size: int) -> ScoreFn:
+    """Share of token ids in the lower half of the vocabulary."""
 
     def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
         del target
-        nothing = jnp.full(1, -1)
-        parsed = Parsed(
-            perceive=nothing[None],
-            compare=nothing,
-            conclude=nothing,
-            formatted=jnp.array(False),
-            truncated=jnp.array(True),
-            length=jnp.int32(tokens.shape[0]),
-        )
-        return jnp.mean(tokens < vocab_size // 2), {}, parsed
+        return jnp.mean(tokens < vocab_size // 2), {}, nothing_said(tokens)
 
     return score
+
+
+def low_ids_on_host(vocab_size: int) -> ScoreFn:
+    """The same as a Python function, to see what leaving the device costs."""
+
+    def reward(tokens: np.ndarray, parsed: Parsed, target: Target) -> dict[str, float]:
+        del parsed, target
+        return {"low": float(np.mean(tokens < vocab_size // 2))}
+
+    return make_host_score(nothing_said, reward, ("low",))
+
+
+def nothing_said(tokens: jax.Array) -> Parsed:
+    """What a text without any tags says."""
+    nothing = jnp.full(1, -1)
+    return Parsed(
+        perceive=nothing[None],
+        compare=nothing,
+        conclude=nothing,
+        formatted=jnp.array(False),
+        truncated=jnp.array(True),
+        length=jnp.int32(tokens.shape[0]),
+    )

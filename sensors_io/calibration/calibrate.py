@@ -29,7 +29,7 @@ class CalibrateConfig:
     least_presses: int = 8
     folds: int = 5
     most_misfit: float = 0.7
-    most_saturated: float = 0.2
+    most_saturated: float = 0.5
     most_drift: float = 40.0
     contact_radii: tuple[float, float] = (0.15, 0.95)
     most_depth_um: float = 60.0

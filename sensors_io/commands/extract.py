@@ -71,7 +71,11 @@ class Extract:
 def encoded(fields: Fields, names: tuple[str, ...], calibration: str) -> bytes:
     """An npz of the arrays that there are, the names of the frames, the pitches and the hash of the calibration."""
     arrays: dict[str, Any] = {name: array for name, array in fields.arrays().items() if array is not None}
-    plain: dict[str, Any] = {"names": np.array(names), "mm_per_px": np.float64(fields.mm_per_px), "calibration": np.array(calibration)}
+    plain: dict[str, Any] = {
+        "names": np.array(names),
+        "mm_per_px": np.float64(fields.mm_per_px),
+        "calibration": np.array(calibration),
+    }
     if fields.grid_mm is not None:
         plain["grid_mm"] = np.array(fields.grid_mm)
     buffer = io.BytesIO()

@@ -58,6 +58,12 @@ def test_the_repeated_way_does_the_same_number_of_rollouts():
     assert np.isfinite(metrics["loss"])
 
 
+def test_the_reward_on_the_host_is_the_one_in_the_graph():
+    inside, outside = (jax.device_get(Job(TINY, 16, config_of(TINY), host=host).step()) for host in (False, True))
+    assert outside["reward"] == pytest.approx(float(inside["reward"]), rel=1e-6)
+    assert outside["grad_norm"] == pytest.approx(float(inside["grad_norm"]), rel=1e-4)
+
+
 def test_one_program_serves_all_steps():
     job = Job(TINY, 16, config_of(TINY))
     before = jax.tree.map(np.array, job.state.params)
@@ -80,6 +86,6 @@ def test_the_experiment_reports_every_prefix(tmp_path):
     results = read_json(directory / "results.json")
     assert [row[0] for row in results["tables"][0]["rows"]] == [16]
     names = {row[0] for row in results["tables"][1]["rows"]}
-    assert names == {"this", "one micro-batch", "Gumbel draws", "remat", "bfloat16", "repeated prefix"}
+    assert names == {"this", "one micro-batch", "Gumbel draws", "remat", "bfloat16", "host reward", "repeated prefix"}
     measured = {r["name"]: r["measured"] for r in results["requirements"]}
     assert measured["programs for one shape"] == 1

@@ -1,1 +1,1 @@
-"""Group rollouts, advantages, divergences, losses, and the one jitted GRPO step that joins them."""
+"""Group rollouts, counterfactual touch, advantages, divergences, losses, alarms, and the jitted GRPO step."""

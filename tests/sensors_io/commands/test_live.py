@@ -15,7 +15,7 @@ import pytest
 from sensors_io import __main__ as cli
 from sensors_io.calibration.geometry import Geometry
 from sensors_io.commands.record import load_gravity
-from sensors_io.devices.tac3d import load_recording
+from sensors_io.devices.tac3d_messages import load_recording
 from sensors_io.force import ForceError
 from sensors_io.records import RecordStore
 

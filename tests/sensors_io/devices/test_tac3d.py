@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from sensors_io.devices import tac3d
+from sensors_io.devices import tac3d, tac3d_messages
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from sensors_io.devices.sources import Tac3dRecording
 
@@ -45,7 +45,7 @@ def datagrams(arrays, *, number=1, packets=3, **rest):
 @pytest.mark.parametrize("style", ["flow", "block"])
 def test_arrays_come_out_as_they_went_in(style):
     arrays = matrices()
-    decoder, assembler = tac3d.Decoder(), tac3d.Assembler()
+    decoder, assembler = tac3d_messages.Decoder(), tac3d_messages.Assembler()
     for index in (10, 11):
         wholes = [assembler.add(d) for d in datagrams(arrays, number=index, index=index, style=style)]
         assert wholes[:-1] == [None] * 3
@@ -57,7 +57,7 @@ def test_arrays_come_out_as_they_went_in(style):
 
 
 def test_a_layout_of_another_shape_is_learnt_anew():
-    decoder = tac3d.Decoder()
+    decoder = tac3d_messages.Decoder()
     for arrays in (matrices(), {"3D_ResultantForce": np.ones((1, 3))}):
         data = b"".join(a.tobytes() for a in arrays.values())
         assert decoder.decode(layout(arrays), data).matrices.keys() == arrays.keys()
@@ -65,18 +65,18 @@ def test_a_layout_of_another_shape_is_learnt_anew():
 
 def test_packets_may_come_in_any_order_twice_and_between_those_of_other_messages():
     a, b = (datagrams(matrices(k), number=k) for k in (1, 2))
-    assembler = tac3d.Assembler()
+    assembler = tac3d_messages.Assembler()
     order = [a[3], b[0], a[0], a[0], b[3], a[2], b[1]]
     assert [assembler.add(d) for d in order] == [None] * 7
     assert assembler.add(a[1]) is not None
     layout_b, data_b = assembler.add(b[2])
     np.testing.assert_array_equal(
-        tac3d.Decoder().decode(layout_b, data_b).matrices["3D_Forces"], matrices(2)["3D_Forces"]
+        tac3d_messages.Decoder().decode(layout_b, data_b).matrices["3D_Forces"], matrices(2)["3D_Forces"]
     )
 
 
 def test_what_is_never_completed_is_counted_and_forgotten():
-    assembler = tac3d.Assembler()
+    assembler = tac3d_messages.Assembler()
     for number in range(40):
         assembler.add(datagrams(matrices(), number=number)[0])
     assert assembler.incomplete == 32
@@ -94,7 +94,7 @@ def test_what_is_never_completed_is_counted_and_forgotten():
 )
 def test_damaged_datagrams_are_refused(datagram, message):
     with pytest.raises(DeviceDataError, match=message):
-        tac3d.Assembler().add(datagram)
+        tac3d_messages.Assembler().add(datagram)
 
 
 GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
@@ -116,7 +116,7 @@ GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
 )
 def test_damaged_layouts_are_refused(bad, data, message):
     with pytest.raises(DeviceDataError, match=message):
-        tac3d.Decoder().decode(bad, data)
+        tac3d_messages.Decoder().decode(bad, data)
 
 
 def pushed(force, move):
@@ -132,7 +132,7 @@ def test_a_known_push_has_the_schemas_signs():
     """Pressed by 2 N and dragged to +x: Fz < 0, depth > 0, deformation along +x; point 0 (+x, +y) is bottom right."""
     arrays = pushed([0.5, 0.0, -2.0], [0.3, 0.1, -0.7])
     arrays["3D_Displacements"][0] = [9, 8, -7]
-    fields = tac3d.to_schema(arrays)
+    fields = tac3d_messages.to_schema(arrays)
     assert fields["force_n"].tolist() == [0.5, 0.0, -2.0]
     np.testing.assert_allclose(fields["depth_mm"][0, 0], 0.7, rtol=1e-6)
     np.testing.assert_allclose(fields["deformation_mm"][0, 0], [0.3, 0.1], rtol=1e-6)
@@ -162,13 +162,13 @@ def test_a_recording_is_read_from_a_folder_and_from_an_archive(tmp_path):
 
 def test_an_incomplete_recording_is_refused(tmp_path):
     with pytest.raises(DeviceNotFoundError, match="neither a folder"):
-        tac3d.load_recording(tmp_path / "nowhere")
+        tac3d_messages.load_recording(tmp_path / "nowhere")
     np.savez(tmp_path / "a.npz", index=np.arange(3))
     with pytest.raises(DeviceDataError, match="sendTimestamp must be among them"):
-        tac3d.load_recording(tmp_path / "a.npz")
+        tac3d_messages.load_recording(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", index=np.arange(3), sendTimestamp=np.arange(2.0))
     with pytest.raises(DeviceDataError, match="one length"):
-        tac3d.load_recording(tmp_path / "b.npz")
+        tac3d_messages.load_recording(tmp_path / "b.npz")
 
 
 @pytest.fixture

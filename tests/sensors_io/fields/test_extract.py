@@ -124,6 +124,20 @@ def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path
         read_pictures([tmp_path], "x")
 
 
+def test_videos_are_read_whole(tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "press.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 25, (32, 24))
+    for level in (10, 20, 30):
+        writer.write(np.full((24, 32, 3), level, np.uint8))
+    writer.release()
+    found = read_pictures([path], "x")
+    assert found.frames.shape == (3, 24, 32, 3)
+    assert found.names == ("press.avi#0", "press.avi#1", "press.avi#2")
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(SourceError, match="convert or replace it"):
+        read_pictures([path], "x")
+
+
 def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.png").write_text("no picture")
     with pytest.raises(SourceError, match="cannot be read as a picture"):

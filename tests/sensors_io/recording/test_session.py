@@ -12,8 +12,9 @@ import pytest
 
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
+from sensors_io.recording.book import ATTEMPTS
 from sensors_io.recording.coach import CoachConfig, Stage, protocol
-from sensors_io.recording.session import ATTEMPTS, SessionConfig, record_session
+from sensors_io.recording.session import SessionConfig, record_session
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
 from tests.sensors_io.recording.hand import Camera, Hand, Scale
