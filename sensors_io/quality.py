@@ -48,18 +48,21 @@ HOLD = 2
 
 
 def saturated(frames: np.ndarray, background: np.ndarray | None, config: QualityConfig) -> np.ndarray:
-    """Frames of which too many pixels have a channel at its ceiling.
+    """Frames of which more pixels have a channel at its ceiling than of the gel at rest.
+
+        share(frame) − share(background) > `saturated_share`
+
+    Shares, not pixels, are compared: where the gel itself has bright spots, they move with it.
 
     Args:
       frames: uint8 [N, H, W, 3].
-      background: uint8 [H, W, 3], whose own bright spots do not count; `None` where there is none.
+      background: uint8 [H, W, 3]; `None` where there is none, and no bright spot is expected.
       config: ceiling and share.
     """
-    bright = (frames >= config.saturated_level).any(-1)
-    if background is not None:
-        bright &= ~(background >= config.saturated_level).any(-1)
-    share: np.ndarray = bright.mean((1, 2)) > config.saturated_share
-    return share
+    bright = (frames >= config.saturated_level).any(-1).mean((1, 2))
+    at_rest = 0.0 if background is None else (background >= config.saturated_level).any(-1).mean()
+    found: np.ndarray = bright - at_rest > config.saturated_share
+    return found
 
 
 def untouched(depth_mm: np.ndarray, valid: np.ndarray | None, config: QualityConfig) -> np.ndarray:

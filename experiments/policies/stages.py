@@ -19,6 +19,7 @@ from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import AnswerFeed, QuestionFeed, each, labelled, question_batch, touch_batch
 from experiments.policies.watching import watched_log
 from experiments.running.context import Context
+from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import Answers
@@ -49,6 +50,8 @@ class SFTConfig:
     """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+    augment: AugmentConfig = AugmentConfig()
+    """How what is felt is changed at random; by default not at all."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,6 +120,7 @@ def run_sft(
         questions=config.questions,
         seed=seed,
         blind=blind,
+        augment=config.augment,
     )
     optimizer, step = sft_program(assembly.agent, config, blind)
     clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)

@@ -218,7 +218,7 @@ def test_many_scenes_are_solved_as_each_alone() -> None:
 # Resuming ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("grid", [24, 32, 48, 64])
+@pytest.mark.parametrize("grid", [24, 32, *(pytest.param(n, marks=pytest.mark.slow) for n in (48, 64))])
 def test_resuming_ends_where_solving_does(grid) -> None:
     soft = _spectrum(36, 24)
     first = contact.solve(_bumps(24), 3.0, soft, 0 * soft, WINDOW_MM / 24, 3e-2)
