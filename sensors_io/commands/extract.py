@@ -16,12 +16,15 @@ from sensors_io.fields.sources import SourceError, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
 from sensors_io.schema import Flag
 
+_REFUSED = (("depth_mm", (1, 1)), ("deformation_mm", (1, 1, 2)), ("shear_mm", (1, 1, 2)))
+"""Fields that a file always holds, and their shape in a frame that cannot carry them."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Extract:
     """Depth, contact, deformation, shear and force of pictures, as arrays over frames in one npz.
 
-    A field that the input cannot carry is left out of the file, said so, and flagged in every frame.
+    A field that the input cannot carry is flagged in every frame, said so, and written as NaN on a grid of one point.
     """
 
     inputs: tyro.conf.Positional[tuple[pathlib.Path, ...]]
@@ -69,8 +72,12 @@ class Extract:
 
 
 def encoded(fields: Fields, names: tuple[str, ...], calibration: str) -> bytes:
-    """An npz of the arrays that there are, the names of the frames, the pitches and the hash of the calibration."""
-    arrays: dict[str, Any] = {name: array for name, array in fields.arrays().items() if array is not None}
+    """An npz of the fields, the names of the frames, the pitches and the hash of the calibration.
+
+    `depth_mm`, `deformation_mm` and `shear_mm` are always there, NaN [N, 1, 1] or [N, 1, 1, 2] where they were refused.
+    """
+    arrays: dict[str, Any] = {name: np.full((len(fields), *shape), np.nan, np.float32) for name, shape in _REFUSED}
+    arrays |= {name: array for name, array in fields.arrays().items() if array is not None}
     plain: dict[str, Any] = {
         "names": np.array(names),
         "mm_per_px": np.float64(fields.mm_per_px),

@@ -56,7 +56,10 @@ def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib
         assert (fields["depth_mm"][:2].max((1, 2)) > 0.5).all()
         assert fields["flags"][2] & 16
         assert not fields["flags"][:2].astype(int)[0] & 16
-        assert "shear_mm" not in fields.files  # a bare gel carries none
+        for name in ("deformation_mm", "shear_mm"):  # a bare gel carries none
+            assert fields[name].shape == (3, 1, 1, 2)
+            assert np.isnan(fields[name]).all()
+        assert (fields["flags"].astype(int) & 2048).all()
         assert str(fields["calibration"]) == Calibration.load(real).hash
 
 
