@@ -11,16 +11,7 @@ Expected: the accuracy term already takes .1 from an answer that cannot be parse
 all of them, so `none` should keep its parse rate, and `heavy` should learn nothing else for its weight.
 """
 
-import dataclasses
-
-from experiments.grpo.ablation import PUBLISHED, Ablation, run_ablation
-from experiments.policies.stages import SFTConfig
-from experiments.policies.study import StudyConfig
-from experiments.reporting.results import Results
-from experiments.running.context import Context
-from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
-from touchr1_jax.rl.config import GRPOConfig
+from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
 
 ABLATION = Ablation(
     arms={
@@ -33,21 +24,4 @@ ABLATION = Ablation(
     example="none",
 )
 
-
-def run(config: StudyConfig, context: Context) -> Results:
-    """Train and compare the arms."""
-    return run_ablation(ABLATION, config, context)
-
-
-DEFAULT = StudyConfig()
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    seeds=2,
-    scenes=SceneConfig(objects=60, sites=1),
-    sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
-    grpo_steps=4,
-)
-
-EXPERIMENT = Experiment(name="ablation_format", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = ablation_experiment("ablation_format", ABLATION)

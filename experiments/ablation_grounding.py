@@ -12,16 +12,8 @@ Expected: PAPO (arXiv 2507.06448), where the term comes from, reports that .04 c
 growing `grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
 """
 
-import dataclasses
-
-from experiments.grpo.ablation import PUBLISHED, Ablation, run_ablation
-from experiments.policies.stages import SFTConfig
-from experiments.policies.study import StudyConfig
-from experiments.reporting.results import Results
-from experiments.running.context import Context
-from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
+from touchr1_jax.rl.config import Paper
 
 STRONG = 0.04
 """The γ at which PAPO collapses without a cap."""
@@ -38,21 +30,4 @@ ABLATION = Ablation(
     curves=("reward", "accuracy", "grounding", "grounding_peak", "entropy", "kl", "parse_rate"),
 )
 
-
-def run(config: StudyConfig, context: Context) -> Results:
-    """Train and compare the arms."""
-    return run_ablation(ABLATION, config, context)
-
-
-DEFAULT = StudyConfig()
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    seeds=2,
-    scenes=SceneConfig(objects=60, sites=1),
-    sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
-    grpo_steps=4,
-)
-
-EXPERIMENT = Experiment(name="ablation_grounding", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = ablation_experiment("ablation_grounding", ABLATION)

@@ -16,7 +16,6 @@ soon as p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle 
 error that comes of that alone is no better touch.  `debiased` should keep the error without the middle answers.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -24,15 +23,14 @@ import numpy as np
 from experiments.policies.baselines import baselines
 from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.policies.examples import rollout_examples
-from experiments.policies.stages import Evaluated, SFTConfig, reward_of
-from experiments.policies.study import BLIND, SFT, Study, StudyConfig, run_study
+from experiments.policies.stages import Evaluated, reward_of
+from experiments.policies.study import BLIND, SFT, SMOKE, Study, StudyConfig, run_study
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import Scores, evaluate
-from touchr1_jax.rl.config import GRPOConfig, preset_name
+from touchr1_jax.rl.config import preset_name
 
 ARMS: Mapping[str, Mapping[str, float]] = {
     "zero_one": {"exact": 0.6, "consistency": 0.3, "format": 0.1},
@@ -168,14 +166,5 @@ def _plain(values: Sequence[float]) -> Estimate:
 
 
 DEFAULT = StudyConfig()
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    seeds=2,
-    scenes=SceneConfig(objects=60, sites=1),
-    sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
-    grpo_steps=4,
-)
 
 EXPERIMENT = Experiment(name="ablation_ordinal", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -13,16 +13,8 @@ Expected: where all answers of a group are right, the literal bonus is the same 
 `control_*` should part further under `recommended` than under `none`.
 """
 
-import dataclasses
-
-from experiments.grpo.ablation import PUBLISHED, Ablation, run_ablation
-from experiments.policies.stages import SFTConfig
-from experiments.policies.study import StudyConfig
-from experiments.reporting.results import Results
-from experiments.running.context import Context
-from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
-from touchr1_jax.rl.config import GRPOConfig, Paper, TactileUse
+from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
+from touchr1_jax.rl.config import Paper, TactileUse
 
 ABLATION = Ablation(
     arms=dict.fromkeys(("none", "literal", "recommended"), PUBLISHED),
@@ -35,21 +27,4 @@ ABLATION = Ablation(
     curves=("reward", "accuracy", "touch_score", "control_drop", "control_noise", "control_order", "entropy"),
 )
 
-
-def run(config: StudyConfig, context: Context) -> Results:
-    """Train and compare the arms."""
-    return run_ablation(ABLATION, config, context)
-
-
-DEFAULT = StudyConfig()
-SMOKE = dataclasses.replace(
-    DEFAULT,
-    seeds=2,
-    scenes=SceneConfig(objects=60, sites=1),
-    sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
-    grpo_steps=4,
-)
-
-EXPERIMENT = Experiment(name="ablation_tactile_use", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = ablation_experiment("ablation_tactile_use", ABLATION)

@@ -1,6 +1,7 @@
 """What the ablations share: arms of GRPO from one SFT checkpoint, scored beside the baselines, compared in pairs."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 
 from experiments.policies.assembly import Weights
@@ -8,9 +9,10 @@ from experiments.policies.baselines import baselines
 from experiments.policies.estimates import compare_over_seeds, estimate
 from experiments.policies.examples import rollout_examples
 from experiments.policies.stages import Evaluated, reward_of
-from experiments.policies.study import SFT, Study, StudyConfig, run_study
+from experiments.policies.study import SFT, SMOKE, Study, StudyConfig, run_study
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context
+from experiments.running.runner import Experiment
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import Scores, evaluate
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
@@ -34,6 +36,13 @@ class Ablation:
     curves: tuple[str, ...] = ("reward", "accuracy", "entropy", "kl", "grounding", "parse_rate", "length")
     example: str = ""
     """The arm whose rollouts are shown; empty for the last."""
+
+
+def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig]:
+    """The experiment that trains and compares the arms, at the default scale and at `smoke`."""
+    return Experiment(
+        name=name, config=StudyConfig(), scales={"smoke": SMOKE}, run=functools.partial(run_ablation, ablation)
+    )
 
 
 def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> Results:

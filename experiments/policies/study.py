@@ -74,6 +74,17 @@ class StudyConfig:
             )
 
 
+SMOKE = StudyConfig(
+    seeds=2,
+    scenes=SceneConfig(objects=60, sites=1),
+    sft=SFTConfig(steps=12, batch_size=8),
+    blind=SFTConfig(steps=12, batch_size=8),
+    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
+    grpo_steps=4,
+)
+"""A study that takes under two minutes and learns nothing."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
     """What a study knows when it is done; `answers[name][seed]` are the answers about the test contacts."""
