@@ -137,7 +137,7 @@ def record(
       moving: whether the object slides, twists or rolls.  Without, it is taken to stand where it was put, and what
         little traction the spreading gel feels is left out.
     """
-    scene = _Scene(press, unit, kernels, sensor, grid, (tolerance, max_iterations))
+    scene = Scene(press, unit, kernels, sensor, grid, (tolerance, max_iterations))
     count = press.path.force_n.shape[0]
     exposure = 1 + press.exposure_drift * jnp.arange(count) / max(count - 1, 1)
     keys = jax.vmap(noise.fold, (None, 0))(key, jnp.arange(count))
@@ -162,7 +162,7 @@ def record(
 
 
 @dataclasses.dataclass(frozen=True)
-class _Scene:
+class Scene:
     """One sensor over one object, while it is traced; `limits` are tolerance and cap of the contact solver."""
 
     press: Press

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from experiments import pareto_chooser
-from experiments.chooser import bench, fit, trial
+from experiments.chooser import bench, fit, sequences, trial
 from experiments.chooser.bench import Outcomes
 from experiments.chooser.draw import FAMILIES, draw
+from experiments.chooser.sequences import Kept
 from experiments.chooser.trial import Trial
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
@@ -18,7 +19,7 @@ from sensors_io.scenes.chooser_law import LAW, MENU
 from sensors_io.scenes.chooser_survey import FEATURES
 from sensors_io.scenes.sensors import XENSE
 
-TINY = dataclasses.replace(pareto_chooser.SMOKE, batch=5, grids=(24,), asked=(0.5,))
+TINY = dataclasses.replace(pareto_chooser.SMOKE, batch=5, grids=(24,), asked=(0.5,), sequences=2)
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +35,14 @@ def directory(tmp_path_factory):
 
 def test_results_hold_every_error_asked_for(directory):
     results = read_json(directory / "results.json")
-    summary, families, costs, law = (table["rows"] for table in results["tables"])
+    summary, families, generated, costs, law = (table["rows"] for table in results["tables"])
     assert [row[0] for row in summary] == list(TINY.asked)
     assert [row[0] for row in families] == list(FAMILIES)
     assert sum(row[1] for row in families) == TINY.batch
     assert len(costs) == len(chooser_law.PADDINGS)
     assert len(law) == 2 * len(dataclasses.fields(chooser_law.Law))
-    assert len(results["requirements"]) == 2 * len(TINY.asked)
+    assert [row[0] for row in generated] == list(TINY.asked)
+    assert len(results["requirements"]) == 3 * len(TINY.asked)
 
 
 def test_the_chart_is_drawn(directory):
@@ -109,6 +111,20 @@ def test_the_fit_finds_the_law_that_made_the_errors():
     found = fit.predict(fit.fit(dataclasses.replace(made, errors=exact), MENU), made, MENU)
     counts = (exact > fit.RANGE[0]) & (exact < fit.RANGE[1])
     assert np.quantile(np.abs(np.log(found / exact))[counts], 0.95) < 0.1
+
+
+def test_frames_count_only_where_they_were_promised():
+    made = Kept(
+        asked=0.1,
+        grid=np.array([64, 128]),
+        met=np.array([True, False]),
+        error=np.array([[0.05, 0.16], [0.9, 0.9]]),
+        motion=("press", "twist"),
+    )
+    again = sequences.join([made.to_json()])
+    assert pareto_chooser._kept_share(again) == 0.5
+    (row,) = pareto_chooser._sequence_table([again]).rows
+    assert row[1:4] == (0.5, 0.0, 0.5)
 
 
 def test_batches_survive_a_round_trip():
