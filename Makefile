@@ -24,7 +24,7 @@ experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
 	$(BIN)/python -m experiments $(EXP) $(ARGS)
 
 test: setup  ## pass the tests (under ten minutes on two cores)
-	$(BIN)/python -m pytest -q -n 2 $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: setup  ## pass the tests that take minutes
 	$(BIN)/python -m pytest -q -m slow $(ARGS)

@@ -12,7 +12,8 @@ agreement of slots), and it drives the middle level out, since sensors disagree 
 term should raise consistency of conclusions (`csc`) without either.
 """
 
-from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
+from experiments.grpo.ablation import Ablation, ablation_experiment
+from experiments.policies.scores import PUBLISHED
 
 ABLATION = Ablation(
     arms={

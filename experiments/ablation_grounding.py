@@ -12,7 +12,8 @@ Expected: PAPO (arXiv 2507.06448), where the term comes from, reports that .04 c
 growing `grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
 """
 
-from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
+from experiments.grpo.ablation import Ablation, ablation_experiment
+from experiments.policies.scores import PUBLISHED
 from touchr1_jax.rl.config import Paper
 
 STRONG = 0.04

@@ -20,26 +20,22 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.policies.baselines import baselines
-from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.policies.estimates import compare_over_objects, compare_over_seeds
 from experiments.policies.examples import rollout_examples
+from experiments.policies.scores import PUBLISHED, Table, score_study, study_settings
 from experiments.policies.stages import Evaluated, reward_of
 from experiments.policies.study import BLIND, SFT, SMOKE, Study, StudyConfig, run_study
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.metrics import Scores, evaluate
-from touchr1_jax.rl.config import preset_name
+from touchr1_jax.bench.metrics import Scores
 
 ARMS: Mapping[str, Mapping[str, float]] = {
     "zero_one": {"exact": 0.6, "consistency": 0.3, "format": 0.1},
-    "ordinal": {"accuracy": 0.6, "consistency": 0.3, "format": 0.1},
+    "ordinal": PUBLISHED,
     "debiased": {"accuracy_debiased": 0.6, "consistency_gated": 0.3, "format": 0.1},
 }
-YARDSTICK = ARMS["ordinal"]
-"""The published reward, by which `reward` is reported for every row, whatever an arm was trained on."""
-
 COMPARED = ("acc", "omae", "middle_rate", "csc", "reward")
 CURVES = {
     "sft": ("loss", "token_accuracy"),
@@ -47,42 +43,26 @@ CURVES = {
     "grpo": ("reward", "accuracy", "middle_rate", "entropy", "kl", "grounding", "degenerate_share", "length"),
 }
 
-Table = dict[str, list[dict[str, Scores]]]  # row → seed → metric
-
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train the arms, score them beside the baselines, compare them in pairs."""
     study = run_study(config, ARMS, context)
-    rows = {name: [score(study, said) for said in seeds] for name, seeds in study.answers.items()}
-    rows |= {name: [score(study, said)] for name, said in baselines(study).items()}
-    objects = study.data.object_ids[study.data.parts["test"]][study.answers[SFT][0].contact]
-    estimates = {
-        name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-        for name, seeds in rows.items()
-    }
-    trained = own_reward(study)
-    comparisons = [*over_seeds(estimates, trained, config.seeds), *over_objects(rows, objects, config.seeds)]
-    arms = (SFT, *ARMS)
+    scored = score_study(study)
+    estimates, trained = scored.estimates, own_reward(study)
+    comparisons = [
+        *over_seeds(estimates, trained, config.seeds),
+        *over_objects(scored.rows, scored.objects, config.seeds),
+    ]
     return Results(
-        arms={name: estimates[name] for name in arms},
-        baselines={name: row for name, row in estimates.items() if name not in arms},
-        settings={
-            "preset": preset_name(config.grpo),
-            "lr_scale": config.grpo.lr_scale,
-            "sft_lr_scale": config.sft.optimizer.lr_scale,
-        },
+        arms=scored.arms,
+        baselines=scored.baselines,
+        settings=study_settings(config),
         comparisons=tuple(comparisons),
         verdict=verdict(comparisons, estimates),
         data=study.data.summary(),
         curves=CURVES,
         examples=rollout_examples(study, "ordinal", ARMS["ordinal"]),
     )
-
-
-def score(study: Study, said: Evaluated) -> dict[str, Scores]:
-    """Every metric of one policy's answers."""
-    reward = reward_of(study.assembly, said, YARDSTICK, study.prior)
-    return evaluate(said.answers(reward), ATTRIBUTES, study.assembly.levels)
 
 
 def own_reward(study: Study) -> dict[str, tuple[list[float], list[float]]]:

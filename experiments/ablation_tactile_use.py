@@ -8,12 +8,13 @@ question is also sampled with the touch dropped, with noise, and with another ob
 
 Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
 
-Expected: where all answers of a group are right, the literal bonus is the same for all and cancels
-(`bonus_cancelled_share` above 0), the recommended one does not pay for it either; the curves `touch_score` and
+Expected: where a group has rewards of two values, right and wrong, the literal bonus cancels by σ
+(`bonus_cancelled_share` against `bonus_telling_share`), the recommended one does not; the curves `touch_score` and
 `control_*` should part further under `recommended` than under `none`.
 """
 
-from experiments.grpo.ablation import PUBLISHED, Ablation, ablation_experiment
+from experiments.grpo.ablation import Ablation, ablation_experiment
+from experiments.policies.scores import PUBLISHED
 from touchr1_jax.rl.config import Paper, TactileUse
 
 ABLATION = Ablation(

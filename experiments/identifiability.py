@@ -10,7 +10,7 @@ contact ladder, on the same presses with the same noise, and asked about the exa
 released, from the protocol, are asked for friction and elasticity, which a press cannot tell.  Intervals are over
 objects.
 
-Cost: about ten minutes on two cores (`smoke` one).
+Cost: about seven minutes on two cores (`smoke` two minutes on one).
 
 Expected: touch tells hardness far above the lines of shape and force, which stay near guessing; roughness is told by
 the camera of the GelSight Mini alone; protrusion by all sensors, short of what its shape tells.  The generator's grid

@@ -7,10 +7,11 @@ disconnects, read through the package's reader: with the device's counter, witho
 duplicates told by their pictures), and by a consumer too slow for its ring.  What the reader's books say is held
 against what was injected; memory is looked at every tenth of the hour, once with Python's own traced.  Then the
 vendor's Tac3D recordings in DIR/tac3d, whose real gaps must come out exactly, and the time to decode a message, cached
-and by YAML where ruamel.yaml is installed.  One minute on one core (`smoke` ten seconds).  Expected: with a counter
-nothing is ever unaccounted for; without one the estimate is off by one in a thousand of the losses until stamps jitter
-by a quarter of the period; memory stays flat; a message decodes in a hundredth of a millisecond, hundreds of times
-faster than by YAML.
+and by YAML where ruamel.yaml is installed.  Last, a camera at its true rate is recorded while browsers watch it, and a
+bridge carries the pictures of a vendor's camera.  Two minutes on one core (`smoke` twenty seconds).  Expected: with a
+counter nothing is ever unaccounted for; without one the estimate is off by one in a thousand of the losses until
+stamps jitter by a quarter of the period; memory stays flat; a message decodes in a hundredth of a millisecond, hundreds
+of times faster than by YAML; watching costs the recording nothing but time of the core.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.devices import vendor
+from experiments.devices import vendor, watching, watching_tables
 from experiments.devices.endurance import Loop, Outcome, endure
 from experiments.reporting.charts import LOOK, PALETTE, svg
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
@@ -47,6 +48,9 @@ class StabilityConfig:
       traced_seconds: of a shorter replay in which Python's memory is traced.
       sweep_seconds, jitter_shares: of the replays over jitter, in periods of the camera.
       rounds: of timing the decoders.
+      watch_seconds: of each recording that is watched.
+      browsers: that watch, in turn.
+      bridge_frames: that a bridge carries.
       data_dir: holds the folder tac3d; `None` leaves the vendor's recordings out.
       seed: of the faults.
     """
@@ -63,6 +67,9 @@ class StabilityConfig:
     sweep_seconds: float = 300.0
     jitter_shares: tuple[float, ...] = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
     rounds: int = 25
+    watch_seconds: float = 5.0
+    browsers: tuple[int, ...] = (0, 1, 3)
+    bridge_frames: int = 600
     data_dir: pathlib.Path | None = None
     seed: int = 0
 
@@ -78,10 +85,21 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     paths = recordings(config.data_dir)
     checked = [vendor.check(path) for path in paths]
     decode = vendor.decode_ms(vendor.message(paths[0] if paths else None), config.rounds)
+    context.say("watched recordings, and a bridge")
+    seen = [watching.watched(_source(config), config.watch_seconds, n) for n in (None, *config.browsers)]
+    carried = watching.bridged(config.bridge_frames)
     return Findings(
-        verdict=verdict(outcomes, checked, decode),
-        requirements=requirements(outcomes, traced, checked, decode),
-        tables=(_accounts(outcomes), *([_recorded(checked)] if checked else []), _decoders(decode)),
+        verdict=(*verdict(outcomes, checked, decode), _watched(seen, carried)),
+        requirements=(
+            *requirements(outcomes, traced, checked, decode),
+            *watching_tables.requirements(seen, carried),
+        ),
+        tables=(
+            _accounts(outcomes),
+            *([_recorded(checked)] if checked else []),
+            _decoders(decode),
+            *watching_tables.tables(seen, carried),
+        ),
         pictures=(_jitter_picture(sweep, config), _memory_picture(outcomes, config)),
         settings={
             "samples": round(config.seconds * config.rate_hz),
@@ -176,6 +194,16 @@ def verdict(
         for c in checked
     ]
     return tuple(said)
+
+
+def _watched(seen: Sequence[watching.Watched], carried: watching.Bridged) -> str:
+    most = seen[-1]
+    age = 1e3 * float(np.median(most.ages_s))
+    return (
+        f"Watched by {most.name}, a recording at full rate loses {most.lost} of {most.written} samples; each sees "
+        f"{most.shown_hz:.0f} states a second, {age:.0f} ms old.  A bridge carries {carried.rate_hz:.0f} pictures of "
+        "640 × 480 a second."
+    )
 
 
 def _replay(name: str, config: StabilityConfig, context: Context) -> Outcome:
@@ -308,6 +336,14 @@ def _memory_picture(outcomes: Mapping[str, Outcome], config: StabilityConfig) ->
 
 
 DEFAULT = StabilityConfig()
-SMOKE = StabilityConfig(seconds=60.0, size_px=(24, 32), traced_seconds=20.0, sweep_seconds=10.0, rounds=5)
+SMOKE = StabilityConfig(
+    seconds=60.0,
+    size_px=(24, 32),
+    traced_seconds=20.0,
+    sweep_seconds=10.0,
+    rounds=5,
+    watch_seconds=1.0,
+    bridge_frames=100,
+)
 
 EXPERIMENT = Experiment(name="stability_devices", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

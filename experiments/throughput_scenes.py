@@ -1,7 +1,7 @@
 """Can a million four-sensor records with physics behind them be made on one laptop, fed or written, and resumed?
 
     python -m experiments throughput_scenes
-    python -m experiments throughput_scenes --scale full      (feeds all 1.32 million records: about half an hour)
+    python -m experiments throughput_scenes --scale full      (feeds all 1.32 million records: about twenty minutes)
 
 Measures records a second, one record being one frame of one sensor with its picture and fields: as a feed without
 disk, at 112² and 448², over the protocol's mix of presses and motions; as a written set, which is then made again by a
@@ -9,7 +9,7 @@ process that is killed five times at random moments, and compared entry by entry
 who else uses the machine, processor times hardly.  Says where the time goes, what the machine's floor is, what the
 protocol left out, and what force alone tells.
 
-Cost: under ten minutes on two cores; `--scale smoke` a minute and a half on one.
+Cost: about four minutes on two cores; `--scale smoke` a minute and a half on one.
 
 Expected: some 800 records a second at 112², so that the paper's 1.32 million records take half an hour and 36 GB.
 """

@@ -7,20 +7,24 @@ import tyro
 
 from sensors_io.calibration.geometry import GeometryError
 from sensors_io.commands.calibrate import Calibrate
+from sensors_io.commands.choices import sections, with_devices
 from sensors_io.commands.console import ERR, complain
 from sensors_io.commands.devices import Devices
 from sensors_io.commands.extract import Extract
+from sensors_io.commands.force_zero import ForceZeroing
 from sensors_io.commands.generate import Generate
 from sensors_io.commands.geometry import Geometry
 from sensors_io.commands.imports import Import
 from sensors_io.commands.record import Record
 from sensors_io.commands.records import Check, List
+from sensors_io.commands.sync import Sync
 from sensors_io.commands.view import View
 from sensors_io.devices.errors import DeviceError
 from sensors_io.fields.sources import SourceError
 from sensors_io.fields.types import CalibrationError
 from sensors_io.force import ForceError
 from sensors_io.importers.keep import ImportSourceError
+from sensors_io.offsets import OffsetsError
 from sensors_io.recording.journal import JournalError
 from sensors_io.records import RecordsError
 from sensors_io.schema import SchemaError
@@ -33,6 +37,8 @@ Command = (
     | Annotated[Geometry, tyro.conf.subcommand("geometry")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[ForceZeroing, tyro.conf.subcommand("force-zero")]
+    | Annotated[Sync, tyro.conf.subcommand("sync")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Extract, tyro.conf.subcommand("extract")]
@@ -44,6 +50,7 @@ KNOWN_ERRORS = (
     ImportSourceError,
     DeviceError,
     ForceError,
+    OffsetsError,
     JournalError,
     SourceError,
     CalibrationError,
@@ -59,9 +66,10 @@ def main(args: list[str] | None = None) -> int:
     Args:
       args: the command line; None takes that of the process.
     """
-    command = tyro.cli(Command, args=args, prog="sensors_io", config=(tyro.conf.OmitArgPrefixes,))
+    first, *others = sections(sys.argv[1:] if args is None else args)
+    command = tyro.cli(Command, args=first, prog="sensors_io", config=(tyro.conf.OmitArgPrefixes,))
     try:
-        return command.run()
+        return with_devices(command, others).run()
     except KNOWN_ERRORS as error:
         complain(error)
         return 1

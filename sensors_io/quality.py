@@ -7,6 +7,7 @@ is switched off again leaves no trace: `without` takes its bit back.
 import dataclasses
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 
 from sensors_io.schema import Flag, Sequence
@@ -52,17 +53,23 @@ def saturated(frames: np.ndarray, background: np.ndarray | None, config: Quality
 
         share(frame) − share(background) > `saturated_share`
 
-    Shares, not pixels, are compared: where the gel itself has bright spots, they move with it.
+    Shares, not pixels, are compared: where the gel itself has bright spots, they move with it.  A pixel counts where
+    most of its 3 × 3 neighbourhood does: what noise lifts to the ceiling stands alone.
 
     Args:
       frames: uint8 [N, H, W, 3].
       background: uint8 [H, W, 3]; `None` where there is none, and no bright spot is expected.
       config: ceiling and share.
     """
-    bright = (frames >= config.saturated_level).any(-1).mean((1, 2))
-    at_rest = 0.0 if background is None else (background >= config.saturated_level).any(-1).mean()
+    bright = np.array([_bright_share(frame, config.saturated_level) for frame in frames])
+    at_rest = 0.0 if background is None else _bright_share(background, config.saturated_level)
     found: np.ndarray = bright - at_rest > config.saturated_share
     return found
+
+
+def _bright_share(picture: np.ndarray, level: int) -> float:
+    brightest = cv2.max(cv2.max(picture[..., 0], picture[..., 1]), picture[..., 2])
+    return float((cv2.medianBlur(brightest, 3) >= level).mean())
 
 
 def untouched(depth_mm: np.ndarray, valid: np.ndarray | None, config: QualityConfig) -> np.ndarray:

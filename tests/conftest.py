@@ -1,7 +1,14 @@
-"""Shape checking for the whole suite, and examples that a busy machine may draw slowly."""
+"""What all tests share: shape checking, patience with a busy machine, quick compilation and its programs."""
+
+import gc
+import os
+import tempfile
+from collections.abc import Iterator
 
 import hypothesis
+import jax
 import jaxtyping
+import pytest
 
 from tests.typecheck import functions
 
@@ -10,3 +17,47 @@ jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions
 # both judge by the clock, which a shared machine falsifies
 hypothesis.settings.register_profile("shared", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("shared")
+
+QUICKLY = "--xla_cpu_use_fusion_emitters=false"
+"""Flag of XLA: of its two ways to write a fused loop the older one compiles twice as fast."""
+
+PROGRAMS = "TOUCHR1_TEST_PROGRAMS"
+"""Environment variable that tells the workers of a session where the session keeps its compiled programs."""
+
+WORTH_KEEPING_S = 0.2
+"""Compilations that take less are done again: under the lock of a folder of many, reading costs as much."""
+
+MOST_BYTES = 16 * 2**30
+"""Never reached; without a limit JAX takes no lock, and a worker could read what another has half written."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep compiled programs for the length of the session, for its files and workers to share, and compile quickly.
+
+    Most of XLA's optimisations are left out: they take longer here than all the arithmetic.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if QUICKLY not in flags:  # XLA reads them when it compiles its first program
+        os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
+    if PROGRAMS not in os.environ:  # else this is a worker of a session that has its folder
+        folder = tempfile.TemporaryDirectory(prefix="touchr1-programs-")
+        config.add_cleanup(folder.cleanup)
+        config.add_cleanup(lambda: os.environ.pop(PROGRAMS))
+        os.environ[PROGRAMS] = folder.name
+    jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
+    jax.config.update("jax_compilation_cache_max_size", MOST_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
+    jax.config.update("jax_disable_most_optimizations", True)
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector the modules and tests, which live to the end: it would walk them a thousand times."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs() -> Iterator[None]:
+    """Drop the compiled programs of each file after it: files have few in common, and by the end they fill 5 GB."""
+    yield
+    jax.clear_caches()

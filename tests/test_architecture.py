@@ -28,8 +28,9 @@ TOUCHR1_LAYERS = (
 
 SENSORS_LAYERS = (
     {"schema"},
-    {"clock"},
-    {"sync", "taps", "force"},
+    {"clock", "json_files"},
+    {"sync", "taps", "force", "offsets"},
+    {"poses"},
     {"deltas"},
     {"quality"},
     {"codec"},
@@ -57,6 +58,8 @@ EXPERIMENTS_LAYERS = (
     {"grpo"},
     {"fields"},
     {"loading"},
+    {"encoder"},
+    {"recordings"},
 )
 """The same; an experiment itself is one file beside them, which nobody imports."""
 

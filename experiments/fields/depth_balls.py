@@ -18,8 +18,6 @@ from sensors_io.calibration.validate import BallErrors, score_ball, score_presse
 from sensors_io.fields.depth import DepthReader, ZeroConfig, zero_level
 from sensors_io.fields.poisson import neumann
 from sensors_io.fields.types import Calibration
-from sensors_io.scenes import fitting, photometric
-from sensors_io.scenes.layer import Layer
 
 PACKAGE = "polynomial, varying"
 MICROMETRES, RADIUS = 15.0, 4.0
@@ -34,8 +32,6 @@ _SCORES = (
     "radius error of the median, %",
     "tip depth median, mm",
 )
-_GENERATED_PX, _GENERATED_MM = 160, 15.2  # side of generated pictures
-_NOISE = 1.2  # grey levels, as fitted to the real camera
 OTHER_BALLS_MM = (4.0, 9.5)
 """Diameters of generated balls that the calibration, made with 6.31 mm, has not seen."""
 
@@ -203,26 +199,6 @@ def calibrated(presses: BallPresses, seed: int) -> Calibration:
         colours=colours,
         made_from={},
     )
-
-
-def generated_presses(diameter_mm: float, count: int, seed: int) -> BallPresses:
-    """Presses of a ball by the generator's optics, which were fitted to a real Mini, over its solved layer."""
-    rng = np.random.default_rng(seed)
-    pitch = _GENERATED_MM / _GENERATED_PX
-    axis = (np.arange(_GENERATED_PX) - (_GENERATED_PX - 1) / 2) * pitch
-    gel = Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5)
-    profiles = fitting.ball_profiles(gel, diameter_mm / 2)
-    flat = photometric.fields(photometric.MINI, _GENERATED_PX, _GENERATED_MM)[0].transpose(1, 2, 0)
-    widest = min(0.6 * diameter_mm / 2, 2.2)
-
-    def picture() -> np.ndarray:
-        touch = np.array([*rng.uniform(-5, 5, 2), rng.uniform(0.8, 1.0) * widest])
-        shaded = 255 * (flat + fitting.change(photometric.MINI, profiles, touch, axis, _GENERATED_MM))
-        return np.clip(shaded + _NOISE * rng.standard_normal(shaded.shape), 0, 255).round().astype(np.uint8)
-
-    background = np.clip(255 * flat, 0, 255).round().astype(np.uint8)
-    pictures = np.stack([picture() for _ in range(count)])
-    return BallPresses(pictures=pictures, background=background, radius_mm=diameter_mm / 2, mm_per_px=pitch)
 
 
 def frame_ms(made: Calibration, size: tuple[int, int], rounds: int) -> float:

@@ -12,6 +12,7 @@ from experiments.fields.motion_subjects import NOISE_GREY, Subject, grey, subjec
 from experiments.fields.motion_truth import Film, Motion
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.quality import QualityConfig, saturated
+from sensors_io.schema import Flag
 
 OFF_PX = 1.0
 """A point further from the truth is wrong."""
@@ -49,12 +50,17 @@ class Outcome:
     Args:
       error_px: 95th percentile of the distance from the truth, over the points that the method gives.
       wrong: share of all points that it gives and that are off by more than `OFF_PX`.
-      flagged: whether the method says that the frame must not be trusted.
+      flags: by which the frame is marked as not to be trusted.
     """
 
     error_px: float
     wrong: float
-    flagged: bool
+    flags: Flag
+
+    @property
+    def flagged(self) -> bool:
+        """Whether anything says that the frame must not be trusted."""
+        return self.flags != Flag.NONE
 
     @property
     def broken(self) -> bool:
@@ -73,7 +79,8 @@ def attempt(rest: Rest, methods: tuple[str, ...], seed: int) -> Iterator[tuple[s
     for stress in STRESSES:
         for level in stress.levels:
             film, pictures, true = _sequence(of, stress.name, level, seed)
-            still, clipped = grey(film.at_rest()), _saturated(pictures[-1], of)
+            still = film.at_rest()
+            clipped, still = _saturated(pictures[-1], still), grey(still)
             seen = [grey(p) for p in pictures]
             for name in methods:
                 follow = FOLLOWERS[name](still, of.points_px, of.half_px)
@@ -90,7 +97,7 @@ def _outcome(points: np.ndarray, true: np.ndarray, of: Subject, clipped: bool) -
     return Outcome(
         error_px=float(np.quantile(error[given], 0.95)) if given.any() else np.inf,
         wrong=float(np.mean(given & (error > OFF_PX))) if inside.any() else 0.0,
-        flagged=clipped or lost > LOST_SHARE,
+        flags=(Flag.SATURATED if clipped else Flag.NONE) | (Flag.MARKER_LOSS if lost > LOST_SHARE else Flag.NONE),
     )
 
 
@@ -107,8 +114,8 @@ def _sequence(of: Subject, stress: str, level: float, seed: int) -> tuple[Film, 
     return rest_film, pictures, of.points_px + motion.forward(of.points_px)
 
 
-def _saturated(picture: np.ndarray, of: Subject) -> bool:
-    return bool(saturated(picture[None], of.rest.picture, QualityConfig())[0])
+def _saturated(picture: np.ndarray, rest: np.ndarray) -> bool:
+    return bool(saturated(picture[None], rest, QualityConfig())[0])
 
 
 def _usual(of: Subject, level: float, seed: int) -> Motion:

@@ -1,64 +1,93 @@
-"""Maps of where tracking and shear break."""
+"""Curves of where tracking and shear break."""
 
+import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from experiments.reporting.charts import LOOK, svg
+from experiments.reporting.charts import LOOK, PALETTE, SHARED, svg
 
-_COLUMNS = 3
-_INCHES = (3.5, 2.5)  # of a panel
+_COLUMNS = 4
+_INCHES = (2.75, 2.45)  # of a panel
+_DECADES = (0.01, 100.0)  # of the error, over the tolerance: what lies beyond is drawn at the edge
 
 
-def break_maps(
-    maps: Mapping[str, np.ndarray],
-    flagged: Mapping[str, np.ndarray],
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Curve:
+    """One method under one stress, level by level.
+
+    Args:
+      error: the worst of the frames [L], infinite where the method gives nothing.
+      flagged: bool [L], whether every frame is flagged.
+      broken: bool [L], whether any frame is broken.
+      silent: bool [L], whether any broken frame carries no flag.
+    """
+
+    error: np.ndarray
+    flagged: np.ndarray
+    broken: np.ndarray
+    silent: np.ndarray
+
+
+def break_curves(
+    curves: Mapping[str, Sequence[Curve]],
     stresses: Sequence[tuple[str, Sequence[float]]],
     tolerance: float,
     unit: str,
 ) -> bytes:
-    """Error of every method under every stress; a cross where the method itself refuses the frame.
+    """Error of every method under every stress, one panel a stress; where each breaks, and whether it says so.
 
     Args:
-      maps: method → error [stresses, levels], NaN where a stress has no such level.
-      flagged: method → bool, the same shape.
+      curves: method → its curve under each stress; the first is drawn above the others.
       stresses: name and levels of each.
-      tolerance: the error at which a method counts as broken, the middle of the colours.
+      tolerance: the error from which a point is wrong.
       unit: of the errors.
     """
-    rows = -(-len(maps) // _COLUMNS)
+    columns = min(_COLUMNS, len(stresses))
+    rows = -(-len(stresses) // columns)
+    colours = dict(zip(curves, itertools.cycle((*PALETTE, SHARED)), strict=False))
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(_COLUMNS * _INCHES[0] + 1.2, rows * _INCHES[1] + 0.3), layout="constrained")
-        panels = figure.subplots(rows, _COLUMNS, squeeze=False, sharey=True)
-        scale = ScalarMappable(LogNorm(tolerance * 0.02, tolerance * 50), "coolwarm")
-        for axes, name in zip(panels.ravel(), maps, strict=False):
-            _draw(axes, maps[name], flagged[name], stresses, scale)
-            axes.set_title(name, fontsize=9)
-        for axes in panels.ravel()[len(maps) :]:
+        figure = Figure(figsize=(columns * _INCHES[0] + 0.6, rows * _INCHES[1] + 0.8), layout="constrained")
+        panels = figure.subplots(rows, columns, squeeze=False, sharey=True)
+        for i, (axes, (name, levels)) in enumerate(zip(panels.ravel(), stresses, strict=False)):
+            for z, method in enumerate(reversed(tuple(curves))):
+                _draw(axes, curves[method][i], colours[method], tolerance, 2.4 if z == len(curves) - 1 else 1.1, 3 + z)
+            axes.axhline(tolerance, color="black", lw=0.8, ls=":")
+            axes.set_title(name, fontsize=9, loc="left")
+            axes.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels], fontsize=7.5)
+            axes.set(yscale="log", ylim=(_DECADES[0] * tolerance, 1.3 * _DECADES[1] * tolerance))
+        for axes in panels[:, 0]:
+            axes.set_ylabel(f"error, {unit}")
+        for axes in panels.ravel()[len(stresses) :]:
             axes.set_visible(False)
-        figure.colorbar(scale, ax=panels, label=f"error, {unit}; white: {tolerance:g}", shrink=0.7)
+        figure.legend(handles=_legend(colours), loc="outside lower center", ncols=5, fontsize=8)
         return svg(figure)
 
 
-def _draw(
-    axes: Axes,
-    error: np.ndarray,
-    flagged: np.ndarray,
-    stresses: Sequence[tuple[str, Sequence[float]]],
-    scale: ScalarMappable,
-) -> None:
-    low, high = scale.get_clim()
-    axes.imshow(np.clip(error, low, high), norm=LogNorm(low, high), cmap=scale.cmap, aspect="auto")
-    y, x = np.nonzero(flagged)
-    axes.plot(x, y, "x", color="black", ms=6)
-    for row, (_, levels) in enumerate(stresses):
-        for column, level in enumerate(levels):
-            axes.text(column, row + 0.38, f"{level:.2g}", ha="center", va="center", fontsize=5.5)
-    axes.grid(False)
-    axes.set_xticks([])
-    axes.set_yticks(range(len(stresses)), [name for name, _ in stresses], fontsize=7)
+def _draw(axes: Axes, curve: Curve, colour: str, tolerance: float, width: float, above: int) -> None:
+    low, high = (d * tolerance for d in _DECADES)
+    error = np.clip(curve.error, low, high)
+    x = np.arange(len(error))
+    axes.plot(x, error, color=colour, lw=width, zorder=above)
+    axes.plot(x[curve.flagged], error[curve.flagged], "o", ms=5, mfc="white", mec=colour, zorder=above)
+    if curve.broken.any():
+        first = int(curve.broken.argmax())
+        mark = "X" if curve.silent[first] else "s"
+        face = colour if curve.silent[first] else "white"
+        axes.plot(first, error[first], mark, ms=8, mfc=face, mec=colour if face == "white" else "white", zorder=above)
+
+
+def _legend(colours: Mapping[str, str]) -> list[Line2D]:
+    lines = [Line2D([], [], color=c, lw=2, label=name) for name, c in colours.items()]
+    mark = lambda shape, face, label: Line2D([], [], ls="", marker=shape, ms=7, mfc=face, mec=SHARED, label=label)
+    return [
+        *lines,
+        mark("X", SHARED, "breaks here, without a flag"),
+        mark("s", "white", "breaks here, and says so"),
+        mark("o", "white", "flagged in every frame"),
+    ]

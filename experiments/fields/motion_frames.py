@@ -13,14 +13,28 @@ from sensors_io.scenes.units import unit_of
 
 _WIDEST_PX = 480  # wider pictures are reduced: their pixels are finer than their optics
 
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """A picture of a gel: its folder in the data directory, its pattern there, and the frame of a video."""
+
+    folder: str
+    pattern: str
+    frame: int = 0
+
+
 REAL = {
-    "GelSight Mini": ("FOTS", "marker_calib/data/3.png"),
-    "GelSlim": ("gelslim", "test_data/ref.jpg"),
-    "GelSlim 2": ("gelsight_heightmap", "test_data/ref.jpg"),
-    "GelSight bench": ("gelsight_driver", "track_markers/video.avi"),
-    "GelSight gripper": ("letac_mpc", "gel/*dp_1_*/*000001.jpg"),
+    "GelSight Mini": Recorded(folder="FOTS", pattern="marker_calib/data/1.png"),
+    "GelSlim": Recorded(folder="gelslim", pattern="test_data/sample_13.jpg"),
+    "GelSlim 2": Recorded(folder="gelsight_heightmap", pattern="test_data/sample_34.jpg"),
+    "GelSight bench": Recorded(folder="gelsight_driver", pattern="track_markers/video.avi", frame=24),
+    "GelSight gripper": Recorded(folder="letac_mpc", pattern="hard_rubber/*dp_1_*/*000001.jpg"),
 }
-"""Gel → folder of the data directory, and the picture in it; of a video the first frame."""
+"""Gel → picture that stands for it at rest.
+
+The tracker's settings, the windows and the number of rest pictures were chosen on others: `marker_calib/data/3.png`,
+the two `ref.jpg`, frame 0 of the video and the first picture of `letac_mpc/gel`.
+"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,16 +58,16 @@ def gels(data_dir: pathlib.Path | None) -> list[Rest]:
     ]
     if data_dir is None:
         return generated
-    found = [(name, sorted((data_dir / folder).glob(pattern))) for name, (folder, pattern) in REAL.items()]
-    real = [Rest(name=name, picture=load(paths[0]), real=True) for name, paths in found if paths]
+    found = [(name, gel.frame, sorted((data_dir / gel.folder).glob(gel.pattern))) for name, gel in REAL.items()]
+    real = [Rest(name=name, picture=load(paths[0], frame), real=True) for name, frame, paths in found if paths]
     if not real:
-        wanted = ", ".join(f"{folder}/{pattern}" for folder, pattern in REAL.values())
+        wanted = ", ".join(f"{gel.folder}/{gel.pattern}" for gel in REAL.values())
         raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
     return [*real, *generated]
 
 
-def load(path: pathlib.Path) -> np.ndarray:
-    """A picture, or the first frame of a video, RGB uint8, at most 480 pixels wide by averaging.
+def load(path: pathlib.Path, frame: int = 0) -> np.ndarray:
+    """A picture, or one frame of a video, RGB uint8, at most 480 pixels wide by averaging.
 
     Raises:
       ValueError: a file that OpenCV cannot read.
@@ -62,16 +76,22 @@ def load(path: pathlib.Path) -> np.ndarray:
     if picture is None:
         reader = cv2.VideoCapture(str(path))
         try:
-            read, picture = reader.read()
+            for _ in range(frame + 1):
+                read, picture = reader.read()
         finally:
             reader.release()
-        if not read:
-            raise ValueError(f"{path} is no picture and no video that OpenCV reads; replace the file")
+        if not read or picture is None:
+            raise ValueError(f"{path} is no picture and no video of {frame + 1} frames that OpenCV reads; replace it")
+    return cv2.cvtColor(reduced(picture), cv2.COLOR_BGR2RGB)
+
+
+def reduced(picture: np.ndarray) -> np.ndarray:
+    """A picture [H, W, 3] at most 480 pixels wide, by averaging over whole pixels."""
     factor = -(-picture.shape[1] // _WIDEST_PX)
-    if factor > 1:
-        size = (picture.shape[1] // factor, picture.shape[0] // factor)
-        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    if factor == 1:
+        return picture
+    size = (picture.shape[1] // factor, picture.shape[0] // factor)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
 def _generated(sensor: SensorModel, side_px: int, order: int) -> np.ndarray:

@@ -43,12 +43,17 @@ def panel(config: MarkerConfig, rests: Sequence[Rest]) -> Panel:
         name: {s.rest.name: errors_of(make, s, PEAK_PX, seeds) for s in subjects} for name, make in FOLLOWERS.items()
     }
     milliseconds = {s.rest.name: speeds(s, config.rounds) for s in subjects}
-    drift = {s.rest.name: drift_px(s, config.drift_frames) for s in subjects[:1]}
+    drifting = [s for s in subjects if s.rest.real] or subjects[:1]
+    drift = {s.rest.name: drift_px(s, config.drift_frames) for s in drifting}
     jumps = {s.rest.name: jump(s, seeds) for s in subjects}
     return Panel(
         verdict=_verdict(errors, milliseconds, subjects),
         requirements=_requirements(errors, drift, jumps, subjects),
-        tables=(_error_table(errors, milliseconds, subjects), _event_table(drift, jumps)),
+        tables=(
+            _error_table(errors, milliseconds, subjects),
+            _drift_table(drift, config.drift_frames),
+            _jump_table(jumps),
+        ),
         pictures=(_picture(errors, milliseconds, subjects[0].rest.name),),
     )
 
@@ -58,7 +63,7 @@ def errors_of(make: Make, of: Subject, peak_px: float, seeds: Sequence[int | Non
     found = []
     for seed in seeds:
         motion = of.motion(peak_px, seed)
-        film = Film(of.rest.picture, NOISE_GREY, 0 if seed is None else seed)
+        film = Film(of.rest.picture, NOISE_GREY, FIRST_SEED if seed is None else seed)
         follow = make(grey(film.at_rest()), of.points_px, of.half_px)
         for step in range(1, _STEPS + 1):
             share = step / _STEPS
@@ -83,20 +88,26 @@ def speeds(of: Subject, rounds: int) -> dict[str, float]:
     return {name: 1e3 / len(pictures) * float(np.median(s)) for name, s in seconds.items()}
 
 
-def drift_px(of: Subject, frames: int) -> dict[str, float]:
-    """Median distance of the points from where they lay, after whole cycles of a motion, by method."""
+def drift_px(of: Subject, frames: int) -> dict[str, np.ndarray]:
+    """Distance of the points from the truth after one cycle of a motion and after `frames`, by method [2, P].
+
+    In pixels of a picture 320 wide; what grows between the two is drift, the first is noise.
+    """
     names = (MAIN, "this, LK alone", "LK frame to frame")
-    film, motion = Film(of.rest.picture, NOISE_GREY, 2), of.motion(PEAK_PX, None)
+    film, motion = Film(of.rest.picture, NOISE_GREY, FIRST_SEED + 50), of.motion(PEAK_PX, FIRST_SEED + 50)
     rest = grey(film.at_rest())
     follow = {name: FOLLOWERS[name](rest, of.points_px, of.half_px) for name in names}
     shares = np.sin(2 * np.pi * np.arange(_DRIFT_PERIOD) / _DRIFT_PERIOD)
     cycle = [film.clean(motion.times(float(share)), abs(float(share))) for share in shares]
-    points = dict.fromkeys(names, of.points_px)
+    errors: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for i in range(1, frames + 1):
         picture = grey(film.exposed(cycle[i % _DRIFT_PERIOD]))
         points = {name: follow[name](picture) for name in names}
-    true = of.points_px + motion.times(float(shares[frames % _DRIFT_PERIOD])).forward(of.points_px)
-    return {name: float(np.nanmedian(np.hypot(*(points[name] - true).T))) for name in names}
+        if i in (min(_DRIFT_PERIOD, frames), frames):
+            true = of.points_px + motion.times(float(shares[i % _DRIFT_PERIOD])).forward(of.points_px)
+            for name in names:
+                errors[name].append(np.hypot(*(points[name] - true).T) / of.unit)
+    return {name: np.stack([found[0], found[-1]]) for name, found in errors.items()}
 
 
 def jump(of: Subject, seeds: Sequence[int | None]) -> dict[str, list[float]]:
@@ -130,21 +141,32 @@ def _pooled(errors: Mapping[str, np.ndarray], subjects: Sequence[Subject]) -> np
 
 def _requirements(
     errors: Mapping[str, Mapping[str, np.ndarray]],
-    drift: Mapping[str, Mapping[str, float]],
+    drift: Mapping[str, Mapping[str, np.ndarray]],
     jumps: Mapping[str, Mapping[str, list[float]]],
     subjects: Sequence[Subject],
 ) -> tuple[Requirement, ...]:
     median, high = _quantiles(_pooled(errors[MAIN], subjects))
-    (drifted,) = drift.values()
+    worst = max(float(np.nanmedian(by[MAIN][1])) for by in drift.values())
     published = max(shares[MAIN][0] for shares in jumps.values())
     return (
         Requirement(name="marker error, median", measured=median, bound=0.04, better="lower", unit="px"),
         Requirement(name="marker error, 95th percentile", measured=high, bound=0.11, better="lower", unit="px"),
-        Requirement(name="drift", measured=drifted[MAIN], bound=0.006, better="lower", unit="px"),
+        Requirement(
+            name="distance from the truth after the frames of the drift test, median over all gels' markers",
+            measured=_drifted(drift, MAIN, 1),
+            bound=0.006,
+            better="lower",
+            unit="px",
+            note=f"worst gel {worst:.4f}; after one cycle {_drifted(drift, MAIN, 0):.4f}",
+        ),
         Requirement(
             name="28 px jump: markers lost or > 1 px off, worst gel", measured=published, bound=0.0, better="lower"
         ),
     )
+
+
+def _drifted(drift: Mapping[str, Mapping[str, np.ndarray]], method: str, when: int) -> float:
+    return float(np.nanmedian(np.concatenate([by[method][when] for by in drift.values()])))
 
 
 def _verdict(
@@ -188,14 +210,32 @@ def _error_table(
     )
 
 
-def _event_table(drift: Mapping[str, Mapping[str, float]], jumps: Mapping[str, Mapping[str, list[float]]]) -> Table:
-    (drifted,) = drift.values()
+def _drift_table(drift: Mapping[str, Mapping[str, np.ndarray]], frames: int) -> Table:
+    methods = list(next(iter(drift.values())))
     rows: list[tuple[Cell, ...]] = [
         (
             method,
-            drifted.get(method),
-            *(value for shares in jumps.values() for value in (shares[method][0], float(np.mean(shares[method])))),
+            *(_drifted(drift, method, when) for when in (0, 1)),
+            *(float(np.nanmedian(by[method][1])) for by in drift.values()),
         )
+        for method in methods
+    ]
+    return Table(
+        title=f"Drift: {frames} frames of a motion that comes back every {_DRIFT_PERIOD}",
+        columns=(
+            Column(name="method"),
+            Column(name="all gels, one cycle", unit="px", format=".4f", meaning="the noise of a single frame"),
+            Column(name="all gels, all frames", unit="px", format=".4f", meaning="noise and drift"),
+            *(Column(name=gel, unit="px", format=".4f") for gel in drift),
+        ),
+        rows=tuple(rows),
+        note="Median over markers; pictures, motion and noise set nothing in the tracker.",
+    )
+
+
+def _jump_table(jumps: Mapping[str, Mapping[str, list[float]]]) -> Table:
+    rows: list[tuple[Cell, ...]] = [
+        (method, *(v for shares in jumps.values() for v in (shares[method][0], float(np.mean(shares[method])))))
         for method in FOLLOWERS
     ]
     columns = [
@@ -207,12 +247,8 @@ def _event_table(drift: Mapping[str, Mapping[str, float]], jumps: Mapping[str, M
         )
     ]
     return Table(
-        title=f"Drift, and a jump of {JUMP_PX:g} px in one frame",
-        columns=(
-            Column(name="method"),
-            Column(name=f"drift on {next(iter(drift))}", unit="px", format=".4f"),
-            *columns,
-        ),
+        title=f"A jump of {JUMP_PX:g} px in one frame",
+        columns=(Column(name="method"), *columns),
         rows=tuple(rows),
     )
 

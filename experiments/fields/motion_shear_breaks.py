@@ -1,12 +1,13 @@
 """Where shear breaks: generated slides with more noise, fewer nodes, and a layer that is not what it is taken for."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from experiments.fields.motion_breaks import Outcome, Stress
-from experiments.fields.motion_shear import BASELINE, MAIN, SUBTRACTED, pressing
+from experiments.fields.motion_shear import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, pressing
 from experiments.fields.motion_slides import Slide, cached_slides, node_grid
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.fields.helmholtz import decompose
@@ -14,6 +15,7 @@ from sensors_io.fields.inversion import InverseConfig
 from sensors_io.fields.shear import ShearReader
 from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.sensors import TAC3D
+from sensors_io.schema import Flag
 
 BROKEN = 0.5
 """Error over the true shear from which a reading is wrong."""
@@ -69,14 +71,23 @@ def _layer(kind: str, level: float) -> Layer:
     return _SENSOR.gel
 
 
+@functools.lru_cache(maxsize=32)
+def _reader(layer: Layer, gradient_free: bool) -> ShearReader:
+    config = dataclasses.replace(_SENSOR_NOISE, gradient_free=gradient_free)
+    return ShearReader(layer, node_grid(_SENSOR), config)
+
+
 def _outcomes(slide: Slide, layer: Layer) -> Iterator[tuple[str, Outcome]]:
     grid = node_grid(_SENSOR)
-    split = ShearReader(layer, grid, _SENSOR_NOISE)
     moving = [f for f in pressing(slide) if slide.moving[f]]
-    found = [split.read(slide.deformation_mm[f], slide.depth_mm[f], slide.valid[f]) for f in moving]
+    found, whole = (
+        [split.read(slide.deformation_mm[f], slide.depth_mm[f], slide.valid[f]) for f in moving]
+        for split in (_reader(layer, gradient_free) for gradient_free in (True, False))
+    )
     readings: dict[str, Callable[[int], np.ndarray]] = {
-        MAIN: lambda i: found[i].modelled_mm,
-        SUBTRACTED: lambda i: found[i].shear_mm,
+        MAIN: lambda i: found[i].shear_mm,
+        WITH_GRADIENT: lambda i: whole[i].shear_mm,
+        SUBTRACTED: lambda i: whole[i].subtracted_mm,
         BASELINE: lambda i: decompose(slide.deformation_mm[moving[i]], grid.pitch_mm).shear,
     }
     flagged = float(np.mean(~slide.valid[moving])) > LOST_SHARE
@@ -84,4 +95,5 @@ def _outcomes(slide: Slide, layer: Layer) -> Iterator[tuple[str, Outcome]]:
         wrong = sum(float(((reading(i) - slide.shear_mm[f]) ** 2).sum()) for i, f in enumerate(moving))
         relative = float(np.sqrt(wrong / (slide.shear_mm[moving] ** 2).sum()))
         broken = 1.0 if relative > BROKEN else 0.0
-        yield name, Outcome(error_px=relative, wrong=broken, flagged=flagged and name != BASELINE)
+        flags = Flag.MARKER_LOSS if flagged and name != BASELINE else Flag.NONE
+        yield name, Outcome(error_px=relative, wrong=broken, flags=flags)

@@ -5,20 +5,14 @@ import functools
 from collections.abc import Mapping, Sequence
 
 from experiments.policies.assembly import Weights
-from experiments.policies.baselines import baselines
-from experiments.policies.estimates import compare_over_seeds, estimate
+from experiments.policies.estimates import compare_over_seeds
 from experiments.policies.examples import rollout_examples
-from experiments.policies.stages import Evaluated, reward_of
-from experiments.policies.study import SFT, SMOKE, Study, StudyConfig, run_study
+from experiments.policies.scores import score_study, study_settings
+from experiments.policies.study import SFT, SMOKE, StudyConfig, run_study
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
-from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.metrics import Scores, evaluate
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
-
-PUBLISHED: Weights = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
-"""The reward of the paper, by which `reward` is reported for every row."""
 
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
 
@@ -48,43 +42,26 @@ def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig
 def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> Results:
     """Train the arms, score them beside the baselines, compare them in pairs over seeds."""
     study = run_study(config, ablation.arms, context, ablation.algorithms)
-    rows = {name: [score(study, said) for said in seeds] for name, seeds in study.answers.items()}
-    rows |= {name: [score(study, said)] for name, said in baselines(study).items()}
-    objects = study.data.object_ids[study.data.parts["test"]][study.answers[SFT][0].contact]
-    estimates = {
-        name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-        for name, seeds in rows.items()
-    }
-    arms = (SFT, *ablation.arms)
-    comparisons = compared(ablation, estimates, config.seeds)
+    scored = score_study(study)
+    comparisons = compared(ablation, scored.estimates, config.seeds)
     shown = ablation.example or list(ablation.arms)[-1]
     return Results(
-        arms={name: estimates[name] for name in arms},
-        baselines={name: row for name, row in estimates.items() if name not in arms},
+        arms=scored.arms,
+        baselines=scored.baselines,
         settings=settings(ablation, config),
         comparisons=tuple(comparisons),
-        verdict=verdict(ablation, comparisons, estimates),
+        verdict=verdict(ablation, comparisons, scored.estimates),
         data=study.data.summary(),
         curves={"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": ablation.curves},
         examples=rollout_examples(study, shown, ablation.arms[shown]),
     )
 
 
-def score(study: Study, said: Evaluated) -> dict[str, Scores]:
-    """Every metric of one policy's answers."""
-    reward = reward_of(study.assembly, said, PUBLISHED, study.prior)
-    return evaluate(said.answers(reward), ATTRIBUTES, study.assembly.levels)
-
-
 def settings(ablation: Ablation, config: StudyConfig) -> dict[str, str | float]:
-    """The preset of every arm, and the factors on the paper's learning rates."""
+    """Those of the study, and the preset of every arm that has its own."""
     of_arm = lambda arm: dataclasses.replace(config.grpo, algorithm=ablation.algorithms.get(arm, config.grpo.algorithm))
-    return {
-        "preset": preset_name(config.grpo),
-        **{f"preset of {arm}": preset_name(of_arm(arm)) for arm in ablation.algorithms},
-        "lr_scale": config.grpo.lr_scale,
-        "sft_lr_scale": config.sft.optimizer.lr_scale,
-    }
+    presets = {f"preset of {arm}": preset_name(of_arm(arm)) for arm in ablation.algorithms}
+    return {**study_settings(config), **presets}
 
 
 def compared(ablation: Ablation, rows: Mapping[str, Mapping[str, Estimate]], seeds: int) -> list[Comparison]:

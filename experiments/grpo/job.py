@@ -6,6 +6,7 @@ one on-policy update by AdamW with β = .04 to a reference.  The reward of a com
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from experiments.grpo.size import BETA, LEARNING_RATE, Size
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
@@ -24,53 +26,8 @@ from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 
-BETA = 0.04
-LEARNING_RATE = 1e-4
 VIEW, TOUCH = 4, 8
 """Prompt tokens that are embeddings of a view and of the touch of the one sensor; the others are text."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Size:
-    """Prompts, rollouts of each, new tokens, and the decoder."""
-
-    prompts: int = 8
-    group: int = 8
-    length: int = 64
-    vocab_size: int = 512
-    hidden_size: int = 128
-    num_layers: int = 4
-    num_heads: int = 4
-    num_kv_heads: int = 2
-    head_dim: int = 32
-    intermediate_size: int = 512
-
-    @property
-    def decoder(self) -> DecoderConfig:
-        """The decoder's own configuration."""
-        names = {f.name for f in dataclasses.fields(DecoderConfig)}
-        half = self.head_dim // 2
-        sections = (half - 2 * (3 * half // 8), 3 * half // 8, 3 * half // 8)
-        shape = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name in names}
-        return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
-
-    def gflop(self, prefix: int, algorithm_beta: float = BETA) -> float:
-        """Multiplications and additions of matrix products that one iteration needs, in 10⁹.
-
-        The prefix once a prompt and pass: sampling, forward and backward (thrice the forward), reference.
-        """
-        c = self
-        weights = c.num_layers * (
-            2 * c.hidden_size * c.num_heads * c.head_dim
-            + 2 * c.hidden_size * c.num_kv_heads * c.head_dim
-            + 3 * c.hidden_size * c.intermediate_size
-        )
-        pair = 2 * c.num_layers * c.num_heads * c.head_dim  # q·k and weights·v of one query and key
-        prompt = prefix * weights + pair * prefix * (prefix + 1) / 2
-        seen = self.length * prefix + self.length * (self.length + 1) / 2
-        completion = self.length * (weights + c.hidden_size * c.vocab_size) + pair * seen
-        passes = 1 + 3 + (algorithm_beta > 0)
-        return 2 * passes * self.prompts * (prompt + self.group * completion) / 1e9
 
 
 class Job:
@@ -82,7 +39,9 @@ class Job:
       config: the step.
       repeated: encode the prefix for every rollout: as many prompts of one rollout each.
       host: compute the reward in Python.
-      learning_rate: AdamW's.
+      end_share: share of the vocabulary that ends a completion, so that a fresh policy's have 1/share tokens on
+        average; 0 lets none end.
+      learning_rate: AdamW's; 0 keeps the policy as it is.
       seed: of the prompts and of the sampling.
     """
 
@@ -94,6 +53,7 @@ class Job:
         *,
         repeated: bool = False,
         host: bool = False,
+        end_share: float = 0.0,
         learning_rate: float = LEARNING_RATE,
         seed: int = 0,
     ) -> None:
@@ -104,14 +64,11 @@ class Job:
                 group=1,
                 micro_prompts=config.micro_prompts * size.group,
             )
-        self.agent = make_agent(size, prefix)
+        self.agent, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
         self.batch = make_batch(size, prefix, config.drawn, seed)
         params = init_decoder(self.agent, self.batch)
-        optimizer = optax.adamw(learning_rate)
         self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
         self._state = start_state(params, optimizer, jax.random.key(seed), config)
-        score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
-        self._step: Any = make_grpo_step(self.agent, score, optimizer, config)
 
     def step(self) -> dict[str, jax.Array]:
         """One iteration; the state moves on."""
@@ -128,6 +85,21 @@ class Job:
         """How many programs the steps so far took."""
         return self._step._cache_size()
 
+    def lowered(self) -> jax.stages.Lowered:
+        """The step as it is handed to the compiler."""
+        return self._step.lower(self._state, self.batch, self.fixed)
+
+
+@functools.cache
+def engine(
+    size: Size, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
+) -> tuple[Agent, optax.GradientTransformation, Any]:
+    """Policy, optimizer and compiled step, made once for all seeds."""
+    agent = make_agent(size, prefix, end_share)
+    score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
+    optimizer = optax.adamw(learning_rate)
+    return agent, optimizer, make_grpo_step(agent, score, optimizer, config)
+
 
 def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
     """The step that the job asks for: plain GRPO with a reference, nothing else."""
@@ -141,18 +113,29 @@ def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
     )
 
 
-def make_agent(size: Size, prefix: int) -> Agent:
-    """A policy of the given decoder whose prompts have `prefix` tokens."""
+def decoder_config(size: Size) -> DecoderConfig:
+    """The decoder of a size; three eighths of the rotary frequencies each for row and column, the rest for time."""
+    names = {f.name for f in dataclasses.fields(DecoderConfig)}
+    half = size.head_dim // 2
+    sections = (half - 2 * (3 * half // 8), 3 * half // 8, 3 * half // 8)
+    shape = {name: value for name, value in dataclasses.asdict(size).items() if name in names}
+    return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
+
+
+def make_agent(size: Size, prefix: int, end_share: float = 0.0) -> Agent:
+    """A policy of the given decoder whose prompts have `prefix` tokens; the highest ids end a completion."""
     policy = Policy(
         PolicyConfig(
             tactile=TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1),
             vision=VisionConfig(),
-            decoder=size.decoder,
+            decoder=decoder_config(size),
         )
     )
     slots = Slots(touch=np.arange(VIEW, VIEW + TOUCH)[None], view=np.arange(VIEW), stream_text=np.full(prefix, -1))
     banned = np.zeros(size.vocab_size, bool)
-    return Agent(policy=policy, slots=slots, banned=banned, end_ids=(size.vocab_size,), pad_id=0)
+    out_of_reach = (size.vocab_size,)
+    ends = tuple(range(size.vocab_size - round(end_share * size.vocab_size), size.vocab_size)) or out_of_reach
+    return Agent(policy=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
 
 
 def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
@@ -185,9 +168,8 @@ def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
     one = jax.tree.map(lambda x: x[0], batch)
 
     def forward(module: Policy) -> jax.Array:
-        banned = jnp.asarray(agent.banned)
-        first, prefix = module.prefill(one.features, one.ids, one.mask, agent.slots, banned)
-        return module.completion_logits(one.ids, first, prefix, banned)
+        first, prefix = module.prefill_state(one.features, one.ids, one.mask, agent.slots)
+        return module.logits(module.completion_states(one.ids, first, prefix), jnp.asarray(agent.banned))
 
     shapes = jax.eval_shape(lambda: agent.policy.init(jax.random.key(0), method=forward))["params"]
     rng = np.random.default_rng(0)

@@ -1,9 +1,16 @@
 """Shapes of checkpoints to read: the released ones, and smaller ones of the same family."""
 
+import dataclasses
 from collections.abc import Mapping
 
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig, released
+
+
+def behind_the_tower(decoder: DecoderConfig) -> QwenConfig:
+    """A decoder behind the released vision tower."""
+    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
+
 
 SHAPES: Mapping[str, QwenConfig] = {
     "tiny": QwenConfig(
@@ -16,33 +23,19 @@ SHAPES: Mapping[str, QwenConfig] = {
         image_id=2,
         video_id=3,
     ),
-    "0.5B": QwenConfig(
-        decoder=DecoderConfig(
-            vocab_size=151936,
+    "0.5B": behind_the_tower(
+        dataclasses.replace(
+            RELEASED["3B"],
             hidden_size=896,
             num_layers=24,
             num_heads=14,
-            num_kv_heads=2,
             head_dim=64,
             intermediate_size=4864,
             mrope_section=(8, 12, 12),
-            rope_theta=1e6,
-        ),
-        vision=QwenVisionConfig(out_size=896),
+        )
     ),
-    "1.5B": QwenConfig(
-        decoder=DecoderConfig(
-            vocab_size=151936,
-            hidden_size=1536,
-            num_layers=28,
-            num_heads=12,
-            num_kv_heads=2,
-            head_dim=128,
-            intermediate_size=8960,
-            mrope_section=(16, 24, 24),
-            rope_theta=1e6,
-        ),
-        vision=QwenVisionConfig(out_size=1536),
+    "1.5B": behind_the_tower(
+        dataclasses.replace(RELEASED["3B"], hidden_size=1536, num_layers=28, num_heads=12, intermediate_size=8960)
     ),
     "3B": released("3B"),
     "7B": released("7B"),

@@ -16,6 +16,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.scoring import ScoreFn, make_score
+from touchr1_jax.text.constraint import Constraint, compile_constraint
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.parser import Parser, compile_parser
 from touchr1_jax.text.template import PromptLayout, build_layout, prompt_words
@@ -52,6 +53,16 @@ class Assembly:
     def levels(self) -> tuple[int, ...]:
         """K of each attribute."""
         return tuple(len(a.levels) for a in self.language.attributes)
+
+    @property
+    def ordered(self) -> np.ndarray:
+        """Which questions depend on the order of frames, bool [Q]: those for an attribute that does."""
+        return self.layout.asked @ np.array([a.ordered for a in self.language.attributes])
+
+    @functools.cached_property
+    def constraint(self) -> Constraint:
+        """What completions may say where only formatted answers are wanted."""
+        return compile_constraint(self.language, self.tokenizer)
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """Fresh parameters."""

@@ -206,6 +206,7 @@ def question_batch(
         ids=jnp.asarray(assembly.layout.ids[attribute]),
         mask=jnp.asarray(assembly.layout.mask[attribute]),
         target=assembly.target(attribute, label[contact], streams),
+        ordered=jnp.asarray(assembly.ordered[attribute]),
     )
 
 

@@ -24,12 +24,15 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.greedy import make_answer
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.guard import check_streams, stream_influence
 from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig, fit
@@ -49,6 +52,8 @@ class SFTConfig:
     questions: int = 2
     """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
+    max_logits: int = MAX_LOGITS
+    """Logits that may exist at once; more tokens than that are scored in blocks."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
     augment: AugmentConfig = AugmentConfig()
     """How what is felt is changed at random; by default not at all."""
@@ -110,8 +115,9 @@ def run_sft(
     seed: int,
     stage: str,
     blind: bool = False,
+    tactile: Params | None = None,
 ) -> Params:
-    """Train a policy from scratch on verified answers; a blind one never feels anything."""
+    """Train a policy on verified answers, from scratch or from a tactile encoder; a blind one never feels anything."""
     feed = AnswerFeed(
         assembly,
         data,
@@ -125,6 +131,8 @@ def run_sft(
     optimizer, step = sft_program(assembly.agent, config, blind)
     clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
     params = assembly.init(seed, touch_batch(next(iter(clips))))
+    if tactile is not None:
+        params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     return _fit(step, state, feed, LoopConfig(steps=config.steps, save_every=config.save_every), context, stage).params
 
@@ -133,7 +141,7 @@ def run_sft(
 def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
-    return optimizer, make_sft_step(agent, optimizer, blind=blind)
+    return optimizer, make_sft_step(agent, optimizer, blind=blind, max_logits=config.max_logits)
 
 
 def _fit(
@@ -238,10 +246,18 @@ def run_grpo(
     seed: int,
     stage: str,
 ) -> Params:
-    """Reinforce the decoder of an SFT policy; both encoders stay as they are."""
-    feed = QuestionFeed(assembly, features, label, batch_size=config.drawn, seed=seed)
-    optimizer, step = grpo_program(assembly.agent, score, config, loop.steps)
+    """Reinforce the decoder of an SFT policy; both encoders stay as they are.
+
+    Raises:
+      ValueError: a stream whose touch does not reach the policy.
+    """
+    new_feed = lambda: QuestionFeed(assembly, features, label, batch_size=config.drawn, seed=seed)
+    constraint = assembly.constraint if config.algorithm.constrained else None
+    optimizer, step = grpo_program(assembly.agent, score, config, loop.steps, constraint)
     decoder = {"decoder": params["decoder"]}
+    influence = influence_program(assembly.agent, config.length)
+    check_streams(*jax.device_get(influence(decoder, next(new_feed()), noise, jax.random.key(seed))))
+    feed = new_feed()
     state = start_state(decoder, optimizer, jax.random.key(seed), config)
     fixed = Fixed(reference=decoder, noise=noise)
     end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage, watched=True)
@@ -250,13 +266,19 @@ def run_grpo(
 
 @functools.cache
 def grpo_program(
-    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int
+    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int, constraint: Constraint | None
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds of an arm."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    return optimizer, make_grpo_step(agent, score, optimizer, config)
+    return optimizer, make_grpo_step(agent, score, optimizer, config, constraint)
+
+
+@functools.cache
+def influence_program(agent: Agent, length: int) -> Any:
+    """Compiled `stream_influence`, made once for all arms and seeds."""
+    return jax.jit(lambda p, batch, noise, key: stream_influence(agent, p, batch, noise, key, length))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble
 from experiments.policies.dataset import Dataset, open_dataset
+from experiments.policies.pretrained import load_encoder
 from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
     Evaluated,
@@ -37,7 +38,7 @@ from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
-from touchr1_jax.types import Parsed
+from touchr1_jax.types import Params, Parsed
 
 SFT, BLIND = "sft", "tactile_blind"
 
@@ -57,13 +58,15 @@ class StudyConfig:
     grpo_share: float = 0.35
     """Share of the training objects that SFT never sees."""
     model: ModelConfig = ModelConfig()
+    encoder: Path | None = None
+    """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
     probe: ProbeConfig = ProbeConfig()
     sft: SFTConfig = SFTConfig()
     blind: SFTConfig = SFTConfig()
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
-    grpo_steps: int = 560
+    grpo_steps: int = 900
     grpo_save_every: int = 200
 
     def __post_init__(self) -> None:
@@ -122,16 +125,26 @@ def run_study(
         for arm in arms
     }
     data = open_study_data(config, context)
-    assembly = assemble(config.model, data.clip.sensors)
+    model, tactile = starting_model(config, data.clip.sensors)
+    assembly = assemble(model, data.clip.sensors)
     probed = probe_features(data, context)
     evidence = gather_evidence(data, probed, config.probe)
     prior = data.prior()
     scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND)}
     for seed in range(config.seeds):
-        for name, said in _Seed(config, data, assembly, evidence, scores, configs, context, seed).answers().items():
+        one = _Seed(config, data, assembly, tactile, evidence, scores, configs, context, seed)
+        for name, said in one.answers().items():
             answers[name].append(said)
     return Study(config=config, data=data, assembly=assembly, probed=probed, prior=prior, arms=arms, answers=answers)
+
+
+def starting_model(config: StudyConfig, sensors: tuple[str, ...]) -> tuple[ModelConfig, Params | None]:
+    """The sizes to train and the tactile encoder to start from, if one is given: then its shape is the encoder's."""
+    if config.encoder is None:
+        return config.model, None
+    pretrained = load_encoder(config.encoder).for_sensors(sensors)
+    return dataclasses.replace(config.model, tactile=pretrained.config), pretrained.params
 
 
 def open_study_data(config: StudyConfig, context: Context) -> Dataset:
@@ -159,6 +172,7 @@ class _Seed:
     config: StudyConfig
     data: Dataset
     assembly: Assembly
+    tactile: Params | None
     evidence: np.ndarray
     scores: Mapping[str, ScoreFn]
     configs: Mapping[str, GRPOConfig]
@@ -174,7 +188,8 @@ class _Seed:
 
     def _train(self) -> None:
         config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
-        params = run_sft(assembly, data, self.evidence, config.sft, context, seed=seed, stage=f"sft/{seed}")
+        stage, tactile = f"sft/{seed}", self.tactile
+        params = run_sft(assembly, data, self.evidence, config.sft, context, seed=seed, stage=stage, tactile=tactile)
         encode = functools.partial(encode_contacts, assembly, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(assembly.agent, params, data, seed=seed)

@@ -32,8 +32,12 @@ from experiments.reporting.results import Results
 from experiments.running import runs
 from experiments.running.artifacts import jsonable, read_json, write_json
 from experiments.running.context import Context
+from touchr1_jax.training.compilation import compilations_kept
 
 PROG = "python -m experiments"
+
+COMPILED = "compiled"
+"""Folder of the cache that holds compiled programs, so that a run like an earlier one compiles next to nothing."""
 
 C = TypeVar("C")
 
@@ -136,7 +140,7 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
             ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Whose defaults to start from.")]),
             ("fresh", Annotated[bool, tyro.conf.arg(help="Start anew beside an unfinished run.")]),
             ("runs_dir", Annotated[Path, tyro.conf.arg(help="Where runs are kept.")]),
-            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Where generated data is kept for all runs.")]),
+            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Where data and compiled programs are kept.")]),
             ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")]),
         ],
         kw_only=True,
@@ -158,7 +162,7 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
     if directory is None:
         directory = runs.create(home, runs.describe(experiment.name, command.scale, config, typed))
     try:
-        with _signals(), runs.locked(directory):
+        with _signals(), runs.locked(directory), compilations_kept(command.cache_dir / COMPILED):
             runs.point_latest(directory)
             _announce(console, directory, resumed)
             _run(experiment, command.config, Context(directory, command.cache_dir, console), about)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.reporting.results import ResultsError, require
+from sensors_io.calibration import circles
+from sensors_io.calibration.presses import BallPresses as Recorded
 from sensors_io.scenes import fitting, mini_optics, optics, photometric
 from sensors_io.scenes.fitting import BallPresses, Noise, Profiles
 from sensors_io.scenes.optics import DeformedGel, Lamp, Light
@@ -78,7 +80,7 @@ def fit(presses: BallPresses) -> Study:
     """Fit to the even presses, align the odd ones."""
     profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
     train = np.arange(0, len(presses.pictures), 2)
-    fitted, touches = fitting.fit_jointly(presses, profiles, train)
+    fitted, touches = fitting.fit_jointly(presses, profiles, located(presses, train), train)
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
     return Study(
         presses=presses,
@@ -88,6 +90,21 @@ def fit(presses: BallPresses) -> Study:
         fitted=fitted,
         noise=fitting.measure_noise(chosen, touches[train], fitted),
     )
+
+
+def located(presses: BallPresses, train: np.ndarray) -> np.ndarray:
+    """Touches (x, y, contact radius), mm, [P, 3], by calibration's finder; held-out ones by the others' optics."""
+    whole = Recorded(
+        pictures=np.round(255 * presses.pictures).astype(np.uint8),
+        background=np.round(255 * presses.background).astype(np.uint8),
+        radius_mm=presses.radius_mm,
+        mm_per_px=presses.mm_per_px,
+    )
+    found = circles.find_circles(whole.chosen(train))
+    rows = circles.align_circles(whole, found.optics).touches.stacked()
+    rows[train] = found.touches.stacked()
+    rows[:, :2] -= (len(presses.axis_mm) - 1) / 2
+    return rows * presses.mm_per_px
 
 
 def candidates(study: Study) -> dict[str, Candidate]:

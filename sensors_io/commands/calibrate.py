@@ -68,4 +68,4 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
 def _without(pictures: Pictures, background: np.ndarray) -> Pictures:
     """The pictures that are not the background itself, which often lies in the same folder."""
     kept = [i for i, frame in enumerate(pictures.frames) if not np.array_equal(frame, background)]
-    return Pictures(frames=pictures.frames[kept], names=tuple(pictures.names[i] for i in kept))
+    return pictures.chosen(np.array(kept, np.int64))

@@ -5,10 +5,10 @@ import dataclasses
 from rich.table import Table
 
 from sensors_io.commands.console import OUT
+from sensors_io.devices.cameras import find_cameras
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.devices.netft import NetFtConfig
 from sensors_io.devices.tac3d import PORT, Tac3dConfig
-from sensors_io.devices.uvc import find_cameras
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,9 +25,9 @@ class Devices:
     def run(self) -> int:
         table = Table("device", "product", "serial", "at")
         for camera in find_cameras():
-            table.add_row(
-                "camera", camera.product, camera.serial or "–", f"{camera.node} ({camera.usb_id or 'not USB'})"
-            )
+            interface = "" if camera.interface is None else f", interface {camera.interface}"
+            where = f"{camera.node} ({camera.usb_id or 'not USB'}{interface})"
+            table.add_row("camera", camera.product, camera.serial or "–", where)
         tac3d, netft = (
             Tac3dConfig(port=self.tac3d_port, wait_s=self.wait_s),
             NetFtConfig(host=self.netft_host, wait_s=self.wait_s),

@@ -55,8 +55,8 @@ class Extract:
         parts = []
         with progress_bar("frames") as progress:
             for i, frame in enumerate(pictures.frames):
-                parts.append(extractor.read(frame))
-                progress(i + 1, len(pictures.frames))
+                parts.append(extractor.read(frame, gap=bool(pictures.gap[i]), apart=bool(pictures.apart[i])))
+                progress(i + 1, len(pictures))
         fields = joined(parts)
         write_whole(self.out, encoded(fields, pictures.names, "" if calibration is None else calibration.hash))
         OUT.print(summary(fields, extractor.refused))

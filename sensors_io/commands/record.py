@@ -2,8 +2,9 @@
 
 import contextlib
 import dataclasses
-import json
 import pathlib
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import rich.console
@@ -12,114 +13,194 @@ import rich.panel
 import rich.progress_bar
 import rich.table
 
-from sensors_io.commands.choices import Force, Tactile, opened, stop_on_interrupt
+from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
 from sensors_io.commands.console import OUT
+from sensors_io.commands.extraction import Extraction
 from sensors_io.devices.errors import StreamEndedError
-from sensors_io.devices.reader import Reader, ReaderConfig
-from sensors_io.force import ForceError, GravityModel
+from sensors_io.devices.reader import Reader
+from sensors_io.devices.rgbd import contact_region
+from sensors_io.devices.rgbd_camera import RgbdCameraConfig
+from sensors_io.force import Mount
+from sensors_io.offsets import Offsets
+from sensors_io.poses import ForceZero
+from sensors_io.recording.book import ObjectView
 from sensors_io.recording.coach import CoachConfig
 from sensors_io.recording.session import SessionConfig, Status, record_session
+from sensors_io.viewer.presenter import Presenter
+from sensors_io.viewer.server import LiveView
 
-_FORCE_CAPACITY = 8192  # readings: a second at the 7 kHz of a Net F/T
+_VIEW_WAIT_S = 10.0  # for the first colour and depth pair of an RGB-D camera
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Record:
+class MountConfig:
+    """How the gel of the first sensor sits on the force sensor.
+
+    Args:
+      turn_deg: turns the force sensor's axes into the gel's (x right, y down, z out of the gel): about x, then y, then
+        z, all of them fixed.
+      offset_mm: from the force sensor's origin to the centre of the window, in the force sensor's frame.
+      sign: 1 where the sensor reads the force on what is mounted on it, −1 where it reads the reaction.
+    """
+
+    turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sign: int = 1
+
+    def mount(self) -> Mount:
+        """The mount, R = Rz Ry Rx."""
+        x, y, z = np.deg2rad(self.turn_deg)
+        about_x = np.array([[1, 0, 0], [0, np.cos(x), -np.sin(x)], [0, np.sin(x), np.cos(x)]])
+        about_y = np.array([[np.cos(y), 0, np.sin(y)], [0, 1, 0], [-np.sin(y), 0, np.cos(y)]])
+        about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
+        return Mount(rotation=about_z @ about_y @ about_x, offset_mm=np.array(self.offset_mm), sign=self.sign)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Record(Bench):
     """Record one object by protocol: a press to 20 N, then six motions at 2, 5 and 10 N, led by the live force.
 
-    Stop with Ctrl-C and start again: what is complete is not asked for again, and a killed session loses at most the
-    frame in flight.
+    Devices are joined by a + of its own: record --out R --object-id cup uvc --serial S + tac3d + netft --host H.  All
+    tactile sensors are recorded at once, into one contact each time; the force sensor carries the first of them.  Stop
+    with Ctrl-C and start again: what is complete is not asked for again, and a killed session loses at most the frame
+    in flight.
     """
 
     out: pathlib.Path
     """Directory of the records."""
     object_id: str
     """Of the object; give its card with labels later."""
-    device: Tactile
-    """The tactile sensor."""
-    force: Force = None
-    """The force sensor; without one the sensor's own force leads, or nothing in free motion."""
     site: int = 0
     """Number of the place on the object."""
     free_s: float = 0.0
     """> 0 records free motion for so many seconds instead of the protocol."""
     gravity: pathlib.Path | None = None
-    """JSON of bias and dead weight, as `force.GravityModel` names them, with `down`; none leaves readings alone."""
-    lag_s: float = 0.0
-    """By which frames are stamped later than forces, see `force.estimate_lag`."""
+    """JSON of bias and dead weight, made by `force-zero`; none leaves readings alone."""
+    sync: pathlib.Path | None = None
+    """JSON of how late each sensor is stamped, made by `sync`; none takes their stamps as they are."""
+    mount: MountConfig = dataclasses.field(default_factory=MountConfig)
+    """How the gel sits on the force sensor."""
+    contact_mm: tuple[float, float, float] | None = None
+    """Centre of the contact in the frame of an RGB-D camera, X right, Y down, Z ahead: stores where it shows."""
+    window_mm: float = 20.0
+    """Side of the sensing window, for that."""
     licence: str = "all rights reserved"
     """Of the recordings."""
     coach: CoachConfig = dataclasses.field(default_factory=CoachConfig)
+    """Thresholds of force and time."""
+    port: int | None = None
+    """Of a live view in the browser beside the recording; none shows the terminal alone."""
+    background: pathlib.Path | None = None
+    """Picture of the gel at rest, for fields in that view."""
+    calibration: pathlib.Path | None = None
+    """Of the colours, for depth in that view."""
 
     def run(self) -> int:
-        model, down = (None, np.array([0.0, 0.0, -1.0])) if self.gravity is None else load_gravity(self.gravity)
-        config = SessionConfig(
-            object_id=self.object_id,
-            site=self.site,
-            licence=self.licence,
-            free_s=self.free_s,
-            coach=self.coach,
-            gravity=model,
-            down=down,
-            lag_s=self.lag_s,
-        )
+        parts = self.parts()
+        parts.require_tactile()
+        config = self.session()
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(stop_on_interrupt())
-            tactile = stack.enter_context(Reader(opened(self.device)))
-            force = None
-            if self.force is not None:
-                force = stack.enter_context(Reader(opened(self.force), config=ReaderConfig(capacity=_FORCE_CAPACITY)))
-            live = stack.enter_context(rich.live.Live(console=OUT, refresh_per_second=12))
-            show = lambda status: live.update(board(status))
+            tactile = stack.enter_context(readers(parts.tactile))
+            force = stack.enter_context(readers((parts.force,) if parts.force else ()))
+            view = None if parts.view is None else self.look(parts.view)
+            board = _Board()
+            show = stack.enter_context(board.shown())
+            if self.port is not None:
+                stack.enter_context(self._live_view(tactile, force, board))
             try:
-                report = record_session(self.out, config, tactile, force, show=show, stop=stop.is_set)
+                report = record_session(
+                    self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
+                )
             except StreamEndedError as end:
                 OUT.print(f"{end}: what was recorded is in {self.out}", markup=False)
                 return 0
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
         return 0
 
-
-def load_gravity(path: pathlib.Path) -> tuple[GravityModel, np.ndarray]:
-    """Bias and dead weight, and the direction of gravity, from JSON.
-
-    Raises:
-      ForceError: a field is missing or is no number.
-    """
-    try:
-        tree = json.loads(path.read_text())
-        model = GravityModel(
-            bias_n=np.array(tree["bias_n"], np.float64),
-            bias_nmm=np.array(tree["bias_nmm"], np.float64),
-            weight_n=float(tree["weight_n"]),
-            first_moment_nmm=np.array(tree["first_moment_nmm"], np.float64),
-            rms_n=float(tree["rms_n"]),
-            rms_nmm=float(tree["rms_nmm"]),
-            poses=int(tree["poses"]),
+    def session(self) -> SessionConfig:
+        """What is recorded, with everything that was measured at the bench."""
+        zero = None if self.gravity is None else ForceZero.load(self.gravity)
+        given: dict[str, Any] = {} if zero is None else {"gravity": zero.model, "down": zero.down}
+        return SessionConfig(
+            object_id=self.object_id,
+            site=self.site,
+            licence=self.licence,
+            free_s=self.free_s,
+            coach=self.coach,
+            mount=self.mount.mount(),
+            late_s={} if self.sync is None else Offsets.load(self.sync).late_s,
+            **given,
         )
-        return model, np.array(tree["down"], np.float64)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ForceError(
-            f"{path} holds no gravity model ({error!r}); write down and the fields of GravityModel"
-        ) from error
+
+    def look(self, camera: RgbdCameraConfig) -> ObjectView:
+        """One picture of the object before anything touches it, and where the contact shows in it."""
+        with camera.open() as device:
+            sample = device.read(_VIEW_WAIT_S)
+        region = None
+        if self.contact_mm is not None:
+            region = contact_region(camera.intrinsics, np.array(self.contact_mm), self.window_mm)
+        assert sample.frame is not None
+        return ObjectView(picture=sample.frame, depth_mm=sample.arrays["view_depth_mm"], region_px=region)
+
+    @contextlib.contextmanager
+    def _live_view(self, tactile: list[Reader], force: list[Reader], board: "_Board") -> Iterator[None]:
+        """A page beside the recording, drawn by threads of its own."""
+        assert self.port is not None
+        channels = Extraction(self.background, self.calibration, _MINI_MM_PER_PX).channels(tactile)
+        with LiveView(port=self.port) as live:
+            OUT.print(f"live view at {live.address}", highlight=False)
+            with Presenter(channels, force[0] if force else None, live, board.words).beside():
+                yield
 
 
-def board(status: Status) -> rich.console.RenderableType:
+_MINI_MM_PER_PX = 0.0634  # of a GelSight Mini at 320 × 240, where no device tells its pitch
+
+
+class _Board:
+    """The terminal's picture of a session, and its words for the page."""
+
+    def __init__(self) -> None:
+        self._status: Status | None = None
+
+    def words(self) -> tuple[str, str]:
+        """Prompt and alarm."""
+        status = self._status
+        return ("", "") if status is None else (status.advice.prompt, status.alarm)
+
+    @contextlib.contextmanager
+    def shown(self) -> Iterator[Callable[[Status], None]]:
+        """A function that shows a status, while the block runs."""
+        with rich.live.Live(console=OUT, refresh_per_second=12, get_renderable=self._render) as live:
+            del live
+
+            def show(status: Status) -> None:
+                self._status = status  # drawn by the thread of the terminal, twelve times a second
+
+            yield show
+
+    def _render(self) -> rich.console.RenderableType:
+        return "waiting for the first sample" if self._status is None else drawn(self._status)
+
+
+def drawn(status: Status) -> rich.console.RenderableType:
     """What the hand sees: the prompt, the force against its target, what has been lost."""
     advice = status.advice
     top = max(advice.target_n * 1.25, 1.0)
     table = rich.table.Table.grid(padding=(0, 2))
     bar = rich.progress_bar.ProgressBar(total=top, completed=min(max(advice.normal_n, 0.0), top), width=50)
     table.add_row("force", bar, f"{advice.normal_n:6.2f} N of {advice.target_n:g} N")
-    counts = status.tactile
-    table.add_row(
-        "frames", str(status.frames), f"lost {counts.lost}, twice {counts.duplicates}, waiting {counts.waiting}"
-    )
+    for stream in status.streams:
+        counts = stream.counts
+        words = f"lost {counts.lost}, twice {counts.duplicates}, waiting {counts.waiting}"
+        table.add_row(stream.sensor, f"{stream.frames} frames", words)
+        if stream.drift is not None:
+            mean = ", ".join(f"{v:+.1f}" for v in stream.drift.mean)
+            table.add_row("", "background drift", f"{stream.drift.rms:.1f} grey levels; R, G, B {mean}")
     if status.force is not None:
-        table.add_row("readings", str(status.force.delivered), f"lost {status.force.lost}")
-    if status.drift is not None:
-        mean = ", ".join(f"{v:+.1f}" for v in status.drift.mean)
-        table.add_row("background", f"{status.drift.rms:.1f} grey levels", f"mean of R, G, B {mean}")
+        table.add_row("force sensor", f"{status.force.delivered} readings", f"lost {status.force.lost}")
+    if status.alarm:
+        table.add_row("[bold red]alarm", f"[bold red]{status.alarm}", "")
     style = "bold red" if advice.prompt.startswith("STOP") else "bold green" if advice.complete else "bold"
     title = f"{status.stage.motion} at {status.stage.force_n:g} N" if advice.target_n else status.stage.motion
     return rich.console.Group(rich.panel.Panel(advice.prompt, title=title, style=style, width=80), table)

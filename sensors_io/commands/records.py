@@ -1,47 +1,131 @@
 """`python -m sensors_io check` and `list`."""
 
+import collections
 import dataclasses
 import pathlib
 
+import numpy as np
 import tyro
+from rich.table import Table
 
 from sensors_io import overview, quality
 from sensors_io.commands.console import OUT, complain, progress_bar
+from sensors_io.fields.extract import Extractor
+from sensors_io.fields.types import Calibration
+from sensors_io.importers.pictures import read_picture
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
+from sensors_io.schema import Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
     """Read every entry, verify its checksum; exit status 1 if anything is damaged or missing.
 
-    Two tables count frames by quality flag: as recorded, and as the quality filters judge them today.  Nothing is
-    changed or deleted.
+    Tables count what an import left out, and frames by quality flag: as recorded, and as the quality filters judge them
+    today.  Another, by `--pictures`, looks at the pictures themselves: contact, its border and number, saturation, lost
+    markers.  Nothing is changed or deleted.
     """
 
     records: tyro.conf.Positional[pathlib.Path]
     """Directory of the records."""
+    pictures: bool = False
+    """Look at the pictures, against the gel at rest that was recorded with them or else `--background`."""
+    background: pathlib.Path | None = None
+    """Picture of the gel at rest, where none was recorded."""
+    calibration: pathlib.Path | None = None
+    """Of the colours, from `calibrate`: contact is then told by depth."""
 
     def run(self) -> int:
         store = RecordStore(self.records, allow_incomplete=True)
-        recorded, judged = overview.FlagCounts(), overview.FlagCounts()
+        recorded, judged, looked = overview.FlagCounts(), overview.FlagCounts(), overview.FlagCounts()
+        unseen: collections.Counter[str] = collections.Counter()
         problems: list[RecordsError] = []
+        eye = _Eye(self.records, self.background, self.calibration)
         with progress_bar("contacts") as progress:
             for i in range(len(store)):
                 try:
                     contact = store.contact(i).values()
-                    recorded.add(contact)
-                    judged.add(quality.judged(sequence) for sequence in contact)
                 except CorruptRecordsError as damage:
                     problems.append(damage)
+                    continue
+                recorded.add(contact)
+                judged.add(quality.judged(sequence) for sequence in contact)
+                for sequence in contact if self.pictures else ():
+                    reason = eye.cannot_see(sequence)
+                    unseen.update([reason] if reason else [])
+                    looked.add([] if reason else [eye.look(sequence)])
                 progress(i + 1, len(store))
         OUT.print(overview.summary_table(store))
+        left_out = _left_out(store)
+        if left_out:
+            OUT.print(_counted(left_out))
         OUT.print(overview.flag_table(recorded, "flags as recorded"))
         OUT.print(overview.flag_table(judged, "flags by the filters"))
+        if self.pictures:
+            OUT.print(overview.flag_table(looked, "flags by the pictures"))
+            for reason, count in unseen.items():
+                OUT.print(f"not looked at: {count} sequences, {reason}", highlight=False)
         if not store.complete:
             problems.append(IncompleteRecordsError(f"{self.records}: its writing has not ended; run its command again"))
         for problem in problems:
             complain(problem)
         return 1 if problems else 0
+
+
+def _left_out(store: RecordStore) -> collections.Counter[str]:
+    """How much was left out when the records were imported, by reason; nothing of records that were not."""
+    report = store.meta.notes.get("report", {})
+    return collections.Counter(skip["reason"] for skip in report.get("skipped", ()))
+
+
+def _counted(reasons: collections.Counter[str]) -> Table:
+    table = Table("left out when imported", "count")
+    for reason, count in reasons.most_common(_MOST_REASONS):
+        table.add_row(reason, str(count))
+    rest = len(reasons) - _MOST_REASONS
+    if rest > 0:
+        table.add_row(f"{rest} other reasons", str(sum(sorted(reasons.values())[:rest])))
+    return table
+
+
+_MOST_REASONS = 12  # that are listed one by one
+
+
+class _Eye:
+    """Judges pictures of records by the extraction of their fields."""
+
+    def __init__(self, records: pathlib.Path, background: pathlib.Path | None, calibration: pathlib.Path | None):
+        self._records = records
+        self._given = None if background is None else read_picture(background)
+        self._calibration = None if calibration is None else Calibration.load(calibration)
+
+    def cannot_see(self, sequence: Sequence) -> str:
+        """Why a sequence cannot be judged; empty if it can."""
+        if sequence.frames is None:
+            return "they hold no pictures"
+        rest = self._at_rest(sequence)
+        if rest is None:
+            return "no gel at rest was recorded with them: give --background"
+        if rest.shape != sequence.frames.shape[1:]:
+            return (
+                f"their pictures are {sequence.frames.shape[1:3]}, the gel at rest is {rest.shape[:2]}: crop them alike"
+            )
+        if sequence.mm_per_px is None:
+            return "nothing tells their mm per px: record them with it"
+        return ""
+
+    def look(self, sequence: Sequence) -> Sequence:
+        """The sequence with the flags that its pictures show, in place of its own."""
+        rest = self._at_rest(sequence)
+        assert sequence.frames is not None
+        assert sequence.mm_per_px is not None
+        assert rest is not None
+        fields = Extractor(rest, sequence.mm_per_px, self._calibration).extract(sequence.frames)
+        return dataclasses.replace(sequence, flags=fields.flags)
+
+    def _at_rest(self, sequence: Sequence) -> np.ndarray | None:
+        name = sequence.camera.get("recording", {}).get("background")
+        return self._given if name is None else read_picture(self._records / name)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -24,6 +24,7 @@ class Identity:
       settings: as read back after setting, JSON values; stored with every recording.
       period_s: time between two samples; `None` where unknown.
       counter_modulus: the counter of its samples runs around at this number; `None` where it never does.
+      mm_per_px: pitch of its pictures on the gel; `None` where unknown.
     """
 
     sensor: str
@@ -33,6 +34,7 @@ class Identity:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     period_s: float | None = None
     counter_modulus: int | None = None
+    mm_per_px: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, slots=True)

@@ -1,10 +1,18 @@
 """Sensors whose SDK must live in another Python: a client of `bridge_server.py`, which runs there.
 
 The vendors pin versions of numpy, OpenCV and Python that exclude each other and this project, so that their code runs
-in a process of its own and only bytes cross.
+in a process of its own and only bytes cross:
+
+    python -m sensors_io view bridge --python ~/xense/bin/python --adapter xense --serial OG000232
+    python -m sensors_io view bridge --python ~/dmtac/bin/python --adapter dmtac --sensor dmtac_x --serial S2508080042
+
+That process starts without this project's PYTHONPATH, out of reach of Ctrl-C, and ends with its reader, also a killed
+one.  Both read the same monotonic clock, so that a frame keeps the stamp that it got beside the SDK.  A pipe carries
+what the sensors send a dozen times over: see `stability_devices`.
 """
 
 import collections
+import contextlib
 import dataclasses
 import json
 import os
@@ -28,6 +36,12 @@ _LARGEST_HEADER = 1 << 16  # bytes: a few names and shapes
 _LARGEST_PAYLOAD = 1 << 28  # bytes: 256 MB, ten times the largest camera frame
 _KINDS = "biuf"  # of arrays: booleans, integers, floats; never Python objects
 _LAST_WORDS = 4096  # bytes of the server's standard error that are kept for a message
+_PIPE_BYTES = 1 << 20  # the most that Linux gives without privileges: a picture of 640 × 480
+_RELEASE_S = 3.0  # for the SDK to let its sensor go
+_OURS = ("PYTHONPATH", "PYTHONHOME")  # would make the vendor's Python import what belongs to this one
+
+_MOMENT_UNIT_NMM = {"resultant": 1.0, "resultant_n_cnm": 10.0}
+"""Resultants by the name that an adapter gives them: force in N, moment in this unit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,6 +55,7 @@ class BridgeConfig:
       serial: of the unit.
       rate_hz: of its frames; 0 where unknown.
       wait_s: for the first frame: loading a vendor's network may take long.
+      mm_per_px: of the pictures; `None` where unknown.
     """
 
     sensor: str = "xense"
@@ -49,6 +64,7 @@ class BridgeConfig:
     serial: str = ""
     rate_hz: float = 0.0
     wait_s: float = 60.0
+    mm_per_px: float | None = None
 
     def open(self) -> "Bridge":
         """The device, not open yet."""
@@ -71,7 +87,7 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
             count = int(np.prod(shape))
             arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
             start += count * dtype.itemsize
-        int(described["number"]), int(described["stamp_ns"])
+        int(described["number"] or 0), int(described["stamp_ns"])
     except (ValueError, KeyError, TypeError) as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
@@ -82,15 +98,17 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
 def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, np.ndarray]]:
     """Picture in RGB, and the other arrays as the schema has them: float32, a 6-D resultant as force and moment.
 
-    The resultant is taken as Fx Fy Fz (N) Mx My Mz (N mm), which no vendor states: hold it against a known weight.
+    A resultant without a unit is taken as Fx Fy Fz in N, Mx My Mz in N mm: hold it against a known weight.
     """
     rest = dict(arrays)
     picture = rest.pop("frame_bgr", None)
-    resultant = rest.pop("resultant", None)
+    resultants = {name: rest.pop(name) for name in _MOMENT_UNIT_NMM if name in rest}
     fields = {name: a.astype(np.float32) for name, a in rest.items()}
-    if resultant is not None:
+    for name, resultant in resultants.items():
         six = resultant.astype(np.float32).ravel()
-        fields |= {"force_n": six[:3]} | ({"moment_nmm": six[3:6]} if six.size >= 6 else {})
+        fields["force_n"] = six[:3]
+        if six.size >= 6:
+            fields["moment_nmm"] = six[3:6] * np.float32(_MOMENT_UNIT_NMM[name])
     if picture is None:
         return None, fields
     picture = np.asarray(picture, np.uint8)
@@ -113,14 +131,27 @@ class Bridge:
     def identity(self) -> Identity:
         c = self._config
         period = 1 / c.rate_hz if c.rate_hz > 0 else None
-        return Identity(sensor=c.sensor, serial=c.serial, product=f"{c.adapter} SDK", where=c.python, period_s=period)
+        return Identity(
+            sensor=c.sensor,
+            serial=c.serial,
+            product=f"{c.adapter} SDK",
+            where=c.python,
+            period_s=period,
+            mm_per_px=c.mm_per_px,
+        )
 
     def __enter__(self) -> Self:
         c = self._config
         command = [c.python, str(_SERVER), c.adapter, c.serial]
         try:
             self._process = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL
+                command,
+                stdin=subprocess.PIPE,  # held open: the server ends when it closes
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                pipesize=_PIPE_BYTES,
+                env={name: value for name, value in os.environ.items() if name not in _OURS},
+                start_new_session=True,
             )
         except OSError as error:
             raise DeviceNotFoundError(
@@ -152,11 +183,10 @@ class Bridge:
         deadline = time.monotonic() + timeout_s
         while (frame := self._take()) is None:
             self._fill(deadline, timeout_s)
-        stamp_ns = time.monotonic_ns()
         described, arrays = unpack(*frame)
         picture, fields = to_schema(arrays)
-        number, device_ns = int(described["number"]), int(described["stamp_ns"])
-        return Sample(host_time_ns=stamp_ns, device_time_ns=device_ns, index=number, frame=picture, arrays=fields)
+        stamp_ns = min(int(described["stamp_ns"]), time.monotonic_ns())
+        return Sample(host_time_ns=stamp_ns, index=described["number"], frame=picture, arrays=fields)
 
     def _take(self) -> tuple[bytes, bytes] | None:
         """Header and payload of a whole frame in the buffer."""
@@ -183,7 +213,7 @@ class Bridge:
             )
         out, _ = self._pipes()
         for key, _ in ready:
-            data = os.read(key.fd, 1 << 20)
+            data = os.read(key.fd, _PIPE_BYTES)
             if key.fileobj is not out:
                 self._words.append(data[-_LAST_WORDS:])
                 if not data:
@@ -191,6 +221,7 @@ class Bridge:
             elif data:
                 self._buffer += data
             else:
+                self._hear_rest()
                 raise DeviceLostError(f"{self._config.sensor}: the bridge has ended{self._last_words()}")
 
     def _pipes(self) -> tuple[IO[bytes], IO[bytes]]:
@@ -199,6 +230,13 @@ class Bridge:
         assert process.stdout is not None
         assert process.stderr is not None
         return process.stdout, process.stderr
+
+    def _hear_rest(self) -> None:
+        """What a server that has ended said last, which may lie unread."""
+        _, errors = self._pipes()
+        with contextlib.suppress(BlockingIOError):  # its children may live on and hold the pipe
+            while data := os.read(errors.fileno(), _LAST_WORDS):
+                self._words.append(data)
 
     def _last_words(self) -> str:
         words = b"".join(self._words).decode(errors="replace").strip()
@@ -210,10 +248,11 @@ class Bridge:
         if self._selector is not None:
             self._selector.close()
             self._selector = None
-        for pipe in self._pipes():
+        assert self._process.stdin is not None
+        for pipe in (self._process.stdin, *self._pipes()):
             pipe.close()
         try:
-            self._process.wait(timeout=2)  # its next frame finds the pipe closed and ends it
+            self._process.wait(timeout=_RELEASE_S)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

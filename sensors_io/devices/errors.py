@@ -29,6 +29,10 @@ class StreamEndedError(DeviceError):
     """A replay has come to its end."""
 
 
+class OutOfViewError(DeviceError, ValueError):
+    """A contact that a camera does not see."""
+
+
 class SettingRefusedWarning(UserWarning):
     """A camera setting that could not be locked at the value asked for."""
 

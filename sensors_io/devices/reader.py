@@ -17,6 +17,8 @@ from sensors_io.devices.errors import (
 )
 from sensors_io.devices.intake import Counts, Intake
 
+_SILENT_PERIODS = 3  # of a slow device: it may drop a sample or two without being lost
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReaderConfig:
@@ -25,14 +27,16 @@ class ReaderConfig:
     Args:
       capacity: samples kept for a consumer that reads in order.
       timeout_s: how long one read waits; also how long stopping may take.
-      lost_after_s: a device silent for longer is taken as lost.
+      lost_after_s: a device silent for longer, and for three periods of its own, is taken as lost.
+      first_s: instead of it, until a device that was just opened gives its first sample.
       first_wait_s, longest_wait_s: between attempts to reconnect, doubling from the first to the longest.
       give_up_after_s: of attempts in vain.
     """
 
     capacity: int = 256
-    timeout_s: float = 0.5
-    lost_after_s: float = 2.0
+    timeout_s: float = 0.2
+    lost_after_s: float = 0.6
+    first_s: float = 5.0
     first_wait_s: float = 0.1
     longest_wait_s: float = 5.0
     give_up_after_s: float = 120.0
@@ -57,6 +61,7 @@ class Pump:
         self._clock = clock
         self._stop = stop
         self._heard_ns = clock.now_ns()
+        self._silent_s = config.first_s
 
     def open(self) -> None:
         """Open the device for the first time.
@@ -66,17 +71,17 @@ class Pump:
         """
         self._device.__enter__()
         self._intake.opened(self._device.identity)
-        self._heard_ns = self._clock.now_ns()
+        self._heard_ns, self._silent_s = self._clock.now_ns(), self._config.first_s
 
     def step(self) -> bool:
         """Read once; False when the stream has ended, for good or because it was stopped."""
         try:
             self._intake.offer(self._device.read(self._config.timeout_s))
-            self._heard_ns = self._clock.now_ns()
+            self._heard_ns, self._silent_s = self._clock.now_ns(), self._longest_silence_s()
         except DeviceTimeoutError:
             self._intake.timed_out()
             silent_s = (self._clock.now_ns() - self._heard_ns) / NS_PER_S
-            return self._reconnect() if silent_s > self._config.lost_after_s else True
+            return self._reconnect() if silent_s > self._silent_s else True
         except DeviceDataError:
             self._intake.broke()
         except DeviceLostError:
@@ -89,6 +94,10 @@ class Pump:
     def close(self) -> None:
         """Close the device."""
         self._device.__exit__(None, None, None)
+
+    def _longest_silence_s(self) -> float:
+        period_s = self._device.identity.period_s or 0.0
+        return max(self._config.lost_after_s, _SILENT_PERIODS * period_s)
 
     def _reconnect(self) -> bool:
         """Close the device and open it again, waiting ever longer between attempts."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Device, Identity, Sample
-from sensors_io.devices.errors import DeviceDataError, DeviceTimeoutError
+from sensors_io.devices.errors import DeviceDataError, DeviceTimeoutError, OutOfViewError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ def contact_region(intrinsics: Intrinsics, centre_mm: np.ndarray, side_mm: float
       side_mm: of the window.
 
     Raises:
-      ValueError: a contact behind the camera or outside its view.
+      OutOfViewError: a contact behind the camera or outside its view.
     """
     half = side_mm / 2
     corners = np.asarray(centre_mm, np.float64) + np.array([[-half, -half, 0], [half, half, 0]])
@@ -60,7 +60,7 @@ def contact_region(intrinsics: Intrinsics, centre_mm: np.ndarray, side_mm: float
     x0, y0 = (int(v) for v in np.clip(np.floor(np.where(np.isnan(low), size, low)), 0, size))
     x1, y1 = (int(v) for v in np.clip(np.ceil(np.where(np.isnan(high), 0, high)), 0, size))
     if x1 <= x0 or y1 <= y0:
-        raise ValueError(
+        raise OutOfViewError(
             f"centre_mm is {np.asarray(centre_mm).tolist()}: must lie in the view; check the hand–eye calibration"
         )
     return x0, y0, x1 - x0, y1 - y0

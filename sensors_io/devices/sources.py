@@ -143,6 +143,7 @@ class RecordedContact:
             where=str(self.path),
             settings=s.camera,
             period_s=period,
+            mm_per_px=s.mm_per_px,
         )
 
     @functools.cached_property
@@ -186,6 +187,10 @@ class Tac3dRecording:
 
 
 def _read_picture(path: pathlib.Path) -> np.ndarray:
+    """RGB uint8, or the counts of a depth camera, uint16."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is not None and image.ndim == 2 and image.dtype == np.uint16:
+        return image
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if image is None:
         raise DeviceNotFoundError(f"{path} cannot be decoded as a picture; take it out of the folder")

@@ -5,7 +5,7 @@ set, read back and stored; one that refuses is stored too, and warned of.
 """
 
 import dataclasses
-import pathlib
+import os
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -15,15 +15,15 @@ from typing import Any, Protocol, Self
 import cv2
 import numpy as np
 
+from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.cameras import CameraInfo, find_cameras
 from sensors_io.devices.errors import (
     DeviceLostError,
     DeviceNotFoundError,
     DeviceTimeoutError,
     SettingRefusedWarning,
 )
-
-SYSFS = pathlib.Path("/sys/class/video4linux")
 
 
 class Capture(Protocol):
@@ -35,46 +35,6 @@ class Capture(Protocol):
     def get(self, propId: int) -> float: ...
     def set(self, propId: int, value: float) -> bool: ...
     def release(self) -> None: ...
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CameraInfo:
-    """One capture node, as the kernel describes it.
-
-    Args:
-      node: such as /dev/video0.
-      product, serial: strings of the USB device; empty where it has none.
-      usb_id: vendor and product number, such as "0c45:636d".
-    """
-
-    node: str
-    product: str
-    serial: str
-    usb_id: str
-
-    def __str__(self) -> str:
-        return f"{self.node} {self.product!r} serial {self.serial or 'none'} ({self.usb_id or 'not USB'})"
-
-
-def find_cameras(sysfs: pathlib.Path = SYSFS) -> tuple[CameraInfo, ...]:
-    """All capture nodes of this machine, in the order of their numbers; metadata nodes are left out."""
-    nodes = sorted(sysfs.glob("video*"), key=lambda p: int(p.name.removeprefix("video")))
-    return tuple(_describe(node) for node in nodes if _line(node / "index") in ("", "0"))
-
-
-def _describe(node: pathlib.Path) -> CameraInfo:
-    usb = (node / "device").resolve().parent  # node/device is the USB interface, its parent the device
-    numbers = [_line(usb / name) for name in ("idVendor", "idProduct")]
-    return CameraInfo(
-        node=f"/dev/{node.name}",
-        product=_line(usb / "product") or _line(node / "name"),
-        serial=_line(usb / "serial"),
-        usb_id=":".join(numbers) if all(numbers) else "",
-    )
-
-
-def _line(path: pathlib.Path) -> str:
-    return path.read_text(errors="replace").strip() if path.is_file() else ""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,18 +61,21 @@ class UvcConfig:
       sensor: canonical name of the sensor behind it.
       serial: exact USB serial.
       product: a part of the product string, such as "GelSight Mini" (it holds the unit's number: "R0B 2D8X-YK21").
+      interface: of the USB device, where one device has several cameras: a RealSense D435 has depth at 0, colour at 3.
       index: number of the video node; only for a machine whose cameras have neither serial nor product string.
       width, height: of the mode asked for, px.
       rate_hz: of the mode asked for.
       pixel_format: FourCC of the mode, such as "MJPG"; empty leaves it. "Z16 " gives uint16 depth pictures.
       border_share: cut off at each side before resizing; a seventh for the GelSight Mini.
       frame_width, frame_height: of the frames given, by INTER_AREA; 0 keeps them.
+      mm_per_px: pitch of the frames given on the gel; `None` where unknown.
       lock: settings to hold still.
     """
 
     sensor: str = "gelsight_mini"
     serial: str = ""
     product: str = ""
+    interface: int | None = None
     index: int | None = None
     width: int = 0
     height: int = 0
@@ -121,6 +84,7 @@ class UvcConfig:
     border_share: float = 0.0
     frame_width: int = 0
     frame_height: int = 0
+    mm_per_px: float | None = None
     lock: Lock = dataclasses.field(default_factory=Lock)
 
     def __post_init__(self) -> None:
@@ -132,6 +96,8 @@ class UvcConfig:
             )
         if bool(self.frame_width) != bool(self.frame_height):
             raise ValueError("frame_width and frame_height must both be given, or neither; give the other one")
+        if self.mm_per_px is not None and not self.mm_per_px > 0:
+            raise ValueError(f"mm_per_px is {self.mm_per_px}: must be > 0; measure it with `geometry`")
 
     def open(self) -> "Uvc":
         """The device, not open yet."""
@@ -146,7 +112,13 @@ class UvcConfig:
         if self.index is not None:
             return CameraInfo(node=f"/dev/video{self.index}", product="", serial="", usb_id="")
         asked = f"serial {self.serial!r}" if self.serial else f"product {self.product!r}"
-        meant = [c for c in cameras if self.product in c.product and (not self.serial or self.serial == c.serial)]
+        if self.interface is not None:
+            asked += f", interface {self.interface}"
+        meant = [
+            c
+            for c in cameras
+            if self.product in c.product and self.serial in ("", c.serial) and self.interface in (None, c.interface)
+        ]
         if len(meant) == 1:
             return meant[0]
         there = "; ".join(map(str, meant or cameras)) or "none"
@@ -203,6 +175,21 @@ def lock_settings(capture: Capture, lock: Lock, name: str) -> dict[str, Any]:
     return found
 
 
+def wait_for_frame(capture: Any, timeout_s: float) -> bool:
+    """Whether a camera of OpenCV has a frame, or an error, to be grabbed within a time; polls the node itself."""
+    if not capture.isOpened():
+        return True  # grabbing says what is wrong; OpenCV itself would crash
+    _, ready = cv2.VideoCapture.waitAny([capture], timeoutNs=round(timeout_s * NS_PER_S))
+    return len(ready) > 0
+
+
+def _open_v4l2(node: str) -> Capture:
+    # a frame that `wait_for_frame` promised and that never comes holds `grab` for so many seconds, by default 10;
+    # OpenCV takes whole ones only, and reads them when it first waits
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
+    return cv2.VideoCapture(node, cv2.CAP_V4L2)
+
+
 class Uvc:
     """One UVC camera.
 
@@ -210,6 +197,7 @@ class Uvc:
       config: which camera, which mode.
       find: lists the cameras of the machine.
       capture: opens a node; OpenCV's V4L2 by default.
+      wait: whether a capture has a frame or an error within some seconds.
     """
 
     def __init__(
@@ -217,11 +205,13 @@ class Uvc:
         config: UvcConfig,
         *,
         find: Callable[[], tuple[CameraInfo, ...]] = find_cameras,
-        capture: Callable[[str], Capture] | None = None,
+        capture: Callable[[str], Capture] = _open_v4l2,
+        wait: Callable[[Any, float], bool] = wait_for_frame,
     ):
         self._config = config
         self._find = find
-        self._open_node = capture or (lambda node: cv2.VideoCapture(node, cv2.CAP_V4L2))
+        self._open_node = capture
+        self._wait = wait
         self._capture: Capture | None = None
         self._identity = Identity(sensor=config.sensor, serial=config.serial, product=config.product)
 
@@ -248,6 +238,7 @@ class Uvc:
             where=camera.node,
             settings=settings,
             period_s=1 / rate if rate > 0 else None,
+            mm_per_px=self._config.mm_per_px,
         )
         return self
 
@@ -259,15 +250,13 @@ class Uvc:
             self._capture = None
 
     def read(self, timeout_s: float) -> Sample:
-        """The next frame, see `Device.read`; OpenCV itself waits up to 10 s for one and cannot be told otherwise."""
+        """The next frame, see `Device.read`; a camera that is unplugged is lost at once, not after OpenCV's 10 s."""
         if self._capture is None:
             raise DeviceLostError(f"{self._identity.sensor} is not open; use it in a with block")
-        began_ns = time.monotonic_ns()
+        if not self._wait(self._capture, timeout_s):
+            raise DeviceTimeoutError(f"{self._identity.sensor} at {self._identity.where}: no frame in {timeout_s} s")
         if not self._capture.grab():
-            waited_s = (time.monotonic_ns() - began_ns) / 1e9
-            if waited_s < timeout_s:
-                raise DeviceLostError(f"{self._identity.sensor} at {self._identity.where} gives no more frames")
-            raise DeviceTimeoutError(f"{self._identity.sensor} at {self._identity.where}: no frame in {waited_s:.1f} s")
+            raise DeviceLostError(f"{self._identity.sensor} at {self._identity.where} gives no more frames")
         stamp_ns = time.monotonic_ns()
         driver_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)  # V4L2: when the driver finished the buffer
         ok, image = self._capture.retrieve()

@@ -1,7 +1,7 @@
 """All fields of a sensor's pictures in one call, and flags for what a picture cannot carry."""
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from sensors_io.fields.depth import DepthReader, ZeroConfig
 from sensors_io.fields.evidence import Pattern, examine
 from sensors_io.fields.shear import ShearReader
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
-from sensors_io.quality import QualityConfig, saturated
+from sensors_io.quality import QualityConfig, saturated, time_gap
 from sensors_io.scenes.layer import Layer
 from sensors_io.schema import Flag
 
@@ -26,12 +26,15 @@ class ExtractConfig:
       nodes: of the vector fields along the longer side of the picture.
       gel: modulus, Poisson ratio and thickness; the modulus scales the forces.
       marker_depth_mm: of the pattern below the surface.
+      shear: `modelled` gives what the traction makes by the gel's compliance; `subtracted` the deformation less what
+        the pressure makes, which supposes less of the traction and keeps the noise.
       zero, contact, quality: of depth, contact mask and saturation.
     """
 
     nodes: int = 24
     gel: Layer = dataclasses.field(default_factory=lambda: Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5))
     marker_depth_mm: float = 0.5
+    shear: Literal["modelled", "subtracted"] = "modelled"
     zero: ZeroConfig = dataclasses.field(default_factory=ZeroConfig)
     contact: ContactConfig = dataclasses.field(default_factory=ContactConfig)
     quality: QualityConfig = dataclasses.field(default_factory=QualityConfig)
@@ -86,18 +89,20 @@ class Extractor:
             reasons.append("shear_mm: needs depth_mm, from which the pressure is told")
         return tuple(reasons)
 
-    def read(self, picture: np.ndarray, gap: bool = False) -> Fields:
+    def read(self, picture: np.ndarray, *, gap: bool = False, apart: bool = False) -> Fields:
         """Fields of one picture, uint8 [H, W, 3] RGB, as `Fields` of one frame.
 
         Args:
           picture: of the same crop as the background.
-          gap: whether frames are missing before it.
+          gap: whether frames are missing before it: flagged `TIME_GAP`, and markers are looked for anywhere.
+          apart: whether nothing says that it follows the picture before, as with stills: markers are looked for
+            anywhere, with no flag.
         """
         depth, contacts = self._touched(picture)
         found: dict[str, np.ndarray] = {} if depth is None else {"depth_mm": depth}
-        flags = self._flags(picture, contacts)
+        flags = self._flags(picture, contacts) | (Flag.TIME_GAP if gap else Flag.NONE)
         if self._deformation is not None:
-            moved = self._deformation.read(picture, gap)
+            moved = self._deformation.read(picture, gap or apart)
             flags |= moved.flags
             found["deformation_mm"] = moved.displacement_mm
             if self._shear is not None and depth is not None:
@@ -110,11 +115,26 @@ class Extractor:
             **{name: array[None].astype(np.float32) for name, array in found.items()},
         )
 
-    def extract(self, frames: np.ndarray) -> Fields:
-        """Fields of N pictures, uint8 [N, H, W, 3] RGB, in the order of time."""
+    def extract(self, frames: np.ndarray, host_time_ns: np.ndarray | None = None) -> Fields:
+        """Fields of N pictures.
+
+        Args:
+          frames: uint8 [N, H, W, 3] RGB, in the order of time.
+          host_time_ns: int64 [N], from which gaps are told; `None` for stills, of which none follows another.
+
+        Raises:
+          ValueError: no picture, or another number of times.
+        """
         if frames.ndim != 4 or not len(frames):
             raise ValueError(f"frames have shape {list(frames.shape)}: must be [N, H, W, 3] with N ≥ 1; stack them")
-        return joined([self.read(frame) for frame in frames])
+        if host_time_ns is None:
+            return joined([self.read(frame, apart=True) for frame in frames])
+        if len(host_time_ns) != len(frames):
+            raise ValueError(
+                f"host_time_ns has {len(host_time_ns)} times: must have {len(frames)}, one a frame; cut it"
+            )
+        late = time_gap(host_time_ns, self.config.quality).tolist()
+        return joined([self.read(frame, gap=gap) for frame, gap in zip(frames, late, strict=True)])
 
     def _touched(self, picture: np.ndarray) -> tuple[np.ndarray | None, Contacts]:
         """Depth where there is a calibration, and contacts by depth, else by colour."""
@@ -172,7 +192,8 @@ class Extractor:
         coarse = cv2.resize(depth, (width, height), interpolation=cv2.INTER_AREA)
         touching = cv2.resize(contacts.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
         found = self._shear.read(moved, coarse, valid, touching)
-        return {"shear_mm": found.shear_mm, "traction_mpa": found.traction_mpa, "force_n": found.force_n}
+        shear = found.shear_mm if self.config.shear == "modelled" else found.subtracted_mm
+        return {"shear_mm": shear, "traction_mpa": found.traction_mpa, "force_n": found.force_n}
 
 
 def joined(parts: list[Fields]) -> Fields:

@@ -50,6 +50,24 @@ def decompose(displacement: np.ndarray, pitch: tuple[float, float]) -> Hodge:
     return Hodge(gradient=gradient, rotation=rotation, harmonic=displacement - gradient - rotation)
 
 
+def shear_matrix(shape: tuple[int, int], pitch: tuple[float, float]) -> np.ndarray:
+    """`Hodge.shear` as one matrix: displacements (u_x, u_y) of all nodes → what of them has no divergence.
+
+    Args:
+      shape: rows and columns.
+      pitch: of the nodes along x and y.
+
+    Returns:
+      float64 [2 h w, 2 h w].
+    """
+    size = 2 * shape[0] * shape[1]
+    matrix = np.empty((size, size))
+    for column, unit in enumerate(np.eye(size)):
+        shear = decompose(np.moveaxis(unit.reshape(2, *shape), 0, -1), pitch).shear
+        matrix[:, column] = np.moveaxis(shear, -1, 0).ravel()
+    return matrix
+
+
 def _convolved(source: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
     """∫ ln|r − r'| / 2π source dr' on the nodes, zero-padded."""
     rows, columns = source.shape

@@ -12,6 +12,10 @@ whose penalty K says that loads of neighbouring nodes are alike over a length �
 
 Nothing acts where nothing touches, and that is what the linear solution lacks: it spreads the load over the window.
 
+What pressure makes along the surface of any even layer is a gradient, so with `gradient_free` u and C lose their
+gradients first (`helmholtz.shear_matrix`).  Pressure is then told by the depth and traction by the rest: thickness and
+Poisson ratio, wrong by a third or by .03, no longer turn into traction that is not there.
+
 Sources: Golub, Heath & Wahba, Technometrics 21, 215, 1979 (cross-validation); Wahba 1990, ch. 1 (penalty as covariance,
 Matérn's of order 3/2).  Departure from Tikhonov in wave numbers, which is the usual way: the window is finite here, and
 its border is where that fails.
@@ -23,6 +27,7 @@ import numpy as np
 from scipy import linalg
 
 from sensors_io.fields.compliance import COMPONENTS, NodeGrid, compliance_matrix
+from sensors_io.fields.helmholtz import shear_matrix
 from sensors_io.scenes.layer import Layer
 
 _WEIGHTS = np.geomspace(1e-7, 1e3, 50)  # α over the largest squared singular value: from none to all of the signal
@@ -38,11 +43,13 @@ class InverseConfig:
     Args:
       lateral_noise_mm, depth_noise_mm: of the displacements; only their ratio counts, α takes their size.
       smooth_mm: ℓ; 0 for loads that know nothing of each other.
+      gradient_free: whether the lateral displacement is read without its gradient part.
     """
 
     lateral_noise_mm: float = 0.01
     depth_noise_mm: float = 0.02
     smooth_mm: float = 2.0
+    gradient_free: bool = True
 
     def __post_init__(self) -> None:
         for name in ("lateral_noise_mm", "depth_noise_mm"):
@@ -88,6 +95,9 @@ class LayerInverse:
         self._noise = np.repeat(noise, self._nodes)
         compliance = compliance_matrix(layer, grid)
         self._lateral = compliance[: 2 * self._nodes].astype(np.float32)
+        self._seen = shear_matrix(grid.shape, grid.pitch_mm) if config.gradient_free else None
+        if self._seen is not None:
+            compliance = np.concatenate([self._seen @ compliance[: 2 * self._nodes], compliance[2 * self._nodes :]])
         self._whitened = compliance / self._noise[:, None]
         self._gram = self._whitened.T @ self._whitened
         self._penalty = _covariance(grid, config.smooth_mm)
@@ -178,10 +188,12 @@ class LayerInverse:
                 f"displacement_mm is {list(displacement_mm.shape)} and depth_mm {list(depth_mm.shape)}: must be "
                 f"{[*shape, 2]} and {list(shape)}; resample them to the grid of the inverse"
             )
-        observed = np.concatenate([displacement_mm[..., 0].ravel(), displacement_mm[..., 1].ravel(), depth_mm.ravel()])
-        if not np.all(np.isfinite(observed)):
+        lateral = np.concatenate([displacement_mm[..., 0].ravel(), displacement_mm[..., 1].ravel()])
+        if not (np.all(np.isfinite(lateral)) and np.all(np.isfinite(depth_mm))):
             raise ValueError("displacement_mm or depth_mm holds a NaN: must be finite; fill unread nodes first")
-        return observed / self._noise
+        if self._seen is not None:
+            lateral = self._seen @ lateral
+        return np.concatenate([lateral, depth_mm.ravel()]) / self._noise
 
     def _fields(self, flat: np.ndarray) -> np.ndarray:
         return np.moveaxis(flat.reshape(-1, *self._grid.shape), 0, -1)

@@ -22,17 +22,20 @@ _WEIGHT_SHARE = 0.7  # standard deviation of the window's weight over its half s
 _ITERATIONS = 3  # from a start within a tenth of a pixel; the third changes it by 0.003 px
 _MOTION, _LIGHT = 6, 4  # unknowns: (d₀, A) and (a, b, g)
 _LARGEST_STEP_PX = 2.0  # a step past it is a window that slipped off its dot
+_NOISE_LEFT = 1 / (4 * np.pi * _BLUR_PX**2)  # of the variance of white noise, after the blur
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Found:
     """Where P windows lie in a picture.
 
-    `points_px` [P, 2]; `likeness` [P]: correlation of window and reference after the fit, in −1..1.
+    `points_px` [P, 2]; `likeness` ρ [P]: correlation of window and reference after the fit, in −1..1; `spread_px` [P]:
+    standard deviation of the point that the noise in its window makes, infinite where ρ ≤ 0.
     """
 
     points_px: np.ndarray
     likeness: np.ndarray
+    spread_px: np.ndarray
 
 
 class Patches:
@@ -63,6 +66,7 @@ class Patches:
         solve = np.linalg.pinv(normal, rcond=1e-9, hermitian=True) @ weighted.transpose(0, 2, 1)
         self._to_motion = np.ascontiguousarray(solve[:, :_MOTION], np.float32)
         self._weight = (weight / weight.sum()).astype(np.float32)
+        self._spread = self._spread_per_noise(normal)
 
     def __len__(self) -> int:
         return len(self._centre)
@@ -82,7 +86,12 @@ class Patches:
             step = (self._to_motion @ error[:, :, None])[:, :, 0]
             at, affine = _compose(at, affine, step)
         likeness = self._likeness(self._sample(smooth, at, affine))
-        return Found(points_px=at + (affine @ self._offset[:, :, None])[:, :, 0], likeness=likeness)
+        noise = np.sqrt(np.maximum(1 / np.maximum(likeness, 1e-6) ** 2 - 1, 0))
+        return Found(
+            points_px=at + (affine @ self._offset[:, :, None])[:, :, 0],
+            likeness=likeness,
+            spread_px=np.where(likeness > 0, noise * self._spread, np.inf),
+        )
 
     def _check(self, shape: tuple[int, ...], half_px: int) -> None:
         low, high = self._centre.min(0) - half_px, self._centre.max(0) + half_px
@@ -91,6 +100,20 @@ class Patches:
                 f"points_px reach from {self._centre.min(0)} to {self._centre.max(0)}: windows of {half_px} px around "
                 f"them must lie inside the picture of {shape[1]} × {shape[0]}; drop the points at the border"
             )
+
+    def _spread_per_noise(self, normal: np.ndarray) -> np.ndarray:
+        """Standard deviation of d₀, pixels, when noise of the window's own contrast lies in the blurred picture [P].
+
+            σ_d = σ √(tr (N⁻¹)_dd / left),   σ² = s² (1/ρ² − 1)
+
+        N is the normal matrix, s the contrast of the reference window; the blur leaves a share of the noise's variance
+        and makes neighbours alike, so that the fit sees the noise of the unblurred picture.
+        """
+        covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+        contrast = self._template - (self._template @ self._weight)[:, None]
+        variance = (contrast**2) @ self._weight
+        spread: np.ndarray = np.sqrt(variance * np.trace(covariance[:, :2, :2], axis1=1, axis2=2) / _NOISE_LEFT)
+        return spread
 
     def _cut(self, picture: np.ndarray) -> np.ndarray:
         """The reference windows [P, K], without interpolation."""

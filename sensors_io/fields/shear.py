@@ -2,6 +2,10 @@
 
 Shear is the lateral displacement that traction along the surface makes.  What the camera sees is more: pressing alone
 spreads the gel, and carries its markers towards the lens, which magnifies the picture.
+
+It is taken as the response of an even layer to the traction that explains the picture best, not as the deformation less
+the pressure's part: that keeps the noise of every node.  A layer taken too thick or too stiff in volume cannot be
+told from what is left unexplained, since some traction always explains it; see `inversion` for what guards against it.
 """
 
 import dataclasses
@@ -19,15 +23,15 @@ class ShearAndForce:
     """One frame on the node grid.
 
     Args:
-      shear_mm: deformation less what the pressure makes [h, w, 2]; it keeps the noise of the deformation.
-      modelled_mm: what the traction makes by the layer's compliance [h, w, 2], without that noise.
+      shear_mm: what the traction makes by the layer's compliance [h, w, 2].
+      subtracted_mm: deformation less what the pressure makes [h, w, 2]; it keeps the noise of the deformation.
       traction_mpa: on the gel along x, y, z [h, w, 3]; pressing is z < 0.
       force_n: its total [3].
       moment_nmm: about the centre of the window [3].
     """
 
     shear_mm: np.ndarray
-    modelled_mm: np.ndarray
+    subtracted_mm: np.ndarray
     traction_mpa: np.ndarray
     force_n: np.ndarray
     moment_nmm: np.ndarray
@@ -85,8 +89,8 @@ class ShearReader:
             deformation_mm = deformation_mm - depth_mm[..., None] / self._camera_mm * self._place_mm
         load = self._inverse.contact(deformation_mm, depth_mm, touching)
         return ShearAndForce(
-            shear_mm=(deformation_mm - load.by_pressure_mm).astype(np.float32),
-            modelled_mm=load.by_traction_mm,
+            shear_mm=load.by_traction_mm,
+            subtracted_mm=(deformation_mm - load.by_pressure_mm).astype(np.float32),
             traction_mpa=load.traction_mpa,
             force_n=total_force(load.traction_mpa, self._grid.pitch_mm),
             moment_nmm=total_moment(load.traction_mpa, self._grid.pitch_mm),

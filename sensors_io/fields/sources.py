@@ -4,13 +4,15 @@ import dataclasses
 import pathlib
 from collections.abc import Iterator, Sequence
 
-import cv2
 import numpy as np
 
+from sensors_io.importers import pictures
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from sensors_io.index import INDEX
+from sensors_io.quality import QualityConfig, time_gap
 from sensors_io.records import RecordStore
+from sensors_io.schema import Flag
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv"})
@@ -22,10 +24,37 @@ class SourceError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """Pictures of one source, uint8 [N, H, W, 3] RGB, and the name of each."""
+    """N pictures, one after the other.
+
+    Args:
+      frames: uint8 [N, H, W, 3] RGB.
+      names: of each.
+      gap: bool [N], where time is known to be missing before a picture.
+      apart: bool [N], where nothing says that a picture follows the one before: stills, and the first of a sequence.
+    """
 
     frames: np.ndarray
     names: tuple[str, ...]
+    gap: np.ndarray
+    apart: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def chosen(self, index: np.ndarray) -> "Pictures":
+        """Some of the pictures."""
+        names = tuple(self.names[i] for i in index)
+        return Pictures(frames=self.frames[index], names=names, gap=self.gap[index], apart=self.apart[index])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Shot:
+    """One picture, uint8 [H, W, 3], its name and what is known of the time before it, as in `Pictures`."""
+
+    name: str
+    frame: np.ndarray
+    gap: bool = False
+    apart: bool = False
 
 
 def read_picture(path: pathlib.Path) -> np.ndarray:
@@ -34,10 +63,10 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
     Raises:
       SourceError: it is no picture, or cut off.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise SourceError(f"{path} cannot be read as a picture: it is missing, damaged or of another kind; replace it")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    try:
+        return pictures.read_picture(path)
+    except pictures.PictureError as error:
+        raise SourceError(f"{path} {error}: must be a whole picture; replace it") from error
 
 
 def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> Pictures:
@@ -50,17 +79,22 @@ def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> Pictures:
     Raises:
       SourceError: a path without pictures, or pictures of different sizes.
     """
-    named = [pair for path in inputs for pair in _read(path, sensor)]
-    if not named:
+    shots = [shot for path in inputs for shot in _read(path, sensor)]
+    if not shots:
         raise SourceError("inputs are empty: at least one path is needed; name a picture, folder, video or records")
-    shapes = {image.shape: name for name, image in reversed(named)}
+    shapes = {shot.frame.shape: shot.name for shot in reversed(shots)}
     if len(shapes) > 1:
         sizes = "; ".join(f"{name} is {shape[1]} × {shape[0]}" for shape, name in shapes.items())
         raise SourceError(f"pictures have different sizes ({sizes}): must be equal; extract them apart")
-    return Pictures(frames=np.stack([image for _, image in named]), names=tuple(name for name, _ in named))
+    return Pictures(
+        frames=np.stack([shot.frame for shot in shots]),
+        names=tuple(shot.name for shot in shots),
+        gap=np.array([shot.gap for shot in shots]),
+        apart=np.array([shot.apart for shot in shots]),
+    )
 
 
-def _read(path: pathlib.Path, sensor: str) -> Iterator[tuple[str, np.ndarray]]:
+def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
     if (path / INDEX).exists():
         yield from _records(path, sensor)
     elif path.is_dir():
@@ -68,26 +102,29 @@ def _read(path: pathlib.Path, sensor: str) -> Iterator[tuple[str, np.ndarray]]:
         if not files:
             kinds = ", ".join(sorted(PICTURES))
             raise SourceError(f"{path} holds no picture ({kinds}): name a folder that does")
-        yield from ((str(file.relative_to(path)), read_picture(file)) for file in files)
+        yield from (_Shot(name=str(f.relative_to(path)), frame=read_picture(f), apart=True) for f in files)
     elif path.suffix.lower() in VIDEOS:
         try:
             video = read_video(path, Keep(height=0, stride=1, max_frames=0))
         except VideoError as error:
             raise SourceError(f"{path} {error}; convert or replace it") from error
-        yield from ((f"{path.name}#{i}", frame) for i, frame in zip(video.index, video.frames, strict=True))
+        for i, frame in zip(video.index, video.frames, strict=True):
+            yield _Shot(name=f"{path.name}#{i}", frame=frame, apart=bool(i == 0))
     else:
-        yield path.name, read_picture(path)
+        yield _Shot(name=path.name, frame=read_picture(path), apart=True)
 
 
-def _records(path: pathlib.Path, sensor: str) -> Iterator[tuple[str, np.ndarray]]:
-    """Camera frames of one sensor, contact by contact."""
+def _records(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
+    """Camera frames of one sensor, contact by contact; gaps by their flags and their times."""
     store, found = RecordStore(path, allow_incomplete=True), False
     for i in range(len(store)):
         if sensor in store.sensors_of(i):
             sequence = store.contact(i, fields=False)[sensor]
             if sequence.frames is not None:
                 found = True
-                yield from ((f"{sequence.name}#{n}", frame) for n, frame in enumerate(sequence.frames))
+                late = time_gap(sequence.host_time_ns, QualityConfig()) | (sequence.flags & Flag.TIME_GAP).astype(bool)
+                for n, (frame, gap) in enumerate(zip(sequence.frames, late.tolist(), strict=True)):
+                    yield _Shot(name=f"{sequence.name}#{n}", frame=frame, gap=gap, apart=n == 0)
     if not found:
         raise SourceError(f"{path} holds no camera frames of {sensor}: name another sensor or other records")
 

@@ -4,6 +4,9 @@
 
 A calibration, not a law: it holds for contacts like those it was fitted to.  So `fit` says how well it predicts whole
 blocks of time that it has not seen, λ chosen without them.
+
+Force and displacement must be of one time: bring the force to the frames first (`sensors_io.force.estimate_lag` and
+`at_frames`).  On a Tac3D recording whose force comes one frame late, that halves the error.
 """
 
 import dataclasses

@@ -2,7 +2,8 @@
 
 One frame goes through five steps:
 
-    1. Lucas–Kanade from the picture at rest, started where the points were last seen
+    1. Lucas–Kanade from the picture at rest, started where the points were last seen; a picture of another exposure
+       is brought to that of the one at rest first
     2. where the points tear the gel, or frames are missing: a new start from dense flow (DIS), and from the largest
        piece that hangs together outward, ring by ring, each ring started where the spline of the piece puts it
     3. the affine fit of `patches`, which takes strain and light into account
@@ -31,6 +32,8 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # the affin
 _BACK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 5, 0.03)
 _PIECES = 3  # that are tried as the one that is right
 _RINGS = 12  # that grow around a piece at most
+_SAMPLED_PX = 4  # of which exposure is told: every so many along both axes
+_LIGHT_OF_CONTACT = 0.1  # relative change of the median that a contact's own shading may make
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,6 +43,7 @@ class TrackingConfig:
     Args:
       back_px: greatest distance from where a point started, after going forth and back.
       likeness: least correlation of a window with itself at rest.
+      spread_px: greatest standard deviation of a point that noise may make; at twice as much it may be a pixel off.
       strain: greatest difference of two neighbours' displacements over their distance; a gel's own stays below 0.4, a
         mistaken dot beside a right one makes 0.6 and more.
       safe_strain: the same, below which a piece is taken for right, to grow from.
@@ -50,6 +54,7 @@ class TrackingConfig:
 
     back_px: float = 1.0
     likeness: float = 0.7
+    spread_px: float = 0.5
     strain: float = 0.5
     safe_strain: float = 0.2
     surprise: float = 0.2
@@ -57,7 +62,7 @@ class TrackingConfig:
     affine: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("back_px", "likeness", "strain", "safe_strain", "surprise", "reseed_share"):
+        for name in ("back_px", "likeness", "spread_px", "strain", "safe_strain", "surprise", "reseed_share"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; raise it")
 
@@ -99,6 +104,7 @@ class Tracker:
         self._patches = Patches(reference, self._start, half_px)
         self._neighbours = Neighbours(self._start)
         self._reference = np.ascontiguousarray(reference)
+        self._brightness = _brightness(reference)
         self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._last = self._start
 
@@ -121,6 +127,7 @@ class Tracker:
           ValueError: a picture of another shape or type.
         """
         self._check(picture)
+        picture = self._exposed_alike(picture)
         points, found = self._forth(picture, self._last)
         reseeded = gap or self._failed(points, found)
         if reseeded:
@@ -129,11 +136,19 @@ class Tracker:
         self._last = self._completed(points, found)
         return Tracked(points_px=self._last, found=found, reseeded=reseeded)
 
+    def _exposed_alike(self, picture: np.ndarray) -> np.ndarray:
+        """The picture as bright as the reference, where its median says that its exposure differs."""
+        gain = self._brightness / max(_brightness(picture), 1.0)
+        if abs(gain - 1) <= _LIGHT_OF_CONTACT:
+            return picture
+        return cv2.LUT(picture, np.clip(np.round(gain * np.arange(256)), 0, 255).astype(np.uint8))
+
     def _gated(self, picture: np.ndarray, points: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Steps 3 and 4."""
         if self._config.affine:
             fit = self._patches.find(picture, points)
-            points, found = fit.points_px, found & (fit.likeness >= self._config.likeness)
+            sure = (fit.likeness >= self._config.likeness) & (fit.spread_px <= self._config.spread_px)
+            points, found = fit.points_px, found & sure
         back, returned = self._lucas_kanade(picture, self._reference, points, self._start, 0, _BACK_STOP)
         found = found & returned & (np.hypot(*(back - self._start).T) <= self._config.back_px)
         return points, self._consistent(points, found)
@@ -224,3 +239,8 @@ class Tracker:
                 f"picture is {picture.dtype}{list(picture.shape)}: must be uint8{list(self._reference.shape)} as the "
                 "reference; convert it to grey and crop it likewise"
             )
+
+
+def _brightness(picture: np.ndarray) -> float:
+    """Median grey level, which a contact hardly moves."""
+    return float(np.median(picture[::_SAMPLED_PX, ::_SAMPLED_PX]))

@@ -4,9 +4,10 @@
     DIR/<...>/<indenter>/tactile/<ms>.png  the pictures that it names, by their Unix time in ms
 
 FT is "Fx Fy Fz Tx Ty Tz" in N and N·m, or empty where nothing was read.  A row without a full reading is reported; its
-picture, where there is one, is kept with a force of 0 and flagged `INCOMPLETE`.  Pictures are found where the table
-says, or by their name in DIR/tactile.  The depth maps are the vendor network's and are not imported, nor are the
-torques: they are about the force sensor's origin, whose place is not published.
+picture, where there is one, is kept with a force of 0 and flagged `INCOMPLETE`; a row that names no picture either is
+left out as incomplete.  Pictures are found where the table says, or by their name in DIR/tactile.  The depth maps are
+the vendor network's and are not imported, nor are the torques: they are about the force sensor's origin, whose place is
+not published.
 
 What the files do not say is the sign of pressing.  `pressing="infer"` takes it from the reading of the largest |Fz|,
 because a gel can be pushed hard and hardly pulled; where no |Fz| of a table reaches `LEAST_PUSH_N` nothing was pressed
@@ -34,6 +35,7 @@ from sensors_io.schema import ContactKey, Flag
 SENSOR = "gelsight_mini"
 COLUMNS = ("tactile", "FT")
 NO_FORCE = "has no six readings"
+NO_ROW = "incomplete row: names no picture and has no reading"
 LEAST_PUSH_N = 1.0
 """Below it drift and noise may have either sign: 0.15 N in a recording that shows no contact."""
 
@@ -114,6 +116,9 @@ def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Row],
     for table in tables:
         for line, cells in enumerate(read_table(table, COLUMNS), start=2):
             name = pathlib.PurePosixPath(cells["tactile"])
+            if not cells["tactile"].strip() and _force(cells["FT"]) is None:
+                skipped.append(Skip(name=f"{table.name}, line {line}", reason=NO_ROW))
+                continue
             if not name.stem.isdigit() or len(name.parts) < 3 or ".." in name.parts:
                 reason = "names no <indenter>/tactile/<ms>.png"
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=reason))

@@ -1,4 +1,7 @@
-"""From the journal of one contact to the sequence that is stored."""
+"""From the journal of one contact to the sequences that are stored, one per sensor.
+
+All their times are on one clock: that of the host, less what each sensor is known to be stamped late by.
+"""
 
 import dataclasses
 import pathlib
@@ -19,94 +22,169 @@ _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "targ
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """What a journal held: the sequence, whether the contact was complete, bytes of an entry that was cut off."""
+    """What a journal held.
 
-    sequence: Sequence
+    Args:
+      sequences: one of each sensor that gave a frame, in the order of the session.
+      backgrounds: the gel at rest before the contact, or else after it, uint8 [H, W, 3] by sensor.
+      complete: whether the contact was.
+      torn_bytes: of an entry that was cut off.
+    """
+
+    sequences: tuple[Sequence, ...]
+    backgrounds: Mapping[str, np.ndarray]
     complete: bool
     torn_bytes: int
 
 
-def assemble(path: pathlib.Path, *, trial: int | None = None) -> Assembled | None:
-    """The sequence of a journal, also of one whose process was killed; `None` if it holds no frame.
-
-    Args:
-      path: of the journal.
-      trial: replaces the one that the journal was begun for.
+def assemble(path: pathlib.Path) -> Assembled | None:
+    """The sequences of a journal, also of one whose process was killed; `None` if it holds no frame.
 
     Raises:
-      JournalError: a damaged journal, or one that does not begin with a contact.
+      JournalError: a damaged journal, one that does not begin with a contact, or one of an earlier version.
     """
     entries, torn = read_journal(path)
-    if not entries or entries[0].kind != "start":
-        if torn or not entries:
-            return None  # killed in its very first entry
+    if not entries:
+        return None  # killed before or in its very first entry
+    if entries[0].kind != "start":
         raise JournalError(f"{path} begins with {entries[0].kind!r}: must be 'start'; it is no contact's journal")
-    frames = [e for e in entries if e.kind == "frame"]
-    if not frames:
+    start = entries[0].plain
+    if "streams" not in start:
+        raise JournalError(f"{path} was written by an earlier version: bring it in with that one, or move it away")
+    ends = [e for e in entries if e.kind == "end"]
+    end = ends[0].plain if ends else None
+    frames = [
+        [e for e in entries if e.kind == "frame" and e.plain["stream"] == i] for i in range(len(start["streams"]))
+    ]
+    if not any(frames):
         return None
-    ends = [e.plain for e in entries if e.kind == "end"]
-    sequence = _sequence(entries[0].plain, entries, frames, ends[0] if ends else None, trial)
-    return Assembled(sequence=sequence, complete=bool(ends and ends[0]["complete"]), torn_bytes=torn)
-
-
-def _sequence(
-    start: Mapping[str, Any], entries: Seq[Entry], frames: Seq[Entry], end: Mapping[str, Any] | None, trial: int | None
-) -> Sequence:
-    time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
-    own = {
-        n: np.stack([e.arrays[n] for e in frames])
-        for n in frames[0].arrays
-        if n in FRAME_ARRAYS and n not in _MADE_HERE
-    }
-    own = {name: a.astype(FRAME_ARRAYS[name].dtype) for name, a in own.items()}
-    gaps = _gaps(time_ns, [e.plain["index"] for e in frames], start["identity"]["period_s"])
-    measured, uncovered, residual_n = _measured(entries, time_ns, start)
-    flags = np.where(gaps | uncovered, np.uint32(Flag.TIME_GAP), np.uint32(0))
-    device = [e.plain["device_time_ns"] for e in frames]
-    pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
-    session = {
-        "end": end,
-        "torn": end is None,
-        "force_residual_n": residual_n,
-        "lag_s": start["lag_s"],
-        "reader": start["reader"],
-    }
-    arrays: dict[str, Any] = own | measured
-    key = dict(start["key"]) | ({} if trial is None else {"trial": trial})
-    return Sequence(
-        key=ContactKey(**key),
-        sensor=start["identity"]["sensor"],
-        serial=start["identity"]["serial"],
-        camera={"settings": start["identity"]["settings"], "recording": session},
-        mm_per_px=start["mm_per_px"],
-        frames=np.stack(pictures) if len(pictures) == len(frames) else None,
-        host_time_ns=time_ns,
-        device_time_ns=None if None in device else np.array(device, np.int64),
-        target_force_n=np.full(len(frames), start["target_n"], np.float32),
-        phase=_phases(entries, time_ns),
-        flags=flags,
-        **arrays,
+    backgrounds = _backgrounds(start, [entries[0], *ends])
+    shared = _Shared(
+        start=start,
+        end=end,
+        entries=entries,
+        backgrounds=backgrounds,
+        absent=tuple(s["identity"]["sensor"] for s, f in zip(start["streams"], frames, strict=True) if not f),
+    )
+    return Assembled(
+        sequences=tuple(shared.sequence(i, own) for i, own in enumerate(frames) if own),
+        backgrounds=backgrounds,
+        complete=bool(end and end["complete"]),
+        torn_bytes=torn,
     )
 
 
-def _measured(
-    entries: Seq[Entry], time_ns: np.ndarray, start: Mapping[str, Any]
-) -> tuple[dict[str, np.ndarray], np.ndarray, float | None]:
-    """Force and moment at the frames, which frames they do not cover, and the largest residual of interpolation."""
-    batches = [e.arrays for e in entries if e.kind == "force"]
-    if not batches:
-        return {}, np.zeros(len(time_ns), bool), None
-    time, force, moment = (np.concatenate([b[name] for b in batches]) for name in ("time_ns", "force_n", "moment_nmm"))
-    order = np.flatnonzero(np.diff(time, prepend=time[0] - 1) > 0)
-    try:
-        found = at_frames(
-            time_ns, time[order], np.concatenate([force, moment], -1)[order].astype(np.float64), lag_s=start["lag_s"]
+def background_name(key: ContactKey, sensor: str) -> pathlib.Path:
+    """Where the picture of the gel at rest lies, beside the records."""
+    return pathlib.Path("backgrounds", f"{key.object_id}-{key.site}-{key.motion}-{key.trial}-{sensor}.png")
+
+
+def _backgrounds(start: Mapping[str, Any], entries: Seq[Entry]) -> dict[str, np.ndarray]:
+    """The first picture that the entries hold of each stream."""
+    found: dict[str, np.ndarray] = {}
+    for i, stream in enumerate(start["streams"]):
+        pictures = [e.arrays[f"background_{i}"] for e in entries if f"background_{i}" in e.arrays]
+        if pictures:
+            found[stream["identity"]["sensor"]] = pictures[0]
+    return found
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Shared:
+    """What all streams of a contact have in common."""
+
+    start: Mapping[str, Any]
+    end: Mapping[str, Any] | None
+    entries: Seq[Entry]
+    backgrounds: Mapping[str, np.ndarray]
+    absent: tuple[str, ...]
+
+    def sequence(self, number: int, frames: Seq[Entry]) -> Sequence:
+        """That of one stream."""
+        start, stream = self.start, self.start["streams"][number]
+        identity, key = stream["identity"], ContactKey(**start["key"])
+        time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
+        own = _own_arrays(frames)
+        gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
+        force = _Force.at(time_ns, self.entries if number == 0 else ())
+        flags = np.where(gaps | force.uncovered, np.uint32(Flag.TIME_GAP), np.uint32(0))
+        flags |= np.where(force.out_of_range, np.uint32(Flag.INCOMPLETE), np.uint32(0))
+        device = [e.plain["device_time_ns"] for e in frames]
+        pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
+        arrays: dict[str, Any] = {**own, **force.arrays}
+        region = start["contact_region_px"]
+        return Sequence(
+            key=key,
+            sensor=identity["sensor"],
+            serial=identity["serial"],
+            camera={"settings": identity["settings"], "recording": self._recording(stream, key, force.residual_n)},
+            contact_region_px=None if region is None else tuple(region),
+            mm_per_px=identity["mm_per_px"],
+            frames=np.stack(pictures) if len(pictures) == len(frames) else None,
+            host_time_ns=time_ns,
+            device_time_ns=None if None in device else np.array(device, np.int64),
+            target_force_n=np.full(len(frames), start["target_n"], np.float32),
+            phase=_phases(self.entries, time_ns),
+            flags=flags,
+            **arrays,
         )
-    except ForceError:
-        return {}, np.ones(len(time_ns), bool), None  # killed before three readings: no force, and every frame says so
-    values = found.value.astype(np.float32)
-    measured = {"force_n": values[:, :3], "moment_nmm": values[:, 3:], "force_time_ns": found.time_ns}
-    return measured, ~found.covered, float(found.residual.max())
+
+    def _recording(self, stream: Mapping[str, Any], key: ContactKey, residual_n: float | None) -> dict[str, Any]:
+        """How it was recorded, as JSON."""
+        sensor = stream["identity"]["sensor"]
+        together = [s["identity"]["sensor"] for s in self.start["streams"]]
+        return {
+            "end": self.end,
+            "torn": self.end is None,
+            "sensors": together,
+            "absent": list(self.absent),
+            "force_sensor": self.start["force_sensor"],
+            "force_residual_n": residual_n,
+            "late_s": stream["late_s"],
+            "reader": stream["reader"],
+            "drift": stream["drift"],
+            "background": background_name(key, sensor).as_posix() if sensor in self.backgrounds else None,
+        }
+
+
+def _own_arrays(frames: Seq[Entry]) -> dict[str, np.ndarray]:
+    """What the sensor itself tells beside pictures, stacked."""
+    names = [n for n in frames[0].arrays if n in FRAME_ARRAYS and n not in _MADE_HERE]
+    return {n: np.stack([e.arrays[n] for e in frames]).astype(FRAME_ARRAYS[n].dtype) for n in names}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Force:
+    """Readings of the force sensor at the frames; no array where there is none."""
+
+    arrays: Mapping[str, np.ndarray]
+    uncovered: np.ndarray
+    out_of_range: np.ndarray
+    residual_n: float | None
+
+    @classmethod
+    def at(cls, time_ns: np.ndarray, entries: Seq[Entry]) -> "_Force":
+        """Force and moment, frames that no reading covers or a reading out of range, the residual of interpolation."""
+        batches = [e.arrays for e in entries if e.kind == "force"]
+        nowhere = np.zeros(len(time_ns), bool)
+        if not batches:
+            return cls(arrays={}, uncovered=nowhere, out_of_range=nowhere, residual_n=None)
+        time, force, moment, beyond = (
+            np.concatenate([b[name] for b in batches]) for name in ("time_ns", "force_n", "moment_nmm", "out_of_range")
+        )
+        order = np.flatnonzero(np.diff(time, prepend=time[0] - 1) > 0)
+        try:
+            found = at_frames(time_ns, time[order], np.concatenate([force, moment], -1)[order].astype(np.float64))
+        except ForceError:  # killed before three readings: no force, and every frame says so
+            return cls(arrays={}, uncovered=~nowhere, out_of_range=nowhere, residual_n=None)
+        after = np.clip(np.searchsorted(time[order], time_ns), 1, len(order) - 1)
+        values = found.value.astype(np.float32)
+        return cls(
+            arrays={"force_n": values[:, :3], "moment_nmm": values[:, 3:], "force_time_ns": found.time_ns},
+            uncovered=~found.covered,
+            out_of_range=beyond[order][after] | beyond[order][after - 1],
+            residual_n=float(found.residual.max()),
+        )
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:

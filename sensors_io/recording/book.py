@@ -4,7 +4,10 @@ import dataclasses
 import pathlib
 from typing import Any
 
-from sensors_io.recording.assemble import assemble
+import cv2
+import numpy as np
+
+from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import Stage
 from sensors_io.records import RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard
@@ -13,6 +16,21 @@ ATTEMPTS = 16
 """Of one contact: trial = level · ATTEMPTS + attempt."""
 
 _PER_SHARD = 19  # contacts: those of one site by protocol
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObjectView:
+    """What an RGB-D camera saw of the object before the first contact.
+
+    Args:
+      picture: uint8 [Hv, Wv, 3] RGB.
+      depth_mm: float32 [Hv, Wv], 0 where the camera saw none; `None` without a depth camera.
+      region_px: (x, y, width, height) of the contact in it; `None` where unknown.
+    """
+
+    picture: np.ndarray
+    depth_mm: np.ndarray | None = None
+    region_px: tuple[int, int, int, int] | None = None
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -32,11 +50,16 @@ class Book:
         self._incomplete: list[list[Any]] = list(writer.notes.get("incomplete", []))
         self._unpublished: list[pathlib.Path] = []
 
-    def add_object(self, object_id: str) -> None:
-        if object_id not in self._writer.objects_done:
-            self._writer.write_object(
-                ObjectCard(object_id=object_id, split="unlabelled", labels={}, annotator="nobody yet")
-            )
+    def add_object(self, object_id: str, view: ObjectView | None = None) -> None:
+        """Store the card of an object that has none; a view is published at once, for no journal holds it."""
+        if object_id in self._writer.objects_done:
+            return
+        card = ObjectCard(object_id=object_id, split="unlabelled", labels={}, annotator="nobody yet")
+        if view is None:
+            self._writer.write_object(card)
+        else:
+            self._writer.write_object(dataclasses.replace(card, view=view.picture, view_depth_mm=view.depth_mm))
+            self._writer.publish()
 
     def recover(self) -> None:
         """Bring journals that a killed session left into the records."""
@@ -55,6 +78,7 @@ class Book:
         return None
 
     def path(self, key: ContactKey) -> pathlib.Path:
+        """The journal of a contact."""
         return self._journals / f"{key.object_id}-{key.site}-{key.motion}-{key.trial}.journal"
 
     def store(self, path: pathlib.Path) -> bool | None:
@@ -64,10 +88,12 @@ class Book:
             path.unlink()
             return None
         self._unpublished.append(path)
-        key = found.sequence.key
+        key = found.sequences[0].key
         if key not in self._writer:  # else it was published, and its journal not yet deleted
             self.add_object(key.object_id)
-            self._writer.write_contact([found.sequence])
+            for sensor, picture in found.backgrounds.items():
+                _write_picture(self._journals.parent / background_name(key, sensor), picture)
+            self._writer.write_contact(found.sequences)
             self._report.contacts += 1
             if not found.complete:
                 self._report.incomplete += 1
@@ -87,3 +113,12 @@ class Book:
 
 def _plain(key: ContactKey) -> list[Any]:
     return [key.object_id, key.site, key.motion, key.trial]
+
+
+def _write_picture(path: pathlib.Path, picture: np.ndarray) -> None:
+    """Write a PNG whole or not at all."""
+    path.parent.mkdir(exist_ok=True)
+    temporary = path.with_suffix(".tmp.png")
+    if not cv2.imwrite(str(temporary), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"{temporary} cannot be written: look whether the disk is full")
+    temporary.replace(path)

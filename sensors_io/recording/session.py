@@ -1,43 +1,33 @@
-"""A recording session: one object, its sites, one tactile sensor, one force sensor.
+"""A recording session: one object, its sites, one or more tactile sensors at once, one force sensor.
 
-Every contact goes into a journal of its own while it is recorded, and into the records when it is over.  A session that
-was stopped or killed is gone on with by starting it again: journals that lie there are brought into the records first,
-the contacts that are complete are not asked for again.
+Every contact goes into a journal of its own while it is recorded, and into the records when it is over: one sequence
+per sensor under one key, their times on one clock.  A session that was stopped or killed is gone on with by starting it
+again: journals that lie there are brought into the records first, the contacts that are complete are not asked for
+again.
 """
 
-import collections
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Seq
+from typing import Any
 
 import numpy as np
 
-from sensors_io.devices.background import Background, Drift
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import Sample
 from sensors_io.devices.errors import DeviceError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
-from sensors_io.recording.book import Book, Report
+from sensors_io.recording.book import Book, ObjectView, Report
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, FreeCoach, Phase, Stage, protocol
 from sensors_io.recording.journal import JournalWriter
+from sensors_io.recording.streams import Feed, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.schema import ContactKey
+from sensors_io.schema import ContactKey, SchemaError
 
 _JOURNALS = ".journals"
-_BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
-
-
-class Feed(Protocol):
-    """What a session reads from; `Reader` is one."""
-
-    @property
-    def identity(self) -> Identity: ...
-    @property
-    def counts(self) -> Counts: ...
-    def drain(self) -> list[Sample]: ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,9 +43,9 @@ class SessionConfig:
       coach: thresholds of force and time.
       gravity: bias and dead weight of the force sensor; `None` leaves readings as they are.
       down: unit vector of gravity in the force sensor's frame, [3].
-      mount: how the gel sits on the force sensor.
-      lag_s: of the frames behind the force, see `force.estimate_lag`.
-      mm_per_px: of the frames; `None` where unknown.
+      mount: how the gel of the first sensor sits on the force sensor.
+      late_s: by which stamps of a sensor lie behind those of the force sensor, by its name, see `taps.Offsets`; 0 for
+        those that are not named.
     """
 
     object_id: str
@@ -67,30 +57,36 @@ class SessionConfig:
     gravity: GravityModel | None = None
     down: np.ndarray = dataclasses.field(default_factory=lambda: np.array([0.0, 0.0, -1.0]))
     mount: Mount = dataclasses.field(default_factory=Mount)
-    lag_s: float = 0.0
-    mm_per_px: float | None = None
+    late_s: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Status:
-    """What a session shows while it goes on."""
+    """What a session shows while it goes on.
+
+    Args:
+      stage: contact under way.
+      advice: to the hand.
+      streams: the sensors, in their order.
+      force: where the readings of the force sensor went, `None` without one.
+      alarm: what is wrong now; empty if nothing is.
+    """
 
     stage: Stage
     advice: Advice
-    frames: int
-    tactile: Counts
+    streams: tuple[StreamStatus, ...]
     force: Counts | None
-    drift: Drift | None
-    newest: Sample | None
+    alarm: str = ""
 
 
 def record_session(
     out: pathlib.Path,
     config: SessionConfig,
-    tactile: Feed,
+    tactile: Seq[Feed],
     force: Feed | None,
     *,
     show: Callable[[Status], None],
+    view: ObjectView | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Report:
     """Record what is missing of a session; a second call goes on behind the first.
@@ -98,26 +94,27 @@ def record_session(
     Args:
       out: directory of the records.
       config: what is recorded.
-      tactile: an open sensor.
-      force: an open force sensor; `None` takes the force that the tactile sensor tells, or none in free motion.
+      tactile: open sensors of different names; the first one sits on the force sensor.
+      force: an open force sensor; `None` takes the force that a tactile sensor tells, or none in free motion.
       show: called after every look at the devices.
+      view: of the object, stored once with its card.
       stop: asked as often; True ends the session after bringing what was recorded into the records.
 
     Raises:
-      RecordsError: the records are another data set's, or are being written.
+      RecordsError: the records are another data set's, of other sensors, or are being written.
+      SchemaError: no sensor, or two of one name.
       ForceError: nothing tells the force that the protocol is led by.
       DeviceError: a device failed for good; what was recorded is in the records.
     """
-    sensor = tactile.identity.sensor
-    meta = RecordsMeta(source="recorded", licence=config.licence, config_hash="recorded-1", sensors=(sensor,))
-    journals = out / _JOURNALS
+    streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
     report = Report()
-    with RecordWriter(out, meta=meta, resume=True) as writer:
+    with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
+        journals = out / _JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
-        book.add_object(config.object_id)
+        book.add_object(config.object_id, view)
         book.recover()
-        session = _Session(config, tactile, force, show, stop, book)
+        session = _Session(config, streams, force, show, stop, book, None if view is None else view.region_px)
         try:
             for stage in _stages(config):
                 while not stop() and (key := book.wanted(config.object_id, config.site, stage)) is not None:
@@ -131,22 +128,35 @@ def _stages(config: SessionConfig) -> tuple[Stage, ...]:
     return (Stage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
 
 
+def _meta(config: SessionConfig, streams: Seq[Stream]) -> RecordsMeta:
+    """That of the records; sessions of other sensors belong into others."""
+    sensors = tuple(stream.sensor for stream in streams)
+    if not sensors or len(set(sensors)) != len(sensors):
+        raise SchemaError(
+            f"sensors are {list(sensors)}: at least one, each once; name two of one kind apart, such as "
+            "--sensor gelsight_mini.left"
+        )
+    together = "+".join(sorted(sensors))
+    return RecordsMeta(source="recorded", licence=config.licence, config_hash=f"recorded-2 {together}", sensors=sensors)
+
+
 class _Session:
     """Reads the devices and leads the hand, one contact at a time."""
 
     def __init__(
         self,
         config: SessionConfig,
-        tactile: Feed,
+        streams: Seq[Stream],
         force: Feed | None,
         show: Callable[[Status], None],
         stop: Callable[[], bool],
         book: Book,
+        region_px: tuple[int, int, int, int] | None,
     ):
-        self._config, self._tactile, self._force = config, tactile, force
-        self._show, self._stop, self._book = show, stop, book
-        self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
-        self._background = Background()
+        self._config, self._streams, self._force = config, streams, force
+        self._show, self._stop, self._book, self._region_px = show, stop, book, region_px
+        self._leads: Stream | None = None
+        self._alarm = ""
 
     def contact(self, stage: Stage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
@@ -155,13 +165,14 @@ class _Session:
         path = self._book.path(key)
         complete, failure = False, None
         with JournalWriter(path) as journal:
-            journal.append("start", self._start(key, stage))
+            journal.append("start", self._start(key, stage), **self._backgrounds())
             try:
                 complete = self._run(stage, coach, journal)
             except DeviceError as error:
                 failure = error  # raised below, when what was recorded is in the records
-            journal.append("end", {"complete": complete, "counts": dataclasses.asdict(self._tactile.counts)})
-        self._before.clear()
+            journal.append("end", {"complete": complete, "counts": self._counts()}, **self._backgrounds())
+        for stream in self._streams:
+            stream.end()
         self._book.store(path)
         if failure is not None:
             raise failure
@@ -170,82 +181,95 @@ class _Session:
         """Read until the coach says done; whether the contact is complete."""
         phase: Phase | None = None
         advice: Advice | None = None
-        written = 0
         while not self._stop():
-            frames = self._tactile.drain()
-            times, forces, moments = self._forces(frames)
+            looked = [stream.look() for stream in self._streams]
+            times, forces = self._forces(looked, journal)
             for at, one in zip(times, forces, strict=True):
                 advice = coach.step(int(at), one)
                 if advice.recording and advice.phase != phase:
                     phase = advice.phase
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
-            recording = advice is not None and (advice.recording or advice.done)
-            if len(times) and self._force is not None:
-                journal.append("force", {}, time_ns=times, force_n=forces, moment_nmm=moments)
-            written += self._frames(frames, recording, advice, journal)
+            self._take(looked, advice, journal)
             if advice is not None:
-                self._show(self._status(stage, advice, written, frames))
+                self._show(self._status(stage, advice))
                 if advice.done:
                     return advice.complete
-            if not frames and not len(times):
+            if not len(times) and not any(looked):
                 time.sleep(_IDLE_S)
         return False
 
-    def _frames(self, frames: list[Sample], recording: bool, advice: Advice | None, journal: JournalWriter) -> int:
-        """Journal the frames of a contact, and those just before it; others are the background."""
-        if not recording:
+    def _take(self, looked: Seq[list[Sample]], advice: Advice | None, journal: JournalWriter) -> None:
+        """Journal the frames of a contact and those just before it; the untouched ones are the background."""
+        recording = advice is not None and (advice.recording or advice.done)
+        touched = None
+        if self._force is not None or self._leads is not None:
             touched = advice is None or abs(advice.normal_n) >= self._config.coach.touch_n
-            for sample in frames:
-                self._before.append(sample)
-                if sample.frame is not None and sample.frame.ndim == 3:
-                    self._background.offer(sample.frame, touched=touched)
-            return 0
-        whole = [*self._before, *frames]
-        self._before.clear()
-        for sample in whole:
-            plain = {"time_ns": sample.host_time_ns, "device_time_ns": sample.device_time_ns, "index": sample.index}
-            picture = {} if sample.frame is None else {"frame": sample.frame}
-            journal.append("frame", plain, **picture, **sample.arrays)
-        return len(whole)
+        for stream, samples in zip(self._streams, looked, strict=True):
+            stream.refresh(samples, touched=touched)
+            if recording:
+                stream.journal(samples, journal)
+            else:
+                stream.keep(samples)
 
-    def _forces(self, frames: list[Sample]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Times [n], forces and moments [n, 3] on the gel; those of the tactile sensor where there is no other."""
-        samples = frames if self._force is None else self._force.drain()
-        times = np.array([s.host_time_ns for s in samples], np.int64)
-        if samples and "force_n" not in samples[0].arrays and not self._config.free_s:
+    def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
+        """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
+        if self._force is not None:
+            return self._measured(self._force.drain(), journal)
+        told = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
+        if self._leads is None and told:
+            self._leads = self._streams[told[0]]
+        if self._leads is not None:
+            samples = looked[self._streams.index(self._leads)]
+            return self._leads.time_ns(samples), _stacked(samples, "force_n")
+        if not self._config.free_s and all(stream.feed.counts.delivered for stream in self._streams):
+            names = ", ".join(stream.sensor for stream in self._streams)
             raise ForceError(
-                f"{self._tactile.identity.sensor} tells no force, which leads the protocol; give a force "
-                "sensor, or record free motion"
+                f"{names} tells no force, which leads the protocol; give a force sensor, or record free motion"
             )
-        nothing = np.zeros(3)
-        force, moment = (
-            np.array([s.arrays.get(name, nothing) for s in samples], np.float64).reshape(-1, 3)
-            for name in ("force_n", "moment_nmm")
-        )
-        if self._force is None:
-            return times, force, moment
+        times = [stream.time_ns(samples) for stream, samples in zip(self._streams, looked, strict=True)]
+        every = np.sort(np.concatenate(times))
+        return every, np.zeros((len(every), 3))
+
+    def _measured(self, samples: list[Sample], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
+        """Readings of the force sensor, compensated, in the gel's frame; journaled."""
+        times = np.array([s.host_time_ns for s in samples], np.int64)
+        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm")
+        beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
         if self._config.gravity is not None:
             force, moment = self._config.gravity.contact(force, moment, self._config.down)
-        return times, *self._config.mount.to_gel(force, moment)
+        force, moment = self._config.mount.to_gel(force, moment)
+        if samples:
+            journal.append("force", {}, time_ns=times, force_n=force, moment_nmm=moment, out_of_range=beyond)
+            self._alarm = "the force sensor is out of its range: release" if beyond[-1] else ""
+        return times, force
 
     def _start(self, key: ContactKey, stage: Stage) -> dict[str, Any]:
-        identity = dataclasses.asdict(self._tactile.identity)
         return {
             "key": dataclasses.asdict(key),
-            "identity": identity | {"settings": dict(identity["settings"])},
+            "streams": [stream.begin() for stream in self._streams],
+            "force_sensor": None if self._force is None else dataclasses.asdict(self._force.identity),
             "target_n": stage.force_n,
-            "lag_s": self._config.lag_s,
-            "mm_per_px": self._config.mm_per_px,
-            "reader": dataclasses.asdict(self._tactile.counts),
+            "contact_region_px": self._region_px,
         }
 
-    def _status(self, stage: Stage, advice: Advice, frames: int, newest: list[Sample]) -> Status:
+    def _backgrounds(self) -> dict[str, np.ndarray]:
+        pictures = {f"background_{i}": stream.background for i, stream in enumerate(self._streams)}
+        return {name: picture for name, picture in pictures.items() if picture is not None}
+
+    def _counts(self) -> dict[str, Any]:
+        force = {} if self._force is None else {"force": dataclasses.asdict(self._force.counts)}
+        return {stream.sensor: dataclasses.asdict(stream.feed.counts) for stream in self._streams} | force
+
+    def _status(self, stage: Stage, advice: Advice) -> Status:
         return Status(
             stage=stage,
             advice=advice,
-            frames=frames,
-            tactile=self._tactile.counts,
+            streams=tuple(stream.status() for stream in self._streams),
             force=None if self._force is None else self._force.counts,
-            drift=self._background.drift(),
-            newest=newest[-1] if newest else None,
+            alarm=self._alarm,
         )
+
+
+def _stacked(samples: list[Sample], name: str) -> np.ndarray:
+    """A vector of every sample, float64 [n, 3]; 0 where one lacks it."""
+    return np.array([s.arrays.get(name, np.zeros(3)) for s in samples], np.float64).reshape(-1, 3)

@@ -18,6 +18,42 @@ VIEW_MM = 45.0
 CAMERA_MM = 300.0
 """From the camera to the table."""
 
+TEXTURE_PX = 64
+"""Side of the view in whose pixels the lengths of textures are given, so that they do not depend on its resolution."""
+
+OUTLINE_POWER = (2.0, 5.0)
+"""Range of a superellipse's exponent, from an ellipse to nearly a rectangle."""
+
+HALF_AXES_MM = (15.0, 20.0), (11.0, 18.0)
+"""Ranges of the half axes of the outline, which stays on a view of 45 mm."""
+
+DOME_MM, EDGE = 12.0, 12.0
+"""Height of the dome in the middle; steepness of the cover at the outline, per half axis: about two pixels of 64."""
+
+RELIEF_PITCH_MM = (4.0, 7.0)
+"""Range of the distance between the bumps that a camera sees, on the whole coarser than those that a gel feels."""
+
+TABLE_SATURATION, TABLE_VALUE, TABLE_GRAIN = (0.0, 0.15), (0.3, 0.75), 0.03
+"""Ranges of the table's colour, grey and neither black nor white, and the standard deviation of its grain."""
+
+SHADOW, SHADOW_SHARPNESS = 0.35, 20.0
+"""Share of light that the object's shadow takes from the table, and the side of the view over the shadow's blur."""
+
+AMBIENT, LAMP, SHINE = 0.35, 0.7, 0.9
+"""Light from everywhere, from the lamp, and in the highlight of a mirror: a lit flat side comes out at 0.93."""
+
+LAMP_SIDE, LAMP_UP = 0.55, 0.835
+"""Parts of the lamp's direction, of length 1, along the table and off it: 33° from the vertical."""
+
+SHARPNESS = (8.0, 60.0)
+"""Blinn–Phong exponent of a dull surface, and what gloss adds to it."""
+
+PICTURE_NOISE, DEPTH_NOISE_MM = 0.012, 0.4
+"""Standard deviations of an RGB-D camera's noise at this distance: three of 255 grey levels, 0.13 %."""
+
+# These, the looks below and the numbers in their textures are set by eye: no measurement stands behind them, and
+# nothing is asked of the pictures but that the materials differ in them.
+
 
 Texture = Callable[[int, np.random.Generator], np.ndarray]
 """Draws a texture of about unit amplitude on [px, px]."""
@@ -40,8 +76,8 @@ class Look:
 
 
 def _smooth_noise(px: int, scale_64: float, rng: np.random.Generator) -> np.ndarray:
-    """Unit-variance noise with a correlation length of `scale_64` pixels of a 64-pixel view."""
-    noise = cv2.GaussianBlur(rng.standard_normal((px, px)), (0, 0), scale_64 * px / 64)
+    """Unit-variance noise with a correlation length of `scale_64` pixels of a view of `TEXTURE_PX`."""
+    noise = cv2.GaussianBlur(rng.standard_normal((px, px)), (0, 0), scale_64 * px / TEXTURE_PX)
     return noise / noise.std()
 
 
@@ -75,8 +111,8 @@ def _grain(px: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _turned_pixels(px: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates along two random perpendicular axes, in pixels of a 64-pixel view."""
-    turn, i = rng.uniform(0, np.pi), np.arange(px) * (64 / px)
+    """Coordinates along two random perpendicular axes, in pixels of a view of `TEXTURE_PX`."""
+    turn, i = rng.uniform(0, np.pi), np.arange(px) * (TEXTURE_PX / px)
     c, s = np.cos(turn), np.sin(turn)
     return c * i[None, :] + s * i[:, None], c * i[:, None] - s * i[None, :]
 
@@ -112,30 +148,31 @@ def view(material: int, px: int, rng: np.random.Generator) -> tuple[np.ndarray, 
     x = ((np.arange(px) + 0.5) / px - 0.5) * VIEW_MM
     height, inside = _shape(material, x[None, :], x[:, None], rng)
     albedo = _albedo(look, px, rng)
-    table = _hsv(rng.random(), rng.uniform(0, 0.15), rng.uniform(0.3, 0.75))
-    table = table * (1 + 0.03 * _smooth_noise(px, 3, rng))[..., None]
+    table = _hsv(rng.random(), rng.uniform(*TABLE_SATURATION), rng.uniform(*TABLE_VALUE))
+    table = table * (1 + TABLE_GRAIN * _smooth_noise(px, 3, rng))[..., None]
     body = look.clear * table + (1 - look.clear) * albedo
     lit = _light(body, height, look.gloss, rng)
     cover = inside[..., None]
-    image = cover * lit + (1 - cover) * table * (1 - 0.35 * _shadow(inside))[..., None]
-    noisy = image + 0.012 * rng.standard_normal(image.shape)
-    depth = CAMERA_MM - height + 0.4 * rng.standard_normal(height.shape)
+    image = cover * lit + (1 - cover) * table * (1 - SHADOW * _shadow(inside))[..., None]
+    noisy = image + PICTURE_NOISE * rng.standard_normal(image.shape)
+    depth = CAMERA_MM - height + DEPTH_NOISE_MM * rng.standard_normal(height.shape)
     return np.round(255 * np.clip(noisy, 0, 1)).astype(np.uint8), depth.astype(np.float32)
 
 
 def _shape(material: int, x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Height, mm, and soft cover 0..1 of a domed superellipse with the relief typical of the material."""
-    turn, power = rng.uniform(0, np.pi), rng.uniform(2, 5)
+    turn, power = rng.uniform(0, np.pi), rng.uniform(*OUTLINE_POWER)
     a = np.cos(turn) * x + np.sin(turn) * y
     b = np.cos(turn) * y - np.sin(turn) * x
-    radius = (np.abs(a / rng.uniform(15, 20)) ** power + np.abs(b / rng.uniform(11, 18)) ** power) ** (1 / power)
-    inside = np.clip((1 - radius) * 12 + 0.5, 0, 1)
+    half_a, half_b = (rng.uniform(*span) for span in HALF_AXES_MM)
+    radius = (np.abs(a / half_a) ** power + np.abs(b / half_b) ** power) ** (1 / power)
+    inside = np.clip((1 - radius) * EDGE + 0.5, 0, 1)
     relief = PROTRUSION.value(PROTRUSION.means[material] + PROTRUSION.spread * rng.standard_normal())
     rough = ROUGHNESS.value(ROUGHNESS.means[material] + ROUGHNESS.spread * rng.standard_normal())
-    pitch = rng.uniform(4, 7)
+    pitch = rng.uniform(*RELIEF_PITCH_MM)
     bumps = 0.25 * (1 + np.cos(2 * np.pi * a / pitch)) * (1 + np.cos(2 * np.pi * b / pitch))
     px = inside.shape[0]
-    height = 12 * np.sqrt(np.clip(1 - radius**2, 0, 1)) + relief * bumps + 2 * rough * _smooth_noise(px, 1, rng)
+    height = DOME_MM * np.sqrt(np.clip(1 - radius**2, 0, 1)) + relief * bumps + 2 * rough * _smooth_noise(px, 1, rng)
     return inside * height, inside
 
 
@@ -151,16 +188,16 @@ def _light(albedo: np.ndarray, height: np.ndarray, gloss: float, rng: np.random.
     normal = np.stack([-d_x, -d_y, np.ones_like(d_x)], -1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     azimuth = rng.uniform(0, 2 * np.pi)
-    lamp = np.array([0.55 * np.cos(azimuth), 0.55 * np.sin(azimuth), 0.835])
+    lamp = np.array([LAMP_SIDE * np.cos(azimuth), LAMP_SIDE * np.sin(azimuth), LAMP_UP])
     halfway = lamp + np.array([0.0, 0.0, 1.0])
     halfway /= np.linalg.norm(halfway)
-    diffuse = 0.35 + 0.7 * np.clip(normal @ lamp, 0, 1)
-    shine = 0.9 * gloss * np.clip(normal @ halfway, 0, 1) ** (8 + 60 * gloss)
+    diffuse = AMBIENT + LAMP * np.clip(normal @ lamp, 0, 1)
+    shine = SHINE * gloss * np.clip(normal @ halfway, 0, 1) ** (SHARPNESS[0] + SHARPNESS[1] * gloss)
     return albedo * diffuse[..., None] + shine[..., None]
 
 
 def _shadow(inside: np.ndarray) -> np.ndarray:
-    return cv2.GaussianBlur(inside, (0, 0), inside.shape[0] / 20)
+    return cv2.GaussianBlur(inside, (0, 0), inside.shape[0] / SHADOW_SHARPNESS)
 
 
 def _hsv(hue: float, saturation: float, value: float) -> np.ndarray:

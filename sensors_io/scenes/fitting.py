@@ -2,7 +2,7 @@
 
 A press is three numbers, the *touch*: where the ball's axis meets the window and how wide the contact is.  Given the
 touches, the contact solver tells slopes and depth, and the optics follow by linear least squares; given the optics,
-each touch follows by non-linear least squares on its own picture.  Both alternate from touches found by thresholds.
+each touch follows by non-linear least squares on its own picture.  Both alternate, from touches that are given.
 
 Departures: the ball is rigid, the gel has the modelled thickness and, as in all scenes, small strain; tilt, friction
 and the gel's edge are ignored.
@@ -27,7 +27,6 @@ ROUNDS = 4
 RIDGE = 1e-6
 """Of the mean diagonal of the normal equations: decides only what no press constrains."""
 
-_CHANGE = 8 / 255  # of a smoothed channel, by which a press is found
 _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation of a normal variable
 
 
@@ -119,25 +118,6 @@ def ball_profiles(gel: layer.Layer, radius_mm: float, presses: int = 24, side_mm
     return Profiles(contact_mm=np.array(contacts), ratio=ratio, depth_mm=np.array(depths))
 
 
-def locate(presses: BallPresses) -> np.ndarray:
-    """First guess of every touch: the centre of the largest patch that changed, a contact of 1.8 mm; [P, 3].
-
-    Raises:
-      ValueError: a picture that shows no change.
-    """
-    found = []
-    for i, picture in enumerate(presses.pictures):
-        change = ndimage.gaussian_filter(np.abs(picture - presses.background).max(-1), 1.5)
-        labels, count = ndimage.label(change > _CHANGE)
-        if count == 0:
-            raise ValueError(f"picture {i} differs from the background by {255 * change.max():.1f} levels: must be > 8")
-        sizes = ndimage.sum_labels(np.ones_like(labels), labels, np.arange(1, count + 1))
-        row, column = ndimage.center_of_mass(labels == 1 + int(np.argmax(sizes)))
-        x, y = (np.interp(c, np.arange(len(presses.axis_mm)), presses.axis_mm) for c in (column, row))
-        found.append((x, y, 1.8))
-    return np.array(found)
-
-
 def fit(presses: BallPresses, profiles: Profiles, touches: np.ndarray) -> PhotometricOptics:
     """Optics by linear least squares: the flat field from the background, slope and depth from the presses' changes."""
     half, axis = presses.window_mm / 2, presses.axis_mm
@@ -168,9 +148,18 @@ def align(presses: BallPresses, profiles: Profiles, touches: np.ndarray, optics:
     )
 
 
-def fit_jointly(presses: BallPresses, profiles: Profiles, train: np.ndarray) -> tuple[PhotometricOptics, np.ndarray]:
-    """Optics from the presses `train` alone, and touches of all: the others are only aligned to finished optics."""
-    touches = locate(presses)
+def fit_jointly(
+    presses: BallPresses, profiles: Profiles, begun: np.ndarray, train: np.ndarray
+) -> tuple[PhotometricOptics, np.ndarray]:
+    """Optics from the presses `train` alone, and touches of all: the others are only aligned to finished optics.
+
+    Args:
+      presses: the pictures.
+      profiles: of their ball.
+      begun: about where the touches are (x, y, contact radius), mm, [P, 3].
+      train: indices of the presses that are fitted.
+    """
+    touches = np.column_stack([begun[:, :2], np.clip(begun[:, 2], *CONTACT_MM)])
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
     optics = fit(chosen, profiles, touches[train])
     for _ in range(ROUNDS):

@@ -18,6 +18,27 @@ SEAM_MM = 0.4
 GRADE_MM = (8.0, 16.0)
 """Range of the half width over which a graded object changes."""
 
+LINE_MM = 4.0
+"""Largest distance of that line from the object's centre: half of the smallest window, 7.6 mm, reaches over it."""
+
+PITCH_MM = (2.5, 6.0)
+"""Range of the distance between features: two to six of them across the smallest window."""
+
+FEATURE_WIDTH = (0.16, 0.26)
+"""Range of a feature's standard width in pitches: apart from its neighbours, and no needle."""
+
+RADIUS_1_MM, RADIUS_2_MM = (8.0, 40.0), (10.0, 80.0)
+"""Ranges of the radii of curvature, even in their logarithm: from a fingertip's to a nearly flat side."""
+
+LONGEST_WAVE_MM, ROLL_OFF_MM = 4.0, 2.0
+"""Longest wave of the roughness, the upper end of `properties.ROUGHNESS_MM`'s band, and that above which it is flat."""
+
+WAVES, HURST = 192, 0.8
+"""Plane waves of a rough skin, enough that no period is seen; Hurst exponent of fracture surfaces (Bouchaud 1997)."""
+
+LIE_DIFFERENCES = 2
+"""In how many properties a lying look must mislead at the least: in one alone it hardly would."""
+
 PATTERNS = ("bumps", "ridges", "plateaus")
 """Shapes of the surface features."""
 
@@ -160,11 +181,11 @@ def sample(
         modulus_mpa=HARDNESS.value(latent["hardness"]),
         rms_mm=rms,
         feature_height_mm=PROTRUSION.value(latent["protrusion"]),
-        feature_pitch_mm=rng.uniform(2.5, 6.0),
-        feature_width=rng.uniform(0.16, 0.26),
+        feature_pitch_mm=rng.uniform(*PITCH_MM),
+        feature_width=rng.uniform(*FEATURE_WIDTH),
         pattern=int(rng.integers(len(PATTERNS))),
-        radius_1_mm=_log_uniform(rng, 8.0, 40.0),
-        radius_2_mm=_log_uniform(rng, 10.0, 80.0),
+        radius_1_mm=_log_uniform(rng, *RADIUS_1_MM),
+        radius_2_mm=_log_uniform(rng, *RADIUS_2_MM),
         turn_rad=rng.uniform(0, np.pi),
         wave_numbers=numbers,
         wave_amplitudes_mm=amplitudes,
@@ -183,7 +204,7 @@ def _variation(material: int, rng: np.random.Generator, part_share: float, grade
     far = {field: p.draw(material, rng) for field, p in zip(VARYING, PROPERTIES.values(), strict=True)}
     return Variation(
         direction_rad=rng.uniform(0, 2 * np.pi),
-        offset_mm=rng.uniform(-4, 4),
+        offset_mm=rng.uniform(-LINE_MM, LINE_MM),
         width_mm=SEAM_MM if kind < part_share else rng.uniform(*GRADE_MM),
         **far,
     )
@@ -194,16 +215,16 @@ def _far_side(variation: Variation) -> dict[str, float]:
 
 
 def rough_waves(
-    rng: np.random.Generator, rms_mm: float, shortest_mm: float, waves: int = 192, hurst: float = 0.8
+    rng: np.random.Generator, rms_mm: float, shortest_mm: float, waves: int = WAVES, hurst: float = HURST
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Plane waves of a self-affine surface: power spectrum flat above 2 mm wavelength, ∝ q^{−2(1+H)} below it.
+    """Plane waves of a self-affine surface: power spectrum flat above `ROLL_OFF_MM`, ∝ q^{−2(1+H)} below it.
 
-    Wave numbers are stratified in log q between 2π/4 mm and the shortest wave, so the sum has the rms asked for.
+    Wave numbers are stratified in log q from the longest wave to the shortest, so the sum has the rms asked for.
 
     Returns:
       wave vectors [K, 2] rad/mm (x, y), amplitudes [K] mm, phases [K] rad.
     """
-    low, roll, high = 2 * np.pi / 4.0, 2 * np.pi / 2.0, 2 * np.pi / shortest_mm
+    low, roll, high = 2 * np.pi / LONGEST_WAVE_MM, 2 * np.pi / ROLL_OFF_MM, 2 * np.pi / shortest_mm
     q = low * (high / low) ** ((np.arange(waves) + rng.random(waves)) / waves)
     angle = rng.uniform(0, 2 * np.pi, waves)
     power = q**2 * np.maximum(q, roll) ** (-2 * (1 + hurst))  # per interval of log q
@@ -218,13 +239,13 @@ def typical_levels(material: int) -> tuple[int, ...]:
 
 
 def lie_materials(material: int) -> list[int]:
-    """Materials whose typical levels differ from this one's in at least two properties."""
+    """Materials whose typical levels differ from this one's in at least `LIE_DIFFERENCES` properties."""
     own = typical_levels(material)
 
     def differences(other: int) -> int:
         return sum(a != b for a, b in zip(own, typical_levels(other), strict=True))
 
-    return [other for other in range(len(MATERIALS)) if differences(other) >= 2]
+    return [other for other in range(len(MATERIALS)) if differences(other) >= LIE_DIFFERENCES]
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

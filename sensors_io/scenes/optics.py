@@ -74,33 +74,59 @@ SOFT_LAMPS = (
     Lamp(colour=(0.24, 0.46, 0.24), angle_deg=120, floor=0.35, peak=0.25, centre=(-0.3, 0.5)),
     Lamp(colour=(0.24, 0.26, 0.48), angle_deg=240, floor=0.35, peak=0.25, centre=(-0.3, -0.5)),
 )
+"""Coloured lamps at 120° of each other, each brighter on its own side: set by eye."""
 
 WHITE_LAMPS = (
     Lamp(colour=(0.35, 0.33, 0.32), angle_deg=30, floor=0.65, peak=0.2),
     Lamp(colour=(0.32, 0.35, 0.32), angle_deg=150, floor=0.65, peak=0.2),
     Lamp(colour=(0.33, 0.33, 0.36), angle_deg=270, floor=0.65, peak=0.2),
 )
+"""Nearly white lamps, even over the gel: set by eye."""
+
+DOT_PITCH_MM = (19.4 / 14, 30.8 / 26)
+"""Between the dots of a Xense's print along x and y: the area over the grid of 14 × 26, margins being unpublished."""
+
+DOT_RADIUS_MM, DOT_INK = 0.28, 0.86
+"""Radius of a dot, a fifth to a quarter of the pitch, and the share of light that it takes: by eye."""
+
+DOT_EDGE_PX = 0.5
+"""Softness of a dot's edge: the blur of one pixel's area."""
+
+SPECKLE_SPAN = 1.5
+"""Side of a speckle texture in windows: a margin for all that shear and shift bring into view."""
+
+SPECKLE_CONTRAST, SPECKLE_HARDNESS = 0.8, 1.8
+"""Share of light that black speckle takes; how far the noise is driven into black and white: by eye."""
+
+SPECKLE_BAND = 0.3
+"""Width of the speckle's band of spatial frequencies, as a standard deviation, over the frequency of its grain."""
+
+DOT_SLOPE_GAIN, SPECKLE_SLOPE_GAIN = 1.1, 0.5
+"""How much a slope brightens the gel towards a lamp; flatter light shows less relief: by eye."""
+
+BRIGHTEST = 3.0
+"""Bound of a lamp's light on a slope, over that on the flat gel, that keeps a steep edge from outshining all else."""
 
 
 def dots(
-    gel: DeformedGel, light: Light, pitch_mm: tuple[float, float] = (19.4 / 14, 30.8 / 26), radius_mm: float = 0.28
+    gel: DeformedGel, light: Light, pitch_mm: tuple[float, float] = DOT_PITCH_MM, radius_mm: float = DOT_RADIUS_MM
 ) -> Float[Array, "H W 3"]:
     """Printed grid of dark dots over a softly lit gel (Xense): 14 × 26 on 19.4 × 30.8 mm."""
-    skin = shade(gel, light, SOFT_LAMPS, slope_gain=1.1)
+    skin = shade(gel, light, SOFT_LAMPS, slope_gain=DOT_SLOPE_GAIN)
     x, y = _pattern_coordinates(gel, light)
     away = jnp.hypot(*(c - p * jnp.round(c / p) for c, p in zip((x, y), pitch_mm, strict=True)))
-    softness = 0.5 * gel.spacing_mm
+    softness = DOT_EDGE_PX * gel.spacing_mm
     ink = jax.nn.sigmoid((radius_mm - away) / softness)[..., None]
-    return skin * (1 - 0.86 * ink)
+    return skin * (1 - DOT_INK * ink)
 
 
-def speckle(gel: DeformedGel, light: Light, contrast: float = 0.8) -> Float[Array, "H W 3"]:
+def speckle(gel: DeformedGel, light: Light, contrast: float = SPECKLE_CONTRAST) -> Float[Array, "H W 3"]:
     """Dense random pattern over a nearly white, evenly lit gel (DM-Tac)."""
-    skin = shade(gel, light, WHITE_LAMPS, slope_gain=0.5)
+    skin = shade(gel, light, WHITE_LAMPS, slope_gain=SPECKLE_SLOPE_GAIN)
     size = light.texture.shape[0]
     x, y = _pattern_coordinates(gel, light)
-    to_texel = (size - 1) / (1.5 * gel.window_mm)
-    at = [jnp.clip((c + 0.75 * gel.window_mm) * to_texel, 0, size - 1.001) for c in (y, x)]
+    to_texel = (size - 1) / (SPECKLE_SPAN * gel.window_mm)
+    at = [jnp.clip((c + SPECKLE_SPAN / 2 * gel.window_mm) * to_texel, 0, size - 1.001) for c in (y, x)]
     ink = jax.scipy.ndimage.map_coordinates(light.texture, at, order=1)[..., None]
     return skin * (1 - contrast * ink)
 
@@ -108,9 +134,9 @@ def speckle(gel: DeformedGel, light: Light, contrast: float = 0.8) -> Float[Arra
 def speckle_texture(rng: np.random.Generator, size: int, grain_texels: float) -> np.ndarray:
     """Random pattern in 0..1, float32 [size, size]: band-limited noise, pushed towards black and white."""
     q = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None])
-    band = np.exp(-((q * grain_texels - 1) ** 2) / 0.18)
+    band = np.exp(-((q * grain_texels - 1) ** 2) / (2 * SPECKLE_BAND**2))
     noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * band, s=(size, size))
-    return (0.5 + 0.5 * np.tanh(1.8 * noise / noise.std())).astype(np.float32)
+    return (0.5 + 0.5 * np.tanh(SPECKLE_HARDNESS * noise / noise.std())).astype(np.float32)
 
 
 def expose(
@@ -144,7 +170,7 @@ def shade(gel: DeformedGel, light: Light, lamps: tuple[Lamp, ...], slope_gain: f
         away = ((x - lamp.centre[0]) / lamp.width[0]) ** 2 + ((y - lamp.centre[1]) / lamp.width[1]) ** 2
         flat = lamp.floor + lamp.peak * jnp.exp(-away / 2)
         lit = up + slope_gain * (along + along**3 / 5) - (n_x**2 + n_y**2) / 4
-        image = image + (gain * flat * jnp.clip(lit, 0, 3))[..., None] * jnp.array(lamp.colour, jnp.float32)
+        image = image + (gain * flat * jnp.clip(lit, 0, BRIGHTEST))[..., None] * jnp.array(lamp.colour, jnp.float32)
     return light.exposure * image
 
 

@@ -1,4 +1,10 @@
-"""The server of the live view: whatever was published last, to any number of browsers."""
+"""The server of the live view: whatever was published last, to any number of browsers.
+
+Publishing hands over references and returns: pictures are drawn and encoded by the threads of those who watch, each
+picture once for all of them.  A browser hears of every state by one stream of numbers and asks for the pictures that it
+has time for: one that is slow skips some instead of falling behind, and any number of panels gets along with the six
+connections that browsers open to one server.
+"""
 
 import dataclasses
 import http.server
@@ -13,9 +19,9 @@ import cv2
 import numpy as np
 
 from sensors_io.viewer.page import PAGE
+from sensors_io.viewer.panels import Panel
 
 _QUALITY = 85  # of the pictures' JPEG; recordings are lossless, a view need not be
-_BOUNDARY = "frame"
 _WAIT_S = 1.0  # how long a stream that has nothing new waits before it looks whether the view has ended
 
 
@@ -27,15 +33,46 @@ class Numbers:
       title: of the page.
       time_s: of the sample.
       force_n: [3], `None` where none is measured.
-      numbers: names and values to be listed, as text.
+      tables: names and values to be listed, as text, by heading.
+      captions: below the pictures, by panel.
       alarm: what is wrong; empty if nothing is.
+      prompt: to the hand, while something is recorded.
     """
 
     title: str
     time_s: float
     force_n: tuple[float, float, float] | None
-    numbers: Mapping[str, str]
+    tables: Mapping[str, Mapping[str, str]]
+    captions: Mapping[str, str] = dataclasses.field(default_factory=dict)
     alarm: str = ""
+    prompt: str = ""
+
+
+class Shown:
+    """One published state; each picture is drawn and encoded once, when it is first asked for."""
+
+    def __init__(self, version: int, panels: Mapping[str, Panel], numbers: Numbers):
+        self.version = version
+        self._panels = panels
+        self._numbers = numbers
+        self._encoded: dict[str, bytes] = {}
+        self._lock = threading.Lock()
+
+    def event(self) -> bytes:
+        """The numbers as a server-sent event."""
+        tree = dataclasses.asdict(self._numbers) | {"panels": list(self._panels), "version": self.version}
+        return f"data: {json.dumps(tree)}\n\n".encode()
+
+    def picture(self, name: str) -> bytes:
+        """A panel as JPEG.
+
+        Raises:
+          KeyError: there is no such panel.
+        """
+        with self._lock:
+            if name not in self._encoded:
+                self._encoded[name] = _jpeg(name, self._panels[name]())
+            return self._encoded[name]
 
 
 class LiveView:
@@ -52,9 +89,8 @@ class LiveView:
     def __init__(self, *, port: int = 8765, host: str = "127.0.0.1"):
         self._wanted = (host, port)
         self._changed = threading.Condition()
+        self._shown = Shown(0, {}, Numbers(title="touch", time_s=0.0, force_n=None, tables={}))
         self._version = 0
-        self._pictures: dict[str, np.ndarray] = {}
-        self._numbers: dict[str, Any] = {}
         self._ended = False
         self._server: http.server.ThreadingHTTPServer | None = None
         self._thread: threading.Thread | None = None
@@ -65,20 +101,25 @@ class LiveView:
         host, port = self._wanted if self._server is None else self._server.server_address[:2]
         return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
 
-    def publish(self, pictures: Mapping[str, np.ndarray], numbers: Numbers) -> None:
-        """Show these pictures (RGB uint8 [H, W, 3] by name) and numbers from now on; watchers encode them."""
+    def publish(self, panels: Mapping[str, Panel], numbers: Numbers) -> None:
+        """Show these panels and numbers from now on; returns at once, and nothing is drawn that nobody watches."""
         with self._changed:
-            self._pictures = dict(pictures)
-            self._numbers = dataclasses.asdict(numbers) | {"panels": list(pictures)}
             self._version += 1
+            self._shown = Shown(self._version, dict(panels), numbers)
             self._changed.notify_all()
 
-    def wait(self, seen: int) -> tuple[int, dict[str, np.ndarray], dict[str, Any]] | None:
-        """What was published after version `seen`, with its version; `None` when the view has ended."""
+    @property
+    def shown(self) -> Shown:
+        """What was published last."""
+        with self._changed:
+            return self._shown
+
+    def wait(self, seen: int) -> Shown | None:
+        """What was published after version `seen`; `None` when the view has ended."""
         with self._changed:
             while self._version == seen and not self._ended:
                 self._changed.wait(_WAIT_S)
-            return None if self._ended else (self._version, self._pictures, self._numbers)
+            return None if self._ended else self._shown
 
     def __enter__(self) -> Self:
         handler = type("Handler", (_Handler,), {"live": self})
@@ -103,20 +144,19 @@ class LiveView:
 
 class _Handler(http.server.BaseHTTPRequestHandler):
     live: ClassVar[LiveView]
+    protocol_version = "HTTP/1.1"  # keeps connections open: a browser asks for hundreds of pictures a second
+    disable_nagle_algorithm = True  # a picture would wait 40 ms for the acknowledgement of its own header
 
     def do_GET(self) -> None:
-        """Answer one request; streams last until the browser or the view goes away."""
-        path = urllib.parse.unquote(self.path)
+        """Answer one request; the stream of numbers lasts until the browser or the view goes away."""
+        path = urllib.parse.unquote(urllib.parse.urlsplit(self.path).path)
         try:
             if path == "/":
-                self._begin("text/html; charset=utf-8")
-                self.wfile.write(PAGE.encode())
+                self._whole("text/html; charset=utf-8", PAGE.encode())
             elif path == "/numbers":
-                self._begin("text/event-stream")
-                self._stream(self._event)
+                self._numbers()
             elif path.startswith("/panel/"):
-                self._begin(f"multipart/x-mixed-replace; boundary={_BOUNDARY}")
-                self._stream(lambda pictures, _: self._picture(pictures, path.removeprefix("/panel/")))
+                self._panel(path.removeprefix("/panel/"))
             else:
                 self.send_error(404)
         except (BrokenPipeError, ConnectionResetError):
@@ -125,32 +165,37 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing: the terminal belongs to the session."""
 
-    def _begin(self, kind: str) -> None:
+    def _whole(self, kind: str, data: bytes) -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
+        self.wfile.write(data)
 
-    def _stream(self, encode: Any) -> None:
+    def _panel(self, name: str) -> None:
+        try:
+            data = self.live.shown.picture(name)
+        except KeyError:
+            self.send_error(404, "no such panel")
+        else:
+            self._whole("image/jpeg", data)
+
+    def _numbers(self) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "text/event-stream")
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Connection", "close")
+        self.end_headers()
         version = 0
-        while (news := self.live.wait(version)) is not None:
-            version, pictures, numbers = news
-            if data := encode(pictures, numbers):
-                self.wfile.write(data)
-                self.wfile.flush()
+        while (shown := self.live.wait(version)) is not None:
+            version = shown.version
+            self.wfile.write(shown.event())
+            self.wfile.flush()
 
-    @staticmethod
-    def _event(pictures: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> bytes:
-        return f"data: {json.dumps(numbers)}\n\n".encode()
 
-    @staticmethod
-    def _picture(pictures: Mapping[str, np.ndarray], name: str) -> bytes:
-        if name not in pictures:
-            return b""
-        ok, data = cv2.imencode(
-            ".jpg", cv2.cvtColor(pictures[name], cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-        )
-        if not ok:
-            raise ValueError(f"panel {name!r} is {pictures[name].shape}: must be RGB uint8 [H, W, 3]; convert it")
-        head = f"--{_BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-        return head.encode() + data.tobytes() + b"\r\n"
+def _jpeg(name: str, picture: np.ndarray) -> bytes:
+    ok, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not ok:
+        raise ValueError(f"panel {name!r} is {picture.shape}: must be RGB uint8 [H, W, 3]; convert it")
+    return data.tobytes()

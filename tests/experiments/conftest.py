@@ -2,7 +2,6 @@
 
 import io
 
-import jax
 import pytest
 from rich.console import Console
 
@@ -13,19 +12,13 @@ from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import config_hash
 from tests.experiments import tiny
-from tests.touchr1_jax.quick import compile_quickly
-
-__all__ = ["compile_quickly"]
 
 
 @pytest.fixture(scope="session")
 def cache_dir(tmp_path_factory):
     """A data cache that holds the tiny scenes already."""
     path = tmp_path_factory.mktemp("data")
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
     generate_records(tiny.SCENES, path / f"scenes-{config_hash(tiny.SCENES)}")
-    jax.config.update("jax_disable_most_optimizations", before)
     return path
 
 

@@ -8,8 +8,8 @@ import pytest
 from experiments import ablation_consistency, ablation_format, ablation_grounding, ablation_tactile_use
 from experiments.running.artifacts import read_json
 from experiments.running.context import read_metrics
-from experiments.running.runner import main
 from tests.experiments import tiny
+from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.rl.config import TactileUse
 
 MODULES = {
@@ -22,13 +22,8 @@ MODULES = {
 
 def run(name: str, home: Path, cache_dir: Path) -> Path:
     """One shrunk ablation on the command line; its run directory."""
-    module = MODULES[name]
-    small = dataclasses.replace(module.EXPERIMENT, config=dataclasses.replace(tiny.STUDY, grpo_steps=1))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "EXPERIMENT", small)
-        assert main([name, "--runs-dir", str(home), "--cache-dir", str(cache_dir)]) == 0
-    (directory,) = (p for p in (home / name).iterdir() if not p.is_symlink())
-    return directory
+    config = dataclasses.replace(tiny.STUDY, grpo_steps=1)
+    return run_shrunk(MODULES[name], config, home, "--cache-dir", str(cache_dir))
 
 
 @pytest.mark.parametrize("name", MODULES)

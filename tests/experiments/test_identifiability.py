@@ -18,16 +18,13 @@ from experiments.identify.studies import SOURCES, STATIC
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import Felt, Tier, feel, means, see
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
 from sensors_io.scenes import SceneConfig, motions, schedule, surface
 from sensors_io.scenes.press import make_kernels
 from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import SENSORS
-from tests.touchr1_jax.quick import compile_quickly
+from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit
-
-__all__ = ["compile_quickly"]
 
 SCENES = SceneConfig(objects=8, sites=1, frames=3, min_force_n=0.3, max_force_n=3.0, image_px=24, contact_grid=24)
 TINY = dataclasses.replace(
@@ -41,11 +38,9 @@ TINY = dataclasses.replace(
 PROBE = ProbeConfig(folds=4, iterations=20)
 
 
-def run(home, monkeypatch):
+def run(home):
     """Results of the experiment at the tiny scale."""
-    monkeypatch.setattr(identifiability, "EXPERIMENT", dataclasses.replace(identifiability.EXPERIMENT, config=TINY))
-    assert main(["identifiability", "--runs-dir", str(home)]) == 0
-    (directory,) = (p for p in (home / "identifiability").iterdir() if not p.is_symlink())
+    directory = run_shrunk(identifiability, TINY, home)
     assert {p.name for p in (directory / "plots").iterdir()} == {"identifiability.svg", "label_transfer.svg"}
     return read_json(directory / "results.json")
 
@@ -91,7 +86,7 @@ def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
     monkeypatch.setattr(identify_presses, "feel", felt)
     monkeypatch.setattr(identify_motions, "feel", moved)
     monkeypatch.setattr(identify_motions, "rows_of", lambda scenes, motion: [0])
-    check(run(tmp_path, monkeypatch))
+    check(run(tmp_path))
 
 
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
@@ -106,8 +101,8 @@ def test_features_repeat_whatever_the_batch_and_grow_with_noise():
 
 
 @pytest.mark.slow  # compiles eight more programs
-def test_a_whole_study_runs(tmp_path, monkeypatch):
-    check(run(tmp_path, monkeypatch))
+def test_a_whole_study_runs(tmp_path):
+    check(run(tmp_path))
 
 
 @pytest.mark.parametrize("order", [SENSORS.index("gelsight_mini"), SENSORS.index("tac3d")])

@@ -1,6 +1,5 @@
 """The measurement of reading weights, shrunken, and the random checkpoints that it reads."""
 
-import dataclasses
 import json
 
 import jax
@@ -13,7 +12,7 @@ from experiments.loading.checkpoints import random_checkpoint, shards
 from experiments.loading.readers import READERS, measure
 from experiments.loading.shapes import SHAPES
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
+from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.load import peak_memory
 
 TINY = SHAPES["tiny"]
@@ -21,10 +20,7 @@ TINY = SHAPES["tiny"]
 
 def test_experiment_runs_shrunken(tmp_path):
     config = load_weights.LoadWeightsConfig(sizes=("tiny",), compare=("tiny",), scratch=tmp_path, shard_bytes=50_000)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(load_weights, "EXPERIMENT", dataclasses.replace(load_weights.EXPERIMENT, config=config))
-        assert main(["load_weights", "--runs-dir", str(tmp_path / "runs")]) == 0
-    (directory,) = (p for p in (tmp_path / "runs" / "load_weights").iterdir() if not p.is_symlink())
+    directory = run_shrunk(load_weights, config, tmp_path / "runs")
     results = read_json(directory / "results.json")
     rows = results["tables"][0]["rows"]
     assert [row[0] for row in rows] == ["tiny, streamed", "tiny, whole first"]

@@ -1,7 +1,5 @@
 """The measurement of the contact ladder, shrunk, and the methods that it compares."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +11,8 @@ from experiments.contact import oracles as contact_oracles
 from experiments.contact.methods import blur, polonsky_keer, spg_plain, winkler_and_response, winkler_only
 from experiments.contact.scenes import displacement_error, exact, make_bench, sample, slope_error
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
 from sensors_io.scenes.sensors import GELSIGHT_MINI
+from tests.experiments.shrunk import run_shrunk
 
 TINY = pareto_contact.ParetoConfig(scenes=3, grid=32, ladder=(24, 32), ladder_scenes=2, rounds=2, oracle_scenes=1)
 
@@ -22,12 +20,7 @@ TINY = pareto_contact.ParetoConfig(scenes=3, grid=32, ladder=(24, 32), ladder_sc
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     home = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        small = dataclasses.replace(pareto_contact.EXPERIMENT, config=TINY)
-        patch.setattr(pareto_contact, "EXPERIMENT", small)
-        assert main(["pareto_contact", "--runs-dir", str(home)]) == 0
-    (directory,) = (p for p in (home / "pareto_contact").iterdir() if not p.is_symlink())
-    return read_json(directory / "results.json")
+    return read_json(run_shrunk(pareto_contact, TINY, home) / "results.json")
 
 
 def test_every_tier_has_a_row(results):

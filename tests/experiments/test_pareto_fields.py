@@ -7,8 +7,8 @@ import pytest
 
 from experiments import pareto_fields
 from experiments.fields import depth_known
-from experiments.fields.depth_balls import generated_presses
 from experiments.fields.depth_methods import MAPS
+from experiments.fields.depth_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 from sensors_io.calibration.circles import find_circles
@@ -36,6 +36,35 @@ def test_published_integrators_get_the_scale_wrong():
     }
     assert worst["this, Neumann"] < 2
     assert worst["as gs_sdk and gsrobotics"] > 20
+
+
+def test_strange_lamps_are_no_polynomial_of_the_normal():
+    """The supposed optics change by a linear function of (n, n², u); the lamps beside the window leave a remainder."""
+    axis = (np.arange(WINDOW_PX) - (WINDOW_PX - 1) / 2) * 15.2 / WINDOW_PX
+    profiles, touch = _Ball(), np.array([1.0, -2.0, 1.6])
+    depth, d_x, d_y = profiles.field(touch, axis[None, :], axis[:, None])
+    inside = depth > 0.02
+    up = 1 / np.sqrt(1 + d_x**2 + d_y**2)
+    n_x, n_y = (d_x * up)[inside], (d_y * up)[inside]
+    flat = np.ones_like(n_x)
+    features = np.stack([flat, n_x, n_y, n_x**2, n_x * n_y, n_y**2, depth[inside]], -1)
+    left = {}
+    for optics in (fitted_optics, near_lamps):
+        change = (optics(profiles, touch, axis) - optics(profiles, None, axis))[inside]
+        rest = change - features @ np.linalg.lstsq(features, change, rcond=None)[0]
+        left[optics.__name__] = float(rest.std() / change.std())
+    assert left["near_lamps"] > 2 * left["fitted_optics"]
+
+
+class _Ball:
+    """A sphere's cap of 3.155 mm radius, flat outside: profiles that need no solving."""
+
+    def field(self, touch, x, y):
+        square = np.minimum((x - touch[0]) ** 2 + (y - touch[1]) ** 2, touch[2] ** 2)
+        height = np.sqrt(3.155**2 - square)
+        inside = square < touch[2] ** 2
+        slopes = [np.where(inside, -(c - at) / height, 0.0) for c, at in ((x, touch[0]), (y, touch[1]))]
+        return height - np.sqrt(3.155**2 - touch[2] ** 2), *slopes
 
 
 @pytest.mark.parametrize("name", MAPS)

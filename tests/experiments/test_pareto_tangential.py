@@ -9,7 +9,6 @@ import pytest
 from experiments import pareto_tangential
 from experiments.reporting.results import ResultsError
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
 from experiments.tangential import checks as tangential_checks
 from experiments.tangential import loops as tangential_loops
 from experiments.tangential import methods as ways
@@ -18,9 +17,7 @@ from experiments.tangential import tables as tangential_tables
 from experiments.tangential.checks import Promise
 from experiments.tangential.tables import MAIN, PLAIN, SOLVER, Row
 from sensors_io.scenes.sensors import XENSE
-from tests.touchr1_jax.quick import compile_quickly
-
-__all__ = ["compile_quickly"]
+from tests.experiments.shrunk import run_shrunk
 
 TINY = dataclasses.replace(
     pareto_tangential.SMOKE, contacts=1, sensors=("xense",), grid=24, frames=20, rounds=1, closed_grid=32
@@ -30,12 +27,7 @@ TINY = dataclasses.replace(
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
     home = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        small = dataclasses.replace(pareto_tangential.EXPERIMENT, config=TINY)
-        patch.setattr(pareto_tangential, "EXPERIMENT", small)
-        assert main(["pareto_tangential", "--runs-dir", str(home)]) == 0
-    (directory,) = (p for p in (home / "pareto_tangential").iterdir() if not p.is_symlink())
-    return directory
+    return run_shrunk(pareto_tangential, TINY, home)
 
 
 @pytest.fixture(scope="module")

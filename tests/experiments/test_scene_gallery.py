@@ -9,14 +9,11 @@ import pytest
 
 from experiments import scene_gallery
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
 from experiments.scenes import sheets as scene_sheets
 from sensors_io.records import RecordStore
 from sensors_io.scenes import SceneConfig, objects
 from sensors_io.schema import SENSORS
-from tests.touchr1_jax.quick import compile_quickly
-
-__all__ = ["compile_quickly"]
+from tests.experiments.shrunk import run_shrunk
 
 TINY = dataclasses.replace(
     scene_gallery.SMOKE,
@@ -42,11 +39,8 @@ def test_a_press_is_a_row_per_sensor(records: Path) -> None:
 
 
 @pytest.mark.slow  # compiles eight programs
-def test_every_sheet_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    small = dataclasses.replace(scene_gallery.EXPERIMENT, config=TINY)
-    monkeypatch.setattr(scene_gallery, "EXPERIMENT", small)
-    assert main(["scene_gallery", "--runs-dir", str(tmp_path)]) == 0
-    (directory,) = (p for p in (tmp_path / "scene_gallery").iterdir() if not p.is_symlink())
+def test_every_sheet_is_drawn(tmp_path: Path) -> None:
+    directory = run_shrunk(scene_gallery, TINY, tmp_path)
     names = {path.name for path in (directory / "plots").iterdir()}
     assert names == {"views.png", "press-0.png", "motions.png", "varied.png", "properties.svg"}
     assert read_json(directory / "results.json")["verdict"] == ["5 sheets, drawn from seed 0."]

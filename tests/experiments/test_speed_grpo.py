@@ -1,13 +1,17 @@
 """The timed job computes what it says, and the experiment reports it."""
 
 import dataclasses
+from typing import get_args
 
 import jax
 import numpy as np
 import pytest
 
 from experiments import speed_grpo
-from experiments.grpo.job import Job, Size, config_of, init_decoder, make_agent, make_batch
+from experiments.grpo.job import Job, config_of, init_decoder, make_agent, make_batch
+from experiments.grpo.size import Size
+from experiments.grpo.speed import Course, Option, in_own_process, many_steps, options, time_alone
+from experiments.grpo.speed_tables import steadiness
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 
@@ -42,12 +46,19 @@ def test_work_by_hand():
 @pytest.mark.slow
 def test_the_second_process_reads_what_the_first_compiled(tmp_path):
     """Shown by the files that one leaves and by none that the other adds."""
-    small = dataclasses.replace(speed_grpo.SMOKE, rounds=1)
-    speed_grpo.in_own_process(speed_grpo.time_alone, small, 16, tmp_path)
-    kept = sorted(p.name for p in tmp_path.glob("*-cache"))
-    speed_grpo.in_own_process(speed_grpo.time_alone, small, 16, tmp_path)
+    measure = lambda: in_own_process(time_alone, TINY, 16, config_of(TINY), 1, tmp_path)
+    measure()
+    kept = sorted(p.name for p in tmp_path.rglob("*-cache"))
+    measure()
     assert kept
-    assert sorted(p.name for p in tmp_path.glob("*-cache")) == kept
+    assert sorted(p.name for p in tmp_path.rglob("*-cache")) == kept
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    """Every option, small, after one step each."""
+    every = options(TINY, 16, 1, (4,), get_args(Option))
+    return {name: (job, jax.device_get(job.step())) for name, job in every.items()}
 
 
 def test_the_repeated_way_does_the_same_number_of_rollouts():
@@ -58,10 +69,17 @@ def test_the_repeated_way_does_the_same_number_of_rollouts():
     assert np.isfinite(metrics["loss"])
 
 
-def test_the_reward_on_the_host_is_the_one_in_the_graph():
-    inside, outside = (jax.device_get(Job(TINY, 16, config_of(TINY), host=host).step()) for host in (False, True))
-    assert outside["reward"] == pytest.approx(float(inside["reward"]), rel=1e-6)
-    assert outside["grad_norm"] == pytest.approx(float(inside["grad_norm"]), rel=1e-4)
+@pytest.mark.slow
+def test_options_change_the_cost_and_not_the_step(jobs):
+    """Rewards in the graph and on the host, one micro-batch or several, weights of an exact sampler, rematerialised."""
+    plain = jobs["this"][1]
+    for name in ("one micro-batch", "remat", "importance weights", "host reward"):
+        assert jobs[name][1]["reward"] == pytest.approx(float(plain["reward"]), rel=1e-6), name
+        assert jobs[name][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=1e-4), name
+    assert jobs["bfloat16"][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=0.2)
+    short, cut = jobs["short answers"][1], jobs["short answers, buckets"][1]
+    assert short["length"] < TINY.length
+    assert cut["grad_norm"] == pytest.approx(float(short["grad_norm"]), rel=1e-4)
 
 
 def test_one_program_serves_all_steps():
@@ -75,17 +93,45 @@ def test_one_program_serves_all_steps():
     )
 
 
+def test_seeds_share_a_program_and_nothing_else():
+    one, two = (Job(TINY, 16, config_of(TINY), seed=seed) for seed in (0, 1))
+    assert (one.batch.ids != two.batch.ids).any()
+    norms = [float(job.step()["grad_norm"]) for job in (one, two)]
+    assert norms[0] != norms[1]
+    assert one.compilations == two.compilations == 1
+
+
+def test_many_steps_take_every_length_in_one_program():
+    size = dataclasses.replace(speed_grpo.SMOKE.steps_size, vocab_size=16, hidden_size=16)
+    course = many_steps(size, 16, (4, 8), 200)
+    assert course.seconds.shape == (200,)
+    assert course.resident_mb.shape == (2,)
+    assert course.programs == 1
+    assert course.lengths[0] < size.length
+
+
+def test_drift_and_growth_by_hand():
+    """Steps that slow down by half, and memory that grows by 20 MB."""
+    seconds = np.concatenate([np.full(500, 1.0), np.full(500, 1.5), np.full(1000, 9.0)])
+    course = Course(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
+    time, memory, programs = steadiness(course)
+    assert (time.measured, time.met) == (1.5, False)  # judged by the first thousand
+    assert (memory.measured, memory.met) == (20.0, False)
+    assert programs.met
+
+
 @pytest.mark.slow
 def test_the_experiment_reports_every_prefix(tmp_path):
-    small = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16,), flat_steps=12, rounds=2)
+    small = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16,), words=256)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed_grpo, "EXPERIMENT", dataclasses.replace(speed_grpo.EXPERIMENT, config=small))
-        patch.setattr(speed_grpo, "in_own_process", lambda work, config, prefix, cache: work(config, prefix, None))
+        patch.setattr(speed_grpo, "in_own_process", lambda work, *arguments: work(*arguments))
         assert main(["speed_grpo", "--runs-dir", str(tmp_path)]) == 0
     (directory,) = (p for p in (tmp_path / "speed_grpo").iterdir() if not p.is_symlink())
     results = read_json(directory / "results.json")
     assert [row[0] for row in results["tables"][0]["rows"]] == [16]
     names = {row[0] for row in results["tables"][1]["rows"]}
-    assert names == {"this", "one micro-batch", "Gumbel draws", "remat", "bfloat16", "host reward", "repeated prefix"}
+    assert names == {"this", "importance weights", "short answers, buckets"}
+    assert {p.name for p in (directory / "plots").iterdir()} == {"prefixes.svg", "steps.svg"}
     measured = {r["name"]: r["measured"] for r in results["requirements"]}
-    assert measured["programs for one shape"] == 1
+    assert measured["programs for one shape"] == measured["programs for all lengths"] == 1

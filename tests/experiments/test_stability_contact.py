@@ -8,7 +8,7 @@ import pytest
 from experiments import stability_contact
 from experiments.contact.failures import suite
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
+from tests.experiments.shrunk import run_shrunk
 
 TINY = dataclasses.replace(stability_contact.SMOKE, scenes=12, forces_n=(0.01, 1.0), roughness=(2.0,))
 
@@ -16,12 +16,7 @@ TINY = dataclasses.replace(stability_contact.SMOKE, scenes=12, forces_n=(0.01, 1
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
     home = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        small = dataclasses.replace(stability_contact.EXPERIMENT, config=TINY)
-        patch.setattr(stability_contact, "EXPERIMENT", small)
-        assert main(["stability_contact", "--runs-dir", str(home)]) == 0
-    (directory,) = (p for p in (home / "stability_contact").iterdir() if not p.is_symlink())
-    return directory
+    return run_shrunk(stability_contact, TINY, home)
 
 
 def test_every_requirement_is_kept(directory):

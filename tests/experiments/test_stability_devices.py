@@ -9,7 +9,16 @@ from experiments import stability_devices
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 
-TINY = dataclasses.replace(stability_devices.SMOKE, seconds=20.0, traced_seconds=8.0, sweep_seconds=4.0, rounds=3)
+TINY = dataclasses.replace(
+    stability_devices.SMOKE,
+    seconds=20.0,
+    traced_seconds=8.0,
+    sweep_seconds=4.0,
+    rounds=3,
+    watch_seconds=0.4,
+    browsers=(1,),
+    bridge_frames=12,
+)
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +38,25 @@ def results(tmp_path_factory):
 
 
 def test_the_books_are_exact(results):
-    timed = {"Tac3D message decoded", "memory gained from the first tenth to the last"}  # by the clock, by the process
+    timed = {  # by the clock, by the process
+        "Tac3D message decoded",
+        "memory gained from the first tenth to the last",
+        "age of what a browser shows, p95, worst",
+        "pictures of 640 × 480 through a bridge",
+    }
     assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"] and r["name"] not in timed} == {}
     for name in (stability_devices.BY_COUNTER, stability_devices.SLOW):
         assert set(results["data"][name].values()) == {0}
 
 
 def test_every_replay_and_recording_is_reported(results):
-    accounts, recorded, decoders = results["tables"]
+    accounts, recorded, decoders, watched, carried = results["tables"]
     assert len(accounts["rows"]) == 3
     assert recorded["rows"][0][:4] == ["AD2-1", 6, 8, 8]
     assert decoders["rows"][0][0] == "cached layout"
+    assert [row[0] for row in watched["rows"]] == ["no page", "1 browser"]
+    assert all(row[-1] == 0 < row[-2] for row in watched["rows"])
+    assert carried["rows"][0][1] > 0
 
 
 def test_a_directory_without_recordings_is_refused(tmp_path):

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from experiments import stability_fields
-from experiments.fields import motion_breaks
+from experiments.fields import motion_breaks, motion_shear_breaks
 from experiments.fields.motion_breaks import Outcome, Stress
 from experiments.fields.motion_truth import Film, pressed
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
+from sensors_io.schema import Flag
 
 TINY = dataclasses.replace(stability_fields.SMOKE, methods=(stability_fields.OURS, "dots, nearest"))
 
@@ -23,6 +24,9 @@ def directory(tmp_path_factory):
         patch.setattr(stability_fields, "EXPERIMENT", dataclasses.replace(stability_fields.EXPERIMENT, config=TINY))
         patch.setattr(motion_breaks, "STRESSES", few)
         patch.setattr(stability_fields, "STRESSES", few)
+        layers = tuple(Stress(name=s.name, levels=s.levels[2:3]) for s in motion_shear_breaks.SHEAR_STRESSES)
+        patch.setattr(motion_shear_breaks, "SHEAR_STRESSES", layers)
+        patch.setattr(stability_fields, "SHEAR_STRESSES", layers)
         assert main(["stability_fields", "--runs-dir", str(home)]) == 0
     (directory,) = (p for p in (home / "stability_fields").iterdir() if not p.is_symlink())
     return directory
@@ -34,7 +38,7 @@ def test_nothing_of_ours_breaks_in_silence(directory):
     assert set(results["data"]["silent"]) == set(TINY.methods)
 
 
-def test_the_maps_are_drawn(directory):
+def test_the_curves_are_drawn(directory):
     assert {p.name for p in (directory / "plots").iterdir()} >= {"stability_tracking.svg", "stability_shear.svg"}
 
 
@@ -57,9 +61,9 @@ def test_the_peak_is_the_peak():
 
 
 def test_silent_is_broken_without_a_flag():
-    assert Outcome(error_px=9.0, wrong=0.2, flagged=False).silent
-    assert not Outcome(error_px=9.0, wrong=0.2, flagged=True).silent
-    assert not Outcome(error_px=0.1, wrong=0.0, flagged=False).silent
+    assert Outcome(error_px=9.0, wrong=0.2, flags=Flag.NONE).silent
+    assert not Outcome(error_px=9.0, wrong=0.2, flags=Flag.MARKER_LOSS).silent
+    assert not Outcome(error_px=0.1, wrong=0.0, flags=Flag.NONE).silent
 
 
 def test_a_configuration_without_the_package_is_refused():

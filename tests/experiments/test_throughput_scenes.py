@@ -9,7 +9,6 @@ import pytest
 
 from experiments import throughput_scenes
 from experiments.running.artifacts import read_json
-from experiments.running.runner import main
 from experiments.scenes import kills as scene_kills
 from experiments.scenes import protocol as scene_protocol
 from experiments.scenes import rates as scene_rates
@@ -18,6 +17,7 @@ from sensors_io import generate, live
 from sensors_io.records import RecordStore
 from sensors_io.scenes import SceneConfig, contact_key, protocol, strength
 from sensors_io.schema import SENSORS
+from tests.experiments.shrunk import run_shrunk
 from tests.sensors_io import fakes
 
 
@@ -57,12 +57,8 @@ def test_the_experiment_runs_shrunken(cheap, tmp_path):
         return kills
 
     config = dataclasses.replace(throughput_scenes.SMOKE, written_contacts=8, kills=5)
-    small = dataclasses.replace(throughput_scenes.EXPERIMENT, config=config)
-    cheap.setattr(throughput_scenes, "EXPERIMENT", small)
     cheap.setattr(scene_kills, "killed_and_resumed", killed)
-    paths = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "cache")]
-    assert main(["throughput_scenes", *paths]) == 0
-    (directory,) = (p for p in (tmp_path / "runs" / "throughput_scenes").iterdir() if not p.is_symlink())
+    directory = run_shrunk(throughput_scenes, config, tmp_path / "runs", "--cache-dir", str(tmp_path / "cache"))
     results = read_json(directory / "results.json")
     named = {r["name"]: r for r in results["requirements"]}
     assert named["kills at random moments"]["met"]

@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.policies.assembly import Assembly, ModelConfig
@@ -13,6 +12,7 @@ from experiments.policies.stages import SFTConfig
 from experiments.policies.study import StudyConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes import SceneConfig
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -69,18 +69,8 @@ def one_batch(data: Dataset) -> TouchBatch:
 
 
 def params(assembly: Assembly, data: Dataset, *, loud: float = 0.4, seed: int = 0) -> Params:
-    """Parameters drawn from N(0, loud²), scales from N(1, loud²), so that answers depend on what is asked and felt.
-
-    Drawn in NumPy from the traced shapes: compiling the initialisation takes longer than all else here.
-    """
-    shapes = jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data))
-    rng = np.random.default_rng(seed)
-
-    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        centre = 1.0 if path[-1].key == "scale" else 0.0
-        return jnp.asarray(rng.normal(centre, loud, leaf.shape), leaf.dtype)
-
-    return jax.tree_util.tree_map_with_path(draw, shapes)
+    """Loud parameters, so that answers depend on what is asked and felt."""
+    return draw_params(jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data)), seed, loud=loud)
 
 
 def features(n: int, seed: int = 0) -> Features:

@@ -1,12 +1,17 @@
 """The command line: tables for people, exit status 1 and one line for known errors."""
 
 import io
+import pathlib
+import re
+import shutil
 
+import numpy as np
 import pytest
 
 from sensors_io import __main__ as cli
 from sensors_io.commands import generate as generating
 from sensors_io.commands.console import ERR, OUT
+from sensors_io.importers.pictures import read_picture
 from sensors_io.records import RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.importers.films import entry, folder
@@ -34,6 +39,8 @@ def test_import_reports_what_it_skipped(run, tmp_path):
     )
     assert status == 0
     assert "does not open as a video" in out
+    _, out, _ = run("check", tmp_path / "out")
+    assert re.search(r"does not open as a video.* 1 ", out)
     status, out, _ = run("list", tmp_path / "out")
     assert status == 0
     assert "ball" in out
@@ -125,3 +132,23 @@ def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
     status, _, err = run("generate", "--out", tmp_path / "r")
     assert status == 130
     assert "run the same command again" in err
+
+
+def test_check_looks_at_pictures_where_it_can(run, tmp_path):
+    """Real presses of a Mini beside their gel at rest; the other sensors' noise has no background and says so."""
+    gelslam = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
+    names = ("background", "press_12", "press_14", "press_18")
+    frames = np.stack([read_picture(gelslam / f"{name}.png") for name in names])
+    fakes.write(tmp_path, 1, sensors=("tac3d",))
+    with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
+        n = len(frames)
+        shown = fakes.sequence(0, length=n, trial=1, frames=frames, camera={"recording": {"background": "rest.png"}})
+        writer.write_contact([shown])
+        writer.write_contact([fakes.sequence(0, trial=2)])
+    shutil.copy(gelslam / "background.png", tmp_path / "rest.png")
+    status, out, _ = run("check", tmp_path, "--pictures")
+    assert status == 0
+    looked = out[out.index("flags by the pictures") :]
+    assert re.search(r"no_contact\W+1 ", looked)
+    assert "not looked at: 1 sequences, they hold no pictures" in out
+    assert "not looked at: 1 sequences, no gel at rest was recorded" in out

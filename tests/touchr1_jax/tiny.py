@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots, init_policy
@@ -69,19 +70,8 @@ def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
 
 @functools.cache
 def params(seed: int = 0, *, loud: float = 0.4) -> Params:
-    """Parameters drawn from N(0, loud²), scales from N(1, loud²), so that attention is not uniform and no bias trivial.
-
-    Drawn in NumPy from the traced shapes: compiling the initialisation takes longer than all else here.
-    """
-    shapes = jax.eval_shape(lambda: initialise(jax.random.key(0)))
-    rng = np.random.default_rng(seed)
-
-    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        centre = 1.0 if path[-1].key == "scale" else 0.0
-        return jnp.asarray(rng.normal(centre, loud, leaf.shape), leaf.dtype)
-
-    with jax.ensure_compile_time_eval():  # the cache must not keep a tracer of whoever asks first
-        return jax.tree_util.tree_map_with_path(draw, shapes)
+    """Loud parameters of `AGENT`."""
+    return draw_params(jax.eval_shape(lambda: initialise(jax.random.key(0))), seed, loud=loud)
 
 
 def initialise(key: jax.Array) -> Params:

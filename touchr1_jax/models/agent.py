@@ -80,27 +80,29 @@ class Agent:
 
         Values and gradients equal those of G separate forward passes over prompt and completion.
         """
-        return self.completion_logits(params, tokens, *self.prefill(params, features, ids, mask))
+        return self.logits(params, self.group_states(params, features, ids, mask, tokens)[0])
 
-    def completion_logits(
-        self, params: Params, tokens: Int[Array, "G T"], first: Float[Array, "V"], prefix: PrefixCache
-    ) -> Float[Array, "G T V"]:
-        """Logits of every token of a group of completions under a prompt that `prefill` encoded."""
-        banned = jnp.asarray(self.banned)
-        return jax.vmap(lambda o: self._apply(params, Policy.completion_logits, o, first, prefix, banned))(tokens)
+    def group_states(
+        self,
+        params: Params,
+        features: Features,
+        ids: Int[Array, "L"],
+        mask: Bool[Array, "L"],
+        tokens: Int[Array, "G T"],
+        known: PrefixCache | None = None,
+        start: int = 0,
+    ) -> tuple[Float[Array, "G T D"], PrefixCache]:
+        """Hidden states that predict every token of a group of completions, and the encoded prompt.
 
-    def completion_log_probs(
-        self, params: Params, tokens: Int[Array, "G T"], first: Float[Array, "V"], prefix: PrefixCache, *, block: int
-    ) -> Float[Array, "G T"]:
-        """Log-probabilities of a group of completions, as from `completion_logits`, but `block` words at a time.
-
-        For vocabularies of a language model: nothing of size [G, T, V] exists, neither here nor in the gradient.
+        What `logits` makes of them is V numbers a token; who cannot afford those of all tokens at once takes some
+        states at a time.  `known` and `start` as in `prefill`.
         """
-        states = jax.vmap(lambda o: self._apply(params, Policy.completion_states, o, prefix))(tokens)
-        later, banned = tokens[:, 1:], jnp.asarray(self.banned)
-        flat = states.reshape(-1, states.shape[-1]), later.reshape(-1)
-        rest = self._apply(params, Policy.log_probs, *flat, banned, block).reshape(later.shape)
-        return jnp.concatenate([jax.nn.log_softmax(first)[tokens[:, :1]], rest], 1)
+        first, prefix = self._apply(params, Policy.prefill_state, features, ids, mask, self.slots, known, start)
+        return jax.vmap(lambda o: self._apply(params, Policy.completion_states, o, first, prefix))(tokens), prefix
+
+    def logits(self, params: Params, states: Float[Array, "*n D"]) -> Float[Array, "*n V"]:
+        """Scores of the token that each hidden state predicts, banned ids out of reach."""
+        return self._apply(params, Policy.logits, states, jnp.asarray(self.banned))
 
     def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
         """Caches of one completion of at most `length` tokens."""

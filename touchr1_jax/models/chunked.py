@@ -1,69 +1,49 @@
-"""Log-probabilities of given tokens without the logits of a whole vocabulary.
+"""A function of many rows, some rows at a time, where what it makes of all of them does not fit.
 
-    log π(o) = s_o − log Σ_v exp s_v,   s = h Wᵀ,   W [V, D]
-
-One block of the vocabulary is scored at a time and folded into a running maximum and sum, so that the largest array is
-[tokens, block] instead of [tokens, V]: for 2 000 tokens and 152 000 words 56 MB instead of 1.2 GB.  The gradient scores
-each block again.
+The logits of 2 000 tokens over 152 000 words are 1.2 GB, and a softmax, a reference, a perturbed policy and the
+gradient each make as much again.  What is kept of a token is a handful of numbers.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.layers import MASKED
+Rows = dict[str, jax.Array]
+"""Arrays with one leading axis."""
+
+MAX_LOGITS = 2**24
+"""Logits that may exist at once, 64 MB in float32: up to 110 tokens of a language model's 152 000 words, and all tokens
+of a policy that knows a few hundred."""
 
 
-def chunked_log_probs(
-    hidden: Float[Array, "n D"],
-    table: Float[Array, "V D"],
-    tokens: Int[Array, "n"],
-    banned: Bool[Array, "V"],
-    *,
-    block: int,
-) -> Float[Array, "n"]:
-    """Log-probability of each token under softmax over the words that are not banned, float32.
+def by_blocks(f: Callable[[Rows], Rows], rows: Rows, *, width: int, most: int = MAX_LOGITS) -> Rows:
+    """f(rows) for an f that treats every row by itself, in blocks of rows for which it makes at most `most` numbers.
+
+    Blocks are of one size, at least one row each; the gradient computes each of them again.  Rows that make no more
+    than `most` numbers in all are given to f as they are, and nothing is computed twice.
 
     Args:
-      hidden: normalised hidden states that predict the tokens.
-      table: a row for each word.
-      tokens: words to score.
-      banned: words that have no probability.
-      block: most words scored at a time.
+      f: from arrays [n, …] to arrays [n, …]; what it closes over is shared by all blocks.
+      rows: arrays of n rows.
+      width: numbers that f makes on the way for each row: the size of the vocabulary.
+      most: bound on width times the rows of a block.
 
     Raises:
-      ValueError: as `block_size`.
+      ValueError: a width or bound below 1.
     """
-    vocabulary, width = table.shape
-    size = block_size(vocabulary, block)
-
-    @jax.checkpoint
-    def fold(carry, words):
-        top, total, picked = carry
-        rows, out, first = words
-        scores = jnp.einsum("nd,vd->nv", hidden, rows, preferred_element_type=jnp.float32)
-        scores = jnp.where(out, MASKED, scores)
-        higher = jax.lax.stop_gradient(jnp.maximum(top, jnp.max(scores, -1)))  # it cancels in the result
-        total = total * jnp.exp(top - higher) + jnp.sum(jnp.exp(scores - higher[:, None]), -1)
-        chosen = tokens[:, None] == first + jnp.arange(size)
-        return (higher, total, picked + jnp.sum(jnp.where(chosen, scores, 0.0), -1)), None
-
-    zero = jnp.zeros(tokens.shape)
-    blocks = table.reshape(-1, size, width), banned.reshape(-1, size), jnp.arange(0, vocabulary, size)
-    (top, total, picked), _ = jax.lax.scan(fold, (zero + 2 * MASKED, zero, zero), blocks)
-    return picked - (top + jnp.log(total))
+    if width < 1 or most < 1:
+        raise ValueError(f"width is {width} and most {most}: must be at least 1; give the vocabulary and a bound")
+    n = len(jax.tree.leaves(rows)[0])
+    count = -(-n // max(1, most // width))
+    if count <= 1:
+        return f(rows)
+    size = -(-n // count)
+    cut = lambda x: _padded(x, count * size).reshape(count, size, *x.shape[1:])
+    found = jax.lax.map(jax.checkpoint(f), jax.tree.map(cut, rows))
+    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:n], found)
 
 
-def block_size(vocabulary: int, most: int) -> int:
-    """Largest divisor of the vocabulary that is at most `most`: blocks of one size are cut without copying the table.
-
-    Raises:
-      ValueError: there is none above an eighth of `most`, and blocks would be many and slow.
-    """
-    size = next((s for s in range(min(most, vocabulary), 0, -1) if vocabulary % s == 0), 0)
-    if 8 * size < min(most, vocabulary) or size < 1:
-        raise ValueError(
-            f"block is {most}: the vocabulary of {vocabulary} has no divisor between an eighth of it and it; choose "
-            "another, or pad the table to a rounder size"
-        )
-    return size
+def _padded(x: jax.Array, n: int) -> jax.Array:
+    """Zeros after the rows of x, up to n; what f makes of them is dropped."""
+    return jnp.pad(x, [(0, n - len(x))] + [(0, 0)] * (x.ndim - 1))

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.chunked import chunked_log_probs
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
 
 
@@ -104,14 +103,6 @@ class Decoder(nn.Module):
         y = self.norm(x)
         scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)
         return jnp.where(banned, MASKED, scores.astype(jnp.float32))
-
-    def log_probs(
-        self, x: Float[Array, "n D"], tokens: Int[Array, "n"], banned: Bool[Array, "V"], block: int
-    ) -> Float[Array, "n"]:
-        """Log-probability of the token after each hidden state, `block` words at a time; see `chunked`."""
-        tied = self.config.tie_embedding
-        table = self.embedding.embedding if tied else self.head.variables["params"]["kernel"].T
-        return chunked_log_probs(self.norm(x), table, tokens, banned, block=block)
 
     def prefill(
         self,

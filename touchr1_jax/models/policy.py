@@ -2,7 +2,7 @@
 
     features = encode(frames, force, view)            once per contact
     logits, prefix = prefill(features, prompt ids)    once per prompt
-    logits = completion_logits(tokens, prefix)        per rollout, the learner
+    states = completion_states(tokens, prefix)        per rollout, the learner; `logits` scores them
     logits, cache = decode(token, t, prefix, cache)   per rollout and token, the sampler
 
 Every function but `encode` works on a single prompt or rollout and is batched by `vmap`.
@@ -128,29 +128,34 @@ class Policy(nn.Module):
 
         Where `known` encodes a prompt that is the same before `start`, only what follows is computed.
         """
+        hidden, prefix = self.prefill_state(features, ids, mask, slots, known, start)
+        return self.decoder.logits(hidden, banned), prefix
+
+    def prefill_state(
+        self,
+        features: Features,
+        ids: Int[Array, "L"],
+        mask: Bool[Array, "L"],
+        slots: Slots,
+        known: PrefixCache | None = None,
+        start: int = 0,
+    ) -> tuple[Float[Array, "D"], PrefixCache]:
+        """As `prefill`, but the hidden state that the first token's logits are made of."""
         x = self.decoder.embed(ids)
         x = x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
         mask = prompt_mask(features, mask, slots)
         positions = prompt_positions(features.touch_time, mask, slots, self.config.vision.grid)
-        hidden, prefix = self.decoder.prefill(x, positions, mask, known, start)
-        return self.decoder.logits(hidden, banned), prefix
+        return self.decoder.prefill(x, positions, mask, known, start)
 
-    def completion_logits(
-        self, tokens: Int[Array, "T"], first: Float[Array, "V"], prefix: PrefixCache, banned: Bool[Array, "V"]
-    ) -> Float[Array, "T V"]:
-        """Logits that predict each completion token, the first from the prefix, the others from what precedes them."""
-        hidden = self.decoder.extend(tokens[:-1], prefix)
-        return jnp.concatenate([first[None], self.decoder.logits(hidden, banned)])
+    def completion_states(
+        self, tokens: Int[Array, "T"], first: Float[Array, "D"], prefix: PrefixCache
+    ) -> Float[Array, "T D"]:
+        """Hidden states that predict each completion token: the first from the prefix, others from what precedes."""
+        return jnp.concatenate([first[None], self.decoder.extend(tokens[:-1], prefix)])
 
-    def completion_states(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T-1 D"]:
-        """Hidden states that predict each completion token but the first."""
-        return self.decoder.extend(tokens[:-1], prefix)
-
-    def log_probs(
-        self, states: Float[Array, "n D"], tokens: Int[Array, "n"], banned: Bool[Array, "V"], block: int
-    ) -> Float[Array, "n"]:
-        """Log-probabilities of the tokens that the states predict, `block` words at a time."""
-        return self.decoder.log_probs(states, tokens, banned, block)
+    def logits(self, states: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
+        """Scores of the token that each hidden state predicts."""
+        return self.decoder.logits(states, banned)
 
     def decode(self, token, t, prefix: PrefixCache, caches: tuple[LayerCache, ...], banned: Bool[Array, "V"]):
         """Logits of completion token t + 1 after token t, and the grown caches."""
@@ -161,8 +166,7 @@ class Policy(nn.Module):
         """Touch every parameter once; `init_policy` calls it."""
         features = jax.tree.map(lambda x: x[0], self.encode(batch))
         banned = jnp.zeros(self.config.decoder.vocab_size, bool)
-        first, prefix = self.prefill(features, ids, mask, slots, banned)
-        return self.completion_logits(ids, first, prefix, banned)
+        return self.logits(self.completion_states(ids, *self.prefill_state(features, ids, mask, slots)), banned)
 
 
 def init_policy(

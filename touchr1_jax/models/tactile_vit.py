@@ -5,12 +5,15 @@ after the transformer each step is pooled by learned queries to `tokens_per_step
 """
 
 import dataclasses
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
 from touchr1_jax.models.layers import MASKED, RMSNorm
+from touchr1_jax.models.salience import busiest_patches, patch_change, rest_mean
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -19,6 +22,10 @@ class TactileViTConfig:
 
     A frame of H × W pixels is read by `stem_px` cells first, then by patches of `patch_cells` cells; `frames_per_step`
     frames make one time step.  With the defaults 4 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
+
+    A `causal` encoder lets a step see itself and earlier ones alone, as the prediction of the next step needs.  With
+    `patches_kept` the transformer gets only the patches of a stream that change most, the same ones in every step; the
+    `rest` is dropped before its pixels are read, or kept as one mean token of each step.
     """
 
     sensors: int
@@ -32,6 +39,16 @@ class TactileViTConfig:
     frames_per_step: int = 1
     tokens_per_step: int = 2
     use_force: bool = True
+    causal: bool = False
+    patches_kept: int | None = None
+    rest: Literal["drop", "merge"] = "drop"
+
+
+class Encoded(NamedTuple):
+    """What a stream becomes: the tokens of all its patches, and those few that they are pooled to."""
+
+    patches: Float[Array, "*n step patch D"]
+    pooled: Float[Array, "*n step token D"]
 
 
 class TactileViT(nn.Module):
@@ -39,7 +56,6 @@ class TactileViT(nn.Module):
 
     config: TactileViTConfig
 
-    @nn.compact
     def __call__(
         self,
         frames: Real[Array, "*n F H W 3"],
@@ -48,6 +64,18 @@ class TactileViT(nn.Module):
         frame_mask: Bool[Array, "*n F"],
         sensor: Int[Array, "*n"],
     ) -> Float[Array, "*n step token D"]:
+        """`tokens_per_step` tokens of each time step; arguments as in `encode`."""
+        return self.encode(frames, force_n, frame_index, frame_mask, sensor).pooled
+
+    @nn.compact
+    def encode(
+        self,
+        frames: Real[Array, "*n F H W 3"],
+        force_n: Float[Array, "*n F 3"],
+        frame_index: Int[Array, "*n F"],
+        frame_mask: Bool[Array, "*n F"],
+        sensor: Int[Array, "*n"],
+    ) -> Encoded:
         """Encode streams.
 
         Args:
@@ -56,17 +84,14 @@ class TactileViT(nn.Module):
           frame_index: position of each frame in its recording.
           frame_mask: which frames exist.
           sensor: index of the sensor that saw them.
-
-        Returns:
-          `tokens_per_step` tokens of each time step.
         """
         c = self.config
         frames = jnp.where(frame_mask[..., None, None, None], frames, 0)  # padding must hold nothing
         force_n = jnp.where(frame_mask[..., None], force_n, 0.0)
-        x = patch_tokens(frames, c)  # *n step patch D
+        kept = kept_patches(frames, frame_mask, c)
+        x = self._placed_patches(frames, kept)  # *n step patch D
         steps = x.shape[-3]
         step_mask = _group(frame_mask, c.frames_per_step).any(-1)
-        x = x + self.param("patch_position", nn.initializers.normal(0.02), (x.shape[-2], c.width))
         x = x + nn.Embed(c.sensors, c.width, name="sensor")(sensor)[..., None, None, :]
         time = _group(frame_index, c.frames_per_step)[..., 0]
         x = x + nn.Dense(c.width, name="time")(sinusoid(time, 32))[..., None, :]
@@ -75,17 +100,57 @@ class TactileViT(nn.Module):
             force = nn.Dense(c.width, name="force_in")(force.reshape(*force.shape[:-2], -1))
             x = x + nn.Dense(c.width, name="force_out")(nn.gelu(force))[..., None, :]
         seen = jnp.repeat(step_mask, x.shape[-2], -1)
+        order = earlier_steps(steps, x.shape[-2]) if c.causal else None
         x = x.reshape(*x.shape[:-3], -1, c.width)
         for i in range(c.num_layers):
-            x = EncoderLayer(c.width, c.num_heads, c.mlp_ratio, name=f"layer_{i}")(x, seen)
+            x = EncoderLayer(c.width, c.num_heads, c.mlp_ratio, name=f"layer_{i}")(x, seen, order)
         x = RMSNorm(name="norm")(x).reshape(*x.shape[:-2], steps, -1, c.width)
-        return QueryPool(c.tokens_per_step, name="pool")(x)
+        return Encoded(patches=x, pooled=QueryPool(c.tokens_per_step, name="pool")(x))
+
+    def _placed_patches(
+        self, frames: Real[Array, "*n F H W 3"], kept: Int[Array, "*n k"] | None
+    ) -> Float[Array, "*n step patch D"]:
+        """Embedded patches with their positions: all, the kept ones, or the kept ones and the mean of the others."""
+        c = self.config
+        merge = kept is not None and c.rest == "merge"
+        x = patch_tokens(frames, c, None if merge else kept)
+        cell = c.stem_px * c.patch_cells
+        grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
+        place = self.param("patch_position", nn.initializers.normal(0.02), (grid, c.width))
+        if kept is None:
+            return x + place
+        if merge:
+            return rest_mean(x + place, kept[..., None, :])
+        return x + place[kept][..., None, :, :]
 
 
-def patch_tokens(frames: Real[Array, "*n F H W 3"], c: TactileViTConfig) -> Float[Array, "*n step patch D"]:
-    """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
+def kept_patches(
+    frames: Real[Array, "*n F H W 3"], frame_mask: Bool[Array, "*n F"], c: TactileViTConfig
+) -> Int[Array, "*n k"] | None:
+    """The patches of each stream that are read, in their order; `None` for all.
 
-    The stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
+    Raises:
+      ValueError: more patches to keep than there are.
+    """
+    if c.patches_kept is None:
+        return None
+    cell = c.stem_px * c.patch_cells
+    grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
+    if not 1 <= c.patches_kept <= grid:
+        raise ValueError(f"patches_kept is {c.patches_kept}: must lie in 1..{grid}, the patches of a frame; change it")
+    return busiest_patches(patch_change(frames, cell), frame_mask, c.patches_kept)
+
+
+def earlier_steps(steps: int, tokens: int) -> Bool[np.ndarray, "N N"]:
+    """Which token may look at which, [query, key]: those of its own time step and of earlier ones."""
+    step = np.repeat(np.arange(steps), tokens)
+    return step[:, None] >= step
+
+
+def cut_patches(
+    frames: Real[Array, "*n F H W 3"], c: TactileViTConfig, kept: Int[Array, "*n k"] | None = None
+) -> Real[Array, "*n F patch cell pixel"]:
+    """The pixels of every stem cell of every patch, or of the kept patches alone.
 
     Raises:
       ValueError: when the frames do not divide into the configured patches or steps.
@@ -102,15 +167,37 @@ def patch_tokens(frames: Real[Array, "*n F H W 3"], c: TactileViTConfig) -> Floa
     x = frames.reshape(*lead, f, rows, c.patch_cells, c.stem_px, columns, c.patch_cells, c.stem_px, 3)
     n = len(lead)
     x = x.transpose(*range(n), *(n + i for i in (0, 1, 4, 2, 5, 3, 6, 7)))
-    x = x.reshape(-1, 3 * c.stem_px**2).astype(jnp.float32) / 127.5 - 1.0
+    x = x.reshape(*lead, f, rows * columns, c.patch_cells**2, -1)
+    return x if kept is None else jnp.take_along_axis(x, kept[..., None, :, None, None], -3)
+
+
+def patch_tokens(
+    frames: Real[Array, "*n F H W 3"], c: TactileViTConfig, kept: Int[Array, "*n k"] | None = None
+) -> Float[Array, "*n step patch D"]:
+    """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
+
+    The stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
+
+    Args:
+      frames: pixel values 0..255.
+      c: shape of the encoder.
+      kept: the only patches to read; all by default.
+
+    Raises:
+      ValueError: when the frames do not divide into the configured patches or steps.
+    """
+    *lead, f = frames.shape[:-3]
+    x = cut_patches(frames, c, kept)
+    patches = x.shape[-3]
     # one long matrix: XLA's CPU gradient of a dense layer over many leading axes is seven times slower
+    x = x.reshape(-1, 3 * c.stem_px**2).astype(jnp.float32) / 127.5 - 1.0
     x = nn.Dense(2 * c.stem_width, name="stem")(x)
-    level, change = jnp.split(x.reshape(*lead, f, rows * columns, c.patch_cells**2, -1), 2, -1)
+    level, change = jnp.split(x.reshape(*lead, f, patches, c.patch_cells**2, -1), 2, -1)
     change = change - change[..., :1, :, :, :]
     texture = log_energy(level - level.mean(-2, keepdims=True))
     moved = log_energy(change)
     energy = jnp.concatenate([texture, texture - texture[..., :1, :, :], moved, change.mean(-2)], -1)
-    x = nn.relu(level + 4.0 * change).reshape(*lead, f, rows * columns, -1)
+    x = nn.relu(level + 4.0 * change).reshape(*lead, f, patches, -1)
     embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
     return embed(x, "patch") + embed(energy, "energy")
 
@@ -131,19 +218,22 @@ def _steps(x: Float[Array, "*n F patch C"], frames_per_step: int) -> Float[Array
 
 
 class EncoderLayer(nn.Module):
-    """Pre-norm transformer layer with full attention over the tokens that exist."""
+    """Pre-norm transformer layer with attention over the tokens that exist, and that `order` allows [query, key]."""
 
     width: int
     num_heads: int
     mlp_ratio: int
 
     @nn.compact
-    def __call__(self, x: Float[Array, "*n N D"], mask: Bool[Array, "*n N"]) -> Float[Array, "*n N D"]:
+    def __call__(
+        self, x: Float[Array, "*n N D"], mask: Bool[Array, "*n N"], order: Bool[np.ndarray, "N N"] | None = None
+    ) -> Float[Array, "*n N D"]:
         head = self.width // self.num_heads
         qkv = nn.Dense(3 * self.width, name="qkv")(RMSNorm(name="norm_attention")(x))
         q, k, v = jnp.split(qkv.reshape(*qkv.shape[:-1], 3 * self.num_heads, head), 3, -2)
         scores = jnp.einsum("...qhd,...khd->...hqk", q, k) * head**-0.5
-        weights = nn.softmax(jnp.where(mask[..., None, None, :], scores, MASKED), -1)
+        seen = mask[..., None, None, :] if order is None else mask[..., None, None, :] & order
+        weights = nn.softmax(jnp.where(seen, scores, MASKED), -1)
         mixed = jnp.einsum("...hqk,...khd->...qhd", weights, v)
         x = x + nn.Dense(self.width, name="out")(mixed.reshape(x.shape))
         y = nn.gelu(nn.Dense(self.mlp_ratio * self.width, name="up")(RMSNorm(name="norm_mlp")(x)))

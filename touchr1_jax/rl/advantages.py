@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from touchr1_jax import masked
+
 SPREAD_FLOOR = 1e-5
 """Rewards closer than this are equal: 1, 0.4 and −0.1 are not exact in float32, so σ of a constant group is not 0."""
 
@@ -28,6 +30,25 @@ def group_advantage(
     if normalise:
         centred = centred / (jnp.std(reward, -1, keepdims=True) + epsilon)
     return jnp.where(degenerate(reward)[..., None], 0.0, centred)
+
+
+def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Float[Array, "P G"]:
+    """Advantage within a group in units of the whole batch, A_i = (R_i − R̄_group)/(σ_batch + ε).
+
+    σ_batch² is the mean variance of the groups that are not degenerate.  A σ of each group's own weighs questions by
+    how alike their rewards are, and so undoes a reward that is fair between answers: under ordinal credit debiased by
+    the prior, a group whose label is the middle one spreads half as wide as others, so that over uniform labels and
+    answers "middle" has an advantage of .23 on average and either end one of −.11.  After REINFORCE++ (arXiv
+    2501.03262), whose mean is the batch's too.
+
+    Args:
+      reward: rewards of the rollouts of all groups.
+      epsilon: added to σ.
+    """
+    flat = degenerate(reward)
+    sigma = jnp.sqrt(masked.mean(jnp.var(reward, -1), ~flat))
+    centred = reward - jnp.mean(reward, -1, keepdims=True)
+    return jnp.where(flat[:, None], 0.0, centred / (sigma + epsilon))
 
 
 def added_after(bonus: Float[Array, "*p G"], weight: float) -> Float[Array, "*p G"]:

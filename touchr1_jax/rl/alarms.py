@@ -1,6 +1,7 @@
 """Alarms: what goes wrong in reinforcement from touch, each seen in the metrics of a run by one small function.
 
-A function gets the means over the last and over the first `WINDOW` steps and returns the number that fired, or `None`.
+A function gets the means over the last `WINDOW` steps and the metrics of the first step, which are those of the
+policy that training starts from, and returns the number that fired, or `None`.
 The codes F1 … F13 number known failures; F11, the collapse of latent prediction, belongs to another stage.
 """
 
@@ -10,6 +11,9 @@ from collections.abc import Callable, Mapping
 
 WINDOW = 20
 """Steps that a mean is over: with 8 prompts of 8 rollouts a share has then a standard error below .02."""
+
+RARE = 0.02
+"""Shares of groups below this are three in a window of 160: too few to judge by."""
 
 Metrics = Mapping[str, float]
 
@@ -69,34 +73,44 @@ def grounding_size(now: Metrics, start: Metrics) -> float | None:
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
     """F4: how much more noise costs than another object's touch; needs the controls of R_tu."""
     del start
-    return now["control_order"] - now["control_noise"] if "control_noise" in now else None
+    controls = _controls(now)
+    return controls["order"] - controls["noise"] if {"order", "noise"} <= set(controls) else None
 
 
 def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
-    """F5: share of groups that earned the tactile bonus and whose advantages it left as they were."""
+    """F5: of the groups whose rollouts earn different bonuses, the share whose advantages are as without them."""
     del start
-    return now["bonus_cancelled_share"]
+    telling = now["bonus_telling_share"]
+    return now["bonus_cancelled_share"] / telling if telling > RARE else None
 
 
 def unearned_credit(now: Metrics, start: Metrics) -> float | None:
     """F6: share of groups with tactile credit, while touch is no better than the best control on average."""
     del start
-    if "tactile_credit_share" not in now:
+    controls = _controls(now)
+    if not controls:
         return None
-    lead = now["touch_score"] - max(now[f"control_{c}"] for c in ("drop", "noise", "order"))
+    lead = now["touch_score"] - max(controls.values())
     return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= 0 else 0.0)
 
 
+def _controls(now: Metrics) -> dict[str, float]:
+    """Scores under the controls that apply to most prompts; none where the run has no controls."""
+    names = (name for name in ("drop", "noise", "order") if f"control_{name}" in now)
+    return {name: now[f"control_{name}"] for name in names if now[f"control_{name}_share"] > 0.5}
+
+
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
-    """F7: share of groups of equal rewards."""
+    """F7: share of groups of equal rewards among those that are not all right; a group that is has nothing to learn."""
     del start
-    return now["degenerate_share"]
+    unsolved = 1 - now["all_right_share"]
+    return (now["degenerate_share"] - now["all_right_share"]) / unsolved if unsolved > 0 else 0.0
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
-    """F8: the largest reference KL of a token, nat."""
+    """F8: the largest penalty of a single token, β times its KL to the reference, in units of the advantage."""
     del start
-    return now["kl_peak"]
+    return now["kl_cost_peak"]
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
@@ -110,11 +124,10 @@ def entropy_growth(now: Metrics, start: Metrics) -> float | None:
 
 
 def forgotten_stream(now: Metrics, start: Metrics) -> float | None:
-    """F10: smallest grounding of a stream over the largest, among streams that were perturbed."""
+    """F10: the smallest grounding of a stream that was perturbed, nat."""
     del start
     streams = [n.removeprefix("perturbed_stream_") for n in now if n.startswith("perturbed_stream_") and now[n] > 0]
-    sizes = [now[f"grounding_stream_{s}"] for s in streams]
-    return min(sizes) / max(sizes) if sizes and max(sizes) > 0 else None
+    return min((now[f"grounding_stream_{s}"] for s in streams), default=None)
 
 
 def frozen_time(now: Metrics, start: Metrics) -> float | None:
@@ -161,8 +174,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         code="F5",
         meaning="the tactile bonus cancels within groups",
-        bound=0.05,
-        reason="a bonus that acts moves advantages, but where all of a group earn the same; one group in twenty may",
+        bound=0.5,
+        reason="a bonus that acts moves the advantages of most groups whose rollouts earn different ones",
         check=cancelled_bonus,
     ),
     Rule(
@@ -176,14 +189,14 @@ RULES: tuple[Rule, ...] = (
         code="F7",
         meaning="most groups teach nothing",
         bound=0.5,
-        reason="half of the rollouts are then spent for nothing",
+        reason="half of the rollouts that could teach something are then spent for nothing",
         check=idle_groups,
     ),
     Rule(
         code="F8",
-        meaning="single tokens dominate the reference KL",
-        bound=10.0,
-        reason="k3 of a word e^2.4 times rarer under the policy than under the reference; its gradient grows as fast",
+        meaning="single tokens dominate the update by their reference KL",
+        bound=1.0,
+        reason="one token then costs more than a standard deviation of the reward is worth",
         check=heavy_tail,
     ),
     Rule(
@@ -204,8 +217,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         code="F10",
         meaning="a stream has no influence on the answer",
-        bound=1e-3,
-        reason="rounding gives a stream that is never attended to less than a thousandth of another's effect",
+        bound=1e-7,
+        reason="a stream that does not reach the policy moves nothing; one that is read moves more than float32 rounds",
         check=forgotten_stream,
         below=True,
     ),
@@ -227,7 +240,7 @@ RULES: tuple[Rule, ...] = (
 
 
 class Watch:
-    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the means of the first."""
+    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the first one."""
 
     def __init__(self) -> None:
         self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
@@ -236,9 +249,8 @@ class Watch:
     def see(self, metrics: Metrics) -> list[Alarm]:
         """The alarms after one more step, from the end of the first window on."""
         self._last.append(metrics)
+        self._start = metrics if self._start is None else self._start
         if len(self._last) < WINDOW:
             return []
         now = {name: sum(m[name] for m in self._last) / WINDOW for name in metrics}
-        self._start = now if self._start is None else self._start
-        start = self._start
-        return [alarm for rule in RULES if (alarm := rule.alarm(now, start)) is not None]
+        return [alarm for rule in RULES if (alarm := rule.alarm(now, self._start)) is not None]

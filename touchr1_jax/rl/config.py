@@ -6,6 +6,9 @@ A preset is a dataclass of its own, so that the command line can choose it: `…
 import dataclasses
 import enum
 
+import jax
+
+from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.rl.kl import KLEstimator
 
 
@@ -37,7 +40,8 @@ class TactileUse(enum.Enum):
 class Algorithm:
     """The objective of an update and how groups are chosen for it; the defaults are Touch-R1's (arXiv 2605.27154).
 
-    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.
+    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.  Weights may be traced scalars,
+    so that one program serves a sweep over them; their sign is then the caller's to check.
     """
 
     surrogate: Surrogate = Surrogate.TOKEN
@@ -50,12 +54,16 @@ class Algorithm:
     average: Average = Average.ROLLOUT
     normalise: bool = True
     """Whether advantages are divided by σ."""
+    batch_sigma: bool = False
+    """Whether that σ is one for all groups of a step instead of each group's own."""
     epsilon: float = 1e-4
     """Added to σ, in the units of the reward."""
     drop_degenerate: bool = False
     """Leave groups of equal rewards out of the policy-gradient mean; KL and G_tg keep all."""
     candidates: int = 1
     """Prompts that are sampled for each that is learned from; groups of equal rewards are passed over."""
+    constrained: bool = False
+    """Sample only what can still become a formatted answer; the learner scores it as the free policy."""
     beta: float = 1e-3
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
@@ -70,6 +78,8 @@ class Algorithm:
     grounding_stop_masked: bool = False
     grounding_cap_nat: float | None = None
     """Largest grounding of a token, nat."""
+    grounding_budget: float | None = None
+    """Most that a prompt's grounding may add to the objective, in standard deviations of the reward."""
     tactile_use: TactileUse = TactileUse.OFF
     tactile_weight: float = 0.3
     """Weight α of the tactile-use reward."""
@@ -79,6 +89,8 @@ class Algorithm:
     """Rollouts of each control."""
     updates: int = 1
     """Updates μ from the same rollouts."""
+    trust_nat: float | None = None
+    """Most that an update may move the policy, KL to the one before in nat a token; longer ones are shortened."""
 
     def __post_init__(self) -> None:
         for field in ("candidates", "controls", "updates", "reference_every"):
@@ -86,12 +98,17 @@ class Algorithm:
             if count is not None and count < 1:
                 raise ValueError(f"{field} is {count}: must be at least 1; raise it")
         for field in ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "tactile_weight"):
-            if not getattr(self, field) >= 0:
+            if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
                 raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0; it is a size, not a sign")
-        for field in ("importance_cap", "grounding_cap_nat", "entropy_floor_nat"):
+        for field in ("importance_cap", "grounding_cap_nat", "grounding_budget", "entropy_floor_nat", "trust_nat"):
             bound = getattr(self, field)
             if bound is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
+
+
+def left_out(weight: float | jax.Array) -> bool:
+    """Whether a term is not even computed: its weight is the number 0, not an array that may hold it."""
+    return not isinstance(weight, jax.Array) and weight == 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,14 +121,24 @@ class Stable(Algorithm):
     """Departures that keep the objective bounded: masked branch held fixed, G_tg capped at 1 nat a token, exact KL,
     groups that teach nothing left out of the policy-gradient mean, R_tu added after normalisation.
 
+    Ours beyond these: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most a
+    twentieth of a standard deviation of the reward, so that no γ outbids the answer; entropy is paid for up to .1 nat a
+    token, about what supervised policies have, so that a group keeps differing; an update moves the policy by at most
+    .003 nat a token.
+
     At margin δ = .13 and 4 rollouts a control, no split of a common distribution over credits 0, .4 and 1 earns R_tu in
     more than 9 % of groups; at the literal δ = .1 a single right answer in eight would pass for touch (18 %).
     """
 
+    batch_sigma: bool = True
     drop_degenerate: bool = True
     kl: KLEstimator = "exact"
     grounding_stop_masked: bool = True
     grounding_cap_nat: float | None = 1.0
+    grounding_budget: float | None = 0.05
+    entropy_weight: float = 0.1
+    entropy_floor_nat: float | None = 0.1
+    trust_nat: float | None = 0.003
     tactile_use: TactileUse = TactileUse.RECOMMENDED
     tactile_margin: float = 0.13
 
@@ -188,6 +215,8 @@ class GRPOConfig:
     """Draw tokens by one uniform number a rollout instead of one Gumbel number a word: faster, other random bits."""
     remat: bool = False
     """Keep only matrix products for the backward pass and compute the rest again: less memory, more time."""
+    max_logits: int = MAX_LOGITS
+    """Logits of a prompt that may exist at once; more tokens than that are scored in blocks (see `models.chunked`)."""
     bfloat16: bool = False
     """Compute forward passes in bfloat16; parameters, softmax, losses and optimizer stay in float32."""
 
@@ -200,6 +229,8 @@ class GRPOConfig:
             raise ValueError(
                 f"buckets is {self.buckets}: must ascend within 2 … length − 1 = {self.length - 1}; sort it"
             )
+        if self.max_logits < 1:
+            raise ValueError(f"max_logits is {self.max_logits}: must be at least 1; a token's logits exist in any case")
 
     @property
     def drawn(self) -> int:

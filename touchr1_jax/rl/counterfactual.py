@@ -43,8 +43,10 @@ def shuffle_touch(features: Features, key: Array) -> Perturbed:
 
     A step is a run of tokens with one frame index.  A stream with fewer than two steps cannot be shuffled, and a prompt
     of such streams alone is one to which the control does not apply: with all time ids 0 it would test nothing.
-    Departure: encoded steps are permuted, not frames; an encoder that lets steps see each other leaves traces of the
-    order in them, which a permutation of frames before the encoder (`permute_frames`) does not.
+    Departure from R_tu's definition, which permutes frames: here encoded steps change places, because the encoder
+    stands still in GRPO and contacts are encoded once.  The two are the same for an encoder that reads each step by
+    itself; one whose steps see each other leaves traces of the order in them, so that this control is the milder one.
+    `permute_frames` is the permutation before the encoder.
     """
     keys = jax.random.split(key, features.stream_mask.shape)
     source, moved = jax.vmap(jax.vmap(_shuffled_tokens))(features.touch_time, keys)

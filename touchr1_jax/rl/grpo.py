@@ -11,7 +11,7 @@ first line and the metrics.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,16 +19,18 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax import masked
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.rl import tactile_use
-from touchr1_jax.rl.advantages import added_after, degenerate, group_advantage, livelier_first
+from touchr1_jax.rl.advantages import added_after, batch_advantage, degenerate, group_advantage, livelier_first
 from touchr1_jax.rl.config import Algorithm, GRPOConfig, TactileUse
 from touchr1_jax.rl.counterfactual import drop_touch, mask_one_stream, noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metrics, touch_metrics
-from touchr1_jax.rl.objective import Experience, GRPOBatch, at_precision, learner_log_probs, objective_gradient
+from touchr1_jax.rl.objective import Experience, GRPOBatch, at_precision, objective_gradient
 from touchr1_jax.rl.rollout import SampleConfig, sample
 from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.rl.trust import within_trust
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
@@ -103,7 +105,12 @@ def make_grpo_step(
       optimizer: applied to the gradient of −J.
       config: sizes and algorithm; a batch holds `config.drawn` prompts.
       constraint: what completions may say; `None` leaves them free.
+
+    Raises:
+      ValueError: an algorithm that samples constrained, without a constraint.
     """
+    if config.algorithm.constrained and constraint is None:
+        raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.bfloat16:
         agent = dataclasses.replace(agent, cache_dtype=jnp.dtype(jnp.bfloat16))
     engine = _Engine(agent, score, optimizer, config, constraint)
@@ -127,7 +134,7 @@ class _Engine:
         control_key = jax.random.fold_in(key, 2)
         group, control_metrics = self.explore(state.params, batch, fixed, sample_key, control_key)
         reference = fixed.reference if state.reference is None else state.reference
-        learn = self.experience(state.params, group, fixed, mask_key)
+        learn = self.experience(group, fixed, mask_key)
         params, opt_state, parts = self.update(state, reference, learn)
         metrics = parts | control_metrics | self.metrics(group, learn)
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
@@ -178,30 +185,28 @@ class _Engine:
         names = ("drop", "noise", "order")
         return bonus, {
             "touch_score": jnp.mean(own),
-            **{f"control_{name}": jnp.mean(by_prompt[:, i]) for i, name in enumerate(names)},
+            **{f"control_{n}": masked.mean(by_prompt[:, i], applies[:, i, None]) for i, n in enumerate(names)},
+            **{f"control_{n}_share": jnp.mean(applies[:, i]) for i, n in enumerate(names)},
             "tactile_credit_share": jnp.mean(jnp.any(bonus > 0, -1)),
             "control_missing_share": 1 - jnp.mean(applies),
             "credit_unearned_share": jnp.mean(jnp.any((bonus > 0) & (own <= 0), -1)),
         }
 
-    def experience(self, params: Params, group: Group, fixed: Fixed, key: Array) -> Experience:
+    def experience(self, group: Group, fixed: Fixed, key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
-        advantage = group_advantage(group.reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
+        advantage = self._advantage(group.reward)
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             advantage += added_after(group.bonus, algorithm.tactile_weight)
         flat = self._flat(group)
         even = jnp.full(flat.shape, 1 / self.config.prompts)
         masked_touch, stream = mask_one_stream(batch.features, fixed.noise, key)
-        old = group.rollout.log_prob
-        if algorithm.importance_cap is not None:
-            old = learner_log_probs(self.agent, self.config, params, batch, group.rollout.tokens)
         return Experience(
             batch=batch,
             masked_touch=masked_touch,
             masked_stream=stream,
             rollout=group.rollout,
-            old=old,
+            old=group.rollout.log_prob,
             advantage=advantage,
             weight=prompt_weights(~flat) if algorithm.drop_degenerate else even,
         )
@@ -211,22 +216,29 @@ class _Engine:
     ) -> tuple[Params, optax.OptState, dict[str, Array]]:
         """μ gradient steps on the same rollouts; the parts are those of the first, `clip_share` that of the last."""
 
-        def once(carry: tuple[Params, optax.OptState], _) -> tuple[tuple[Params, optax.OptState], dict[str, Array]]:
-            params, opt_state = carry
-            grads, parts = self.gradient(params, reference, learn)
+        def once(carry: tuple[Params, optax.OptState, Array], first: Any):
+            params, opt_state, old = carry
+            grads, parts = self.gradient(params, reference, learn._replace(old=old), first)
+            old = parts.pop("old", old)
             updates, opt_state = self.optimizer.update(grads, opt_state, params)
             parts = parts | {"grad_norm": optax.tree.norm(grads)}
-            return (optax.apply_updates(params, updates), opt_state), parts
+            moved = optax.apply_updates(params, updates)
+            if (trust := self.config.algorithm.trust_nat) is not None:
+                moved, size = within_trust(self.agent, self.config, params, moved, learn, trust)
+                parts |= size
+            return (moved, opt_state, old), parts
 
-        start = (state.params, state.opt_state)
-        if self.config.algorithm.updates == 1:
-            (params, opt_state), parts = once(start, None)
+        start, count = (state.params, state.opt_state, learn.old), self.config.algorithm.updates
+        if count == 1:
+            (params, opt_state, _), parts = once(start, True)
             return params, opt_state, parts
-        (params, opt_state), all_parts = jax.lax.scan(once, start, length=self.config.algorithm.updates)
+        (params, opt_state, _), all_parts = jax.lax.scan(once, start, jnp.arange(count) == 0)
         parts = jax.tree.map(lambda x: x[0], all_parts)
         return params, opt_state, parts | {"clip_share": all_parts["clip_share"][-1]}
 
-    def gradient(self, params: Params, reference: Params, learn: Experience) -> tuple[Params, dict[str, Array]]:
+    def gradient(
+        self, params: Params, reference: Params, learn: Experience, first: bool | Bool[Array, ""] = True
+    ) -> tuple[Params, dict[str, Array]]:
         """The gradient of −J over as many tokens as the shortest sufficient bucket has."""
         lengths = (*self.config.buckets, self.config.length)
         longest = jnp.max(jnp.sum(learn.rollout.mask, -1))
@@ -234,7 +246,14 @@ class _Engine:
         def over(length: int):
             cut = lambda x: x[..., :length]
             short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
-            return lambda p: objective_gradient(self.agent, self.config, p, reference, short)
+
+            def of(p: Params) -> tuple[Params, dict[str, Array]]:
+                grads, parts = objective_gradient(self.agent, self.config, p, reference, short, first=first)
+                if "old" in parts:
+                    parts["old"] = jnp.pad(parts["old"], [(0, 0), (0, 0), (0, self.config.length - length)])
+                return grads, parts
+
+            return of
 
         if len(lengths) == 1:
             return over(self.config.length)(params)
@@ -259,17 +278,23 @@ class _Engine:
         metrics |= rollout_metrics(group.rollout, group.reward, self._flat(group), group.parsed, target)
         metrics |= answer_metrics(group.parsed, target)
         metrics |= group_metrics(group.reward, learn.advantage, right)
-        metrics |= {"bonus_cancelled_share": self._cancelled(group, learn)}
+        metrics |= self._bonus_metrics(group, learn)
         return metrics | touch_metrics(group.batch.features)
 
-    def _cancelled(self, group: Group, learn: Experience) -> Float[Array, ""]:
-        """Share of groups with a tactile bonus whose advantages are those that they would have without it."""
+    def _advantage(self, reward: Float[Array, "P G"]) -> Float[Array, "P G"]:
+        algorithm = self.config.algorithm
+        if algorithm.batch_sigma:
+            return batch_advantage(reward, epsilon=algorithm.epsilon)
+        return group_advantage(reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
+
+    def _bonus_metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
+        """Shares of groups whose rollouts earn different tactile bonuses, and of those whose advantages ignore them."""
         algorithm, reward = self.config.algorithm, group.reward
         if algorithm.tactile_use is TactileUse.LITERAL:
             reward = reward - algorithm.tactile_weight * group.bonus
-        without = group_advantage(reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
-        moved = jnp.max(jnp.abs(learn.advantage - without), -1)
-        return jnp.mean(jnp.any(group.bonus > 0, -1) & (moved < NO_MOVE))
+        moved = jnp.max(jnp.abs(learn.advantage - self._advantage(reward)), -1)
+        tells = ~degenerate(group.bonus)
+        return {"bonus_telling_share": jnp.mean(tells), "bonus_cancelled_share": jnp.mean(tells & (moved < NO_MOVE))}
 
     def _flat(self, group: Group) -> Bool[Array, "D"]:
         """Groups that teach nothing: the reward is constant, and the bonus where it counts by itself."""

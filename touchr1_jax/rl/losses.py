@@ -135,6 +135,15 @@ def grounding_kl(
     return kl if cap is None else jnp.minimum(kl, cap)
 
 
+def grounding_bonus(mean_grounding: Float[Array, "*n"], algorithm: Algorithm) -> Float[Array, "*n"]:
+    """min(γ G_tg, budget): what a prompt's grounding adds to the objective, and no gradient once that is the budget.
+
+    Without a budget the term is linear, as published: at a large γ it pays more than any answer can earn.
+    """
+    linear = algorithm.gamma * mean_grounding
+    return linear if algorithm.grounding_budget is None else jnp.minimum(linear, algorithm.grounding_budget)
+
+
 def entropy_bonus(mean_entropy: Float[Array, ""], algorithm: Algorithm) -> Float[Array, ""]:
     """w · min(H, floor): pays for entropy as long as a prompt's mean entropy H lies below the floor, nat."""
     if algorithm.entropy_floor_nat is None:

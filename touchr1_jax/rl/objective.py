@@ -1,13 +1,14 @@
 """The objective of one GRPO update and its gradient, prompt by prompt.
 
-Per prompt the policy and the reference each encode their prefix once and score the whole group; the perturbed policy
-encodes only what follows the first perturbed token.
+Per prompt the policy and the reference each encode their prefix once and pass over the whole group; the perturbed
+policy encodes only what follows the first perturbed token.  What is wanted of the vocabulary, a few numbers a token, is
+computed from the hidden states of all of them in one place, `token_terms`, and in blocks where it is large.
 """
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,13 +17,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.chunked import Rows, by_blocks
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig
+from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, left_out
 from touchr1_jax.rl.kl import estimated_kl, exact_kl
 from touchr1_jax.rl.losses import (
     entropy,
     entropy_bonus,
+    grounding_bonus,
     grounding_kl,
     group_mean,
     importance_weight,
@@ -51,7 +54,8 @@ class GRPOBatch:
 class Experience(NamedTuple):
     """What an update needs of each prompt; every field has a leading P.
 
-    `old` are the log-probabilities that ratios are taken to: the sampler's, or the learner's before the update.
+    `old` are the log-probabilities that ratios are taken to: the sampler's, or, under an importance cap and after the
+    first of several updates, the learner's before it.
     """
 
     batch: GRPOBatch
@@ -64,27 +68,41 @@ class Experience(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """Log-probabilities of the vocabulary at each completion token, and the prefix that they stand on."""
+    """Hidden states that predict each completion token, and the prefix that they stand on."""
 
-    log_p: Float[Array, "G T V"]
+    states: Float[Array, "G T D"]
     prefix: PrefixCache
 
 
 def objective_gradient(
-    agent: Agent, config: GRPOConfig, params: Params, reference: Params, experience: Experience
+    agent: Agent,
+    config: GRPOConfig,
+    params: Params,
+    reference: Params,
+    experience: Experience,
+    *,
+    first: bool | Bool[Array, ""] = True,
 ) -> tuple[Params, dict[str, Array]]:
     """Gradient of −J with respect to the parameters, and the mean of each of `PARTS` (of a peak the largest).
 
     Summed over micro-batches of `micro_prompts` prompts, whose working set stays in cache.
+
+    Args:
+      agent, config: as in `make_grpo_step`.
+      params: the learner.
+      reference: the policy that the KL is taken to.
+      experience: rollouts and what they are worth.
+      first: whether `params` are those before any update from this experience; asked only under an importance cap,
+        where the learner's own log-probabilities are then the old ones.  The parts hold them as `old`, [P, G, T].
     """
     chunks = config.prompts // config.micro_prompts
     cut = lambda x: x.reshape(chunks, config.micro_prompts, *x.shape[1:])
     algorithm = config.algorithm
 
     def loss(params: Params, chunk: Experience) -> tuple[Array, dict[str, Array]]:
-        terms = chunk_terms(agent, config, params, reference, chunk)
+        terms = chunk_terms(agent, config, params, reference, chunk, first)
         gain = jnp.sum(chunk.weight * terms["surrogate"])
-        extra = algorithm.gamma * terms["grounding"] - algorithm.beta * terms["kl"]
+        extra = grounding_bonus(terms["grounding"], algorithm) - algorithm.beta * terms["kl"]
         bonus = jax.vmap(lambda h: entropy_bonus(h, algorithm))(terms["entropy"])
         gain += jnp.sum(extra + bonus) / config.prompts
         return -gain, terms | {"loss": jnp.broadcast_to(-gain, chunk.weight.shape)}
@@ -94,7 +112,10 @@ def objective_gradient(
         return jax.tree.map(jnp.add, grads, more), terms
 
     grads, terms = jax.lax.scan(body, jax.tree.map(jnp.zeros_like, params), jax.tree.map(cut, experience))
-    parts = {name: _gathered(name, value) for name, value in terms.items()}
+    parts = {name: _gathered(name, value) for name, value in terms.items() if name != "old"}
+    if "old" in terms:
+        parts["old"] = terms["old"].reshape(experience.old.shape)
+    parts["kl_cost_peak"] = algorithm.beta * parts["kl_peak"]
     return grads, parts | _grounding_by_stream(terms["grounding"].reshape(-1), experience)
 
 
@@ -117,10 +138,15 @@ def _gathered(name: str, value: Float[Array, "chunk micro"]) -> Float[Array, ""]
 
 
 def chunk_terms(
-    agent: Agent, config: GRPOConfig, params: Params, reference: Params, chunk: Experience
-) -> dict[str, Float[Array, "micro"]]:
+    agent: Agent,
+    config: GRPOConfig,
+    params: Params,
+    reference: Params,
+    chunk: Experience,
+    first: bool | Bool[Array, ""] = True,
+) -> dict[str, Array]:
     """`prompt_terms` of every prompt of a micro-batch; a single prompt is not batched, so that its branches stay."""
-    terms = lambda e: prompt_terms(agent, config, params, reference, e)
+    terms = lambda e: prompt_terms(agent, config, params, reference, e, first)
     if chunk.weight.shape[0] > 1:
         return jax.vmap(terms)(chunk)
     one = jax.tree.map(lambda x: x[0], chunk)
@@ -128,34 +154,83 @@ def chunk_terms(
 
 
 def prompt_terms(
-    agent: Agent, config: GRPOConfig, params: Params, reference: Params, experience: Experience
-) -> dict[str, Float[Array, ""]]:
-    """Terms of one prompt, each its configured mean over the tokens of the group; peaks are largest tokens."""
-    batch, rollout, algorithm = experience.batch, experience.rollout, config.algorithm
-    score = scorer(agent, config, batch, rollout.tokens)
-    scored = score(params, batch.features)
-    log_p, mask = scored.log_p, rollout.mask
-    log_prob = token_log_probs(log_p, rollout.tokens)
+    agent: Agent,
+    config: GRPOConfig,
+    params: Params,
+    reference: Params,
+    experience: Experience,
+    first: bool | Bool[Array, ""] = True,
+) -> dict[str, Array]:
+    """Terms of one prompt, each its configured mean over the tokens of the group; peaks are largest tokens.
+
+    Under an importance cap also `old`, [G, T] (see `objective_gradient`).
+    """
+    rollout, algorithm = experience.rollout, config.algorithm
+    mask = rollout.mask
+    tokens = token_terms(agent, config, params, reference, experience)
+    capped = algorithm.importance_cap is not None
+    old = jnp.where(first, jax.lax.stop_gradient(tokens["log_prob"]), experience.old) if capped else experience.old
     objective, clipped = jax.vmap(surrogate, in_axes=(None, 0, 0, 0, 0))(
-        algorithm, log_prob, experience.old, mask, experience.advantage
+        algorithm, tokens["log_prob"], old, mask, experience.advantage
     )
     if algorithm.importance_cap is not None:
-        objective *= importance_weight(experience.old, rollout.log_prob, algorithm.importance_cap)
-    kl = _kl_to_reference(algorithm, score, reference, experience, log_p)
-    grounding = perturbed_kl(agent, config, params, experience, scored)
+        objective *= importance_weight(old, rollout.log_prob, algorithm.importance_cap)
     mean = lambda kind, x: group_mean(kind, x, mask, config.length)
     per_rollout = lambda x: mean(Average.ROLLOUT, x)
-    spread = entropy(log_p if algorithm.entropy_weight else jax.lax.stop_gradient(log_p))
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0))
     return {
         "surrogate": mean(algorithm.average, objective),
-        "kl": mean(algorithm.average, kl),
-        "kl_peak": peak(kl),
-        "grounding": per_rollout(grounding),
-        "grounding_peak": peak(grounding),
-        "entropy": per_rollout(spread),
+        "kl": mean(algorithm.average, tokens["kl"]),
+        "kl_peak": peak(tokens["kl"]),
+        "grounding": per_rollout(tokens["grounding"]),
+        "grounding_peak": peak(tokens["grounding"]),
+        "entropy": per_rollout(tokens["entropy"]),
         "clip_share": per_rollout(clipped.astype(jnp.float32)),
+        **({"old": old} if capped else {}),
     }
+
+
+def token_terms(
+    agent: Agent, config: GRPOConfig, params: Params, reference: Params, experience: Experience
+) -> dict[str, Float[Array, "G T"]]:
+    """Of every token: its log-probability, KL to the reference, tactile grounding, entropy of its distribution.
+
+    Logits exist nowhere else, and at most `max_logits` of each policy at once.  The reference is not run at β = 0, the
+    perturbed policy not at γ = 0.
+    """
+    algorithm, shape = config.algorithm, experience.rollout.tokens.shape
+    score = scorer(agent, config, experience.batch, experience.rollout.tokens)
+    own = score(params, experience.batch.features)
+    rows: Rows = {"own": own.states, "token": experience.rollout.tokens}
+    if not left_out(algorithm.beta):
+        rows["reference"] = jax.lax.stop_gradient(score(reference, experience.batch.features).states)
+    if not left_out(algorithm.gamma):
+        rows["perturbed"] = perturbed_states(agent, config, params, experience, own.prefix)
+    terms = vocabulary_terms(agent, config, params, reference)
+    rows = {name: x.reshape(-1, *x.shape[2:]) for name, x in rows.items()}
+    found = by_blocks(terms, rows, width=len(agent.banned), most=config.max_logits)
+    return {name: x.reshape(shape) for name, x in found.items()}
+
+
+def vocabulary_terms(
+    agent: Agent, config: GRPOConfig, params: Params, reference: Params
+) -> Callable[[Rows], dict[str, Float[Array, "n"]]]:
+    """The function from hidden states [n, D] of the policies, and tokens [n], to `token_terms`, [n] each."""
+    algorithm = config.algorithm
+    heads = {"own": params, "reference": reference, "perturbed": _masked_branch(config, params)}
+    heads = {name: at_precision(config, p) for name, p in heads.items()}
+
+    def terms(rows: Rows) -> dict[str, Float[Array, "n"]]:
+        log = {n: jax.nn.log_softmax(agent.logits(p, rows[n])) for n, p in heads.items() if n in rows}
+        log_p, nothing = log["own"], jnp.zeros(rows["token"].shape)
+        return {
+            "log_prob": token_log_probs(log_p, rows["token"]),
+            "kl": reference_kl(algorithm, log_p, log["reference"], rows["token"]) if "reference" in log else nothing,
+            "grounding": _grounding(algorithm, log_p, log["perturbed"]) if "perturbed" in log else nothing,
+            "entropy": entropy(jax.lax.stop_gradient(log_p) if left_out(algorithm.entropy_weight) else log_p),
+        }
+
+    return _remat(config, terms)
 
 
 def scorer(agent: Agent, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]) -> Callable[..., Scored]:
@@ -163,16 +238,19 @@ def scorer(agent: Agent, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array
 
     def score(start: int, params: Params, features: Features, known: PrefixCache | None) -> Scored:
         p = at_precision(config, params)
-        first, prefix = agent.prefill(p, features, batch.ids, batch.mask, known, start)
-        return Scored(jax.nn.log_softmax(agent.completion_logits(p, tokens, first, prefix)), prefix)
+        return Scored(*agent.group_states(p, features, batch.ids, batch.mask, tokens, known, start))
 
     def configured(params: Params, features: Features, known: PrefixCache | None = None, start: int = 0) -> Scored:
-        run: Callable[..., Scored] = functools.partial(score, start)
-        if config.remat:
-            run = jax.checkpoint(run, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
-        return run(params, features, known)
+        return _remat(config, functools.partial(score, start))(params, features, known)
 
     return configured
+
+
+def _remat(config: GRPOConfig, f: Callable[..., Any]) -> Callable[..., Any]:
+    """f, of which the backward pass keeps only matrix products where the configuration says so."""
+    if not config.remat:
+        return f
+    return jax.checkpoint(f, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
 
 
 def at_precision(config: GRPOConfig, params: Params) -> Params:
@@ -180,62 +258,44 @@ def at_precision(config: GRPOConfig, params: Params) -> Params:
     return jax.tree.map(lambda x: x.astype(jnp.bfloat16), params) if config.bfloat16 else params
 
 
-def learner_log_probs(
-    agent: Agent, config: GRPOConfig, params: Params, batch: GRPOBatch, tokens: Int[Array, "P G T"]
-) -> Float[Array, "P G T"]:
-    """Log-probabilities of sampled tokens under the learner, prompt by prompt."""
-
-    def of_prompt(x: tuple[GRPOBatch, Array]) -> Array:
-        scored = scorer(agent, config, *x)(params, x[0].features)
-        return token_log_probs(scored.log_p, x[1])
-
-    return jax.lax.map(of_prompt, (batch, tokens))
-
-
-def _kl_to_reference(
-    algorithm: Algorithm, score: Callable[..., Scored], reference: Params, experience: Experience, log_p: Array
-) -> Float[Array, "G T"]:
-    """KL to the reference at each token; the reference is not even run when β is 0."""
-    if algorithm.beta == 0.0:
-        return jnp.zeros(log_p.shape[:-1])
-    log_ref = jax.lax.stop_gradient(score(reference, experience.batch.features).log_p)
-    return reference_kl(algorithm, log_p, log_ref, experience.rollout.tokens)
-
-
 def reference_kl(
-    algorithm: Algorithm, log_p: Float[Array, "G T V"], log_ref: Float[Array, "G T V"], tokens: Int[Array, "G T"]
-) -> Float[Array, "G T"]:
+    algorithm: Algorithm, log_p: Float[Array, "*n V"], log_ref: Float[Array, "*n V"], tokens: Int[Array, "*n"]
+) -> Float[Array, "*n"]:
     """KL to the reference policy at each token, by the configured estimator."""
     if algorithm.kl == "exact":
         return exact_kl(log_p, log_ref)
     return estimated_kl(token_log_probs(log_p, tokens), token_log_probs(log_ref, tokens), algorithm.kl)
 
 
-def perturbed_kl(
-    agent: Agent, config: GRPOConfig, params: Params, experience: Experience, scored: Scored
-) -> Float[Array, "G T"]:
-    """Tactile grounding at each token; skipped, not computed and multiplied by 0, when γ is 0.
+def perturbed_states(
+    agent: Agent, config: GRPOConfig, params: Params, experience: Experience, prefix: PrefixCache
+) -> Float[Array, "G T D"]:
+    """Hidden states of the completions under perturbed touch.
 
     Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
     batch of prompts, whose branches would all be computed, what follows the first stream's.
+
+    Args:
+      prefix: the prompt as the policy encodes it.
     """
-    algorithm, batch = config.algorithm, experience.batch
-    if algorithm.gamma == 0.0:
-        return jnp.zeros(scored.log_p.shape[:-1])
+    batch = experience.batch
     score = scorer(agent, config, batch, experience.rollout.tokens)
     features = dataclasses.replace(batch.features, touch=experience.masked_touch)
-    fixed = jax.lax.stop_gradient if algorithm.grounding_stop_masked else lambda x: x
-    prefix, own = fixed(scored.prefix), fixed(params)
+    known, own = _masked_branch(config, prefix), _masked_branch(config, params)
     starts = [int(row.min()) for row in agent.slots.touch]
 
     def again(start: int, p: Params) -> Array:
-        return score(p, features, prefix, start).log_p
+        return score(p, features, known, start).states
 
-    if config.micro_prompts == 1:
-        branches = [functools.partial(again, start) for start in starts]
-        log_masked = jax.lax.switch(experience.masked_stream, branches, own)
-    else:
-        log_masked = again(min(starts), own)
-    return grounding_kl(
-        scored.log_p, log_masked, stop_masked=algorithm.grounding_stop_masked, cap=algorithm.grounding_cap_nat
-    )
+    if config.micro_prompts > 1:
+        return again(min(starts), own)
+    return jax.lax.switch(experience.masked_stream, [functools.partial(again, start) for start in starts], own)
+
+
+def _masked_branch(config: GRPOConfig, tree: Any) -> Any:
+    """What the perturbed branch reads, without gradient where the algorithm holds that branch fixed."""
+    return jax.lax.stop_gradient(tree) if config.algorithm.grounding_stop_masked else tree
+
+
+def _grounding(algorithm: Algorithm, log_p: Float[Array, "n V"], log_masked: Float[Array, "n V"]) -> Float[Array, "n"]:
+    return grounding_kl(log_p, log_masked, stop_masked=algorithm.grounding_stop_masked, cap=algorithm.grounding_cap_nat)

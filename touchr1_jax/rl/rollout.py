@@ -1,7 +1,8 @@
 """Sample a group of completions per prompt from a shared, once-encoded prefix.
 
 The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix
-batched).  The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended.
+batched).  The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended, those of all
+runs where whole steps are batched by `vmap`.
 """
 
 import dataclasses
@@ -10,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.lm import LayerCache, PrefixCache
@@ -100,9 +102,22 @@ def sample(
         log_prob=jnp.zeros((t_max, p, g)),
         mask=jnp.zeros((t_max, p, g), bool),
     )
-    end = jax.lax.while_loop(lambda s: (s.t < t_max) & jnp.any(s.alive), body, start)
+    end = jax.lax.while_loop(lambda s: (s.t < t_max) & _any_alive(s.alive), body, start)
     by_rollout = lambda x: jnp.moveaxis(x, 0, -1)
     return Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
+
+
+@custom_vmap
+def _any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
+    """Whether a rollout goes on.  Under `vmap` the answer is one for all: a condition of each run's own would batch the
+    token index too, and with it every write to a cache."""
+    return jnp.any(alive)
+
+
+@_any_alive.def_vmap
+def _any_alive_anywhere(size: int, batched: list[bool], alive: Array) -> tuple[Array, bool]:
+    del size, batched
+    return _any_alive(alive), False
 
 
 def _allowed(loop: _Loop, config: SampleConfig) -> Float[Array, "P G V"]:

@@ -42,7 +42,7 @@ def literal(
 
 
 def recommended(
-    own: Float[Array, "G"], best: Float[Array, ""], formatted: Bool[Array, "G"], margin: float
+    own: Float[Array, "G"], best: Float[Array, ""], formatted: Bool[Array, "G"], margin: float | Array
 ) -> Float[Array, "G"]:
     """1[s̄ > b + δ] · 1[formatted_i] · max(0, s_i − b)."""
     return jnp.where((jnp.mean(own) > best + margin) & formatted, jnp.maximum(own - best, 0.0), 0.0)

@@ -16,11 +16,15 @@ _PHRASE = re.compile(r"[a-z0-9_]+(?:[ \-][a-z0-9_]+)*")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Attribute:
-    """A property that can be asked for: `levels[k]` are the phrases that name level k, the canonical one first."""
+    """A property that can be asked for: `levels[k]` are the phrases that name level k, the canonical one first.
+
+    `ordered` marks a property that shows in the order of the frames, so that a shuffle of them is a control for it.
+    """
 
     name: str
     levels: tuple[tuple[str, ...], ...]
     ordinal: bool = True
+    ordered: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -203,6 +203,7 @@ def test_a_question_is_felt_by_the_streams_that_it_says(assembly, features, data
     batch = question_batch(assembly, features, label, rows, attribute, streams)
     assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
     assert np.array_equal(batch.target.streams, streams)
+    assert not batch.ordered.any()  # a press shows its peak in whatever order
     assert np.array_equal(batch.features.touch, features.touch[rows])
     assert np.array_equal(take(features, rows).view, features.view[rows])
 

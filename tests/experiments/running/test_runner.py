@@ -1,5 +1,6 @@
 """The command line end to end: finding, overriding, running, continuing, stopping."""
 
+import contextlib
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.running import runs
+from experiments.running import runner, runs
 from experiments.running.artifacts import read_json
 from experiments.running.runner import Experiment, find, main, parse
 from tests.experiments.fakes import coin
@@ -100,6 +101,19 @@ def test_a_run_leaves_the_agreed_files(capsys):
     assert results["timing"]["total"] >= results["timing"]["train/paid/0"] > 0
     assert {p.name for p in (directory / "plots").iterdir()} == {"curves_train.svg", "accuracy_against_middle.svg"}
     assert "report.html" in capsys.readouterr().out
+
+
+def test_compiled_programs_are_kept_beside_the_data(monkeypatch):
+    kept = []
+
+    @contextlib.contextmanager
+    def keeper(directory):
+        kept.append(directory)
+        yield
+
+    monkeypatch.setattr(runner, "compilations_kept", keeper)
+    assert run("coin", "--scale=smoke", "--cache-dir", "elsewhere") == 0
+    assert kept == [Path("elsewhere/compiled")]
 
 
 def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):

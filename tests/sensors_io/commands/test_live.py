@@ -1,22 +1,23 @@
 """`record`, `view` and `devices` from the command line, on replays."""
 
-import json
 import os
 import pathlib
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 
 from sensors_io import __main__ as cli
 from sensors_io.calibration.geometry import Geometry
-from sensors_io.commands.record import load_gravity
 from sensors_io.devices.tac3d_messages import load_recording
-from sensors_io.force import ForceError
+from sensors_io.offsets import Offset, Offsets
+from sensors_io.poses import ForceZero
 from sensors_io.records import RecordStore
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
@@ -42,7 +43,7 @@ def press(tmp_path):
 def test_free_motion_is_recorded_from_a_replay(tmp_path, press):
     out = tmp_path / "records"
     args = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.3", "replay", "--path", press]
-    assert cli.main([*map(str, args), "no-force"]) == 0
+    assert cli.main([*map(str, args)]) == 0
     made = RecordStore(out).contact(0)["tac3d"]
     assert 25 <= len(made) <= 40
     assert made.depth_mm.shape[1:] == (20, 20)
@@ -52,7 +53,7 @@ def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, c
     """The protocol asks for 20 N, the recording ends at 3: kept as incomplete, with the force of the sensor itself."""
     out = tmp_path / "records"
     args = ["record", "--out", out, "--object-id", "cup", "replay", "--path", press]
-    assert cli.main([*map(str, args), "no-force"]) == 0
+    assert cli.main([*map(str, args)]) == 0
     store = RecordStore(out, allow_incomplete=True)
     made = store.contact(0)["tac3d"]
     assert made.key.motion == "press"
@@ -63,7 +64,7 @@ def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, c
 def test_ctrl_c_ends_a_recording_cleanly(tmp_path, press):
     out = tmp_path / "records"
     command = [sys.executable, "-m", "sensors_io", "record", "--out", str(out), "--object-id", "cup"]
-    command += ["--free-s", "60", "replay", "--path", str(press), "--seconds", "60", "no-force"]
+    command += ["--free-s", "60", "replay", "--path", str(press), "--seconds", "60"]
     child = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"JAX_PLATFORMS": "cpu"}, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while not list(out.glob(".journals/*")) and time.monotonic() < deadline:
@@ -76,7 +77,7 @@ def test_ctrl_c_ends_a_recording_cleanly(tmp_path, press):
 
 
 def test_view_serves_and_ends(press, capsys):
-    args = ["view", "--port", "0", "--seconds", "0.4", "replay", "--path", press, "no-force"]
+    args = ["view", "--port", "0", "--seconds", "0.4", "replay", "--path", press]
     assert cli.main(list(map(str, args))) == 0
 
 
@@ -84,7 +85,7 @@ def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
     """Presses of a real Mini without calibration: no depth and no shear can be told, and the view says so."""
     gelslam = ROOT / "tests" / "data" / "gelslam"
     args = ["view", "--port", "0", "--seconds", "0.3", "--background", gelslam / "background.png", "replay"]
-    assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30", "no-force"]) == 0
+    assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30"]) == 0
     assert "not shown: depth_mm: without a calibration" in capsys.readouterr().out
 
 
@@ -98,20 +99,8 @@ def test_devices_says_what_is_absent(capsys):
 
 
 def test_an_absent_sensor_is_one_line(capsys):
-    assert cli.main(["view", "uvc", "--serial", "none", "no-force"]) == 1
+    assert cli.main(["view", "uvc", "--serial", "none"]) == 1
     assert "no camera answers to it" in capsys.readouterr().err.replace("\n", " ")
-
-
-def test_a_gravity_file_is_read_and_checked(tmp_path):
-    path = tmp_path / "g.json"
-    tree = {"bias_n": [0, 0, 1], "bias_nmm": [0, 0, 0], "first_moment_nmm": [0, 0, 0], "weight_n": 0.5, "rms_n": 0.01}
-    path.write_text(json.dumps(tree | {"rms_nmm": 0.1, "poses": 6, "down": [0, 0, -1]}))
-    model, down = load_gravity(path)
-    assert model.weight_n == 0.5
-    assert down.tolist() == [0, 0, -1]
-    path.write_text(json.dumps(tree))
-    with pytest.raises(ForceError, match="holds no gravity model"):
-        load_gravity(path)
 
 
 def test_a_pin_board_gives_a_geometry(tmp_path):
@@ -130,3 +119,121 @@ def test_a_pin_board_gives_a_geometry(tmp_path):
     assert Geometry.load(tmp_path / "g.json").held_out_mm < 0.07
     assert cli.main([*map(str, args), "--pitch-mm", "-1", "--out", str(tmp_path / "h.json")]) == 1
     assert not (tmp_path / "h.json").exists()
+
+
+def pictures(folder, brightness):
+    """A folder of flat pictures."""
+    folder.mkdir(parents=True)
+    for n, level in enumerate(brightness):
+        cv2.imwrite(str(folder / f"{n:04d}.png"), np.full((24, 32, 3), level, np.uint8))
+    return folder
+
+
+def run(*args):
+    return cli.main([str(arg) for arg in args])
+
+
+def test_two_sensors_are_recorded_into_one_contact(tmp_path, press):
+    """Each at its own rate, one offset taken off, with a page beside the recording."""
+    out, sync = tmp_path / "records", tmp_path / "s.json"
+    late = Offset(late_s=0.1, spread_s=0.001, events=5, by="taps")
+    Offsets(reference="netft", sensors={"gelsight_mini": late}).save(sync)
+    camera = ["replay", "--path", pictures(tmp_path / "film", range(40, 80)), "--rate-hz", 50]
+    bench = [*camera, "+", "replay", "--path", press]
+    assert run("record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench) == 0
+    made = RecordStore(out).contact(0)
+    assert list(made) == ["gelsight_mini", "tac3d"]
+    assert 12 <= len(made["gelsight_mini"]) <= 25
+    assert 25 <= len(made["tac3d"]) <= 45
+    starts = [s.host_time_ns[0] for s in made.values()]
+    assert -0.15e9 < starts[0] - starts[1] < -0.05e9
+    assert made["gelsight_mini"].camera["recording"]["late_s"] == 0.1
+
+
+def test_the_object_is_looked_at_before_it_is_touched(tmp_path, press):
+    """A replayed RGB-D camera: 16-bit depth, and 20 mm at 300 mm seen with f = 30 px."""
+    folder = tmp_path / "rgbd"
+    pictures(folder / "colour", [90, 91])
+    (folder / "depth").mkdir()
+    cv2.imwrite(str(folder / "depth" / "0.png"), np.full((24, 32), 600, np.uint16))
+    view = ["rgbd", "--replay", folder, "--width", 32, "--height", 24, "--fx", 30, "--fy", 30, "--cx", 16, "--cy", 12]
+    out = tmp_path / "records"
+    args = ["record", "--out", out, "--object-id", "cup", "--free-s", 0.2, "--contact-mm", 0, 0, 300, "replay"]
+    assert run(*args, "--path", press, "+", *view, "--depth-unit-mm", 0.5) == 0
+    store = RecordStore(out)
+    assert store.objects["cup"].view[0, 0].tolist() == [90, 90, 90]
+    assert store.objects["cup"].view_depth_mm[0, 0] == 300
+    assert store.contact(0)["tac3d"].contact_region_px == (15, 11, 2, 2)
+    away = [*args[:3], "--object-id", "mug", *args[5:8], 0, 0, -300, "replay", "--path", press, "+", *view]
+    assert run(*away) == 1
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["list", "x", "+", "tac3d"], "list takes no device after a \\+"),
+        (["view", "netft", "+", "netft"], "2 force sensors are named"),
+        (["record", "--out", "x", "--object-id", "cup", "netft"], "no tactile sensor is named"),
+        (["sync", "tac3d"], "two or more can be compared"),
+        (["force-zero", "--out", "x", "--poses", "3", "netft"], "poses is 3: must be ≥ 4"),
+    ],
+)
+def test_benches_that_make_no_sense_are_one_line(args, message, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(args) == 1
+    assert re.search(message, capsys.readouterr().err.replace("\n", " "))
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """A recording of a force sensor held in eight directions, 60 ms each, at 1 kHz; 1.5 N hang on it."""
+    down = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
+    down = down[[0, 1, 3, 2, 6, 7, 5, 4]].repeat(60, 0)
+    force = [1.0, -2.0, 3.0] + 1.5 * down
+    path = tmp_path / "HDL1.npz"
+    np.savez(
+        path,
+        index=np.arange(len(down)),
+        sendTimestamp=np.arange(len(down)) * 0.001,
+        **{
+            "3D_Displacements": np.zeros((len(down), 400, 3)),
+            "3D_ResultantForce": force[:, None],
+            "3D_ResultantMoment": np.cross([0, 0, 15.0], 1.5 * down)[:, None],
+        },
+    )
+    return path
+
+
+def test_force_zero_from_static_poses(tmp_path, poses, capsys):
+    args = ["force-zero", "--out", tmp_path / "g.json", "--hold-s", 0.03, "replay", "--path", poses]
+    assert run(*args) == 0
+    zero = ForceZero.load(tmp_path / "g.json")
+    np.testing.assert_allclose(zero.model.bias_n, [1, -2, 3], atol=1e-5)
+    assert zero.model.mass_kg == pytest.approx(1.5 / 9.80665, abs=1e-5)
+    np.testing.assert_allclose(zero.model.centre_mm, [0, 0, 15], atol=1e-3)
+    assert "153.0 g" in capsys.readouterr().out
+    assert run(*args[:3], "--poses", 9, "--hold-s", 0.03, "replay", "--path", poses) == 1
+    assert "8 of 9 poses" in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_sync_and_its_check(tmp_path, capsys):
+    """A film and a force recording of the same taps; the film is replayed beside it, so that little is left over."""
+    at = np.cumsum([0.3, 0.45, 0.35, 0.5])
+    time_s = np.arange(0, 1.9, 0.005)
+    past = time_s[:, None] - at
+    load = (np.clip(past / 0.02, 0, 1) * np.exp(-np.clip(past - 0.02, 0, None) / 0.05)).sum(-1)
+    force = np.zeros((len(load), 1, 3))
+    force[:, 0, 2] = -5 * load
+    arrays = {"3D_Displacements": np.zeros((len(load), 400, 3)), "3D_ResultantForce": force}
+    np.savez(tmp_path / "A1.npz", index=np.arange(len(load)), sendTimestamp=time_s, **arrays)
+    film = pictures(tmp_path / "film", np.clip(60 + 150 * load, 0, 255).astype(int)[::2])
+    bench = ["replay", "--path", tmp_path / "A1.npz", "+", "replay", "--path", film, "--rate-hz", 100]
+    assert run("sync", "--seconds", 4, "--out", tmp_path / "s.json", *bench) == 0
+    found = Offsets.load(tmp_path / "s.json")
+    assert found.reference == "tac3d"
+    assert abs(found.sensors["gelsight_mini"].late_s) < 0.15  # the second device opens a little later
+    assert found.sensors["gelsight_mini"].events == 4
+    off = Offset(late_s=0.5, spread_s=0.0, events=4, by="taps")
+    Offsets(reference="tac3d", sensors={"gelsight_mini": off}).save(tmp_path / "off.json")
+    assert run("sync", "--seconds", 4, "--check", tmp_path / "off.json", *bench) == 1
+    assert "measure again" in capsys.readouterr().out

@@ -34,3 +34,17 @@ def test_an_empty_background_has_no_picture_and_no_drift():
         background.offer(np.zeros((4, 4, 3), np.uint8), touched=False)
     with pytest.raises(ValueError, match="memory is 0"):
         Background(0)
+
+
+def test_pictures_tell_a_touch_and_not_the_lamps():
+    rng = np.random.default_rng(0)
+    gel = rng.integers(60, 120, (60, 80, 3)).astype(np.uint8)
+    background = Background()
+    assert not background.looks_touched(gel)
+    background.offer(gel, touched=False)
+    noisy = (gel + rng.normal(0, 2, gel.shape)).clip(0, 255).astype(np.uint8)
+    assert not background.looks_touched(noisy)
+    assert not background.looks_touched(gel + np.uint8(25))  # all lamps brighter
+    touched = gel.copy()
+    touched[20:30, 30:40] += 40
+    assert background.looks_touched(touched)

@@ -133,8 +133,24 @@ def test_a_silent_device_is_taken_as_lost():
             return super().read(timeout_s)
 
     clock = JumpingClock()
-    counts = pumped(Slow([silence, silence, silence, sample(3)]), clock=clock, timeout_s=0.5, lost_after_s=1.2).counts
+    script = [sample(2), silence, silence, silence, sample(3)]
+    counts = pumped(Slow(script), clock=clock, timeout_s=0.5, lost_after_s=1.2).counts
     assert (counts.timeouts, counts.disconnects, counts.reconnects) == (3, 1, 1)
+
+
+def test_a_slow_device_and_one_just_opened_get_more_time():
+    """Three periods of a picture every two seconds; five seconds for a first sample."""
+    silence = DeviceTimeoutError("silence")
+    clock = JumpingClock()
+
+    class Slow(Scripted):
+        def read(self, timeout_s):
+            clock.sleep_until(clock.now_ns() + round(timeout_s * 1e9))
+            return super().read(timeout_s)
+
+    script = [silence] * 4 + [sample(0)] + [silence] * 5 + [sample(1)]
+    assert pumped(Slow(script, period_s=2.0), clock=clock, timeout_s=1.0).counts.disconnects == 0
+    assert pumped(Slow(script), clock=clock, timeout_s=1.0).counts.disconnects >= 1
 
 
 def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock():

@@ -1,14 +1,18 @@
 """UVC cameras on a made-up /sys, with a fake in place of cv2.VideoCapture."""
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.cameras import CameraInfo, find_cameras
 from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, SettingRefusedWarning
-from sensors_io.devices.uvc import CameraInfo, Lock, Uvc, UvcConfig, find_cameras
+from sensors_io.devices.reader import Reader
+from sensors_io.devices.uvc import Lock, Uvc, UvcConfig, wait_for_frame
 
 
-def plug(root, number, *, index="0", usb=None, name="camera"):
+def plug(root, number, *, index="0", usb=None, name="camera", at=None):
     """A node as the kernel shows it: video4linux/videoN with a link to the USB interface below its device."""
     node = root / "class" / f"video{number}"
     node.mkdir(parents=True)
@@ -16,10 +20,13 @@ def plug(root, number, *, index="0", usb=None, name="camera"):
     (node / "name").write_text(f"{name}\n")
     if usb is not None:
         device = root / "usb" / usb["serial"]
-        (device / "1.0").mkdir(parents=True, exist_ok=True)
+        interface = device / (at or "1.0")
+        interface.mkdir(parents=True, exist_ok=True)
+        if at is not None:
+            (interface / "bInterfaceNumber").write_text(f"{at}\n")
         for key, value in usb.items():
             (device / key).write_text(f"{value}\n")
-        (node / "device").symlink_to(device / "1.0")
+        (node / "device").symlink_to(interface)
 
 
 MINI = {"serial": "2D8XYK21", "product": "GelSight Mini R0B 2D8X-YK21", "idVendor": "0c45", "idProduct": "636d"}
@@ -68,13 +75,20 @@ def test_an_ambiguous_or_absent_camera_is_named(config, message):
 class FakeCapture:
     """Settings that stick unless they are in `refuses`; frames that count."""
 
-    def __init__(self, frames=3, refuses=(), opens=True, size=(6, 8)):
+    def __init__(self, frames=3, refuses=(), opens=True, size=(6, 8), stalls_after=None):
+        self.stalls_after = stalls_after
         self.left, self.refuses, self.opens = frames, refuses, opens
         self.settings = {cv2.CAP_PROP_FRAME_WIDTH: size[1], cv2.CAP_PROP_FRAME_HEIGHT: size[0], cv2.CAP_PROP_FPS: 25.0}
         self.count, self.released = 0, False
 
     def isOpened(self):
         return self.opens
+
+    def wait(self, timeout_s):
+        if self.stalls_after is not None and self.count >= self.stalls_after:
+            time.sleep(timeout_s)
+            return False
+        return True
 
     def grab(self):
         self.count += 1
@@ -99,7 +113,12 @@ class FakeCapture:
 
 
 def camera(capture, **config):
-    return Uvc(UvcConfig(serial="2D8XYK21", **config), find=lambda: CAMERAS, capture=lambda node: capture)
+    return Uvc(
+        UvcConfig(serial="2D8XYK21", **config),
+        find=lambda: CAMERAS,
+        capture=lambda node: capture,
+        wait=lambda capture, timeout_s: capture.wait(timeout_s),
+    )
 
 
 def test_frames_come_in_rgb_with_both_stamps_and_the_identity_is_complete():
@@ -141,9 +160,55 @@ def test_a_camera_that_stops_is_lost_and_may_be_opened_again():
         device.read(1.0)
 
 
-def test_a_camera_that_waits_too_long_is_a_timeout():
-    with camera(FakeCapture(frames=0)) as device, pytest.raises(DeviceTimeoutError):
-        device.read(0.0)
+def test_a_camera_that_stalls_is_a_timeout_when_it_is_told_to():
+    with camera(FakeCapture(stalls_after=0)) as device:
+        began = time.monotonic()
+        with pytest.raises(DeviceTimeoutError, match=r"no frame in 0\.05 s"):
+            device.read(0.05)
+    assert time.monotonic() - began < 1
+
+
+@pytest.mark.parametrize("fault", [{"frames": 2}, {"frames": 10**6, "stalls_after": 2}])
+def test_an_unplugged_or_stalled_camera_is_noticed_within_a_second(fault):
+    """Unplugged, the node answers with an error; stalled, with nothing: both are disconnects, and opened again."""
+    device = camera(FakeCapture(**fault))
+    with Reader(device) as reader:
+        assert [reader.next(5.0).frame[0, 0, 2] for _ in range(2)] == [1, 2]
+        began = time.monotonic()
+        while reader.counts.disconnects == 0 and time.monotonic() - began < 5:
+            time.sleep(0.005)
+        assert time.monotonic() - began < 1
+
+
+def test_opencv_has_the_wait_and_takes_what_it_is_given(tmp_path):
+    """A video file gets as far as the question what kind of camera it is; a closed camera is left to `grab`."""
+    path = str(tmp_path / "a.avi")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (16, 12))
+    writer.write(np.zeros((12, 16, 3), np.uint8))
+    writer.release()
+    capture = cv2.VideoCapture(path)
+    with pytest.raises(cv2.error, match="V4L"):
+        wait_for_frame(capture, 0.01)
+    capture.release()
+    assert wait_for_frame(capture, 0.01)
+
+
+def test_the_cameras_of_one_device_are_told_apart_by_their_interfaces(tmp_path):
+    """As a RealSense: depth at interface 0, colour at 3, one product and serial."""
+    for number, interface in ((0, "00"), (4, "03")):
+        plug(
+            tmp_path,
+            number,
+            usb={"serial": "9", "product": "D435", "idVendor": "8086", "idProduct": "0b07"},
+            at=interface,
+        )
+    found = find_cameras(tmp_path / "class")
+    assert [c.interface for c in found] == [0, 3]
+    assert UvcConfig(product="D435", interface=3).choose(found).node == "/dev/video4"
+    with pytest.raises(DeviceNotFoundError, match=r"several cameras .* interface 0\)"):
+        UvcConfig(product="D435").choose(found)
+    with pytest.raises(DeviceNotFoundError, match="interface 7: no camera"):
+        UvcConfig(product="D435", interface=7).choose(found)
 
 
 def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
@@ -164,6 +229,7 @@ def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
         ({"border_share": 0.5}, "border_share is 0.5"),
         ({"pixel_format": "MJPEG"}, "must have four letters"),
         ({"frame_width": 4}, "must both be given"),
+        ({"mm_per_px": 0.0}, "mm_per_px is 0.0"),
     ],
 )
 def test_configs_are_checked(changes, message):

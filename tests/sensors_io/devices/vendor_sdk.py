@@ -15,6 +15,7 @@ def frames(serial):
         picture[..., 2] = 200  # red, in the SDK's BGR
         yield (
             time.monotonic_ns(),
+            n,
             {
                 "frame_bgr": picture,
                 "depth_mm": np.full((2, 3), 0.5 * n),

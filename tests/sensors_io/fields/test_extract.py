@@ -12,7 +12,9 @@ from sensors_io.fields.extract import ExtractConfig, Extractor, joined
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.fields.sources import SourceError, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.records import RecordWriter
 from sensors_io.schema import Flag, SchemaError
+from tests.sensors_io import fakes
 
 SHAPE = (160, 214)
 
@@ -89,6 +91,8 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
     assert fields.traction_mpa is not None
     assert fields.force_n is not None
     assert fields.shear_mm.shape == fields.deformation_mm.shape  # type: ignore[union-attr]
+    noisy = Extractor(dotted(), 0.1, calibration(dotted()), ExtractConfig(nodes=12, shear="subtracted"))
+    assert not np.allclose(noisy.read(dotted(0.5)).shear_mm, fields.shear_mm, atol=1e-3)  # type: ignore[arg-type]
 
 
 def test_a_calibration_of_another_camera_is_refused() -> None:
@@ -113,12 +117,47 @@ def test_fields_of_wrong_shapes_are_refused() -> None:
     assert dataclasses.replace(Fields(contact=contact, flags=flags, mm_per_px=0.1)).depth_mm is None
 
 
+def test_a_gap_is_flagged_and_the_markers_are_looked_for_anywhere() -> None:
+    extractor = Extractor(dotted(), 0.1)
+    far = dotted(11.0)  # more than half a pitch: without the gap the nearest dots would do
+    assert extractor.read(dotted()).flags[0] & Flag.TIME_GAP == 0
+    late = extractor.read(far, gap=True)
+    assert late.flags[0] & Flag.TIME_GAP
+    still = extractor.read(far, apart=True)
+    assert still.flags[0] & Flag.TIME_GAP == 0
+
+
+def test_times_tell_the_gaps_of_a_run() -> None:
+    extractor = Extractor(bare(), 0.1, calibration(bare()))
+    frames = np.stack([bare()] * 5)
+    fields = extractor.extract(frames, np.array([0, 40, 80, 240, 280], np.int64))
+    assert [bool(f & Flag.TIME_GAP) for f in fields.flags.tolist()] == [False, False, False, True, False]
+    assert not (extractor.extract(frames).flags & np.uint32(Flag.TIME_GAP)).any()  # stills carry no time
+    with pytest.raises(ValueError, match="host_time_ns has 2 times: must have 5"):
+        extractor.extract(frames, np.array([0, 1], np.int64))
+
+
+def test_records_carry_their_gaps(tmp_path: pathlib.Path) -> None:
+    times = np.array([0, 40, 80, 240, 280, 320], np.int64) * 1_000_000
+    lost = np.zeros(6, np.uint32)
+    lost[5] = Flag.TIME_GAP
+    with RecordWriter(tmp_path, meta=fakes.META) as writer:
+        writer.write_object(fakes.card())
+        writer.write_contact([fakes.sequence(length=6, host_time_ns=times, flags=lost)])
+    found = read_pictures([tmp_path], "gelsight_mini")
+    assert found.gap.tolist() == [False, False, False, True, False, True]
+    assert found.apart.tolist() == [True] + [False] * 5
+
+
 def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path) -> None:
     for name, side in (("2", 8), ("10", 8)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((side, side, 3), int(name), np.uint8))
     found = read_pictures([tmp_path], "x")
     assert found.names == ("2.png", "10.png")
     assert found.frames[:, 0, 0, 0].tolist() == [2, 10]
+    assert found.apart.all()
+    assert not found.gap.any()
+    assert found.chosen(np.array([1])).names == ("10.png",)
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((9, 8, 3), np.uint8))
     with pytest.raises(SourceError, match="different sizes"):
         read_pictures([tmp_path], "x")
@@ -133,6 +172,7 @@ def test_videos_are_read_whole(tmp_path: pathlib.Path) -> None:
     found = read_pictures([path], "x")
     assert found.frames.shape == (3, 24, 32, 3)
     assert found.names == ("press.avi#0", "press.avi#1", "press.avi#2")
+    assert found.apart.tolist() == [True, False, False]
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(SourceError, match="convert or replace it"):
         read_pictures([path], "x")
@@ -140,7 +180,11 @@ def test_videos_are_read_whole(tmp_path: pathlib.Path) -> None:
 
 def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.png").write_text("no picture")
-    with pytest.raises(SourceError, match="cannot be read as a picture"):
+    with pytest.raises(SourceError, match="does not open as a picture: must be a whole picture"):
         read_pictures([tmp_path], "x")
-    with pytest.raises(SourceError, match="cannot be read"):
+    with pytest.raises(SourceError, match="is absent"):
         read_pictures([tmp_path / "none.png"], "x")
+    cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8))
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-200])
+    with pytest.raises(SourceError, match="is cut off"):
+        read_pictures([tmp_path], "x")

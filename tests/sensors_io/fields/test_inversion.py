@@ -1,10 +1,13 @@
 """The compliance matrix against the scenes' spectra, the inversion against loads that are known."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sensors_io.fields.compliance import NodeGrid, compliance_matrix, total_force, total_moment
+from sensors_io.fields.helmholtz import decompose, shear_matrix
 from sensors_io.fields.inversion import InverseConfig, LayerInverse
 from sensors_io.fields.shear import ShearReader
 from sensors_io.scenes.layer import Layer
@@ -21,6 +24,10 @@ def load(centre=(7.0, 8.0), radius=4.0):
     y, x = np.mgrid[:SIDE, :SIDE] * PITCH
     pressure = 0.15 * np.sqrt(np.maximum(1 - ((x - centre[0]) ** 2 + (y - centre[1]) ** 2) / radius**2, 0))
     return np.stack([0.4 * pressure, -0.2 * pressure, -pressure], -1)
+
+
+def rms(field):
+    return np.sqrt((field**2).sum(-1).mean())
 
 
 def moved(traction, depth_mm=0.3):
@@ -80,11 +87,28 @@ def test_shear_is_what_the_traction_makes(inverse, noisy):
     traction = load() * [1, 1, 0]
     true = moved(traction)[..., :2]
     found = inverse.contact(noisy[..., :2], noisy[..., 2])
-    rms = lambda field: np.sqrt((field**2).sum(-1).mean())
     assert rms(found.by_traction_mm - true) < 0.06 * rms(true)
     assert rms(noisy[..., :2] - found.by_pressure_mm - true) < 0.013
     linear = inverse.linear(noisy[..., :2], noisy[..., 2])
     assert rms(found.by_traction_mm - true) < rms(linear.by_traction_mm - true)
+
+
+def test_without_gradients_a_wrong_layer_makes_no_traction(noisy):
+    """A gel taken for thinner, and for harder to compress, than it is."""
+    wrong = Layer(modulus_mpa=0.3, poisson=0.495, thickness_mm=3.5 / 1.3)
+    true = moved(load() * [1, 1, 0])[..., :2]
+    error = {}
+    for free in (True, False):
+        inverse = LayerInverse(wrong, GRID, dataclasses.replace(CONFIG, gradient_free=free))
+        error[free] = rms(inverse.contact(noisy[..., :2], noisy[..., 2]).by_traction_mm - true)
+    assert error[True] < 0.5 * error[False]
+
+
+def test_the_shear_matrix_is_the_decomposition():
+    field = np.random.default_rng(4).normal(size=(5, 6, 2))
+    flat = np.moveaxis(field, -1, 0).ravel()
+    found = np.moveaxis((shear_matrix((5, 6), (1.0, 0.8)) @ flat).reshape(2, 5, 6), 0, -1)
+    np.testing.assert_allclose(found, decompose(field, (1.0, 0.8)).shear, atol=1e-12)
 
 
 def test_without_noise_the_linear_solution_explains_the_displacement(inverse):

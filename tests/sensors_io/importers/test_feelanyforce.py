@@ -1,12 +1,13 @@
 """FeelAnyForce: pictures with forces; the sign of pressing is inferred from a push, or told."""
 
+import collections
 import dataclasses
 
 import numpy as np
 import pytest
 
 from sensors_io.importers.catalogue import import_catalogue
-from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce, pressing_sign
+from sensors_io.importers.feelanyforce import NO_ROW, FeelAnyForceConfig, list_feelanyforce, pressing_sign
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
@@ -103,3 +104,11 @@ def test_wrong_directories_and_tables_are_named(tmp_path):
     (tmp_path / "a.csv").write_text(HEAD + "x,,\n")
     with pytest.raises(ImportSourceError, match="no row with a picture and six readings"):
         list_feelanyforce(tmp_path, KEEP)
+
+
+def test_every_empty_row_is_left_out_as_incomplete(tmp_path):
+    """As in the published table, most of which is empty."""
+    source = write(tmp_path / "in", row(tmp_path / "in", 1000, "0 0 -3 0 0 0"), *[",,\n"] * 7)
+    report, store = imported(source, tmp_path / "out")
+    assert collections.Counter(skip.reason for skip in report.skipped) == {NO_ROW: 7}
+    assert store.frames == {"gelsight_mini": 1}

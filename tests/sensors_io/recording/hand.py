@@ -48,7 +48,9 @@ class Camera:
         self.hand, self.count, self.sensor = hand, 0, sensor
 
     identity = property(
-        lambda self: Identity(sensor=self.sensor, serial="R0B-1", settings={"exposure": 100.0}, period_s=0.01)
+        lambda self: Identity(
+            sensor=self.sensor, serial="R0B-1", settings={"exposure": 100.0}, period_s=0.01, mm_per_px=0.0634
+        )
     )
     counts = property(lambda self: Counts(arrived=self.count, delivered=self.count))
 
@@ -75,3 +77,25 @@ class Scale:
         force = np.array([0.0, 0.0, 1.0 - self.hand.force_n], np.float32)
         arrays = {"force_n": force, "moment_nmm": np.zeros(3, np.float32)}
         return [Sample(host_time_ns=int(t), arrays=arrays) for t in times]
+
+
+class Skin:
+    """A feed of fields and forces, at the times of the camera's looks, stamped late.
+
+    Args:
+      hand: whose force it tells, as it was when the moment came that its stamp says, less `late_ns`.
+    """
+
+    identity = property(lambda self: Identity(sensor="tac3d", serial="A1", period_s=0.01))
+    counts = property(lambda self: Counts(arrived=self.count, delivered=self.count))
+
+    def __init__(self, hand, late_ns=0):
+        self.hand, self.late_ns, self.count = hand, late_ns, 0
+
+    def drain(self):
+        self.count += 1
+        arrays = {
+            "depth_mm": np.full((3, 3), self.hand.force_n / 20, np.float32),
+            "force_n": np.array([0.0, 0.0, -self.hand.force_n], np.float32),
+        }
+        return [Sample(host_time_ns=self.hand.time_ns + self.late_ns, index=self.count, arrays=arrays)]

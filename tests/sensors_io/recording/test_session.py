@@ -7,17 +7,20 @@ import signal
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
-from sensors_io.recording.book import ATTEMPTS
+from sensors_io.recording.assemble import assemble
+from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig, Stage, protocol
+from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import SessionConfig, record_session
-from sensors_io.records import RecordStore
-from sensors_io.schema import Flag
-from tests.sensors_io.recording.hand import Camera, Hand, Scale
+from sensors_io.records import RecordsExistError, RecordStore
+from sensors_io.schema import Flag, SchemaError
+from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 
 BIAS = GravityModel(
     bias_n=np.array([0, 0, 1.0]), bias_nmm=np.zeros(3), weight_n=0.0, first_moment_nmm=np.zeros(3), rms_n=0, rms_nmm=0,
@@ -30,7 +33,7 @@ SHORT = dataclasses.replace(CONFIG, stages=(protocol()[0], Stage(motion="slide_x
 
 
 def session(out, hand, config=CONFIG, **rest):
-    return record_session(out, config, Camera(hand), Scale(hand), show=hand.show, **rest)
+    return record_session(out, config, [Camera(hand)], Scale(hand), show=hand.show, **rest)
 
 
 def test_the_whole_protocol_of_a_site(tmp_path):
@@ -84,7 +87,7 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
 
     hand = Hand()
     with pytest.raises(DeviceLostError):
-        record_session(tmp_path, SHORT, Failing(hand), Scale(hand), show=hand.show)
+        record_session(tmp_path, SHORT, [Failing(hand)], Scale(hand), show=hand.show)
     assert not list((tmp_path / ".journals").iterdir())
     report = session(tmp_path, Hand(), SHORT)
     assert (report.contacts, report.recovered, report.incomplete) == (2, 0, 0)
@@ -97,13 +100,13 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
 def test_a_protocol_without_any_force_is_refused(tmp_path):
     hand = Hand()
     with pytest.raises(ForceError, match="gelsight_mini tells no force"):
-        record_session(tmp_path, SHORT, Camera(hand), None, show=hand.show)
+        record_session(tmp_path, SHORT, [Camera(hand)], None, show=hand.show)
 
 
 def test_free_motion_needs_no_force_sensor(tmp_path):
     hand = Hand()
     config = dataclasses.replace(CONFIG, free_s=0.5)
-    report = record_session(tmp_path, config, Camera(hand), None, show=hand.show)
+    report = record_session(tmp_path, config, [Camera(hand)], None, show=hand.show)
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
     assert report.contacts == 1
     assert made.key.motion == "free"
@@ -119,7 +122,7 @@ def test_a_gap_of_the_camera_is_flagged(tmp_path):
             return super().drain()
 
     hand = Hand()
-    record_session(tmp_path, dataclasses.replace(CONFIG, free_s=0.6), Gappy(hand), Scale(hand), show=hand.show)
+    record_session(tmp_path, dataclasses.replace(CONFIG, free_s=0.6), [Gappy(hand)], Scale(hand), show=hand.show)
     flags = RecordStore(tmp_path).contact(0)["gelsight_mini"].flags
     assert np.flatnonzero(flags & np.uint32(Flag.TIME_GAP)).tolist() == [40]
 
@@ -132,13 +135,14 @@ from tests.sensors_io.recording.test_session import CONFIG
 hand = hand_.Hand()
 def show(status):
     hand.show(status)
-    print(status.frames, flush=True)
+    print(*(stream.frames for stream in status.streams), flush=True)
     time.sleep(0.002)
-record_session(sys.argv[1], CONFIG, hand_.Camera(hand), hand_.Scale(hand), show=show)
+sensors = [hand_.Camera(hand), hand_.Skin(hand)]
+record_session(sys.argv[1], CONFIG, sensors, hand_.Scale(hand), show=show)
 """
 
 
-def test_a_kill_loses_no_frame_that_was_shown(tmp_path):
+def test_a_kill_loses_no_frame_of_any_sensor_that_was_shown(tmp_path):
     """SIGKILL in the middle of the press; every frame that the session had reported is in the records afterwards."""
     root = pathlib.Path(__file__).resolve().parents[3]
     code = CHILD.replace("sys.argv[1]", "__import__('pathlib').Path(sys.argv[1])")
@@ -146,17 +150,113 @@ def test_a_kill_loses_no_frame_that_was_shown(tmp_path):
     child = subprocess.Popen(
         [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True, env=environment, cwd=root
     )
-    shown = 0
-    while shown < 30:
-        shown = int(child.stdout.readline())
+    shown = [0, 0]
+    while shown[0] < 30:
+        shown = [int(word) for word in child.stdout.readline().split()]
     child.send_signal(signal.SIGKILL)
-    rest = child.stdout.read().split("\n")
+    rest = [line.split() for line in child.stdout.read().split("\n")[:-1]]
     assert child.wait() == -signal.SIGKILL
     child.stdout.close()
-    last = max([shown, *(int(line) for line in rest[:-1])])
+    last = np.max([shown, *([int(word) for word in line] for line in rest)], axis=0)
     hand = Hand()
-    report = session(tmp_path, hand, SHORT)
-    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    report = record_session(tmp_path, SHORT, [Camera(hand), Skin(hand)], Scale(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)
     assert report.recovered == 1
-    assert last <= len(made) <= last + 1
-    assert np.all(np.diff(made.frames[:, 0, 0, 0].astype(int)) % 256 == 1)
+    assert last[0] <= len(made["gelsight_mini"]) <= last[0] + 1
+    assert last[1] <= len(made["tac3d"]) <= last[1] + 1
+    assert np.all(np.diff(made["gelsight_mini"].frames[:, 0, 0, 0].astype(int)) % 256 == 1)
+    assert made["gelsight_mini"].camera["recording"]["torn"]
+
+
+def both(out, config=SHORT, **rest):
+    """A session of a camera, and of a skin that is stamped 30 ms late."""
+    hand = Hand()
+    sensors = [Camera(hand), Skin(hand, late_ns=30 * MS)]
+    report = record_session(out, config, sensors, Scale(hand), show=hand.show, **rest)
+    return report, RecordStore(out)
+
+
+def test_two_sensors_make_one_contact_on_one_clock(tmp_path):
+    """The skin feels the hand's force itself: with its lateness taken off it agrees with the force sensor at once."""
+    report, store = both(tmp_path, dataclasses.replace(SHORT, late_s={"tac3d": 0.03}))
+    assert (report.contacts, report.incomplete) == (2, 0)
+    assert store.sensors_of(0) == ("gelsight_mini", "tac3d")
+    for i in range(2):
+        camera, skin = store.contact(i)["gelsight_mini"], store.contact(i)["tac3d"]
+        assert camera.key == skin.key
+        assert abs(int(camera.host_time_ns[0]) - int(skin.host_time_ns[0])) <= 10 * MS
+        at_camera = np.interp(skin.host_time_ns, camera.host_time_ns, camera.force_n[:, 2])
+        inside = (skin.host_time_ns >= camera.host_time_ns[0]) & (skin.host_time_ns <= camera.host_time_ns[-1])
+        np.testing.assert_allclose(skin.force_n[inside, 2], at_camera[inside], atol=1e-3)
+        assert skin.camera["recording"]["late_s"] == 0.03
+        assert skin.camera["recording"]["sensors"] == ["gelsight_mini", "tac3d"]
+        assert skin.mm_per_px is None
+        assert camera.mm_per_px == 0.0634
+    as_stamped = both(tmp_path / "as stamped")[1].contact(0)
+    first = [s.host_time_ns[np.argmax(-s.force_n[:, 2] > 0.25)] for s in as_stamped.values()]
+    assert first[1] - first[0] == 30 * MS
+
+
+def test_a_skin_leads_the_protocol_where_there_is_no_force_sensor(tmp_path):
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Camera(hand), Skin(hand)], None, show=hand.show)
+    made = RecordStore(tmp_path).contact(0)
+    assert (report.contacts, report.incomplete) == (2, 0)
+    assert made["gelsight_mini"].force_n is None
+    assert -made["tac3d"].force_n[:, 2].min() == pytest.approx(20, abs=1.1)
+
+
+def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
+    hand = Hand()
+    with pytest.raises(SchemaError, match="name two of one kind apart"):
+        record_session(tmp_path, SHORT, [Camera(hand), Camera(hand)], Scale(hand), show=hand.show)
+    session(tmp_path, hand, SHORT)
+    with pytest.raises(RecordsExistError, match=r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'"):
+        both(tmp_path)
+
+
+def test_the_gel_at_rest_is_kept_beside_the_records(tmp_path):
+    """Before each contact, where the force says that nothing touches; extraction finds it by its name."""
+    session(tmp_path, Hand(), SHORT)
+    made = RecordStore(tmp_path).contact(1)["gelsight_mini"]
+    name = made.camera["recording"]["background"]
+    assert name == "backgrounds/cup-0-slide_x-0-gelsight_mini.png"
+    picture = cv2.imread(str(tmp_path / name))
+    assert picture.shape == made.frames.shape[1:]
+    assert np.all(picture[1:] == 0)
+
+
+def test_the_object_is_seen_once_with_the_place_of_its_contact(tmp_path):
+    view = ObjectView(
+        picture=np.full((6, 8, 3), 90, np.uint8), depth_mm=np.full((6, 8), 300.5, np.float32), region_px=(2, 1, 3, 4)
+    )
+    session(tmp_path, Hand(), SHORT, view=view)
+    store = RecordStore(tmp_path)
+    assert store.objects["cup"].view.tolist() == view.picture.tolist()
+    assert store.objects["cup"].view_depth_mm[0, 0] == 300.5
+    assert store.contact(0)["gelsight_mini"].contact_region_px == (2, 1, 3, 4)
+
+
+def test_a_force_sensor_out_of_its_range_is_an_alarm_and_a_flag(tmp_path):
+    class Strained(Scale):
+        def drain(self):
+            beyond = self.hand.force_n > 15
+            return [
+                dataclasses.replace(s, arrays=s.arrays | {"out_of_range": np.array(beyond)}) for s in super().drain()
+            ]
+
+    hand = Hand()
+    record_session(tmp_path, SHORT, [Camera(hand)], Strained(hand), show=hand.show)
+    press, slide = (RecordStore(tmp_path).contact(i)["gelsight_mini"] for i in (0, 1))
+    flagged = (press.flags & np.uint32(Flag.INCOMPLETE)) != 0
+    assert flagged.any()
+    assert np.all(-press.force_n[flagged, 2] > 14)
+    assert not np.any(slide.flags)
+    assert any("out of its range" in status.alarm for status in hand.statuses)
+
+
+def test_a_journal_of_an_earlier_version_is_refused(tmp_path):
+    with JournalWriter(tmp_path / "old.journal") as writer:
+        writer.append("start", {"key": {}, "identity": {}})
+    with pytest.raises(JournalError, match="earlier version"):
+        assemble(tmp_path / "old.journal")

@@ -63,7 +63,8 @@ def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> N
 
 def test_optics_and_touches_are_found_again(presses: BallPresses, profiles: fitting.Profiles) -> None:
     train = np.arange(0, 16, 2)
-    found, touches = fitting.fit_jointly(presses, profiles, train)
+    begun = _touches() + np.random.default_rng(3).uniform(-0.4, 0.4, (16, 3))
+    found, touches = fitting.fit_jointly(presses, profiles, begun, train)
     np.testing.assert_allclose(touches, _touches(), atol=0.1)
     held_out = [fitting.change(found, profiles, t, presses.axis_mm, presses.window_mm) for t in touches[1::2]]
     true = [fitting.change(MINI, profiles, t, presses.axis_mm, presses.window_mm) for t in _touches()[1::2]]
@@ -80,12 +81,6 @@ def test_noise_and_grain_are_found_again(presses: BallPresses) -> None:
         assert noise.read[c] + noise.shot[c] * level == pytest.approx(READ + SHOT * level, rel=0.15)
         assert noise.grain[c] == pytest.approx(GRAIN, rel=0.3)
     assert noise.shared == pytest.approx(0.5, abs=0.15)
-
-
-def test_a_picture_without_a_press_is_refused(presses: BallPresses) -> None:
-    blank = dataclasses.replace(presses, pictures=np.stack([presses.pictures[0], presses.background]))
-    with pytest.raises(ValueError, match=r"picture 1 differs from the background by 0\.0 levels: must be > 8"):
-        fitting.locate(blank)
 
 
 def test_pictures_must_be_square_and_like_the_background(presses: BallPresses) -> None:

@@ -1,7 +1,11 @@
-"""The live view through real HTTP."""
+"""The live view through real HTTP, as a browser uses it."""
 
+import dataclasses
+import http.client
 import json
+import threading
 import urllib.error
+import urllib.parse
 import urllib.request
 
 import cv2
@@ -12,40 +16,63 @@ from sensors_io.devices.base import Sample
 from sensors_io.viewer.panels import arrows, coloured, panels
 from sensors_io.viewer.server import LiveView, Numbers
 
-NUMBERS = Numbers(title="gelsight_mini R0B", time_s=1.5, force_n=(0.0, 0.1, -2.0), numbers={"missing": "3"})
+NUMBERS = Numbers(
+    title="gelsight_mini R0B", time_s=1.5, force_n=(0.0, 0.1, -2.0), tables={"gelsight_mini": {"rate": "25.0 Hz"}}
+)
 
 
 def ask(view, path):
     return urllib.request.urlopen(view.address + path, timeout=10)
 
 
-def part(stream):
-    """One picture of a multipart stream."""
-    assert stream.readline() == b"--frame\r\n"
-    assert stream.readline() == b"Content-Type: image/jpeg\r\n"
-    length = int(stream.readline().split()[1])
-    stream.readline()
-    data = stream.read(length)
-    stream.readline()
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+def picture(view, name):
+    with ask(view, "panel/" + urllib.parse.quote(name)) as answer:
+        return cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_COLOR)
+
+
+def plain(*colour):
+    return lambda: np.full((8, 8, 3), colour, np.uint8)
 
 
 def test_page_numbers_and_pictures():
     with LiveView(port=0) as view:
         with ask(view, "") as page:
             assert b"EventSource('/numbers')" in page.read()
-        view.publish({"camera": np.full((8, 8, 3), (200, 0, 0), np.uint8)}, NUMBERS)
+        view.publish({"tac3d: depth": plain(200, 0, 0)}, NUMBERS)
         with ask(view, "numbers") as events:
             said = json.loads(events.readline().removeprefix(b"data: "))
-            assert said["panels"] == ["camera"]
+            assert said["panels"] == ["tac3d: depth"]
             assert said["force_n"] == [0.0, 0.1, -2.0]
-        with ask(view, "panel/camera") as stream:
-            blue, _, red = part(stream).mean((0, 1))
+            blue, _, red = picture(view, "tac3d: depth").mean((0, 1))
             assert red > 180 > 50 > blue
-            view.publish({"camera": np.full((8, 8, 3), (0, 0, 200), np.uint8)}, NUMBERS)
-            assert part(stream).mean((0, 1))[0] > 180
-        with pytest.raises(urllib.error.HTTPError, match="404"):
-            ask(view, "etc/passwd")
+            view.publish({"tac3d: depth": plain(0, 0, 200)}, dataclasses.replace(NUMBERS, alarm="overload"))
+            events.readline()
+            again = json.loads(events.readline().removeprefix(b"data: "))
+            assert (again["version"], again["alarm"]) == (said["version"] + 1, "overload")
+        assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
+        for path in ("panel/shear", "etc/passwd"):
+            with pytest.raises(urllib.error.HTTPError, match="404"):
+                ask(view, path)
+
+
+def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
+    drawn = []
+
+    def panel():
+        drawn.append(threading.get_ident())
+        return np.zeros((4, 4, 3), np.uint8)
+
+    with LiveView(port=0) as view:
+        host, port = view.address.removeprefix("http://").rstrip("/").split(":")
+        connection = http.client.HTTPConnection(host, int(port), timeout=10)
+        view.publish({"camera": panel}, NUMBERS)
+        assert drawn == []  # nobody has looked yet
+        for _ in range(5):
+            connection.request("GET", "/panel/camera")
+            assert connection.getresponse().read()[:2] == b"\xff\xd8"
+        connection.close()
+    assert len(drawn) == 1
+    assert drawn[0] != threading.get_ident()
 
 
 def test_streams_end_with_the_view():
@@ -71,21 +98,27 @@ def test_panels_of_a_sample():
         "force_n": np.zeros(3),
     }
     shown = panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays=arrays))
-    assert list(shown) == ["camera", "depth, 0 to 1.5 mm", "deformation, arrows ×4"]
-    assert all(p.dtype == np.uint8 and p.ndim == 3 for p in shown.values())
+    assert list(shown) == ["camera", "depth", "deformation"]
+    assert all(p().dtype == np.uint8 and p().ndim == 3 for p in shown.values())
     touched = np.zeros((4, 4), bool)
     touched[1:3, 1:3] = True
-    outlined = panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays={"contact": touched}))[
-        "camera"
-    ]
-    assert np.array_equal(outlined[..., 0] == 255, touched)
-    depth = panels(Sample(host_time_ns=0, frame=np.full((4, 4), 700, np.uint16)))["camera"]
+    seen = panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays={"contact": touched}))
+    assert np.array_equal(seen["camera"]()[..., 0] == 255, touched)
+    depth = panels(Sample(host_time_ns=0, frame=np.full((4, 4), 700, np.uint16)))["camera"]()
     assert depth.shape == (320, 320, 3)
+    view = {"view_depth_mm": np.full((4, 4), 300.0, np.float32)}
+    assert list(panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays=view))) == [
+        "camera",
+        "distance",
+    ]
 
 
 def test_fields_are_coloured_and_holes_are_black():
     field = np.array([[0.0, 1.0], [np.nan, 2.0]])
-    picture = coloured(field, 1.0)
-    assert picture[-1, 0].tolist() == [0, 0, 0]
-    assert picture[0, -1].tolist() == picture[-1, -1].tolist() != picture[0, 0].tolist()
-    assert arrows(np.zeros((40, 30, 2))).shape[:2] == (320, 240)
+    drawn = coloured(field, 1.0)
+    assert drawn[-1, 0].tolist() == [0, 0, 0]
+    assert drawn[0, -1].tolist() == drawn[-1, -1].tolist() != drawn[0, 0].tolist()
+    still = arrows(np.zeros((40, 30, 2)))
+    assert still.shape[:2] == (320, 240)
+    assert np.ptp(still.reshape(-1, 3), axis=0).max() == 0  # no arrow where nothing moves
+    assert (arrows(np.full((40, 30, 2), 0.2)) == 255).all(-1).any()

@@ -42,7 +42,7 @@ def test_value_and_gradient_equal_those_of_the_plain_softmax(queries, shared):
         def run(q, k, v, own_k, own_v):
             return jnp.sum(weight * attention(q, [KeySource(k, v, seen), KeySource(own_k, own_v, causal)]))
 
-        return jax.value_and_grad(run, argnums=range(5))(*args)
+        return jax.jit(jax.value_and_grad(run, argnums=range(5)))(*args)
 
     (ours, gradient), (theirs, expected) = total(attend), total(naive)
     np.testing.assert_allclose(ours, theirs, rtol=1e-5)
@@ -55,7 +55,7 @@ def test_keys_that_a_group_shares_get_the_sum_of_its_gradients():
     run = lambda attention, k: jnp.sum(
         jnp.sin(jax.vmap(lambda x: attention(x, [KeySource(k, v, jnp.ones(6, bool))]))(q))
     )
-    ours, theirs = (jax.grad(lambda k, a=a: run(a, k))(k) for a in (attend, naive))
+    ours, theirs = (jax.jit(jax.grad(lambda k, a=a: run(a, k)))(k) for a in (attend, naive))
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
@@ -66,21 +66,24 @@ def test_blocks_of_queries_see_what_the_whole_sees(rows):
     mask = jnp.arange(length) != 4
     q, cache = normal(0, rows, KV, R, D), LayerCache(normal(1, KV, length, D), normal(2, KV, length, D))
     whole = naive(q, [KeySource(cache.k, cache.v, jnp.tri(rows, length, length - rows, dtype=bool) & mask)])
-    np.testing.assert_allclose(attend_causally(q, cache, mask), whole, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(attend_causally)(q, cache, mask), whole, rtol=1e-4, atol=1e-5)
+
+
+prefill = jax.jit(tiny.AGENT.prefill, static_argnums=5)
 
 
 @pytest.mark.parametrize("stream", range(tiny.S))
 def test_a_prompt_encoded_again_from_a_change_on_is_the_prompt_encoded_whole(stream):
-    agent, params = tiny.AGENT, tiny.params()
+    params = tiny.params()
     features = jax.tree.map(lambda x: x[0], tiny.features(0))
     changed = features.replace(touch=features.touch.at[stream].set(normal(9, *features.touch.shape[1:])))
     ids, mask = jnp.asarray(tiny.LAYOUT.ids[0]), jnp.asarray(tiny.LAYOUT.mask[0])
-    _, known = agent.prefill(params, features, ids, mask)
-    again = agent.prefill(params, changed, ids, mask, known, int(tiny.SLOTS.touch[stream].min()))
-    whole = agent.prefill(params, changed, ids, mask)
+    _, known = prefill(params, features, ids, mask)
+    again = prefill(params, changed, ids, mask, known, int(tiny.SLOTS.touch[stream].min()))
+    whole = prefill(params, changed, ids, mask)
     for a, b in zip(*map(jax.tree.leaves, (again, whole)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
-    assert jnp.abs(whole[0] - agent.prefill(params, features, ids, mask)[0]).max() > 1e-3
+    assert jnp.abs(whole[0] - prefill(params, features, ids, mask)[0]).max() > 1e-3
 
 
 def test_touch_starts_at_the_first_sensor_name():

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.models.tactile_vit import QueryPool, TactileViTConfig, force_features, patch_tokens, sinusoid
+from touchr1_jax.models.tactile_vit import (
+    QueryPool,
+    TactileViT,
+    TactileViTConfig,
+    force_features,
+    patch_tokens,
+    sinusoid,
+)
 
 CONFIG = dataclasses.replace(tiny.CONFIG.tactile, patch_cells=2, stem_px=2)  # patches of 4 px
 F, H, W = 4, 8, 12
@@ -167,3 +174,53 @@ def test_pool_by_hand():
     out = QueryPool(1).apply({"params": params}, jnp.array([[0.0], [1.0]]))
     p = 1 / (1 + np.exp(-2))
     np.testing.assert_allclose(out, [[10 * p]], rtol=1e-6)
+
+
+WIDE = TactileViTConfig(sensors=2, width=8, num_layers=2, num_heads=2, stem_width=2, patch_cells=2, stem_px=2)
+
+
+def encode_alone(config: TactileViTConfig, frames: np.ndarray, seed: int = 0):
+    """Patch tokens and pooled tokens of one stream."""
+    f = len(frames)
+    streams = (jnp.zeros((f, 3)), jnp.arange(f), jnp.ones(f, bool), jnp.int32(0))
+    module = TactileViT(config)
+    params = jax.jit(module.init)(jax.random.key(seed), jnp.asarray(frames), *streams)
+    return jax.jit(lambda x: module.apply(params, x, *streams, method=TactileViT.encode))(jnp.asarray(frames))
+
+
+def test_a_causal_encoder_does_not_look_ahead():
+    frames = np.random.default_rng(0).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
+    later = frames.copy()
+    later[2:] = 255 - later[2:]
+    for causal in (False, True):
+        config = dataclasses.replace(WIDE, causal=causal)
+        before, after = encode_alone(config, frames).pooled, encode_alone(config, later).pooled
+        same = np.asarray(before == after).all((1, 2))
+        np.testing.assert_array_equal(same, [causal, causal, False, False])
+
+
+def test_kept_patches_are_the_busy_ones_in_their_places():
+    """Two of six patches change: the others are never read, and the kept ones embed as they do among all."""
+    frames = np.full((F, H, W, 3), 90.0, np.float32)
+    frames[1:, :4, 4:8] += 60
+    frames[2:, 4:, 8:] += 40
+    shallow = dataclasses.replace(WIDE, num_layers=0)
+    every = encode_alone(shallow, frames).patches
+    kept = encode_alone(dataclasses.replace(shallow, patches_kept=2), frames).patches
+    np.testing.assert_allclose(kept, every[:, [1, 5]], rtol=1e-5, atol=1e-6)
+    dull = frames.copy()
+    dull[:, 4:, :4] = 91
+    np.testing.assert_array_equal(encode_alone(dataclasses.replace(shallow, patches_kept=2), dull).patches, kept)
+
+
+def test_the_rest_is_one_more_token():
+    frames = np.random.default_rng(0).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
+    merged = encode_alone(dataclasses.replace(WIDE, patches_kept=2, rest="merge"), frames)
+    assert merged.patches.shape == (F, 3, WIDE.width)
+    assert merged.pooled.shape == (F, WIDE.tokens_per_step, WIDE.width)
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_more_patches_than_there_are_cannot_be_kept(count):
+    with pytest.raises(ValueError, match=rf"patches_kept is {count}: must lie in 1\.\.6"):
+        encode_alone(dataclasses.replace(WIDE, patches_kept=count), np.zeros((F, H, W, 3), np.float32))

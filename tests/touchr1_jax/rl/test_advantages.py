@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchr1_jax.rl.advantages import degenerate, group_advantage
+from touchr1_jax.rl.advantages import batch_advantage, degenerate, group_advantage
 
 
 def test_advantages_by_hand():
@@ -62,3 +62,19 @@ def test_sum_is_zero_and_order_follows_the_reward(rewards):
     np.testing.assert_array_equal(
         np.sign(np.subtract.outer(rewards, rewards)), np.sign(np.subtract.outer(advantage, advantage))
     )
+
+
+def test_one_sigma_for_all_groups_keeps_a_debiased_reward_fair():
+    """Each of three levels answered once under each label; debiased, every answer earns .467 on average."""
+    credit = np.array([[1, 0.4, 0], [0.4, 1, 0.4], [0, 0.4, 1]])
+    debiased = jnp.asarray(credit - (credit.mean(0) - credit.mean()), jnp.float32)
+    np.testing.assert_allclose(batch_advantage(debiased).mean(0), 0, atol=1e-6)
+    np.testing.assert_allclose(group_advantage(debiased).mean(0), [-0.113, 0.226, -0.113], atol=2e-3)
+
+
+def test_degenerate_groups_have_no_part_in_the_sigma_of_the_batch():
+    reward = jnp.array([[1.0, 0.0], [0.4, 0.4], [1.0, 0.5]])
+    sigma = np.sqrt((0.25 + 0.0625) / 2)
+    expected = np.array([[0.5, -0.5], [0, 0], [0.25, -0.25]]) / sigma
+    np.testing.assert_allclose(batch_advantage(reward, epsilon=0.0), expected, rtol=1e-6)
+    assert not batch_advantage(jnp.full((2, 3), 0.4)).any()

@@ -129,6 +129,36 @@ def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     assert any(jnp.abs(a - b).max() > 1e-4 for a, b in zip(*map(jax.tree.leaves, (free, held)), strict=True))
 
 
+def test_blocks_of_tokens_give_the_gradient_of_all_of_them(one_stream):
+    """Three tokens' logits at a time, of policy, reference and perturbed policy, each with its KL."""
+    whole = compute(one_stream, PARAMS)
+    grads, parts = gradient(dataclasses.replace(CONFIG, max_logits=3 * tiny.V))(one_stream)
+    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[0]))
+    for a, b in zip(*map(jax.tree.leaves, (grads, whole[0])), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+    for name, value in whole[1].items():
+        np.testing.assert_allclose(parts[name], value, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_under_a_cap_the_learner_before_the_update_is_old(experience):
+    """At the first update its ratio is 1 whatever the sampler said, and the sampler counts in the weight alone."""
+    cap = 1.2
+    config = dataclasses.replace(ALONE, algorithm=dataclasses.replace(ALONE.algorithm, importance_cap=cap))
+    capped = jax.jit(lambda e, f: objective_gradient(AGENT, config, PARAMS, REFERENCE, e, first=f))
+    b, r = experience.batch, experience.rollout
+    log_p = jax.nn.log_softmax(group_logits(PARAMS, b.features, b.ids, b.mask, r.tokens))
+    learner = token_log_probs(log_p, r.tokens)
+    _, parts = capped(experience, True)
+    np.testing.assert_allclose(parts["old"], learner, rtol=1e-5, atol=1e-5)
+    assert parts["clip_share"] == 0
+    weight = np.minimum(np.exp(learner - r.log_prob), cap)
+    gain = np.where(r.mask, weight * experience.advantage[..., None], 0).sum(-1) / r.mask.sum(-1)
+    np.testing.assert_allclose(parts["surrogate"], gain.mean(), rtol=1e-4)
+    _, later = capped(experience, False)  # a later update: the ratio is to what the first one left in `old`
+    np.testing.assert_array_equal(later["old"], experience.old)
+    assert later["clip_share"] > 0
+
+
 @pytest.mark.parametrize("change", [{"remat": True}, {"bfloat16": True}])
 def test_cheaper_passes_give_the_gradient_of_the_exact_ones(one_stream, change):
     """Rematerialised to rounding; in bfloat16, whose numbers have eight bits, to a few per cent."""

@@ -1,62 +1,21 @@
 """R_tu by hand, and how often it pays by chance, enumerated."""
 
-import itertools
-from math import factorial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from touchr1_jax.rl.config import Stable
+from touchr1_jax.rl.credit_odds import CREDIT, HELPED, HINDERED, credit_odds, false_credit
 from touchr1_jax.rl.tactile_use import bar, literal, recommended
 
-G, CONTROLS = 8, 3
-CREDIT = np.array([0.0, 0.4, 1.0])
+SIZES = {"group": 8, "rollouts": Stable().controls, "controls": 3}
 
 
-def counts(n: int) -> np.ndarray:
-    """All ways to spread n rollouts over the three credits, [m, 3]."""
-    return np.array([c for c in itertools.product(range(n + 1), repeat=3) if sum(c) == n])
-
-
-def probability(count: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """Multinomial probability of each count."""
-    ways = np.array([factorial(sum(c)) / np.prod([factorial(x) for x in c]) for c in count.tolist()])
-    return ways * np.prod(p**count, -1)
-
-
-def table(j: int, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Own counts, control counts, control means, and whether any m_i > 0 for each pair, by the engine's own formula."""
-    own, control = counts(G), counts(j)
-    rows = jnp.asarray([np.repeat(CREDIT, c) for c in own.tolist()], jnp.float32)
-    mean = (control @ CREDIT / j).astype(np.float32)
-    pays = jax.vmap(lambda s: jax.vmap(lambda b: jnp.any(recommended(s, b, jnp.ones(G, bool), margin) > 0))(mean))(rows)
-    return own, control, mean, np.asarray(pays)
-
-
-def paid_share(parts, real: np.ndarray, null: np.ndarray, controls: int) -> float:
-    """Exact probability that a group earns credit when b is the largest mean of independent controls."""
-    own, control, mean, pays = parts
-    order = np.argsort(mean, kind="stable")
-    up_to = np.cumsum(probability(control[order], null)) ** controls
-    # equal means share their step of the distribution function
-    largest = np.diff(np.concatenate([[0.0], up_to]))
-    return float(probability(own, real) @ pays[:, order] @ largest)
-
-
-@pytest.fixture(scope="module")
-def stable():
-    return table(Stable().controls, Stable().tactile_margin)
-
-
-def test_false_credit_and_power_of_the_stable_preset(stable):
+def test_false_credit_and_power_of_the_stable_preset():
     """Null: answers and controls from one distribution over 0, .4, 1, for every split of what is not right."""
-    splits = [
-        np.array([(1 - p) * (1 - q), (1 - p) * q, p]) for p in np.arange(1, 10) / 10 for q in np.linspace(0, 1, 11)
-    ]
-    worst = max(paid_share(stable, p, p, CONTROLS) for p in splits)
-    power = paid_share(stable, np.array([0.05, 0.25, 0.70]), np.array([0.22, 0.45, 0.33]), CONTROLS)
+    margin = Stable().tactile_margin
+    worst = false_credit(**SIZES, margin=margin)
+    power = credit_odds(HELPED, HINDERED, **SIZES, margin=margin)
     assert worst <= 0.12
     assert worst == pytest.approx(0.086, abs=0.002)
     assert power >= 0.5
@@ -65,8 +24,24 @@ def test_false_credit_and_power_of_the_stable_preset(stable):
 
 def test_the_literal_margin_is_too_small():
     """At δ = .1 one right answer in eight passes for touch: why the stable preset departs from the paper."""
-    parts = table(4, 0.1)
-    assert paid_share(parts, np.array([0.9, 0, 0.1]), np.array([0.9, 0, 0.1]), CONTROLS) > 0.15
+    rare = np.array([0.9, 0, 0.1])
+    assert credit_odds(rare, rare, **SIZES, margin=0.1) > 0.15
+
+
+def test_odds_by_hand():
+    """One rollout against one control of one rollout: it pays where its credit is the larger one."""
+    touch, control = np.array([0.5, 0.2, 0.3]), np.array([0.7, 0.2, 0.1])
+    odds = credit_odds(touch, control, group=1, rollouts=1, controls=1, margin=0.13)
+    assert odds == pytest.approx(0.2 * 0.7 + 0.3 * 0.9)
+
+
+def test_odds_agree_with_drawing():
+    """Groups and controls drawn at random, and paid by the formula itself."""
+    rng, n = np.random.default_rng(0), 20_000
+    own = rng.choice(CREDIT, (n, 8), p=HELPED)
+    control = rng.choice(CREDIT, (n, 3, 4), p=HINDERED).mean(-1).max(-1)
+    paid = (own.mean(-1) > control + 0.13) & (own.max(-1) > control)
+    assert paid.mean() == pytest.approx(credit_odds(HELPED, HINDERED, **SIZES, margin=0.13), abs=0.015)
 
 
 def test_recommended_by_hand():

@@ -82,6 +82,18 @@ def test_importance_weights_of_an_exact_sampler_are_one(plain):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("buckets", [(), (2, 4)])
+def test_inner_updates_remember_the_learner_before_them(buckets):
+    """With an exact sampler the learner before the first of three updates is the sampler, in every bucket."""
+    clip = {"updates": 3, "clip_low": 1e-3, "clip_high": 1e-3}
+    state, metrics = take(of(Paper(**clip)))
+    capped, found = take(of(Paper(**clip, importance_cap=2.0), buckets=buckets))
+    np.testing.assert_allclose(found["clip_share"], metrics["clip_share"], atol=0.02)
+    for a, b in zip(*map(jax.tree.leaves, (capped.params, state.params)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.slow
 def test_the_reference_is_refreshed_on_time():
     config = of(Paper(reference_every=2, beta=0.1))
     state, _ = take(config, 1)

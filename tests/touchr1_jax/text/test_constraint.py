@@ -39,7 +39,7 @@ def test_every_draw_is_formatted_and_ends(name, extra):
     tokenizer = TOKENIZERS[name]
     length = compile_constraint(tiny.LANGUAGE, tokenizer).shortest + extra
     said = draw(tokenizer, length, 64)
-    parsed = jax.vmap(compile_parser(tiny.LANGUAGE, tokenizer))(said.tokens)
+    parsed = jax.jit(jax.vmap(compile_parser(tiny.LANGUAGE, tokenizer)))(said.tokens)
     assert parsed.formatted.all()
     assert not parsed.truncated.any()
     for row, mask in zip(np.asarray(said.tokens), np.asarray(said.mask), strict=True):

@@ -54,8 +54,13 @@ def arrays(state) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    return run(tmp_path_factory.mktemp("whole"), feed())
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("whole")
+
+
+@pytest.fixture(scope="module")
+def whole(home):
+    return run(home, feed())
 
 
 def test_lines_come_in_order_once_each_from_zero(whole):
@@ -69,7 +74,10 @@ def test_lines_belong_to_their_steps(whole):
     assert [line["first"] for _, line in whole[1]] == [float(next(batches)[0]) for _ in range(STEPS)]
 
 
-@pytest.mark.parametrize("after", [1, 3, 4, 8, 9])
+LATER = [pytest.param(after, marks=pytest.mark.slow) for after in (4, 9)]
+
+
+@pytest.mark.parametrize("after", [1, 3, 8, *LATER])
 def test_resumed_run_equals_the_uninterrupted_one(whole, tmp_path, after):
     """It breaks before, at and between the checkpoints at 3, 6 and 9; lines after the last one are written again."""
     with pytest.raises(Broken):
@@ -93,9 +101,8 @@ def test_two_breaks_are_as_good_as_none(whole, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_finished_run_does_nothing_more(whole, tmp_path):
-    run(tmp_path, feed())
-    state, lines = run(tmp_path, Failing(0))
+def test_a_finished_run_does_nothing_more(whole, home):
+    state, lines = run(home, Failing(0))
     assert lines == []
     for a, b in zip(arrays(state), arrays(whole[0]), strict=True):
         np.testing.assert_array_equal(a, b)

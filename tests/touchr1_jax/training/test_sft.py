@@ -71,6 +71,18 @@ def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
     np.testing.assert_allclose(accuracy, right / count, rtol=1e-6)
 
 
+def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
+    """And the same gradient, five tokens' logits at a time."""
+    few, all_at_once = (
+        jax.jit(jax.value_and_grad(lambda p, most=most: sft_loss(AGENT, p, batch, max_logits=most)[0]))(params)
+        for most in (5 * tiny.V, 10**9)
+    )
+    np.testing.assert_allclose(few[0], all_at_once[0], rtol=1e-6)
+    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(all_at_once[1]))
+    for a, b in zip(*map(jax.tree.leaves, (few[1], all_at_once[1])), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+
+
 def test_only_answer_tokens_count(params, batch):
     """Other ids where the prompt or the answer is padding, other pixels in a stream that the question may not feel."""
     before = loss(params, batch)

@@ -4,9 +4,9 @@ import functools
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from tests.touchr1_jax import tiny
+from tests.touchr1_jax.drawn import draw_params
 from tests.touchr1_jax.models.qwen import words
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Slots, init_policy
@@ -58,7 +58,4 @@ def params() -> Params:
     shapes = jax.eval_shape(
         lambda k: init_policy(POLICY, k, tiny.touch_batch(), LAYOUT.ids[0], LAYOUT.mask[0], SLOTS), jax.random.key(0)
     )
-    rng = np.random.default_rng(0)
-    draw = lambda path, x: rng.normal(float(path[-1].key == "scale"), 0.3, x.shape).astype(np.float32)
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(jnp.asarray, jax.tree_util.tree_map_with_path(draw, shapes))
+    return draw_params(shapes, loud=0.3)

@@ -185,9 +185,9 @@ def test_half_precision_decodes_as_the_learner_scores(batch):
 
     @jax.jit
     def both(params):
-        first, prefix = agent.prefill(params, features, batch.ids[0], batch.mask[0])
+        states, prefix = agent.group_states(params, features, batch.ids[0], batch.mask[0], tokens)
         step, caches = agent.decode(params, tokens[0, 0], jnp.int32(0), prefix, agent.empty_cache(T))
-        return step, caches, agent.completion_logits(params, tokens, first, prefix)[0, 1]
+        return step, caches, agent.logits(params, states)[0, 1]
 
     step, caches, scored = both(half)
     assert caches[0].k.dtype == caches[0].v.dtype == jnp.bfloat16

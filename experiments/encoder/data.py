@@ -1,0 +1,67 @@
+"""The recordings that encoders learn from: other scenes than those of the later stages, split by object."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from experiments.encoder.held_out import Watched
+from experiments.policies.dataset import Dataset, open_dataset
+from experiments.policies.sources import Source, SourceConfig, prepare_records
+from experiments.running.context import Context
+from sensors_io.importers.physiclear import PhysiclearConfig
+from sensors_io.pipeline import ClipConfig
+from sensors_io.scenes import SceneConfig
+from sensors_io.schema import Flag
+from touchr1_jax.training.evidence import ProbeConfig
+
+STAGE_ONE_SEED = 1
+"""Seed of the scenes of stage 1: its objects are none of those, of seed 0, that later stages train and test on."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchConfig:
+    """Which recordings, and how many labelled contacts the probes are fitted on (at most)."""
+
+    data: Source = "generated"
+    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
+    data_dir: Path | None = None
+    """Folder of the videos or records."""
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1, seed=STAGE_ONE_SEED)
+    physiclear: PhysiclearConfig = PhysiclearConfig()
+    probe_fit: int = 1680
+    probe: ProbeConfig = ProbeConfig()
+
+
+def open_touch(config: TouchConfig, frames: int, image_px: int, context: Context) -> Dataset:
+    """The records, made first where the cache lacks them; frames past the strain limit stay in, as in the studies."""
+    source = SourceConfig(
+        kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
+    )
+    clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
+    return open_dataset(prepare_records(source, context), clip, grpo_share=0.5)
+
+
+def training_rows(data: Dataset) -> np.ndarray:
+    """Contacts of all training objects, ascending: no later stage shares these scenes, so none is kept back."""
+    return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+
+
+def watched(data: Dataset, part: str, config: TouchConfig, fit: int | None = None) -> Watched:
+    """Probes fitted on training contacts and read on a part.
+
+    Args:
+      data: the records.
+      part: "val" for choosing, "test" for reporting.
+      config: how many contacts to fit on, and the probe.
+      fit: another number of them.
+    """
+    return Watched(
+        store=data.store,
+        clip=data.clip,
+        fit_rows=training_rows(data)[: config.probe_fit if fit is None else fit],
+        read_rows=data.parts[part],
+        label=data.label,
+        objects=data.object_ids,
+        probe=config.probe,
+    )

@@ -1,0 +1,210 @@
+"""Stage 1 as a stage of a run: feed, steps, held-out skill and probes on the way, what other studies start from."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from experiments.encoder.held_out import Watched, assess
+from experiments.policies.feeds import Feed, touch_batch
+from experiments.policies.pretrained import PretrainedEncoder
+from experiments.running.context import Context
+from sensors_io.augment import AugmentConfig
+from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
+from touchr1_jax.models.predictor import PredictorConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.dynamics import (
+    DynamicsConfig,
+    DynamicsState,
+    DynamicsStep,
+    Guards,
+    make_dynamics_step,
+    start_dynamics,
+)
+from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.probes import collapse_alarms
+from touchr1_jax.types import TouchBatch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PretrainConfig:
+    """Stage 1; the learning rate is the paper's 1e-5 times `lr_scale`, `encoder.sensors` is set by the data."""
+
+    encoder: TactileViTConfig = TactileViTConfig(sensors=0, causal=True)
+    predictor: PredictorConfig = PredictorConfig()
+    frames: int = 4
+    frames_kept: int | None = None
+    """How many of them are read, the most telling ones; all by default."""
+    image_px: int = 112
+    full_share: float = 0.5
+    """Share of contacts whose prediction sees all their streams; the others see a random subset."""
+    variance: float = 1.0
+    covariance: float = 0.04
+    ema: float = 0.99
+    steps: int = 450
+    batch_size: int = 32
+    probe_every: int = 150
+    """Steps between held-out measurements, and between checkpoints."""
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+    augment: AugmentConfig = AugmentConfig()
+
+    def dynamics(self, sensors: int) -> DynamicsConfig:
+        """The networks for that many streams."""
+        encoder = dataclasses.replace(self.encoder, sensors=sensors)
+        return DynamicsConfig(
+            encoder=encoder, predictor=self.predictor, full_share=self.full_share, frames_kept=self.frames_kept
+        )
+
+    def guards(self) -> Guards:
+        """What keeps the latents from collapsing."""
+        return Guards(variance=self.variance, covariance=self.covariance, ema=self.ema)
+
+
+class ClipFeed(Feed):
+    """Clips of touch in random order, for ever."""
+
+    def __init__(
+        self,
+        store: Contacts,
+        rows: np.ndarray,
+        clip: ClipConfig,
+        *,
+        batch_size: int,
+        seed: int,
+        augment: AugmentConfig | None = None,
+    ) -> None:
+        super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed, augment=augment), seed)
+
+    def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch:
+        """The clips as they are."""
+        del rng
+        return touch_batch(element)
+
+
+def clip_of(config: PretrainConfig, clip: ClipConfig) -> ClipConfig:
+    """The clip that the encoder reads: that many frames of that size."""
+    return dataclasses.replace(clip, frames=config.frames, image_px=config.image_px)
+
+
+def pretrain(
+    config: PretrainConfig,
+    store: Contacts,
+    rows: np.ndarray,
+    clip: ClipConfig,
+    context: Context,
+    *,
+    stage: str,
+    seed: int,
+    watched: Watched | None = None,
+    start: PretrainedEncoder | None = None,
+) -> DynamicsState:
+    """Train encoder and predictor on some contacts, without their labels; a stopped stage goes on where it was.
+
+    Args:
+      config: networks and training.
+      store: where contacts come from.
+      rows: which of them.
+      clip: sensors and flags; frames and size are the config's.
+      context: the run.
+      stage: name of the stage, `PHASE/SEED`.
+      seed: of parameters and order.
+      watched: contacts to measure on every `probe_every` steps; none leaves measuring out.
+      start: an encoder to go on from, of the same shape.
+    """
+    clip = clip_of(config, clip)
+    feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed, augment=config.augment)
+    networks = config.dynamics(len(clip.sensors))
+    _, step = dynamics_program(networks, config.optimizer, config.steps, config.guards())
+    state = untrained(config, store, rows, clip, seed)
+    state = state if start is None else starting_from(state, start.for_sensors(clip.sensors))
+    measure = functools.partial(_measure, networks, context, f"probe/{stage.rpartition('/')[2]}", watched)
+    measure(state, 0)
+    for end in range(config.probe_every, config.steps + config.probe_every, config.probe_every):
+        loop = LoopConfig(steps=min(end, config.steps), save_every=config.probe_every)
+        state = train_stage(step, state, feed, loop, context, stage)
+        measure(state, loop.steps)
+    return state
+
+
+def encoder_of(
+    config: PretrainConfig, state: DynamicsState, sensors: tuple[str, ...], **notes: Any
+) -> PretrainedEncoder:
+    """What other studies start from: the averaged encoder."""
+    encoder = dataclasses.replace(config.encoder, sensors=len(sensors))
+    return PretrainedEncoder(config=encoder, sensors=sensors, params=jax.device_get(state.target), notes=notes)
+
+
+def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: ClipConfig, seed: int) -> DynamicsState:
+    """Where training begins; its target is an encoder that never learned anything."""
+    networks = config.dynamics(len(clip.sensors))
+    optimizer, _ = dynamics_program(networks, config.optimizer, config.steps, config.guards())
+    one = next(iter(clip_batches(store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
+    start = jax.jit(lambda key, batch: start_dynamics(networks, optimizer, key, batch))
+    # bound to the device, as a restored state is: else the step would be compiled once for either
+    state: DynamicsState = jax.device_put(start(jax.random.key(seed), touch_batch(one)), jax.devices()[0])
+    return state
+
+
+def starting_from(state: DynamicsState, encoder: PretrainedEncoder) -> DynamicsState:
+    """The state with another encoder in both places; the predictor stays as it is.
+
+    Raises:
+      ValueError: the encoder has another shape.
+    """
+    shapes = [jax.tree.map(np.shape, params) for params in (encoder.params, state.target)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(f"start has shapes {shapes[0]}: must be {shapes[1]}; give the config that it was trained with")
+    copies = [jax.tree.map(jnp.array, encoder.params) for _ in range(2)]  # the step gives its buffers away
+    return dataclasses.replace(state, params={**state.params, "encoder": copies[0]}, target=copies[1])
+
+
+@functools.cache
+def dynamics_program(
+    networks: DynamicsConfig, optimizer: OptimizerConfig, steps: int, guards: Guards
+) -> tuple[optax.GradientTransformation, DynamicsStep]:
+    """Optimizer and compiled step, made once for all seeds."""
+    made = make_optimizer(optimizer, steps)
+    return made, make_dynamics_step(networks, made, guards)
+
+
+def train_stage(
+    step: Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]],
+    state: Any,
+    feed: Feed,
+    loop: LoopConfig,
+    context: Context,
+    stage: str,
+) -> Any:
+    """`fit` with the run's checkpoints, log and progress bar, from the newest checkpoint where there is one."""
+    with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
+        start = min(checkpoints.latest() or 0, loop.steps)
+        with context.progress(stage, loop.steps, start) as advance:
+
+            def log(t: int, metrics: Mapping[str, float]) -> None:
+                context.log(stage, t, **metrics)
+                advance()
+
+            return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
+
+
+def _measure(
+    networks: DynamicsConfig, context: Context, stage: str, watched: Watched | None, state: DynamicsState, step: int
+) -> None:
+    """Log what the encoder knows after so many steps, and the alarms that it raises; once for a run."""
+    if watched is None or context.done(f"{stage}/at{step}"):
+        return
+    found = assess(networks, state, watched).summary()
+    if step:  # a random encoder is what the probes are held against, and has no lead over itself
+        found["probe_lead"] = found["probe"] - context.load_stage(f"{stage}/at0")["probe"]
+        for alarm in collapse_alarms(found):
+            context.say(f"{stage}, step {step}: {alarm}")
+    context.log(stage, step, **found)
+    context.say(f"{stage}, step {step}: " + ", ".join(f"{name} {value:.3g}" for name, value in found.items()))
+    context.save_stage(f"{stage}/at{step}", found)

@@ -1,0 +1,77 @@
+"""How fast an encoder reads prompts, how near the machine it comes, and where the rest of the time goes."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.running.timing import interleaved
+from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, patch_tokens
+from touchr1_jax.training.dynamics import DynamicsConfig, encode_batch, read_frames
+from touchr1_jax.types import Params, TouchBatch
+
+MATRIX = 1024  # side of the matrices whose product is the yardstick of the machine
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Program:
+    """A compiled call and the arithmetic that XLA counts in it, in Gflop."""
+
+    call: Callable[[], Any]
+    gflop: float
+
+
+def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> Program:
+    """The encoder from the bytes of a batch to its tokens."""
+    return compiled(lambda p, b: encode_batch(networks.encoder, p, read_frames(networks, b)), params, batch)
+
+
+def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Program]:
+    """Programs that each do one thing more than the one before, up to the whole encoder."""
+    e = networks.encoder
+    shallow = dataclasses.replace(e, num_layers=0)
+    few = {name: x for name, x in params.items() if not name.startswith("layer_")}
+    stem = {name: params[name] for name in ("stem", "patch", "energy")}
+    read = lambda b: read_frames(networks, b)
+    return {
+        "cut the bytes": compiled(lambda b: cut_patches(read(b).frames, e).astype(jnp.float32) / 127.5, batch),
+        "stem, energies, embedding": compiled(lambda p, b: _Stem(e).apply({"params": p}, read(b).frames), stem, batch),
+        "time, force, pooling": compiled(lambda p, b: encode_batch(shallow, p, read(b)), few, batch),
+        "transformer": forward(networks, params, batch),
+    }
+
+
+class _Stem(nn.Module):
+    """`patch_tokens` as a module."""
+
+    config: TactileViTConfig
+
+    @nn.compact
+    def __call__(self, frames: jax.Array) -> jax.Array:
+        return patch_tokens(frames, self.config)
+
+
+def matrix_product() -> Program:
+    """One product of square matrices."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
+    return compiled(lambda a: a @ a, x)
+
+
+def compiled(function: Callable[..., Any], *arguments: Any) -> Program:
+    """Compile for some arguments; they are held, so that a call takes none."""
+    placed = jax.device_put(arguments)
+    program = jax.jit(function).lower(*placed).compile()
+    cost: Any = program.cost_analysis()
+    return Program(call=lambda: program(*placed), gflop=float(cost["flops"]) / 1e9)
+
+
+def medians(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
+    """Median seconds of each, in interleaved rounds."""
+    for program in programs.values():
+        jax.block_until_ready(program.call())
+    seconds = interleaved({name: program.call for name, program in programs.items()}, rounds)
+    return {name: float(np.median(s)) for name, s in seconds.items()}

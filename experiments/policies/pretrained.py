@@ -1,0 +1,86 @@
+"""A pretrained tactile encoder as one file: its shape, its sensors and its parameters."""
+
+import dataclasses
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.running.artifacts import jsonable, write_bytes
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.types import Params
+
+_ABOUT = "about"  # entry of the file that holds its JSON; parameters are named by their path, joined by "/"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PretrainedEncoder:
+    """An encoder and the names of its sensors, in the order of its embedding; `notes` say how it was made."""
+
+    config: TactileViTConfig
+    sensors: tuple[str, ...]
+    params: Params
+    notes: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def for_sensors(self, sensors: tuple[str, ...]) -> "PretrainedEncoder":
+        """The same encoder for other sensors, in another order; one that it never saw gets the mean embedding."""
+        table = self.params["sensor"]["embedding"]
+        rows = [table[self.sensors.index(s)] if s in self.sensors else table.mean(0) for s in sensors]
+        params = {**self.params, "sensor": {"embedding": jnp.stack(rows)}}
+        config = dataclasses.replace(self.config, sensors=len(sensors))
+        return dataclasses.replace(self, config=config, sensors=sensors, params=params)
+
+
+def save_encoder(path: Path, encoder: PretrainedEncoder) -> None:
+    """Publish an encoder atomically, as an `.npz` file."""
+    about = {"config": encoder.config, "sensors": encoder.sensors, "notes": encoder.notes}
+    arrays: dict[str, Any] = {_ABOUT: np.frombuffer(json.dumps(jsonable(about)).encode(), np.uint8)}
+    arrays |= _flat(encoder.params)
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_encoder(path: Path) -> PretrainedEncoder:
+    """Read an encoder that `save_encoder` wrote; a run's directory stands for its `encoder.npz`.
+
+    Raises:
+      FileNotFoundError: there is no such file.
+      ValueError: the file is no encoder, or one of another version of its config.
+    """
+    path = path / "encoder.npz" if path.is_dir() else path
+    if not path.exists():
+        raise FileNotFoundError(f"encoder is {path}: no such file; give the run directory of pretrain_encoder")
+    with np.load(path) as file:
+        if _ABOUT not in file:
+            raise ValueError(f"encoder is {path}: it has no entry {_ABOUT!r}; give a file that pretrain_encoder wrote")
+        about = json.loads(file[_ABOUT].tobytes())
+        params = _nested({name: jnp.asarray(file[name]) for name in file.files if name != _ABOUT})
+    known = {f.name for f in dataclasses.fields(TactileViTConfig)}
+    if set(about["config"]) != known:
+        odd = sorted(set(about["config"]) ^ known)
+        raise ValueError(f"encoder {path} has a config that differs in {odd}: it is of another version; train it again")
+    config = TactileViTConfig(**about["config"])
+    return PretrainedEncoder(config=config, sensors=tuple(about["sensors"]), params=params, notes=about["notes"])
+
+
+def _flat(tree: Params, prefix: str = "") -> dict[str, np.ndarray]:
+    flat: dict[str, np.ndarray] = {}
+    for name, value in tree.items():
+        here = f"{prefix}{name}"
+        flat |= _flat(value, f"{here}/") if isinstance(value, dict) else {here: np.asarray(value)}
+    return flat
+
+
+def _nested(flat: dict[str, Any]) -> Params:
+    tree: dict[str, Any] = {}
+    for path, value in flat.items():
+        *folders, name = path.split("/")
+        here = tree
+        for folder in folders:
+            here = here.setdefault(folder, {})
+        here[name] = value
+    return tree

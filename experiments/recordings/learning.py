@@ -1,0 +1,256 @@
+"""From described videos to a trained policy, and from a trained policy to answers."""
+
+import dataclasses
+import functools
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+from jaxtyping import Float, Int
+
+from experiments.recordings.descriptions import Described
+from experiments.recordings.evidence import EvidenceConfig, cross_probe, probe, standardise
+from experiments.recordings.policy import COMBINATIONS, PolicyShape, assemble_policy, choose, utility
+from experiments.recordings.scenes import Scenes, sense
+from experiments.recordings.training import Lesson, ReinforceConfig, TuneConfig, reinforce, tune
+from experiments.recordings.validation import object_weights
+from experiments.running.artifacts import jsonable, write_bytes
+from sensors_io.importers.keep import ImportSourceError
+from touchr1_jax.types import Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LearnConfig:
+    """What a policy is made of and how it is trained.
+
+    Args:
+      evidence: probes whose log-probabilities the encoder reads, and whose verdict `perceive` repeats.
+      read_evidence: whether the encoder reads them.
+      components: principal components of the description that it reads beside them.
+      members: policies of different seeds whose log-probabilities are averaged.
+    """
+
+    evidence: EvidenceConfig = EvidenceConfig()
+    read_evidence: bool = True
+    components: int = 0
+    members: int = 3
+    shape: PolicyShape = PolicyShape()
+    tune: TuneConfig = TuneConfig()
+    reinforce: ReinforceConfig = ReinforceConfig()
+
+    def __post_init__(self) -> None:
+        if not self.read_evidence and not self.components:
+            raise ValueError("components is 0 and read_evidence False: the encoder must read something; raise one")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Background:
+    """What is known without labels of real objects: scenes, and descriptions of unlabelled videos [m, D]."""
+
+    scenes: Scenes
+    unlabelled: Float[np.ndarray, "m D"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Learned:
+    """A trained policy: parameters of its members, and what its probes remember."""
+
+    config: LearnConfig
+    params: Params
+    memory: Described
+    background: Background
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Said:
+    """Answers about n videos: what was perceived, log-probabilities of the 27 conclusions, and the one chosen."""
+
+    percept: Int[np.ndarray, "n A"]
+    log_prob: Float[np.ndarray, "n 27"]
+
+    @property
+    def conclude(self) -> Int[np.ndarray, "n A"]:
+        """The levels that are expected to score most."""
+        return choose(self.log_prob, utility())
+
+
+def learn(
+    config: LearnConfig, training: Described, background: Background, seed: int
+) -> tuple[Learned, dict[str, np.ndarray]]:
+    """Train every member on labelled videos.
+
+    Args:
+      config: the policy.
+      training: videos, all of known levels.
+      background: what else is known.
+      seed: of members and folds; member m has 1000 · seed + m.
+
+    Returns:
+      The policy, and its loss and rewards by step, [members, steps].
+    """
+    policy = assemble_policy(config.shape)
+    everywhere = np.ones(len(training.names), bool)
+    weight = object_weights(training.objects, everywhere)
+    felt = _Felt(training, background, training, config)
+    trained, losses, rewards = [], [], []
+    for member in range(config.members):
+        own = 1000 * seed + member
+        x, percept = felt.inputs(own)
+        lesson = _lesson(x, percept, training.label, weight)
+        params, loss = tune(policy, config.tune, lesson, own)
+        params, log = reinforce(policy, config.reinforce, params, lesson, own)
+        trained.append(params)
+        losses.append(loss)
+        rewards.append([row["reward"] for row in log])
+    params = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(trained))
+    return Learned(config=config, params=params, memory=training, background=background), {
+        "loss": np.array(losses),
+        "reward": np.array(rewards),
+    }
+
+
+def say(learned: Learned, videos: Described) -> Said:
+    """Ask a trained policy about videos, known or not; their levels and objects are not looked at."""
+    policy = assemble_policy(learned.config.shape)
+    x, _ = _Felt(learned.memory, learned.background, videos, learned.config).inputs(None)
+    members = np.broadcast_to(x, (learned.config.members, *x.shape))
+    percept, log_prob = jax.device_get(policy.posterior(learned.params, jnp.asarray(members, jnp.float32)))
+    return Said(percept=COMBINATIONS[percept], log_prob=log_prob)
+
+
+def evidence_alone(
+    config: LearnConfig, training: Described, background: Background, videos: Described
+) -> Int[np.ndarray, "n A"]:
+    """What the probes answer without a policy: the most likely level of each attribute, families averaged."""
+    return _Felt(training, background, videos, config).evidence.mean(1).argmax(-1)
+
+
+class _Felt:
+    """Training videos and others as their probes and encoders read them.
+
+    Args:
+      training: videos to learn from.
+      background: what else is known.
+      videos: videos to read; those of the training themselves, to learn.
+      config: of the policy.
+    """
+
+    def __init__(self, training: Described, background: Background, videos: Described, config: LearnConfig) -> None:
+        world = np.concatenate([training.x, background.unlabelled])
+        widen = lambda x: np.concatenate([x, sense(background.scenes, world, x, config.evidence)], 1)
+        self._config, self._training = config, training
+        self._x, self._other = widen(training.x).astype(np.float64), widen(videos.x).astype(np.float64)
+        senses = self._x.shape[1] - training.x.shape[1]
+        self._family = np.array([*training.family, *["scenes"] * senses])
+        self._weight = object_weights(training.objects, np.ones(len(training.names), bool))
+
+    @functools.cached_property
+    def evidence(self) -> Float[np.ndarray, "n M A K"]:
+        """What probes that were fitted on all training videos say of the others."""
+        n = len(self._x)
+        label = np.zeros((n + len(self._other), self._training.label.shape[1]), np.int32)
+        label[:n] = self._training.label
+        weight = np.concatenate([self._weight, np.zeros(len(self._other))])
+        x = np.concatenate([self._x, self._other])
+        return probe(x, label, weight, self._family, self._config.evidence)[n:]
+
+    def crossed(self, seed: int) -> Float[np.ndarray, "n M A K"]:
+        """What probes say of the training videos, each fitted without the object that it reads."""
+        t = self._training
+        return cross_probe(self._x, t.label, self._weight, t.objects, self._family, self._config.evidence, seed)
+
+    def inputs(self, seed: int | None) -> tuple[Float[np.ndarray, "n D"], Int[np.ndarray, "n A"]]:
+        """What the encoder reads, with mean 0 and deviation 1 in training, and what the evidence says.
+
+        With a seed, of the training videos by out-of-fold evidence, else of the others.  The constants of the
+        standardisation are those of the evidence of seed 0 in any case, so that all members share them.
+        """
+        reference = self.crossed(0)
+        said = self.evidence if seed is None else self.crossed(seed)
+        summary = _components(self._x, self._other, self._config.components, self._config.evidence.clip)
+        parts = [
+            np.concatenate([_read(self._config, evidence), scores], 1)
+            for evidence, scores in zip((reference, said), summary, strict=True)
+        ]
+        both = np.concatenate(parts)
+        fitted = np.arange(len(both)) < len(reference)
+        z = standardise(both, fitted, self._config.evidence.clip)[len(reference) :]
+        return z, said.mean(1).argmax(-1)
+
+
+def _read(config: LearnConfig, evidence: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n E"]:
+    """Log-probabilities as inputs, less their mean over the levels."""
+    if not config.read_evidence:
+        return np.zeros((len(evidence), 0))
+    log = np.log(np.maximum(evidence, 1e-3))
+    return (log - log.mean(-1, keepdims=True)).reshape(len(evidence), -1)
+
+
+def _components(training: np.ndarray, videos: np.ndarray, count: int, clip: float) -> tuple[np.ndarray, np.ndarray]:
+    """Principal components of standardised descriptions, of the training videos and of others."""
+    both = np.concatenate([training, videos]).astype(np.float64)
+    fitted = np.arange(len(both)) < len(training)
+    z = standardise(both, fitted, clip)
+    _, _, axes = np.linalg.svd(z[fitted] - z[fitted].mean(0), full_matrices=False)
+    scores = z @ axes[:count].T
+    return scores[fitted], scores[~fitted]
+
+
+def _lesson(x: np.ndarray, percept: np.ndarray, label: np.ndarray, weight: np.ndarray) -> Lesson:
+    as_levels = lambda y: jnp.asarray(y, jnp.int32)
+    return Lesson(
+        x=jnp.asarray(x, jnp.float32), percept=as_levels(percept), label=as_levels(label), weight=jnp.asarray(weight)
+    )
+
+
+def save(path: Path, learned: Learned) -> None:
+    """Publish a policy as one file."""
+    flat: Mapping[str, Any] = traverse_util.flatten_dict(learned.params, sep="/")
+    memory = {name: getattr(learned.memory, name) for name in _MEMORY}
+    memory |= {"unlabelled": learned.background.unlabelled}
+    memory |= {"scenes_x": learned.background.scenes.x, "scenes_target": learned.background.scenes.target}
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        identity=identity(learned.config),
+        **{f"params/{k}": v for k, v in flat.items()},
+        **{f"memory/{k}": v for k, v in memory.items()},
+    )
+    write_bytes(path, buffer.getvalue())
+
+
+def identity(config: LearnConfig) -> str:
+    """Hash of what a policy is made of and how it is trained."""
+    return hashlib.sha256(json.dumps(jsonable(config), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def load(path: Path, config: LearnConfig) -> Learned:
+    """The policy that `save` published.
+
+    Raises:
+      ImportSourceError: no such file, or a policy of another configuration.
+    """
+    if not path.is_file():
+        raise ImportSourceError(f"policy is {path}: no such file; train one, or name a run's policy.npz")
+    with np.load(path) as file:
+        if str(file["identity"]) != identity(config):
+            raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
+        part = lambda head: {k.removeprefix(head): file[k] for k in file.files if k.startswith(head)}
+        params, memory = traverse_util.unflatten_dict(part("params/"), sep="/"), part("memory/")
+    scenes = Scenes(x=memory["scenes_x"], target=memory["scenes_target"])
+    return Learned(
+        config=config,
+        params=params,
+        memory=Described(**{name: memory[name] for name in _MEMORY}, skipped=()),
+        background=Background(scenes=scenes, unlabelled=memory["unlabelled"]),
+    )
+
+
+_MEMORY = ("names", "objects", "label", "x")

@@ -1,0 +1,80 @@
+"""What limits the answers: how they grow with the number of objects, and how far the labels can be told at all."""
+
+import numpy as np
+from jaxtyping import Int
+
+from experiments.recordings.descriptions import Described
+from experiments.recordings.evidence import standardise
+from experiments.recordings.learning import Background, LearnConfig, evidence_alone
+from experiments.recordings.validation import Row, intervals
+from touchr1_jax.bench.statistics import Interval
+
+SHARES = (0.25, 0.5, 0.75, 1.0)
+"""Of the training objects, that the probes learn from."""
+
+
+def cross_answers(
+    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray, share: float = 1.0
+) -> Int[np.ndarray, "n A"]:
+    """Answers of the probes alone, each fold read by probes on a share of the objects of the other folds."""
+    answer = np.zeros_like(videos.label)
+    for k in np.unique(fold):
+        names = np.unique(videos.objects[fold != k])
+        kept = np.random.default_rng(0).permutation(names)[: max(1, round(share * len(names)))]
+        training = videos.rows(np.flatnonzero(np.isin(videos.objects, kept)))
+        answer[fold == k] = evidence_alone(config, training, background, videos.rows(np.flatnonzero(fold == k)))
+    return answer
+
+
+def growth(
+    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray
+) -> dict[int, dict[str, Interval]]:
+    """Scores of the probes by the number of objects that they learn from."""
+    objects = np.mean([len(np.unique(videos.objects[fold != k])) for k in np.unique(fold)])
+    return {
+        round(share * objects): intervals(
+            cross_answers(config, videos, background, fold, share), videos.label, videos.objects
+        )
+        for share in SHARES
+    }
+
+
+def label_limits(config: LearnConfig, videos: Described, background: Background) -> list[Row]:
+    """Answers that bound what can be told.
+
+    - *the object was touched before*: probes on all other videos, those of the same object among them.  What is wrong
+      then is wrong because trials of one object differ more than objects of different labels do.
+    - *nearest other object*: the labels of the object whose mean description lies nearest.  What is wrong then is how
+      often objects that feel alike, by this description, were judged differently.
+    """
+    known = np.zeros_like(videos.label)
+    for i in range(len(videos.names)):
+        rest = videos.rows(np.flatnonzero(np.arange(len(videos.names)) != i))
+        known[i] = evidence_alone(config, rest, background, videos.rows(np.array([i])))
+    return [
+        Row(name="probes, the object was touched before", answer=known),
+        Row(
+            name="labels of the nearest other object", answer=videos.label[_nearest_other(videos, config.evidence.clip)]
+        ),
+    ]
+
+
+def _nearest_other(videos: Described, clip: float) -> Int[np.ndarray, "n"]:
+    """A video of the object nearest to that of each video."""
+    z = standardise(videos.x.astype(np.float64), np.ones(len(videos.names), bool), clip)
+    names, first, member = np.unique(videos.objects, return_index=True, return_inverse=True)
+    centre = np.stack([z[member == i].mean(0) for i in range(len(names))])
+    distance = np.linalg.norm(centre[:, None] - centre, axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return first[distance.argmin(1)][member]
+
+
+def agreement(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> float:
+    """Per cent of pairs of videos of one object that are answered alike in all attributes."""
+    same, pairs = 0.0, 0
+    for name in np.unique(objects):
+        mine = answer[objects == name]
+        alike = (mine[:, None] == mine[None]).all(-1)
+        same += (alike.sum() - len(mine)) / 2
+        pairs += len(mine) * (len(mine) - 1) // 2
+    return 100 * same / max(pairs, 1)

@@ -1,0 +1,176 @@
+"""The policy that answers for one touch: an encoder of its description in front of the decoder, and its answers.
+
+The prompt asks for hardness, roughness and protrusion at once, so that the answer is drawn from their joint
+distribution: the decoder writes roughness knowing the hardness that it wrote.  All 27 answers can be scored, so the
+answer is not sampled but chosen by what it is expected to earn (`choose`).
+"""
+
+import dataclasses
+import functools
+import itertools
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.losses import token_log_probs
+from touchr1_jax.text.language import HARDNESS, PROTRUSION, ROUGHNESS, SENSORS, Language
+from touchr1_jax.text.parser import Parser, compile_parser
+from touchr1_jax.text.template import PromptLayout, answer_text, build_layout, encode_answer, prompt_words
+from touchr1_jax.text.tokenizer import Tokenizer, word_level
+from touchr1_jax.types import Params
+
+LANGUAGE = Language(attributes=(HARDNESS, ROUGHNESS, PROTRUSION), sensors=SENSORS[:1])
+"""One GelSight Mini, three ordinal attributes."""
+
+LEVELS = 3
+COMBINATIONS = np.array(list(itertools.product(range(LEVELS), repeat=len(LANGUAGE.attributes))))
+"""Every answer, int [27, A], in the order of `np.unravel_index`."""
+
+LENGTH = 18
+"""Tokens of an answer with its end: six tags, the sensor, three times three levels, the end, and one to spare."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyShape:
+    """Sizes: tactile tokens, width of the encoder, decoder."""
+
+    tokens: int = 4
+    width: int = 96
+    decoder: DecoderConfig = DecoderConfig(
+        vocab_size=0, hidden_size=64, num_layers=1, num_heads=2, intermediate_size=128
+    )
+
+
+class DescriptionEncoder(nn.Module):
+    """Tactile tokens of a description: x → W₂ gelu(W₁ x), cut into N tokens of the decoder's width."""
+
+    shape: PolicyShape
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n N H"]:
+        hidden = self.shape.decoder.hidden_size
+        y = nn.gelu(nn.Dense(self.shape.width, name="in")(x))
+        return nn.Dense(self.shape.tokens * hidden, name="out")(y).reshape(*x.shape[:-1], self.shape.tokens, hidden)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TouchPolicy:
+    """Everything static; parameters are `{"encoder", "decoder"}` and always an argument."""
+
+    shape: PolicyShape
+    tokenizer: Tokenizer
+    layout: PromptLayout
+    agent: Agent
+    parser: Parser
+
+    def init(self, key: Array, inputs: int) -> Params:
+        """Fresh parameters for descriptions of so many numbers."""
+        encoder_key, decoder_key = jax.random.split(key)
+        encoder = DescriptionEncoder(self.shape).init(encoder_key, jnp.zeros(inputs))["params"]
+        features = self.features({"encoder": encoder}, jnp.zeros(inputs))
+        banned = jnp.asarray(self.agent.banned)
+        prompt = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0]), self.agent.slots, banned
+        decoder = self.agent.policy.init(decoder_key, features, *prompt, method=Policy.prefill)["params"]["decoder"]
+        return {"encoder": encoder, "decoder": decoder}
+
+    def features(self, params: Params, x: Float[Array, "*n D"]) -> Features:
+        """What the decoder reads of touches: one stream, all of whose tokens share one time; no view."""
+        lead, tokens, hidden = x.shape[:-1], self.shape.tokens, self.shape.decoder.hidden_size
+        touch = jnp.asarray(DescriptionEncoder(self.shape).apply({"params": params["encoder"]}, x))
+        return Features(
+            touch=touch[..., None, :, :],
+            touch_time=jnp.zeros((*lead, 1, tokens), jnp.int32),
+            stream_mask=jnp.ones((*lead, 1), bool),
+            view=jnp.zeros((*lead, 0, hidden)),
+            view_mask=jnp.zeros(lead, bool),
+        )
+
+    def log_probs(self, params: Params, x: Float[Array, "D"], tokens: Int[Array, "G T"]) -> Float[Array, "G T"]:
+        """Log-probability of every token of answers about one touch."""
+        ids, mask = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0])
+        logits = self.agent.group_logits(params, self.features(params, x), ids, mask, tokens)
+        return token_log_probs(jax.nn.log_softmax(logits), tokens)
+
+    @functools.cached_property
+    def slots(self) -> np.ndarray:
+        """Where an answer says its levels, int [2, A]: in `perceive`, in `conclude`."""
+        said = [self.answer(np.full(3, a), np.full(3, b))[0] for a, b in ((0, 0), (1, 0), (0, 1))]
+        perceived, concluded = (np.flatnonzero(said[0] != other) for other in said[1:])
+        return np.stack([perceived[: len(concluded)], concluded])
+
+    def answer(self, perceive: np.ndarray, conclude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tokens of an answer and what of them counts, [T] each; with one sensor, `compare` is what it perceives."""
+        streams = np.ones(1, bool)
+        asked = np.ones(len(LANGUAGE.attributes), bool)
+        text = answer_text(
+            LANGUAGE, asked=asked, streams=streams, perceive=perceive[None], compare=perceive, conclude=conclude
+        )
+        return encode_answer(self.tokenizer, text, LENGTH)
+
+    @functools.cached_property
+    def answers(self) -> np.ndarray:
+        """Every answer to every percept, int32 [27, 27, T]."""
+        rows = [[self.answer(p, c)[0] for c in COMBINATIONS] for p in COMBINATIONS]
+        return np.array(rows, np.int32)
+
+    @functools.cached_property
+    def posterior(self) -> Any:
+        """Compiled (params of M members, x of M members [M, n, D]) → (percept [n], log-probabilities [n, 27]).
+
+        The members' log-probabilities are averaged, first over the 27 percepts; those of the conclusions follow the
+        most likely percept.
+        """
+        answers, (perceive, conclude) = jnp.asarray(self.answers), self.slots
+        same = jnp.arange(len(COMBINATIONS))
+
+        def scored(params: Params, x: Array, tokens: Array, slots: np.ndarray) -> Array:
+            each = jax.vmap(self.log_probs, in_axes=(0, 0, None))(params, x, tokens)
+            return jnp.mean(jnp.sum(each[..., slots], -1), 0)
+
+        def one(params: Params, x: Float[Array, "M D"]) -> tuple[Array, Array]:
+            percept = jnp.argmax(scored(params, x, answers[same, same], perceive))
+            return percept, jax.nn.log_softmax(scored(params, x, answers[percept], conclude))
+
+        return jax.jit(lambda params, x: jax.lax.map(lambda row: one(params, row), x.swapaxes(0, 1), batch_size=16))
+
+
+@functools.cache
+def assemble_policy(shape: PolicyShape) -> TouchPolicy:
+    """Tokenizer, prompt, decoder and parser of one question about one sensor; made once, as are its programs."""
+    tokenizer = word_level(LANGUAGE, prompt_words())
+    asked = [[attribute.name for attribute in LANGUAGE.attributes]]
+    layout = build_layout(tokenizer, LANGUAGE, tactile_tokens=shape.tokens, view_tokens=0, asked=asked)
+    config = PolicyConfig(
+        tactile=TactileViTConfig(sensors=1),
+        vision=VisionConfig(),
+        decoder=dataclasses.replace(shape.decoder, vocab_size=tokenizer.vocab_size),
+    )
+    agent = Agent(
+        policy=Policy(config),
+        slots=Slots(layout.touch, layout.view, layout.stream_text),
+        banned=tokenizer.banned,
+        end_ids=tokenizer.end_ids,
+        pad_id=tokenizer.pad_id,
+    )
+    parser = compile_parser(LANGUAGE, tokenizer)
+    return TouchPolicy(shape=shape, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser)
+
+
+def choose(log_prob: Float[np.ndarray, "n 27"], utility: Float[np.ndarray, "27 27"]) -> Int[np.ndarray, "n A"]:
+    """Levels of the answer that is expected to earn most, argmax_y Σ_t p(t) u(y, t)."""
+    return COMBINATIONS[(np.exp(log_prob) @ utility.T).argmax(-1)]
+
+
+def utility() -> Float[np.ndarray, "27 27"]:
+    """u(y, t) = 1[y = t] + mean 1[y_a = t_a] − mean |y_a − t_a|: what is reported, each with weight 1."""
+    distance = np.abs(COMBINATIONS[:, None] - COMBINATIONS[None])
+    return (distance == 0).all(-1) + (distance == 0).mean(-1) - distance.mean(-1)

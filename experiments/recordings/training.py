@@ -1,0 +1,162 @@
+"""Supervised fine-tuning of a touch policy and GRPO after it, each one compiled program for every fold and member."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from experiments.recordings.policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS, TouchPolicy
+from touchr1_jax import masked
+from touchr1_jax.rewards import make_rewards
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.scoring import make_score
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
+from touchr1_jax.types import Params, Target
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """Supervised fine-tuning; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 300
+    batch_size: int = 32
+    drop: float = 0.3
+    """Probability with which an input of the encoder is left out, the others growing to the same sum."""
+    noise: float = 0.2
+    """Standard deviation of what is added to each input; the inputs have 1."""
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0, weight_decay=0.05)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReinforceConfig:
+    """GRPO after it; 0 steps leave it out."""
+
+    steps: int = 0
+    weights: tuple[tuple[str, float], ...] = (("accuracy", 0.5), ("exact", 0.5))
+    grpo: GRPOConfig = dataclasses.field(
+        default_factory=lambda: dataclasses.replace(
+            GRPOConfig.paper(), prompts=32, micro_prompts=32, length=LENGTH, lr_scale=300.0
+        )
+    )
+
+
+@struct.dataclass
+class Lesson:
+    """What a policy learns from: n videos, of which those of weight 0 are never drawn.
+
+    `percept` is what out-of-fold evidence says of a video, `label` what the annotators said of its object.
+    """
+
+    x: Float[Array, "n D"]
+    percept: Int[Array, "n A"]
+    label: Int[Array, "n A"]
+    weight: Float[Array, "n"]
+
+
+def tune(policy: TouchPolicy, config: TuneConfig, lesson: Lesson, seed: int) -> tuple[Params, Float[np.ndarray, "T"]]:
+    """A policy trained from scratch on verified answers, and its loss at every step."""
+    params, losses = _tune_program(policy, config)(jax.random.key(seed), lesson)
+    return params, np.asarray(losses)
+
+
+@functools.cache
+def _tune_program(policy: TouchPolicy, config: TuneConfig) -> Any:
+    """Compiled (key, lesson) → (params, losses)."""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    answers = jnp.asarray(policy.answers)
+    counted = jnp.asarray(policy.answer(COMBINATIONS[0], COMBINATIONS[0])[1])
+
+    def loss(params: Params, x: Array, tokens: Array) -> Array:
+        each = jax.vmap(lambda row, said: policy.log_probs(params, row, said[None])[0])(x, tokens)
+        return -masked.mean(each, counted[None])
+
+    def run(key: Array, lesson: Lesson) -> tuple[Params, Array]:
+        start, course = jax.random.split(key)
+        params = policy.init(start, lesson.x.shape[-1])
+        share = lesson.weight / jnp.sum(lesson.weight)
+        said = answers[number(lesson.percept), number(lesson.label)]
+
+        def step(carry: tuple[Params, Any], key: Array) -> tuple[tuple[Params, Any], Array]:
+            params, opt_state = carry
+            draw, change = jax.random.split(key)
+            rows = jax.random.choice(draw, len(share), (config.batch_size,), p=share)
+            x = disturb(change, lesson.x[rows], config)
+            value, grads = jax.value_and_grad(loss)(params, x, said[rows])
+            updates, opt_state = optimizer.update(grads, opt_state, params)
+            return (optax.apply_updates(params, updates), opt_state), value
+
+        (params, _), losses = jax.lax.scan(
+            step, (params, optimizer.init(params)), jax.random.split(course, config.steps)
+        )
+        return params, losses
+
+    return jax.jit(run)
+
+
+def disturb(key: Array, x: Float[Array, "n D"], config: TuneConfig) -> Float[Array, "n D"]:
+    """Inputs with some left out and noise on the rest."""
+    drop_key, noise_key = jax.random.split(key)
+    kept = jax.random.bernoulli(drop_key, 1 - config.drop, x.shape)
+    return jnp.where(kept, x + config.noise * jax.random.normal(noise_key, x.shape), 0.0) / (1 - config.drop)
+
+
+def number(levels: Int[Array, "*n A"]) -> Int[Array, "*n"]:
+    """Index of a combination of levels in `COMBINATIONS`."""
+    return jnp.sum(levels * LEVELS ** jnp.arange(levels.shape[-1])[::-1], -1)
+
+
+def reinforce(
+    policy: TouchPolicy, config: ReinforceConfig, params: Params, lesson: Lesson, seed: int
+) -> tuple[Params, list[dict[str, float]]]:
+    """GRPO of the decoder, the encoder held fixed; the metrics of every step with it."""
+    if not config.steps:
+        return params, []
+    step, optimizer = _reinforce_program(policy, config)
+    decoder = {"decoder": params["decoder"]}
+    rng = np.random.default_rng(seed)
+    noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
+    fixed = Fixed(reference=decoder, noise=policy.features(params, noise).touch)
+    state = start_state(decoder, optimizer, jax.random.key(seed), config.grpo)
+    share = np.asarray(lesson.weight, np.float64) / np.sum(lesson.weight, dtype=np.float64)
+    log = []
+    for _ in range(config.steps):
+        rows = rng.choice(len(share), config.grpo.drawn, p=share)
+        state, metrics = step(state, _questions(policy, params, lesson, rows), fixed)
+        log.append(jax.device_get(metrics))
+    return {**params, **state.params}, [{name: float(value) for name, value in row.items()} for row in log]
+
+
+@functools.cache
+def _reinforce_program(policy: TouchPolicy, config: ReinforceConfig) -> tuple[Any, optax.GradientTransformation]:
+    """Compiled step and optimizer."""
+    equal = np.full((len(LANGUAGE.attributes), LEVELS), 1 / LEVELS, np.float32)
+    score = make_score(policy.parser, make_rewards(equal), dict(config.weights))
+    grpo = config.grpo
+    optimizer = falling_adamw(grpo.learning_rate * grpo.lr_scale, grpo.final_share, config.steps, grpo.max_grad_norm)
+    return make_grpo_step(policy.agent, score, optimizer, grpo), optimizer
+
+
+def _questions(policy: TouchPolicy, params: Params, lesson: Lesson, rows: np.ndarray) -> GRPOBatch:
+    """The one question about each of some videos."""
+    n, attributes = len(rows), len(LANGUAGE.attributes)
+    everything: Bool[np.ndarray, "n A"] = np.ones((n, attributes), bool)
+    return GRPOBatch(
+        features=policy.features(params, lesson.x[rows]),
+        ids=jnp.broadcast_to(jnp.asarray(policy.layout.ids[0]), (n, policy.layout.ids.shape[1])),
+        mask=jnp.broadcast_to(jnp.asarray(policy.layout.mask[0]), (n, policy.layout.mask.shape[1])),
+        target=Target(
+            asked=jnp.asarray(everything),
+            label=lesson.label[rows],
+            levels=jnp.full((n, attributes), LEVELS, jnp.int32),
+            ordinal=jnp.asarray(everything),
+            streams=jnp.ones((n, 1), bool),
+        ),
+    )

@@ -1,0 +1,95 @@
+"""Cross-validation of policies, and what their parts contribute."""
+
+import dataclasses
+
+import numpy as np
+
+from experiments.recordings.descriptions import Described
+from experiments.recordings.descriptors import families
+from experiments.recordings.learning import Background, LearnConfig, learn, say
+from experiments.recordings.limits import cross_answers
+from experiments.recordings.scenes import Scenes
+from experiments.recordings.training import ReinforceConfig
+from experiments.recordings.validation import Row
+from experiments.running.context import Context
+
+
+def cross_validate(
+    config: LearnConfig,
+    videos: Described,
+    background: Background,
+    fold: np.ndarray,
+    seed: int,
+    context: Context,
+    stage: str,
+) -> np.ndarray:
+    """Answers about every video by a policy that never met its object, int [n, A]; finished folds are not repeated."""
+    answer = np.zeros_like(videos.label)
+    with context.progress(stage, int(fold.max()) + 1) as advance:
+        for k in np.unique(fold):
+            held, name = np.flatnonzero(fold == k), f"{stage}/{k}"
+            if not context.done(name):
+                with context.timed(name):
+                    learned, course = learn(config, videos.rows(np.flatnonzero(fold != k)), background, seed)
+                for step, loss in enumerate(course["loss"].mean(0)):
+                    context.log(name, step, loss=float(loss))
+                context.save_stage(name, say(learned, videos.rows(held)).conclude.tolist())
+            answer[held] = context.load_stage(name)
+            advance()
+    return answer
+
+
+def ablate(
+    config: LearnConfig,
+    videos: Described,
+    background: Background,
+    fold: np.ndarray,
+    seed: int,
+    context: Context,
+) -> list[Row]:
+    """Answers of the policy and of variants of it."""
+    rows = []
+    for name, learning in policies(config).items():
+        stage = "ablation/" + name.replace(" ", "-").replace(",", "")
+        rows.append(Row(name=name, answer=cross_validate(learning, videos, background, fold, seed, context, stage)))
+    return rows
+
+
+def ablate_probes(config: LearnConfig, videos: Described, background: Background, fold: np.ndarray) -> list[Row]:
+    """Answers of the probes alone and of variants of them."""
+    return [
+        Row(name=name, answer=cross_answers(learning, videos, known, fold))
+        for name, (learning, known) in probes(config, background).items()
+    ]
+
+
+def policies(config: LearnConfig) -> dict[str, LearnConfig]:
+    """Name → policy with something left out or added."""
+    single = dataclasses.replace(config, members=1)
+    still = dataclasses.replace(config.tune, drop=0.0, noise=0.0)
+    return {
+        "policy": config,
+        "one member": single,
+        "one member, components beside the evidence": dataclasses.replace(single, components=12),
+        "one member, components alone": dataclasses.replace(single, components=24, read_evidence=False),
+        "one member, undisturbed inputs": dataclasses.replace(single, tune=still),
+        "one member, then GRPO": dataclasses.replace(single, reinforce=ReinforceConfig(steps=40)),
+    }
+
+
+def probes(config: LearnConfig, background: Background) -> dict[str, tuple[LearnConfig, Background]]:
+    """Name → probes alone, with something left out or added."""
+    bare = dataclasses.replace(background, unlabelled=background.unlabelled[:0])
+    reading = lambda *names: dataclasses.replace(config, evidence=dataclasses.replace(config.evidence, families=names))
+    own = tuple(dict.fromkeys(families()))
+    tenth = dataclasses.replace(
+        background, scenes=Scenes(x=background.scenes.x[::10], target=background.scenes.target[::10])
+    )
+    return {
+        "probe of what scenes teach": (config, background),
+        "the same, a tenth of the scenes": (config, tenth),
+        "the same, no unlabelled videos": (config, bare),
+        "probes of the description, no scenes": (reading(*own), background),
+        "both": (reading(*own, "scenes"), background),
+        **{f"probe of {name} alone, no scenes": (reading(name), background) for name in own},
+    }

@@ -1,0 +1,99 @@
+"""`python -m sensors_io sync`."""
+
+import contextlib
+import dataclasses
+import pathlib
+import time
+
+import rich.live
+from rich.table import Table
+
+from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
+from sensors_io.commands.console import OUT
+from sensors_io.devices.errors import StreamEndedError
+from sensors_io.offsets import Offsets, OffsetsError
+from sensors_io.recording.signals import By, Listener, measure_offsets
+
+_LOOK_S = 0.02  # between two looks at the devices
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sync(Bench):
+    """Measure how late each sensor is stamped against the force sensor, or against the first one, by touching them.
+
+    Devices are joined by a + of its own: sync --out S.json uvc --serial S + tac3d + netft --host H.  Keep still for a
+    second, then tap everything at once, sharply and irregularly, five times or more (`--by taps`), or press and release
+    slowly (`--by presses`, against a force).
+    """
+
+    out: pathlib.Path | None = None
+    """JSON for `record --sync`; none only prints."""
+    check: pathlib.Path | None = None
+    """JSON of an earlier `sync`: what is left over with it is printed, exit status 1 where it is too much."""
+    most_s: float = 0.01
+    """Left over, for `--check`."""
+    seconds: float = 15.0
+    """Of touching."""
+    by: By = "taps"
+    """What is compared: when taps rose, or how presses went."""
+
+    def run(self) -> int:
+        parts = self.parts()
+        parts.require_tactile()
+        configs = (*((parts.force,) if parts.force else ()), *parts.tactile)
+        if len(configs) < 2:
+            raise OffsetsError("one device is named: two or more can be compared; join them by +")
+        with stop_on_interrupt() as stop, readers(configs) as devices:
+            listeners = [Listener(device) for device in devices]
+            end_s = time.monotonic() + self.seconds
+            with rich.live.Live(console=OUT, refresh_per_second=10) as live, contextlib.suppress(StreamEndedError):
+                while not stop.is_set() and time.monotonic() < end_s:
+                    for listener in listeners:
+                        listener.look()
+                    live.update(_board(listeners, end_s - time.monotonic()))
+                    stop.wait(_LOOK_S)
+        names = [listener.name for listener in listeners]
+        if len(set(names)) != len(names):
+            raise OffsetsError(f"devices are {names}: each name once; name them apart, such as --sensor tac3d.left")
+        first, *others = listeners
+        signals = {listener.name: listener.signal() for listener in others}
+        found = measure_offsets(first.signal(), signals, first.name, self.by)
+        if self.check is not None:
+            return self._check(found, Offsets.load(self.check))
+        OUT.print(report(found))
+        if self.out is not None:
+            found.save(self.out)
+            OUT.print(f"wrote {self.out}", highlight=False)
+        return 0
+
+    def _check(self, found: Offsets, stored: Offsets) -> int:
+        """What is left over with stored offsets; 1 if any is too much."""
+        before = stored.late_s
+        unknown = [name for name in found.late_s if name not in before]
+        if unknown:
+            raise OffsetsError(f"{self.check} knows nothing of {', '.join(unknown)}; measure again with --out")
+        zero_s = before[found.reference]
+        left_s = {name: offset.late_s - (before[name] - zero_s) for name, offset in found.sensors.items()}
+        table = Table("sensor", "left over", f"against {found.reference}, at most {1e3 * self.most_s:g} ms")
+        for name, left in left_s.items():
+            table.add_row(name, f"{1e3 * left:+.1f} ms", "good" if abs(left) <= self.most_s else "measure again")
+        OUT.print(table)
+        return 0 if all(abs(left) <= self.most_s for left in left_s.values()) else 1
+
+
+def report(found: Offsets) -> Table:
+    """How late each sensor is stamped, and from what that is known."""
+    table = Table("sensor", "late by", "spread of one tap", "known from", title=f"stamps against {found.reference}")
+    for name, offset in found.sensors.items():
+        spread = "–" if offset.spread_s is None else f"{1e3 * offset.spread_s:.1f} ms"
+        known = f"{offset.events} taps" if offset.by == "taps" else f"presses, correlation {offset.agreement:.2f}"
+        table.add_row(name, f"{1e3 * offset.late_s:+.1f} ms", spread, known)
+    return table
+
+
+def _board(listeners: list[Listener], left_s: float) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_row("touch all of them now", f"{max(0.0, left_s):.0f} s left")
+    for listener in listeners:
+        table.add_row(listener.name, f"{listener.newest:.2f}")
+    return table

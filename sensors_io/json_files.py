@@ -1,0 +1,17 @@
+"""Small JSON files that are whole or not there."""
+
+import json
+import os
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+
+def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
+    """Replace a file by JSON in one step."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w") as file:
+        json.dump(tree, file, indent=1, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)

@@ -1,0 +1,145 @@
+"""One tactile sensor of a session: the frames from before a contact, the gel at rest, what goes into the journal."""
+
+import collections
+import dataclasses
+from typing import Any, Protocol
+
+import numpy as np
+
+from sensors_io.clock import NS_PER_S
+from sensors_io.devices.background import Background, Drift
+from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.intake import Counts
+from sensors_io.recording.journal import JournalWriter
+
+_BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
+_DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
+
+
+class Feed(Protocol):
+    """What a session reads from; `Reader` is one."""
+
+    @property
+    def identity(self) -> Identity: ...
+    @property
+    def counts(self) -> Counts: ...
+    def drain(self) -> list[Sample]: ...
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StreamStatus:
+    """What a session shows of one sensor.
+
+    Args:
+      sensor: its name.
+      frames: journaled of this contact.
+      counts: where its samples went.
+      drift: of the gel at rest; `None` before enough of it was seen.
+      newest: sample of the last look, `None` if none came.
+    """
+
+    sensor: str
+    frames: int
+    counts: Counts
+    drift: Drift | None
+    newest: Sample | None
+
+
+class Stream:
+    """A feed, and what a session remembers of it.
+
+    Args:
+      number: of the stream in the session.
+      feed: an open sensor.
+      late_s: by which its stamps lie behind those of the force sensor, or of the first stream.
+    """
+
+    def __init__(self, number: int, feed: Feed, late_s: float):
+        self.feed, self.late_s = feed, late_s
+        self.frames = 0
+        self._number = number
+        self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
+        self._background = Background()
+        self._drift: Drift | None = None
+        self._newest: Sample | None = None
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor."""
+        return self.feed.identity.sensor
+
+    def look(self) -> list[Sample]:
+        """Everything that came since the last look."""
+        samples = self.feed.drain()
+        self._newest = samples[-1] if samples else None
+        return samples
+
+    def time_ns(self, samples: list[Sample]) -> np.ndarray:
+        """When samples were taken, on the common clock, int64 [n]."""
+        late_ns = round(self.late_s * NS_PER_S)
+        return np.array([s.host_time_ns for s in samples], np.int64) - late_ns
+
+    def keep(self, samples: list[Sample]) -> None:
+        """Keep frames that belong to no contact, the last few of them, in case one begins."""
+        self._before.extend(samples)
+
+    def refresh(self, samples: list[Sample], *, touched: bool | None) -> None:
+        """Refresh the background by what shows the gel at rest.
+
+        Args:
+          samples: of the last look.
+          touched: by the force; `None` where there is none and the pictures must tell.
+        """
+        for sample in samples:
+            if sample.frame is not None and sample.frame.ndim == 3:
+                seen = self._background.looks_touched(sample.frame) if touched is None else touched
+                self._background.offer(sample.frame, touched=seen)
+                if not seen and self._background.frames % _DRIFT_EVERY == 0:
+                    self._drift = self._background.drift()
+
+    def journal(self, samples: list[Sample], journal: JournalWriter) -> None:
+        """Journal frames of a contact, behind those just before it."""
+        whole = [*self._before, *samples]
+        self._before.clear()
+        times = self.time_ns(whole).tolist()
+        for time_ns, sample in zip(times, whole, strict=True):
+            plain = {
+                "stream": self._number,
+                "time_ns": time_ns,
+                "device_time_ns": sample.device_time_ns,
+                "index": sample.index,
+            }
+            picture = {} if sample.frame is None else {"frame": sample.frame}
+            journal.append("frame", plain, **picture, **sample.arrays)
+        self.frames += len(whole)
+
+    @property
+    def background(self) -> np.ndarray | None:
+        """The gel at rest, uint8 [H, W, 3]; `None` before it was seen."""
+        return self._background.picture() if self._background.frames else None
+
+    def begin(self) -> dict[str, Any]:
+        """What a journal begins with: identity, lateness, accounts, and how far the background has drifted."""
+        self.frames = 0
+        identity = dataclasses.asdict(self.feed.identity)
+        drift = self._background.drift()
+        return {
+            "identity": identity | {"settings": dict(identity["settings"])},
+            "late_s": self.late_s,
+            "reader": dataclasses.asdict(self.feed.counts),
+            "drift": None if drift is None else {"rms": drift.rms, "mean": drift.mean.tolist()},
+        }
+
+    def end(self) -> None:
+        """Forget the frames that came after a contact."""
+        self._before.clear()
+
+    def status(self) -> StreamStatus:
+        """What is shown of it."""
+        return StreamStatus(
+            sensor=self.sensor,
+            frames=self.frames,
+            counts=self.feed.counts,
+            drift=self._drift,
+            newest=self._newest,
+        )

@@ -1,0 +1,38 @@
+"""The RGB-D camera of the command line: two interfaces of one device, or two folders."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sensors_io.clock import JumpingClock
+from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
+from sensors_io.devices.rgbd_camera import RgbdCameraConfig
+
+PINHOLE = {"fx": 10.0, "fy": 10.0, "cx": 4.0, "cy": 3.0, "width": 8, "height": 6}
+
+
+def test_two_folders_are_one_camera(tmp_path):
+    for n in range(3):
+        for name, picture in (
+            ("colour", np.full((6, 8, 3), n, np.uint8)),
+            ("depth", np.full((6, 8), 250 + n, np.uint16)),
+        ):
+            (tmp_path / name).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / name / f"{n}.png"), picture)
+    camera = RgbdCameraConfig(replay=tmp_path, depth_unit_mm=2.0, **PINHOLE)
+    with camera.open(JumpingClock()) as device:
+        samples = [device.read(1.0) for _ in range(3)]
+        with pytest.raises(StreamEndedError):
+            device.read(1.0)
+        assert device.identity.settings["intrinsics"]["fx"] == 10
+    assert [s.frame[0, 0, 0] for s in samples] == [0, 1, 2]
+    assert [s.arrays["view_depth_mm"][0, 0] for s in samples] == [500, 502, 504]
+
+
+def test_folders_and_cameras_that_are_absent_are_named(tmp_path):
+    (tmp_path / "colour").mkdir()
+    with pytest.raises(DeviceNotFoundError, match="depth is no folder"):
+        RgbdCameraConfig(replay=tmp_path, **PINHOLE).open()
+    absent = RgbdCameraConfig(product="nobody's D435", colour_interface=3, depth_interface=0, **PINHOLE)
+    with pytest.raises(DeviceNotFoundError, match=r"nobody's D435\", interface 3: no camera"), absent.open():
+        pass

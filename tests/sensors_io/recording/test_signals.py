@@ -1,0 +1,89 @@
+"""Devices that feel one hand, stamped apart: the offsets come out with their signs."""
+
+import numpy as np
+import pytest
+
+from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.intake import Counts
+from sensors_io.offsets import OffsetsError
+from sensors_io.recording.signals import Listener, measure_offsets
+
+AT = np.cumsum([1.0, 1.3, 0.9, 1.7, 1.1, 1.45])
+
+
+def touches(time_s, rise_s):
+    """Taps at `AT`: a rise, then a slower fall."""
+    past = time_s[:, None] - AT
+    return (np.clip(past / rise_s, 0, 1) * np.exp(-np.clip(past - rise_s, 0, None) / (3 * rise_s))).sum(-1)
+
+
+class Feed:
+    """Samples of a device with some rate and lateness, all in one look."""
+
+    counts = property(lambda self: Counts())
+
+    def __init__(self, sensor, rate_hz, late_s=0.0, rise_s=0.02, picture=False, seed=0):
+        self.identity = Identity(sensor=sensor)
+        rng = np.random.default_rng(seed)
+        time_s = np.arange(0, 9, 1 / rate_hz)
+        load = touches(time_s, rise_s) + 0.002 * rng.normal(size=len(time_s))
+        self.samples = [self._sample(round(1e9 * (t + late_s)), n, picture) for t, n in zip(time_s, load, strict=True)]
+
+    @staticmethod
+    def _sample(time_ns, load, picture):
+        if picture:
+            return Sample(host_time_ns=time_ns, frame=np.full((8, 8, 3), 60 + 100 * max(load, 0), np.uint8))
+        return Sample(host_time_ns=time_ns, arrays={"force_n": np.array([0, 0, -5 * load])})
+
+    def drain(self):
+        given, self.samples = self.samples, []
+        return given
+
+
+def heard(feed):
+    listener = Listener(feed)
+    listener.look()
+    return listener.signal()
+
+
+@pytest.mark.parametrize(("by", "rise_s"), [("taps", 0.02), ("presses", 0.3)])
+def test_what_is_stamped_late_is_late(by, rise_s):
+    reference = heard(Feed("netft", 500, rise_s=rise_s))
+    others = {
+        "gelsight_mini": heard(Feed("gelsight_mini", 60, late_s=0.045, rise_s=rise_s, picture=True)),
+        "tac3d": heard(Feed("tac3d", 100, late_s=-0.02, rise_s=rise_s)),
+    }
+    found = measure_offsets(reference, others, "netft", by)
+    assert found.late_s == pytest.approx({"netft": 0, "gelsight_mini": 0.045, "tac3d": -0.02}, abs=0.004)
+    assert found.sensors["tac3d"].by == by
+
+
+def test_a_sensor_that_felt_nothing_is_named():
+    reference = heard(Feed("netft", 500))
+    silent = Feed("tac3d", 100)
+    silent.samples = [Sample(host_time_ns=s.host_time_ns, arrays={"force_n": np.zeros(3)}) for s in silent.samples]
+    with pytest.raises(OffsetsError, match=r"tac3d against netft: signal b shows 0 taps"):
+        measure_offsets(reference, {"tac3d": heard(silent)}, "netft", "taps")
+    empty = Feed("tac3d", 100)
+    empty.samples = []
+    with pytest.raises(OffsetsError, match="tac3d gave 0 samples"):
+        heard(empty)
+
+
+def test_repeated_stamps_are_left_out_and_bare_samples_refused():
+    feed = Feed("tac3d", 100)
+    count = len(feed.samples)
+    feed.samples = [s for s in feed.samples for _ in range(2)]
+    assert len(heard(feed).time_ns) == count
+    bare = Feed("tac3d", 100)
+    bare.samples = [Sample(host_time_ns=0)]
+    with pytest.raises(OffsetsError, match="nothing tells a touch"):
+        heard(bare)
+
+
+def test_fields_are_numbers_too():
+    feed = Feed("dmtac_x", 100)
+    feed.samples = [
+        Sample(host_time_ns=i, arrays={"deformation_mm": np.full((2, 2, 2), 3.0 * i) * [1, 4 / 3]}) for i in range(20)
+    ]
+    np.testing.assert_allclose(heard(feed).value, 5.0 * np.arange(20))

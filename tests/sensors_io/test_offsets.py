@@ -1,0 +1,38 @@
+"""Offsets come back from their file, and a file that holds none is named."""
+
+import json
+
+import pytest
+
+from sensors_io.offsets import Offset, Offsets, OffsetsError
+
+FOUND = Offsets(
+    reference="netft",
+    sensors={
+        "gelsight_mini": Offset(late_s=0.031, spread_s=0.002, events=6, by="taps"),
+        "tac3d": Offset(late_s=-0.01, spread_s=None, events=0, by="presses", agreement=0.9),
+    },
+)
+
+
+def test_offsets_come_back(tmp_path):
+    FOUND.save(tmp_path / "s.json")
+    assert Offsets.load(tmp_path / "s.json") == FOUND
+    assert FOUND.late_s == {"netft": 0.0, "gelsight_mini": 0.031, "tac3d": -0.01}
+    assert [p.name for p in tmp_path.iterdir()] == ["s.json"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[]",
+        json.dumps({"reference": "netft"}),
+        json.dumps({"reference": "a", "sensors": {"b": {"late_s": 1}}}),
+        json.dumps({"reference": "a", "sensors": {"b": {"late_s": 31, "spread_s": 0, "events": 1, "by": "taps"}}}),
+    ],
+)
+def test_anything_else_is_refused(tmp_path, text):
+    (tmp_path / "s.json").write_text(text)
+    with pytest.raises(OffsetsError, match="make them with `sync`"):
+        Offsets.load(tmp_path / "s.json")

@@ -1,0 +1,89 @@
+"""A sensor turned by hand: poses are found between the turns, and gravity tells what hangs on it."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+
+from sensors_io.force import ForceError
+from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, fit_poses
+
+BIAS, BIAS_M = np.array([1.2, -0.4, 3.0]), np.array([20.0, -5.0, 8.0])
+WEIGHT, CENTRE = 1.5, np.array([2.0, -1.0, 12.0])
+MS = 1_000_000
+
+
+def turned(count=8, hold_s=1.0, turn_s=0.4, noise_n=0.005, rate_hz=200, seed=0):
+    """Times, forces and moments of a hand that holds `count` directions, and the direction of gravity in the last."""
+    rng = np.random.default_rng(seed)
+    held = rng.normal(size=(count, 3))
+    held /= np.linalg.norm(held, axis=-1, keepdims=True)
+    path = [np.repeat(held[:1], round(hold_s * rate_hz), 0)]
+    for a, b in itertools.pairwise(held):
+        share = np.linspace(0, 1, round(turn_s * rate_hz))[:, None]
+        path += [(1 - share) * a + share * b, np.repeat(b[None], round(hold_s * rate_hz), 0)]
+    down = np.concatenate(path)
+    down /= np.linalg.norm(down, axis=-1, keepdims=True)
+    force = BIAS + WEIGHT * down + noise_n * rng.normal(size=down.shape)
+    moment = BIAS_M + np.cross(CENTRE, WEIGHT * down) + 5 * noise_n * rng.normal(size=down.shape)
+    return np.arange(len(down)) * round(1e9 / rate_hz), force, moment, held[-1]
+
+
+def found_in(times, force, moment, **config):
+    finder = PoseFinder(PoseConfig(**config))
+    for row in zip(times, force, moment, strict=True):
+        finder.offer(*row)
+    return finder.poses
+
+
+def test_every_pose_is_found_once_and_tells_bias_and_weight():
+    times, force, moment, down = turned()
+    poses = found_in(times, force, moment)
+    assert len(poses) == 8
+    zero = fit_poses(poses)
+    np.testing.assert_allclose(zero.model.bias_n, BIAS, atol=0.01)
+    np.testing.assert_allclose(zero.model.bias_nmm, BIAS_M, atol=0.1)
+    assert zero.model.weight_n == pytest.approx(WEIGHT, abs=0.01)
+    np.testing.assert_allclose(zero.model.centre_mm, CENTRE, atol=0.1)
+    np.testing.assert_allclose(zero.down, down, atol=0.01)
+    assert zero.model.rms_n < 0.01
+
+
+def test_a_sensor_that_never_rests_has_no_pose():
+    times, force, moment, _ = turned(hold_s=0.1, turn_s=1.0)
+    assert found_in(times, force, moment) == []
+    rng = np.random.default_rng(1)
+    assert found_in(times, force + rng.normal(0, 0.2, force.shape), moment) == []
+
+
+def test_the_same_pose_held_again_is_not_another():
+    times, force, moment, _ = turned(count=1, hold_s=5)
+    assert len(found_in(times, force, moment)) == 1
+    with pytest.raises(ForceError, match="span no sphere"):
+        fit_poses(found_in(times, force, moment))
+
+
+def test_a_zero_comes_back_from_its_file(tmp_path):
+    zero = fit_poses(found_in(*turned()[:3]))
+    path = tmp_path / "g.json"
+    zero.save(path)
+    back = ForceZero.load(path)
+    np.testing.assert_array_equal(back.down, zero.down)
+    for name in ("bias_n", "bias_nmm", "first_moment_nmm", "weight_n", "rms_n", "rms_nmm", "poses"):
+        np.testing.assert_array_equal(getattr(back.model, name), getattr(zero.model, name))
+
+
+@pytest.mark.parametrize("change", [{"down": [1, 2]}, {"bias_n": 3}, {"weight": 1}, None])
+def test_a_file_without_a_zero_is_named(tmp_path, change):
+    path = tmp_path / "g.json"
+    fit_poses(found_in(*turned()[:3])).save(path)
+    tree = [] if change is None else json.loads(path.read_text()) | change
+    path.write_text(json.dumps(tree))
+    with pytest.raises(ForceError, match="make one with `force-zero`"):
+        ForceZero.load(path)
+
+
+def test_configs_are_checked():
+    with pytest.raises(ValueError, match="still_n is 0"):
+        PoseConfig(still_n=0)

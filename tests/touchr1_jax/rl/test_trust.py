@@ -1,0 +1,76 @@
+"""An update that is too long is shortened to its bound; a short one stays as it is."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl.test_grpo import AGENT, P
+from touchr1_jax.rl.config import GRPOConfig, Paper, Stable
+from touchr1_jax.rl.grpo import sample_group
+from touchr1_jax.rl.losses import grounding_bonus
+from touchr1_jax.rl.objective import Experience
+from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.trust import log_probs, within_trust
+
+G, T, DELTA = 8, 4, 0.01
+CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
+BEFORE = tiny.shallow_params(0)
+DIRECTION = jax.tree.map(lambda a, b: b - a, BEFORE, tiny.shallow_params(1))
+
+
+@pytest.fixture(scope="module")
+def learn() -> Experience:
+    """Rollouts of the policy before the update."""
+    batch = tiny.question_batch(1, P)
+    draw = SampleConfig(group=G, length=T, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id)
+    rollout = jax.jit(lambda: sample_group(AGENT, BEFORE, batch, jax.random.key(0), draw))()
+    touch = batch.features.touch
+    zero = jnp.zeros((P, G))
+    stream = jnp.zeros(P, jnp.int32)
+    return Experience(batch, touch, stream, rollout, rollout.log_prob, zero, jnp.ones(P))
+
+
+@pytest.fixture(scope="module")
+def shorten(learn):
+    """The parameters and sizes of an update of a given length along one direction, from one program."""
+    along = lambda size: jax.tree.map(lambda a, d: a + size * d, BEFORE, DIRECTION)
+    return jax.jit(lambda size: within_trust(AGENT, CONFIG, BEFORE, along(size), learn, DELTA))
+
+
+def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
+    ours = jax.jit(lambda: log_probs(AGENT, CONFIG, BEFORE, learn))()
+    mask = np.asarray(learn.rollout.mask)
+    np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
+
+
+def test_a_short_update_stays(shorten):
+    params, size = shorten(1e-3)
+    assert size["update_scale"] == 1
+    assert 0 <= size["update_kl"] < DELTA
+    for a, b, d in zip(*map(jax.tree.leaves, (params, BEFORE, DIRECTION)), strict=True):
+        np.testing.assert_allclose(a, b + 1e-3 * d, atol=1e-6)
+
+
+def test_a_long_update_ends_near_its_bound(shorten):
+    """Where KL is quadratic the shortened step has exactly δ; from afar it is of that order or below."""
+    _, long = shorten(0.1)
+    assert long["update_kl"] > 2 * DELTA
+    _, again = shorten(0.1 * long["update_scale"])
+    assert 0.3 * DELTA < again["update_kl"] < 2 * DELTA
+    _, wild = shorten(3.0)
+    assert wild["update_scale"] < 0.2
+    _, again = shorten(3.0 * wild["update_scale"])
+    assert again["update_kl"] < wild["update_kl"] / 5
+
+
+def test_grounding_pays_up_to_its_budget():
+    algorithm = dataclasses.replace(Stable(), gamma=0.1, grounding_budget=0.05)
+    gain = lambda g: grounding_bonus(g, algorithm)
+    np.testing.assert_allclose(gain(jnp.array([0.2, 0.5, 3.0])), [0.02, 0.05, 0.05], rtol=1e-6)
+    assert jax.grad(gain)(0.2) == pytest.approx(0.1)
+    assert jax.grad(gain)(3.0) == 0
+    assert grounding_bonus(jnp.array(3.0), Paper(gamma=0.1)) == pytest.approx(0.3)

@@ -1,0 +1,57 @@
+"""Compiled programs are written below the folder, found again, and only inside the block."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+
+from touchr1_jax.training import compilation
+from touchr1_jax.training.compilation import compilations_kept, processor
+
+
+@pytest.fixture
+def keeping(monkeypatch):
+    """No cache of the session's own, and no compilation too small for one."""
+    monkeypatch.setattr(compilation, "WORTH_KEEPING_S", 0.0)
+    session = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    compilation_cache.reset_cache()
+    yield
+    jax.config.update("jax_compilation_cache_dir", session)
+    compilation_cache.reset_cache()
+
+
+def entries(folder):
+    return sorted(p.relative_to(folder) for p in folder.rglob("*-cache"))
+
+
+def compiled(x: float) -> float:
+    """A program that is compiled anew each time it is asked for."""
+    return float(jax.jit(lambda y: jnp.sin(y) * 3.25 + 1)(x))
+
+
+def test_a_program_is_kept_and_found_again(keeping, tmp_path):
+    with compilations_kept(tmp_path):
+        first = compiled(0.5)
+        kept = entries(tmp_path)
+        jax.clear_caches()
+        assert compiled(0.5) == first
+    assert kept
+    assert {path.parts[0] for path in kept} == {processor()}
+    assert entries(tmp_path) == kept
+
+
+def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
+    with compilations_kept(tmp_path):
+        pass
+    compiled(0.7)
+    assert jax.config.values["jax_compilation_cache_dir"] is None
+    assert not entries(tmp_path)
+
+
+def test_a_cache_of_the_users_own_stays(keeping, tmp_path):
+    mine, other = tmp_path / "mine", tmp_path / "other"
+    with compilations_kept(mine), compilations_kept(other):
+        compiled(0.9)
+    assert entries(mine)
+    assert not other.exists()

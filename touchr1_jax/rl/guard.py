@@ -1,0 +1,70 @@
+"""A check before training that every stream reaches the policy: a divergence cannot pay for touch that nobody gets."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from touchr1_jax import masked
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.rl.grpo import sample_group
+from touchr1_jax.rl.kl import exact_kl
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.types import Params
+
+ROUNDING_NAT = 1e-7
+"""A stream that is never attended to moves the answers by exactly nothing, or by what float32 rounds."""
+
+
+def stream_influence(
+    agent: Agent, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
+) -> tuple[Float[Array, "S"], Bool[Array, "S"]]:
+    """How much noise in each stream alone moves sampled answers, and which streams any prompt has.
+
+    KL(π(· | touch) ‖ π(· | stream s made noise)), mean over the tokens of one answer a prompt and over the prompts that
+    have the stream, nat.
+
+    Args:
+      agent: policy, prompts, vocabulary.
+      params: the policy's.
+      batch: P prompts.
+      noise: encoded noise as in `grpo.Fixed`.
+      key: randomness of the answers and of the noise.
+      length: most tokens of an answer.
+    """
+    sample_key, noise_key = jax.random.split(key)
+    draw = SampleConfig(group=1, length=length, end_ids=agent.end_ids, pad_id=agent.pad_id)
+    rollout = sample_group(agent, params, batch, sample_key, draw)
+    p, s = batch.features.stream_mask.shape
+    drawn = noise[jax.random.randint(noise_key, (p, s), 0, noise.shape[0]), jnp.arange(s)]
+
+    def log_p(touch: Float[Array, "P S N D"]) -> Float[Array, "P G T V"]:
+        changed = dataclasses.replace(batch.features, touch=touch)
+        each = jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0))
+        return jax.nn.log_softmax(each(params, changed, batch.ids, batch.mask, rollout.tokens))
+
+    own = log_p(batch.features.touch)
+
+    def influence(stream: Array) -> Array:
+        one = jnp.where((jnp.arange(s) == stream)[:, None, None], drawn, batch.features.touch)
+        per_prompt = jnp.mean(masked.mean(exact_kl(own, log_p(one)), rollout.mask, axis=-1), -1)
+        return masked.mean(per_prompt, batch.features.stream_mask[:, stream])
+
+    return jax.lax.map(influence, jnp.arange(s)), jnp.any(batch.features.stream_mask, 0)
+
+
+def check_streams(influence: Float[np.ndarray, "S"], present: Bool[np.ndarray, "S"]) -> None:
+    """Refuse to train where a present stream has no influence at all.
+
+    Raises:
+      ValueError: noise in a stream moves no answer by more than float32 rounds.
+    """
+    for s, (size, there) in enumerate(zip(influence, present, strict=True)):
+        if there and not size > ROUNDING_NAT:
+            raise ValueError(
+                f"stream {s}: noise in it moves the answers by {size:.3g} nat a token, must exceed {ROUNDING_NAT:g}; "
+                "its touch does not reach the policy: look at its encoder, its slots in the prompt and its mask"
+            )

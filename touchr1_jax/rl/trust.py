@@ -1,0 +1,49 @@
+"""Updates of a bounded size: what a step moves the policy by is measured, and a step that is too long is shortened."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from touchr1_jax import masked
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.kl import estimated_kl
+from touchr1_jax.rl.objective import Experience, token_terms
+from touchr1_jax.types import Params
+
+
+def within_trust(
+    agent: Agent, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
+) -> tuple[Params, dict[str, Array]]:
+    """Shorten an update so that it moves the policy by at most δ nat a token on the rollouts that it is from.
+
+    θ = θ₀ + s (θ₁ − θ₀) with s = min(1, √(δ / KL(π₀ ‖ π₁))), as KL grows with the square of a small step.  The KL is
+    the k3 estimate on the rollouts, which π₀ sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477,
+    appendix C), here of any optimizer's, without its line search.
+
+    Args:
+      agent, config: as in `make_grpo_step`.
+      before: parameters θ₀ that the rollouts were sampled with.
+      after: parameters θ₁ that the optimizer proposes.
+      learn: the rollouts.
+      delta: δ; with several updates from the same rollouts it bounds all of them together, since the KL is that to the
+        policy that sampled.
+
+    Returns:
+      The parameters θ, and `update_kl`, the KL that was proposed, and `update_scale`, s.
+    """
+    moved = log_probs(agent, config, after, learn)
+    kl = jnp.mean(masked.mean(estimated_kl(learn.rollout.log_prob, moved, "k3"), learn.rollout.mask, axis=-1))
+    scale = jnp.minimum(1.0, jnp.sqrt(delta / jnp.maximum(kl, delta)))
+    params = jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
+    return params, {"update_kl": kl, "update_scale": scale}
+
+
+def log_probs(agent: Agent, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:
+    """Log-probabilities of the sampled tokens under some parameters, nothing else."""
+    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
+    plain = dataclasses.replace(config, algorithm=algorithm)
+    of_prompt = lambda e: token_terms(agent, plain, params, params, e)["log_prob"]
+    return jax.lax.map(of_prompt, learn, batch_size=config.micro_prompts)

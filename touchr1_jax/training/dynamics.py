@@ -1,0 +1,253 @@
+"""Stage 1, tactile dynamics: predict the next latent of touch, with no label.
+
+    L = mean |P(f(x_≤t)) − LN(sg f̄(x_≤t+1))| + w_v · mean_d max(0, 1 − std_d) + w_c · Σ_{i≠j} cov_ij² / D
+
+over the steps and streams that exist.  f is a causal `TactileViT`, f̄ its moving average, P a `LatentPredictor` that
+sees a random subset of the streams and is asked about all.  Standard deviation and covariance are those of f's latents
+before the layer norm *between contacts*: of one sensor at one step, across the batch.  Pooled over sensors and steps
+they would be satisfied by telling sensors and forces apart, which is no news.
+
+Sources: Assran et al. 2023 (I-JEPA) for the objective; Bardes et al. 2022 (VICReg, §4.1) for the two terms, here with
+std = √(var + 1e-4); Grill et al. 2020 (BYOL) for the moving average.  Departures: the predictor is told time and force
+of the step that it predicts, and other sensors take part in the prediction.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax import masked
+from touchr1_jax.models.predictor import LN_FLOOR, LatentPredictor, PredictorConfig, layer_norm
+from touchr1_jax.models.salience import fewer_frames
+from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
+from touchr1_jax.types import Params, TouchBatch
+
+SPREAD_FLOOR = 1e-4
+"""Added to a variance under the root, whose gradient is then finite; VICReg's."""
+
+
+@struct.dataclass
+class Guards:
+    """What keeps the latents from collapsing; numbers, so that a compiled step serves them all.
+
+    Args:
+      variance, covariance: weights w_v, w_c of the two terms.
+      ema: share of the moving average that stays in a step; 0 makes the target the encoder itself.
+      leak: share of the gradient that reaches the target; 0 is the stop-gradient.
+    """
+
+    variance: Float[Array, ""] | float = 1.0
+    covariance: Float[Array, ""] | float = 0.04
+    ema: Float[Array, ""] | float = 0.99
+    leak: Float[Array, ""] | float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DynamicsConfig:
+    """Encoder and predictor; with probability `full_share` all streams are shown, else a random non-empty subset.
+
+    With `frames_kept` only the most telling frames of each stream are read, see `salience.fewer_frames`.
+    """
+
+    encoder: TactileViTConfig
+    predictor: PredictorConfig = PredictorConfig()
+    full_share: float = 0.5
+    frames_kept: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.encoder.causal:
+            raise ValueError("encoder.causal is False: a step that sees the next one predicts it by copying; set it")
+        if not 0 <= self.full_share <= 1:
+            raise ValueError(f"full_share is {self.full_share}: must lie in [0, 1], a probability; change it")
+
+
+@struct.dataclass
+class DynamicsState:
+    """What a step changes; `params` holds "encoder" and "predictor", `target` the averaged encoder."""
+
+    params: Params
+    target: Params
+    opt_state: optax.OptState
+    step: Int[Array, ""]
+    key: Array
+
+
+@struct.dataclass
+class Steps:
+    """What is said of every time step: [P, S, T] frame index, force of its last frame, whether it exists."""
+
+    index: Int[Array, "P S T"]
+    force_n: Float[Array, "P S T 3"]
+    exists: Bool[Array, "P S T"]
+
+
+def read_frames(config: DynamicsConfig, batch: TouchBatch) -> TouchBatch:
+    """The batch with the frames that are read."""
+    return batch if config.frames_kept is None else fewer_frames(batch, config.frames_kept)
+
+
+def steps_of(batch: TouchBatch, frames_per_step: int) -> Steps:
+    """Time steps of the streams that are present."""
+    p, s, f = batch.frame_index.shape
+    split = lambda x: x.reshape(p, s, f // frames_per_step, frames_per_step, *x.shape[3:])
+    exists = split(batch.frame_mask).any(-1) & batch.stream_mask[..., None]
+    force_n = jnp.where(batch.frame_mask[..., None], batch.force_n, 0.0)
+    return Steps(index=split(batch.frame_index)[..., 0], force_n=split(force_n)[:, :, :, -1], exists=exists)
+
+
+BLOCK = 2
+"""Contacts that are encoded at once: the activations of the stem then stay in a core's cache on their way to the next
+layer; eight contacts of 32 frames have 25 MB of them, and the encoder waits for memory."""
+
+
+def encode_batch(config: TactileViTConfig, params: Params, batch: TouchBatch) -> Float[Array, "P S T N D"]:
+    """Latents f(x_≤t) of all streams of a batch, block by block: the pooled tokens of each step."""
+    sensors = jnp.broadcast_to(jnp.arange(batch.frames.shape[1]), batch.frames.shape[:2])
+    streams = (batch.frames, batch.force_n, batch.frame_index, batch.frame_mask, sensors)
+    size = math.gcd(BLOCK, len(batch.frames))
+    blocks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), streams)
+    latent: Any = jax.lax.map(lambda block: TactileViT(config).apply({"params": params}, *block), blocks)
+    return latent.reshape(-1, *latent.shape[2:])
+
+
+def predict_next(
+    config: DynamicsConfig, params: Params, latent: Float[Array, "P S T N D"], steps: Steps, shown: Bool[Array, "P S"]
+) -> Float[Array, "P S T-1 N D"]:
+    """Predicted latents of the steps 1 … T − 1 from the shown streams."""
+    predictor = LatentPredictor(config.predictor, latent.shape[1])
+    visible = steps.exists & shown[..., None]
+    told = (steps.index[:, :, 1:], steps.force_n[:, :, 1:])
+    out: Any = predictor.apply({"params": params}, latent[:, :, :-1], visible[:, :, :-1], *told)
+    return out
+
+
+def dynamics_loss(
+    config: DynamicsConfig, params: Params, target: Params, batch: TouchBatch, shown: Bool[Array, "P S"], guards: Guards
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """The loss of the module's formula and what it consists of.
+
+    Args:
+      config: networks.
+      params: of encoder and predictor.
+      target: of the averaged encoder.
+      batch: P contacts.
+      shown: streams that the predictor sees.
+      guards: weights.
+    """
+    batch = read_frames(config, batch)
+    steps = steps_of(batch, config.encoder.frames_per_step)
+    latent = encode_batch(config.encoder, params["encoder"], batch)
+    leaked = jax.tree.map(lambda t, p: t + guards.leak * (p - jax.lax.stop_gradient(p)), target, params["encoder"])
+    goal = layer_norm(encode_batch(config.encoder, leaked, batch))
+    error, copied = prediction_errors(predict_next(config, params["predictor"], latent, steps, shown), goal, steps)
+    spread, mixed = spread_of(latent, steps.exists), covariance_of(latent, steps.exists)
+    variance = jnp.maximum(0.0, 1.0 - spread).mean()
+    metrics = {
+        "prediction": error,
+        "skill": 1.0 - error / jnp.maximum(copied, LN_FLOOR),
+        "variance_term": variance,
+        "covariance_term": mixed,
+        "flat_share": jnp.mean(spread < FLAT),
+        "spread": spread.mean(),
+    }
+    return error + guards.variance * variance + guards.covariance * mixed, metrics
+
+
+FLAT = 0.1
+"""Standard deviation of a latent dimension between contacts below which it counts as collapsed; the goal is 1."""
+
+
+def prediction_errors(
+    predicted: Float[Array, "P S pair N D"], goal: Float[Array, "P S T N D"], steps: Steps
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean |ẑ_{t+1} − z_{t+1}| and mean |z_t − z_{t+1}|, copy-last, over the T − 1 pairs of steps, if both exist."""
+    both = (steps.exists[:, :, 1:] & steps.exists[:, :, :-1])[..., None, None]
+    error = masked.mean(jnp.abs(predicted - goal[:, :, 1:]), both)
+    return error, masked.mean(jnp.abs(goal[:, :, :-1] - goal[:, :, 1:]), both)
+
+
+def spread_of(latent: Float[Array, "P S T N D"], exists: Bool[Array, "P S T"]) -> Float[Array, "D"]:
+    """Standard deviation of each dimension between contacts, √(var + 1e-4), mean over sensors, steps and tokens."""
+    seen = exists[..., None, None]
+    spread = jnp.sqrt(masked.var(latent, seen, 0) + SPREAD_FLOOR)  # S T N D
+    return masked.mean(spread, (exists.sum(0) > 1)[..., None, None], (0, 1, 2))
+
+
+def covariance_of(latent: Float[Array, "P S T N D"], exists: Bool[Array, "P S T"]) -> Float[Array, ""]:
+    """Σ_{i≠j} cov_ij² / D of the dimensions between contacts, pooled over sensors, steps and tokens."""
+    rows, d = residuals(latent, exists), latent.shape[-1]
+    cov = rows.T @ rows / jnp.maximum(latent.shape[3] * exists.sum(), 1)
+    return jnp.sum(jnp.where(jnp.eye(d, dtype=bool), 0.0, cov) ** 2) / d
+
+
+def residuals(latent: Float[Array, "P S T N D"], exists: Bool[Array, "P S T"]) -> Float[Array, "rows D"]:
+    """Latents less their mean over the contacts of the batch, one row each; zeros where a step does not exist."""
+    seen = exists[..., None, None]
+    centred = jnp.where(seen, latent - masked.mean(latent, seen, 0, keepdims=True), 0.0)
+    return centred.reshape(-1, latent.shape[-1])
+
+
+def random_shown(key: Array, present: Bool[Array, "P S"], full_share: float) -> Bool[Array, "P S"]:
+    """All present streams with probability `full_share`, else a random non-empty subset of them.
+
+    A subset keeps each stream with probability one half, and one stream chosen at random in any case.
+    """
+    full_key, keep_key, one_key = jax.random.split(key, 3)
+    full = jax.random.bernoulli(full_key, full_share, (present.shape[0], 1))
+    score = jnp.where(present, jax.random.uniform(one_key, present.shape), -1.0)
+    one = score == score.max(-1, keepdims=True)
+    return present & (full | one | jax.random.bernoulli(keep_key, 0.5, present.shape))
+
+
+def start_dynamics(
+    config: DynamicsConfig, optimizer: optax.GradientTransformation, key: Array, batch: TouchBatch
+) -> DynamicsState:
+    """Fresh state from one key and the shapes of a batch."""
+    encoder_key, predictor_key, key = jax.random.split(key, 3)
+    one = read_frames(config, jax.tree.map(lambda x: x[:1], batch))
+    sensors = jnp.arange(batch.frames.shape[1])[None]
+    streams = (one.frames, one.force_n, one.frame_index, one.frame_mask, sensors)
+    encoder = TactileViT(config.encoder).init(encoder_key, *streams)["params"]
+    latent, steps = encode_batch(config.encoder, encoder, one), steps_of(one, config.encoder.frames_per_step)
+    asked = (latent[:, :, :-1], steps.exists[:, :, :-1], steps.index[:, :, 1:], steps.force_n[:, :, 1:])
+    predictor = LatentPredictor(config.predictor, batch.frames.shape[1]).init(predictor_key, *asked)["params"]
+    params = {"encoder": encoder, "predictor": predictor}
+    target = jax.tree.map(jnp.copy, encoder)  # the step gives its buffers away: the two must not share any
+    zero = jnp.zeros((), jnp.int32)
+    return DynamicsState(params=params, target=target, opt_state=optimizer.init(params), step=zero, key=key)
+
+
+DynamicsStep = Callable[[DynamicsState, TouchBatch], tuple[DynamicsState, dict[str, Array]]]
+
+
+def dynamics_update(
+    config: DynamicsConfig,
+    optimizer: optax.GradientTransformation,
+    guards: Guards,
+    state: DynamicsState,
+    batch: TouchBatch,
+) -> tuple[DynamicsState, dict[str, Array]]:
+    """One step of gradient descent, then f̄ ← ema · f̄ + (1 − ema) · f; pure, for `jit` and `vmap`."""
+    shown = random_shown(jax.random.fold_in(state.key, state.step), batch.stream_mask, config.full_share)
+    loss = lambda p: dynamics_loss(config, p, state.target, batch, shown, guards)
+    (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+    updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+    params = optax.apply_updates(state.params, updates)
+    target = jax.tree.map(lambda t, p: guards.ema * t + (1 - guards.ema) * p, state.target, params["encoder"])
+    metrics = {"loss": value, **metrics, "grad_norm": optax.tree.norm(grads)}
+    return dataclasses.replace(state, params=params, target=target, opt_state=opt_state, step=state.step + 1), metrics
+
+
+def make_dynamics_step(
+    config: DynamicsConfig, optimizer: optax.GradientTransformation, guards: Guards | None = None
+) -> DynamicsStep:
+    """Build the jitted step, (state, batch) → (state, metrics); it takes the buffers of its state over."""
+    fixed = guards or Guards()
+    return jax.jit(lambda state, batch: dynamics_update(config, optimizer, fixed, state, batch), donate_argnums=0)
