@@ -125,7 +125,8 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findi
     background = background_of(config, everything, context)
     fold = deal_folds(videos.objects, videos.label, config.folds, config.seed)
     answer = cross_validate(config.learn, videos, background, fold, config.seed, context, "fold")
-    trained_s = sum(seconds for stage, seconds in context.timing().items() if stage.startswith("fold/"))
+    counted = ("descriptions", "data", "scenes", "fold/")  # what a cache holds costs nothing again
+    trained_s = sum(seconds for stage, seconds in context.timing().items() if stage.startswith(counted))
     keep(config, videos, background, context)
     baselines = [Row(name=name, answer=said) for name, said in constants(videos.label, videos.objects, fold).items()]
     probes = Row(name="probes alone", answer=cross_answers(config.learn, videos, background, fold))
@@ -212,7 +213,7 @@ def requirements(main: Mapping[str, Interval], minutes: float) -> tuple[Requirem
         )
         for name, bound in GOALS.items()
     ]
-    time = Requirement(name="training, all folds", measured=minutes, bound=MINUTES, better="lower", unit="min")
+    time = Requirement(name="data and training, all folds", measured=minutes, bound=MINUTES, better="lower", unit="min")
     return (*kept, time)
 
 
@@ -271,6 +272,7 @@ SMOKE = dataclasses.replace(
     learn=dataclasses.replace(
         DEFAULT.learn,
         members=1,
+        reading=dataclasses.replace(DEFAULT.learn.reading, steps=4),
         tune=dataclasses.replace(DEFAULT.learn.tune, steps=4),
         evidence=dataclasses.replace(DEFAULT.learn.evidence, folds=2),
     ),

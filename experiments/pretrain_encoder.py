@@ -10,9 +10,10 @@ encoder as it was before training.  The averaged encoder lies in the run as `enc
 
 Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
 
-Expected: copying the last latent is poor because a press changes every latent, so a skill of .2 is little; the skill
-over each step's mean latent, which knows the force but not the object, says more.  A random encoder already has filters
-and their energies, which the probes read well.
+Expected: a skill well above .2, since most of what the next level of force changes can be foreseen.  The skill over
+each step's mean latent, which knows the force but not the object, says more.  A random encoder is hard to beat: it
+computes the energies of its filters by design, and probes read two thirds of the labels in them, close to what fixed
+statistics of the pictures tell; prediction moves hardness up, which is dynamics, and texture down, which is not.
 """
 
 import dataclasses

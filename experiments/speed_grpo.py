@@ -49,13 +49,15 @@ from experiments.grpo.speed_tables import (
     alone_table,
     compare_table,
     median,
+    memory_table,
     peer_table,
     requirements,
-    words_table,
 )
 from experiments.reporting.findings import Findings, Picture
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
+
+MANY_WORDS = "Two prompts of eight rollouts at the shortest prefix."
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -70,7 +72,7 @@ class SpeedConfig:
     options_at: int = 64
     """Prefix at which the options are timed."""
     repeated_at: tuple[int, ...] = (64, 512)
-    """Prefixes at which the repeated way is timed."""
+    """Prefixes at which the repeated way is timed, and lean compilation at the last; they must be among `prefixes`."""
     buckets: tuple[int, ...] = (16, 32, 48)
     """Lengths that updates from short answers may pay for."""
     words: int = 131_072
@@ -97,11 +99,21 @@ class SpeedConfig:
     """Prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one."""
     size: Size = Size()
 
+    def __post_init__(self) -> None:
+        missing = sorted({*self.repeated_at} - {*self.prefixes})
+        if missing or not self.repeated_at:
+            raise ValueError(
+                f"repeated_at is {self.repeated_at}: must be some of prefixes {self.prefixes}; add them there"
+            )
+
 
 def run(config: SpeedConfig, context: Context) -> Findings:
     """Every prefix alone, the variants side by side, many words, many steps, the peers."""
+    lean_at = config.repeated_at[-1]
     with tempfile.TemporaryDirectory() as folder:
         first, alone = every_prefix(config, Path(folder), context)
+        step = dataclasses.replace(config_of(config.size, config.micro_prompts), lean_compilation=True)
+        lean = in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))
         words = many_words(config, Path(folder), context)
     jobs = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
     found = side_by_side(jobs, config.rounds)
@@ -122,7 +134,12 @@ def run(config: SpeedConfig, context: Context) -> Findings:
             *((peer_table(config.size, alone, first, peers),) if peers else ()),
             compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
             compare_table("Repeating the prefix: time over that of the engine as it is", twice),
-            *((words_table(config.words, words),) if words else ()),
+            memory_table(
+                f"Compiling at prefix {lean_at}",
+                "The older code generator needs less memory and makes slower programs.",
+                {"as it is": first[lean_at], "lean": lean},
+            ),
+            *((memory_table(f"A vocabulary of {config.words:,} words", MANY_WORDS, words),) if words else ()),
         ),
         settings={"beta": BETA, "micro_prompts": config.micro_prompts, "devices": str(jax.devices())},
     )
@@ -221,7 +238,7 @@ def verdict(alone: Mapping[int, Alone], twice: Mapping[int, Mapping[str, float]]
 
 DEFAULT = SpeedConfig()
 SMOKE = SpeedConfig(
-    prefixes=(16, 32),
+    prefixes=(16,),
     rounds=2,
     options=("importance weights", "short answers, buckets"),
     options_at=16,

@@ -9,7 +9,7 @@ breaks where more than 5 % of the points that it gives are a pixel off, or shear
 curves say where, and whether a flag said so.  How often flags fire on real pictures, and how often a bare gel is taken
 for one with markers, on every folder of the data directory.  Pictures, motions and noise set nothing in the tracker.
 
-Ten minutes on one core (`smoke` half a minute).  Expected: the package's tracker breaks last and never in silence; what
+Six minutes on one core (`smoke` half a minute).  Expected: the package's tracker breaks last and never in silence; what
 is matched from frame to frame or to the nearest dot breaks at half a pitch and says nothing.
 """
 

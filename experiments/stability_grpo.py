@@ -136,7 +136,8 @@ def _drive_side(
     scenario: Scenario, variant: Variant, values: Sequence[float], config: StabilityConfig, courses: Courses
 ) -> Side:
     found = [courses.course(variant, scenario.place(variant, v), guarded=variant is STABLE) for v in values]
-    fired = [[bool(set(scenario.alarms) & set(alarms_of(c, s))) for s in range(config.seeds)] for c in found]
+    raised = lambda c, s: not c.refused and bool(set(scenario.alarms) & set(alarms_of(c, s)))
+    fired = [[raised(c, seed) for seed in range(config.seeds)] for c in found]
     return Side(failed=np.array([scenario.failed(c) for c in found]), fired=np.array(fired))
 
 

@@ -42,8 +42,13 @@ class Arm:
 
 @struct.dataclass
 class Look:
-    """What is measured of an encoder on held-out contacts; the names are those of the alarms."""
+    """What is measured of an encoder on held-out contacts; three names are those of the alarms.
 
+    `telling` is the difference between contacts over the size of the latents, √(mean (z − z̄)² / mean z²), z̄ the mean
+    over contacts: the share that is left for a decoder that normalises what it reads.
+    """
+
+    telling: Float[Array, ""]
     flat_share: Float[Array, ""]
     rank_share: Float[Array, ""]
     skill: Float[Array, ""]
@@ -53,6 +58,7 @@ class Look:
 class Course:
     """One run: measurements after every block of steps, and the features of all contacts before and after."""
 
+    start: Look
     looks: Look
     before: Float[Array, "n D"]
     after: Float[Array, "n D"]
@@ -94,7 +100,7 @@ def make_runner(
 
         end, looks = jax.lax.scan(block, start, draws)
         features = functools.partial(_features, config, contacts)
-        return Course(looks=looks, before=features(start), after=features(end))
+        return Course(start=look_at(config, start, held), looks=looks, before=features(start), after=features(end))
 
     return jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
 
@@ -107,10 +113,12 @@ def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> 
     seen = encode_batch(config.encoder, state.params["encoder"], batch)
     predicted = predict_next(config, state.params["predictor"], seen, steps, batch.stream_mask)
     error, copied = prediction_errors(predicted, goal, steps)
-    rank = rank_me(residuals(latent, steps.exists))
+    rows = residuals(latent, steps.exists)
+    size = jnp.sum(jnp.where(steps.exists[..., None, None], latent, 0.0) ** 2)
     return Look(
+        telling=jnp.sqrt(jnp.sum(rows**2) / size),
         flat_share=jnp.mean(spread_of(latent, steps.exists) < FLAT),
-        rank_share=rank / latent.shape[-1],
+        rank_share=rank_me(rows) / latent.shape[-1],
         skill=1.0 - error / jnp.maximum(copied, COPY_FLOOR),
     )
 

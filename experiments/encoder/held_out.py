@@ -19,7 +19,7 @@ from touchr1_jax.training.dynamics import (
     FLAT,
     DynamicsConfig,
     DynamicsState,
-    encode_batch,
+    encode_each,
     predict_next,
     read_frames,
     residuals,
@@ -136,7 +136,7 @@ def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: Watched) -
     def encode(batch: TouchBatch) -> dict[str, Any]:
         batch = read_frames(networks, batch)
         exists = steps_of(batch, networks.encoder.frames_per_step).exists
-        return {"latent": encode_batch(networks.encoder, encoder, batch), "exists": exists}
+        return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
 
     rows = np.concatenate([watched.fit_rows, watched.read_rows])
     seen = encode_rows(jax.jit(encode), watched.store, rows, watched.clip)
@@ -163,9 +163,9 @@ def _look(networks: DynamicsConfig) -> Callable[[Params, Params, TouchBatch], di
     def look(params: Params, target: Params, batch: TouchBatch) -> dict[str, Any]:
         batch = read_frames(networks, batch)
         steps = steps_of(batch, networks.encoder.frames_per_step)
-        latent = encode_batch(networks.encoder, target, batch)
+        latent = encode_each(networks.encoder, target, batch)
         goal = layer_norm(latent)
-        seen = encode_batch(networks.encoder, params["encoder"], batch)
+        seen = encode_each(networks.encoder, params["encoder"], batch)
         predicted = predict_next(networks, params["predictor"], seen, steps, batch.stream_mask)
         both = (steps.exists[:, :, 1:] & steps.exists[:, :, :-1])[..., None, None]
         mean = lambda x: masked.mean(jnp.abs(x), both, (1, 2, 3, 4))

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.running.timing import interleaved
-from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, patch_tokens
-from touchr1_jax.training.dynamics import DynamicsConfig, encode_batch, read_frames
+from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, kept_patches, patch_tokens
+from touchr1_jax.training.dynamics import DynamicsConfig, encode_each, read_frames
 from touchr1_jax.types import Params, TouchBatch
 
 MATRIX = 1024  # side of the matrices whose product is the yardstick of the machine
@@ -27,20 +27,28 @@ class Program:
 
 def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> Program:
     """The encoder from the bytes of a batch to its tokens."""
-    return compiled(lambda p, b: encode_batch(networks.encoder, p, read_frames(networks, b)), params, batch)
+    return compiled(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
 
 
 def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Program]:
-    """Programs that each do one thing more than the one before, up to the whole encoder."""
+    """Programs that each do one thing more than the one before, contact by contact, up to the whole encoder."""
     e = networks.encoder
     shallow = dataclasses.replace(e, num_layers=0)
     few = {name: x for name, x in params.items() if not name.startswith("layer_")}
     stem = {name: params[name] for name in ("stem", "patch", "energy")}
-    read = lambda b: read_frames(networks, b)
+
+    def each(one: Callable[[jax.Array, jax.Array | None], Any], b: TouchBatch) -> Any:
+        b = read_frames(networks, b)
+        kept = lambda x: None if e.rest == "merge" else kept_patches(x[0], x[1], e)  # merging reads every patch
+        return jax.lax.map(lambda x: one(x[0], kept(x)), (b.frames, b.frame_mask))
+
+    cut = lambda x, kept: cut_patches(x, e, kept).astype(jnp.float32) / 127.5
     return {
-        "cut the bytes": compiled(lambda b: cut_patches(read(b).frames, e).astype(jnp.float32) / 127.5, batch),
-        "stem, energies, embedding": compiled(lambda p, b: _Stem(e).apply({"params": p}, read(b).frames), stem, batch),
-        "time, force, pooling": compiled(lambda p, b: encode_batch(shallow, p, read(b)), few, batch),
+        "cut the bytes": compiled(lambda b: each(cut, b), batch),
+        "stem, energies, embedding": compiled(
+            lambda p, b: each(lambda x, kept: _Stem(e).apply({"params": p}, x, kept), b), stem, batch
+        ),
+        "time, force, pooling": compiled(lambda p, b: encode_each(shallow, p, read_frames(networks, b)), few, batch),
         "transformer": forward(networks, params, batch),
     }
 
@@ -51,8 +59,8 @@ class _Stem(nn.Module):
     config: TactileViTConfig
 
     @nn.compact
-    def __call__(self, frames: jax.Array) -> jax.Array:
-        return patch_tokens(frames, self.config)
+    def __call__(self, frames: jax.Array, kept: jax.Array | None) -> jax.Array:
+        return patch_tokens(frames, self.config, kept)
 
 
 def matrix_product() -> Program:

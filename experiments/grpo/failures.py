@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.grpo.training import Dials, Variant, dials_of
 from experiments.grpo.world import K, S, World
-from touchr1_jax.rl.config import Paper, Stable, TactileUse
+from touchr1_jax.rl.config import GRPOConfig, Paper, Stable, TactileUse
 from touchr1_jax.rl.guard import ROUNDING_NAT
 
 PAPER = Variant(name="paper", algorithm=Paper())
@@ -117,7 +117,7 @@ def _bonus_cancels(c: Course) -> np.ndarray:
 
 
 def _credit_by_chance(c: Course) -> np.ndarray:
-    return (c.late("tactile_credit_share") > 0.12) & (c.lead("swap") < 0.05)
+    return c.metrics["tactile_credit_share"].mean(1) > 0.12
 
 
 def _idles(c: Course) -> np.ndarray:
@@ -125,7 +125,7 @@ def _idles(c: Course) -> np.ndarray:
 
 
 def _penalty_does_not_hold(c: Course) -> np.ndarray:
-    return c.after["kl"] > np.maximum(1.0, 2 * c.before["kl"])
+    return c.after["kl"] > 1.0
 
 
 def _entropy_blows_up(c: Course) -> np.ndarray:
@@ -155,6 +155,11 @@ def _time_ids(variant: Variant, fps: float) -> Place:
     """Two frames a step: the paper's base model counts int(seconds a step) · 2 ids, the engine counts frames."""
     tick = 2 if variant is STABLE else 2 * int(2 / fps)
     return World(asked=1, noise=0.3, tick=tick), dials_of(variant)
+
+
+def _standing_still(variant: Variant, sight: float) -> Place:
+    """Touch that says nothing, and the paper's own learning rate, at which the small policy stays what it is."""
+    return World(noise=8.0, sight=sight), dials_of(variant)._replace(learning_rate=GRPOConfig().learning_rate)
 
 
 def _lenience(variant: Variant, value: float) -> Place:
@@ -204,6 +209,7 @@ SCENARIOS = (
         failing=WATCHED,
         place=_turn("gamma", NO_TOUCH),
         failed=_detects_noise,
+        others=("F3",),
     ),
     Scenario(
         code="F5",
@@ -218,11 +224,11 @@ SCENARIOS = (
     Scenario(
         code="F6",
         title="tactile credit by chance",
-        knob="noise of touch σ, levels",
-        values=(0.5, 1.0, 2.0, 4.0),
-        criterion="more than 12 % of groups earn credit while another object's touch costs less than 5 points",
+        knob="share of right pictures, useless touch",
+        values=(0.9, 0.6, 0.3, 0.0),
+        criterion="more than 12 % of the groups of a policy that stands still earn credit",
         failing=LITERAL,
-        place=_change("noise"),
+        place=_standing_still,
         failed=_credit_by_chance,
     ),
     Scenario(
@@ -237,7 +243,7 @@ SCENARIOS = (
     ),
     Scenario(
         code="F8",
-        title="the KL estimate does not hold the policy",
+        title="the KL estimate does not hold",
         knob="weight of the reference KL β",
         values=(1e-3, 1.0, 10.0, 100.0),
         criterion="exact KL to the reference above 1 nat a token",
@@ -268,9 +274,9 @@ SCENARIOS = (
     ),
     Scenario(
         code="F10",
-        title="a stream that never reaches the policy",
+        title="a stream that never arrives",
         knob="share of the second sensor's touch that arrives",
-        values=(1.0, 0.1, 0.01, 0.0),
+        values=(1.0, 0.3, 0.1, 0.0),
         criterion="noise in it moves no answer, and training goes on",
         failing=PAPER,
         place=_change("kept"),

@@ -21,7 +21,7 @@ from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import prompt_words
 from touchr1_jax.text.tokenizer import word_level
-from touchr1_jax.training.compilation import compilations_kept
+from touchr1_jax.training.compilation import compilations_kept, return_memory
 
 MATRIX = 1024  # side of the matrices whose product is the yardstick of the machine
 SHORT = 1 / 8  # share of the words that end a completion where answers are to be short
@@ -35,6 +35,7 @@ Option = Literal[
     "Gumbel draws",
     "remat",
     "bfloat16",
+    "lean compilation",
     "importance weights",
     "host reward",
     "short answers",
@@ -93,6 +94,7 @@ def time_alone(size: Size, prefix: int, config: GRPOConfig, rounds: int, cache: 
         job = Job(size, prefix, config)
         jax.block_until_ready(job.step())
     first_s = time.perf_counter() - began
+    return_memory()
     jax.block_until_ready(job.step())
     seconds = interleaved({"step": job.step}, rounds)["step"]
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB / GIB
@@ -125,6 +127,7 @@ def options(
         "Gumbel draws": change(inverse_draws=False),
         "remat": change(remat=True),
         "bfloat16": change(bfloat16=True),
+        "lean compilation": change(lean_compilation=True),
         "importance weights": change(algorithm=dataclasses.replace(plain.algorithm, importance_cap=2.0)),
         "host reward": lambda: Job(size, prefix, plain, host=True),
         "short answers": short(plain),

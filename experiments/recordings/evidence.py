@@ -109,7 +109,8 @@ def kernel_ridge(
     """
     square = (z**2).sum(1)
     distance = np.sqrt(np.maximum(square[:, None] + square[fit] - 2 * z @ z[fit].T, 0))
-    kernel = np.exp(-distance / np.median(distance[fit]))
+    median = float(np.median(distance[fit]))
+    kernel = np.exp(-distance / (median if median > 0 else 1.0))  # rows that coincide have no scale of their own
     mean = share @ target
     return mean + kernel @ np.linalg.solve(kernel[fit] + ridge * np.diag(share.mean() / share), target - mean)
 

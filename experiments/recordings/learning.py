@@ -17,13 +17,28 @@ from jaxtyping import Float, Int
 
 from experiments.recordings.descriptions import Described
 from experiments.recordings.evidence import EvidenceConfig, cross_probe, probe, standardise
-from experiments.recordings.policy import COMBINATIONS, PolicyShape, assemble_policy, choose, utility
+from experiments.recordings.policy import COMBINATIONS, LEVELS, PolicyShape, assemble_policy, choose, utility
 from experiments.recordings.scenes import Scenes, sense
-from experiments.recordings.training import Lesson, ReinforceConfig, TuneConfig, reinforce, tune
+from experiments.recordings.training import (
+    READING,
+    Lesson,
+    ReinforceConfig,
+    TuneConfig,
+    evidence_inputs,
+    reading_lesson,
+    reinforce,
+    tune,
+)
 from experiments.recordings.validation import object_weights
 from experiments.running.artifacts import jsonable, write_bytes
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
+
+READINGS = 8192
+"""Examples of made-up evidence."""
+
+ROWS = 64
+"""Numbers of videos are padded to a multiple of it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,6 +48,7 @@ class LearnConfig:
     Args:
       evidence: probes whose log-probabilities the encoder reads, and whose verdict `perceive` repeats.
       read_evidence: whether the encoder reads them.
+      reading, tune, reinforce: first to read made-up evidence, then the answers of real objects, then GRPO.
       components: principal components of the description that it reads beside them.
       members: policies of different seeds whose log-probabilities are averaged.
     """
@@ -42,6 +58,7 @@ class LearnConfig:
     components: int = 0
     members: int = 3
     shape: PolicyShape = PolicyShape()
+    reading: TuneConfig = READING
     tune: TuneConfig = TuneConfig()
     reinforce: ReinforceConfig = ReinforceConfig()
 
@@ -90,7 +107,7 @@ def learn(
       config: the policy.
       training: videos, all of known levels.
       background: what else is known.
-      seed: of members and folds; member m has 1000 · seed + m.
+      seed: of members and folds; member m has 1000 · seed + m, but what it reads with is the same for all seeds.
 
     Returns:
       The policy, and its loss and rewards by step, [members, steps].
@@ -99,12 +116,14 @@ def learn(
     everywhere = np.ones(len(training.names), bool)
     weight = object_weights(training.objects, everywhere)
     felt = _Felt(training, background, training, config)
+    families = len(config.evidence.families) if config.read_evidence else 0
     trained, losses, rewards = [], [], []
     for member in range(config.members):
         own = 1000 * seed + member
         x, percept = felt.inputs(own)
+        params = _reader(config.shape, config.reading, families, config.components, 1000 + member)
         lesson = _lesson(x, percept, training.label, weight)
-        params, loss = tune(policy, config.tune, lesson, own)
+        params, loss = tune(policy, config.tune, params, lesson, own)
         params, log = reinforce(policy, config.reinforce, params, lesson, own)
         trained.append(params)
         losses.append(loss)
@@ -116,13 +135,24 @@ def learn(
     }
 
 
+@functools.cache
+def _reader(shape: PolicyShape, reading: TuneConfig, families: int, components: int, seed: int) -> Params:
+    """A policy that can read the evidence of so many families and has met no object; made once for all folds."""
+    policy = assemble_policy(shape)
+    params = policy.init(jax.random.key(seed), families * COMBINATIONS.shape[1] * LEVELS + components)
+    if not families:
+        return params
+    return tune(policy, reading, params, reading_lesson(families, components, READINGS, seed), seed)[0]
+
+
 def say(learned: Learned, videos: Described) -> Said:
     """Ask a trained policy about videos, known or not; their levels and objects are not looked at."""
     policy = assemble_policy(learned.config.shape)
     x, _ = _Felt(learned.memory, learned.background, videos, learned.config).inputs(None)
-    members = np.broadcast_to(x, (learned.config.members, *x.shape))
-    percept, log_prob = jax.device_get(policy.posterior(learned.params, jnp.asarray(members, jnp.float32)))
-    return Said(percept=COMBINATIONS[percept], log_prob=log_prob)
+    padded = jnp.asarray(_padded(x), jnp.float32)
+    members = jnp.broadcast_to(padded, (learned.config.members, *padded.shape))
+    percept, log_prob = jax.device_get(policy.posterior(learned.params, members))
+    return Said(percept=COMBINATIONS[percept[: len(x)]], log_prob=log_prob[: len(x)])
 
 
 def evidence_alone(
@@ -167,30 +197,14 @@ class _Felt:
         return cross_probe(self._x, t.label, self._weight, t.objects, self._family, self._config.evidence, seed)
 
     def inputs(self, seed: int | None) -> tuple[Float[np.ndarray, "n D"], Int[np.ndarray, "n A"]]:
-        """What the encoder reads, with mean 0 and deviation 1 in training, and what the evidence says.
+        """What the encoder reads, and what the evidence says.
 
-        With a seed, of the training videos by out-of-fold evidence, else of the others.  The constants of the
-        standardisation are those of the evidence of seed 0 in any case, so that all members share them.
+        With a seed, of the training videos by out-of-fold evidence, else of the others.
         """
-        reference = self.crossed(0)
         said = self.evidence if seed is None else self.crossed(seed)
-        summary = _components(self._x, self._other, self._config.components, self._config.evidence.clip)
-        parts = [
-            np.concatenate([_read(self._config, evidence), scores], 1)
-            for evidence, scores in zip((reference, said), summary, strict=True)
-        ]
-        both = np.concatenate(parts)
-        fitted = np.arange(len(both)) < len(reference)
-        z = standardise(both, fitted, self._config.evidence.clip)[len(reference) :]
-        return z, said.mean(1).argmax(-1)
-
-
-def _read(config: LearnConfig, evidence: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n E"]:
-    """Log-probabilities as inputs, less their mean over the levels."""
-    if not config.read_evidence:
-        return np.zeros((len(evidence), 0))
-    log = np.log(np.maximum(evidence, 1e-3))
-    return (log - log.mean(-1, keepdims=True)).reshape(len(evidence), -1)
+        fitted, others = _components(self._x, self._other, self._config.components, self._config.evidence.clip)
+        read = evidence_inputs(said) if self._config.read_evidence else np.zeros((len(said), 0))
+        return np.concatenate([read, others if seed is None else fitted], 1), said.mean(1).argmax(-1)
 
 
 def _components(training: np.ndarray, videos: np.ndarray, count: int, clip: float) -> tuple[np.ndarray, np.ndarray]:
@@ -199,15 +213,24 @@ def _components(training: np.ndarray, videos: np.ndarray, count: int, clip: floa
     fitted = np.arange(len(both)) < len(training)
     z = standardise(both, fitted, clip)
     _, _, axes = np.linalg.svd(z[fitted] - z[fitted].mean(0), full_matrices=False)
-    scores = z @ axes[:count].T
+    scores = standardise(z @ axes[:count].T, fitted, clip)
     return scores[fitted], scores[~fitted]
 
 
 def _lesson(x: np.ndarray, percept: np.ndarray, label: np.ndarray, weight: np.ndarray) -> Lesson:
-    as_levels = lambda y: jnp.asarray(y, jnp.int32)
+    """Padded by videos of weight 0, so that folds of different sizes share one compiled program."""
+    pad = lambda y, kind: jnp.asarray(_padded(np.asarray(y)), kind)
     return Lesson(
-        x=jnp.asarray(x, jnp.float32), percept=as_levels(percept), label=as_levels(label), weight=jnp.asarray(weight)
+        x=pad(x, jnp.float32),
+        percept=pad(percept, jnp.int32),
+        label=pad(label, jnp.int32),
+        weight=pad(weight, jnp.float32),
     )
+
+
+def _padded(x: np.ndarray) -> np.ndarray:
+    """x with rows of zeros behind it, up to a multiple of `ROWS`."""
+    return np.pad(x, [(0, -len(x) % ROWS), *[(0, 0)] * (x.ndim - 1)])
 
 
 def save(path: Path, learned: Learned) -> None:

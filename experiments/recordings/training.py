@@ -26,13 +26,23 @@ from touchr1_jax.types import Params, Target
 class TuneConfig:
     """Supervised fine-tuning; the learning rate is the paper's 1e-5 times `lr_scale`."""
 
-    steps: int = 300
+    steps: int = 40
     batch_size: int = 32
     drop: float = 0.3
     """Probability with which an input of the encoder is left out, the others growing to the same sum."""
-    noise: float = 0.2
+    noise: float = 0.5
     """Standard deviation of what is added to each input; the inputs have 1."""
-    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0, weight_decay=0.05)
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=30.0, weight_decay=0.05)
+
+
+READING = TuneConfig(
+    steps=600,
+    batch_size=64,
+    drop=0.0,
+    noise=0.0,
+    optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=400.0, weight_decay=0.01),
+)
+"""How a policy learns to read evidence."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,15 +71,52 @@ class Lesson:
     weight: Float[Array, "n"]
 
 
-def tune(policy: TouchPolicy, config: TuneConfig, lesson: Lesson, seed: int) -> tuple[Params, Float[np.ndarray, "T"]]:
-    """A policy trained from scratch on verified answers, and its loss at every step."""
-    params, losses = _tune_program(policy, config)(jax.random.key(seed), lesson)
+def tune(
+    policy: TouchPolicy, config: TuneConfig, params: Params, lesson: Lesson, seed: int
+) -> tuple[Params, Float[np.ndarray, "T"]]:
+    """A policy trained on verified answers, and its loss at every step; 0 steps leave it as it is."""
+    if not config.steps:
+        return params, np.zeros(0, np.float32)
+    params, losses = _tune_program(policy, config)(jax.random.key(seed), params, lesson)
     return params, np.asarray(losses)
+
+
+def reading_lesson(families: int, others: int, rows: int, seed: int) -> Lesson:
+    """Made-up evidence, and the answers that say it: the most likely levels perceived, the conclusion drawn from it.
+
+    With p ~ Dirichlet(1, 1, 1) of each family and attribute, p̄ their mean, and the input log p less its mean,
+    percept = argmax p̄ and conclusion ~ p̄³ / Σ p̄³: ridge regression shrinks its probabilities, and a policy that
+    repeats them would, by its own small errors, turn what is nearly a tie.  What this teaches costs no label.
+
+    Args:
+      families: M, probes whose evidence is read.
+      others: inputs beside it, which say nothing here.
+      rows: examples.
+      seed: of the draws.
+    """
+    rng, attributes = np.random.default_rng(seed), len(LANGUAGE.attributes)
+    p = rng.dirichlet(np.ones(LEVELS), (rows, families, attributes))
+    mean = p.mean(1)
+    sure = mean**3 / (mean**3).sum(-1, keepdims=True)
+    drawn = (rng.random((rows, attributes, 1)) > sure.cumsum(-1)).sum(-1)
+    x = np.concatenate([evidence_inputs(p), rng.standard_normal((rows, others))], 1)
+    return Lesson(
+        x=jnp.asarray(x, jnp.float32),
+        percept=jnp.asarray(mean.argmax(-1), jnp.int32),
+        label=jnp.asarray(np.minimum(drawn, LEVELS - 1), jnp.int32),
+        weight=jnp.ones(rows, jnp.float32),
+    )
+
+
+def evidence_inputs(p: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n E"]:
+    """Probabilities as inputs: their logarithms less the mean over the levels."""
+    log = np.log(np.maximum(p, 1e-3))
+    return (log - log.mean(-1, keepdims=True)).reshape(len(p), -1)
 
 
 @functools.cache
 def _tune_program(policy: TouchPolicy, config: TuneConfig) -> Any:
-    """Compiled (key, lesson) → (params, losses)."""
+    """Compiled (key, params, lesson) → (params, losses)."""
     optimizer = make_optimizer(config.optimizer, config.steps)
     answers = jnp.asarray(policy.answers)
     counted = jnp.asarray(policy.answer(COMBINATIONS[0], COMBINATIONS[0])[1])
@@ -78,9 +125,7 @@ def _tune_program(policy: TouchPolicy, config: TuneConfig) -> Any:
         each = jax.vmap(lambda row, said: policy.log_probs(params, row, said[None])[0])(x, tokens)
         return -masked.mean(each, counted[None])
 
-    def run(key: Array, lesson: Lesson) -> tuple[Params, Array]:
-        start, course = jax.random.split(key)
-        params = policy.init(start, lesson.x.shape[-1])
+    def run(key: Array, params: Params, lesson: Lesson) -> tuple[Params, Array]:
         share = lesson.weight / jnp.sum(lesson.weight)
         said = answers[number(lesson.percept), number(lesson.label)]
 
@@ -93,9 +138,7 @@ def _tune_program(policy: TouchPolicy, config: TuneConfig) -> Any:
             updates, opt_state = optimizer.update(grads, opt_state, params)
             return (optax.apply_updates(params, updates), opt_state), value
 
-        (params, _), losses = jax.lax.scan(
-            step, (params, optimizer.init(params)), jax.random.split(course, config.steps)
-        )
+        (params, _), losses = jax.lax.scan(step, (params, optimizer.init(params)), jax.random.split(key, config.steps))
         return params, losses
 
     return jax.jit(run)
@@ -125,7 +168,8 @@ def reinforce(
     noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
     fixed = Fixed(reference=decoder, noise=policy.features(params, noise).touch)
     state = start_state(decoder, optimizer, jax.random.key(seed), config.grpo)
-    share = np.asarray(lesson.weight, np.float64) / np.sum(lesson.weight, dtype=np.float64)
+    weight = np.asarray(lesson.weight, np.float64)
+    share = weight / weight.sum()
     log = []
     for _ in range(config.steps):
         rows = rng.choice(len(share), config.grpo.drawn, p=share)

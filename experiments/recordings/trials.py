@@ -9,7 +9,7 @@ from experiments.recordings.descriptors import families
 from experiments.recordings.learning import Background, LearnConfig, learn, say
 from experiments.recordings.limits import cross_answers
 from experiments.recordings.scenes import Scenes
-from experiments.recordings.training import ReinforceConfig
+from experiments.recordings.training import ReinforceConfig, TuneConfig
 from experiments.recordings.validation import Row
 from experiments.running.context import Context
 
@@ -66,15 +66,22 @@ def ablate_probes(config: LearnConfig, videos: Described, background: Background
 def policies(config: LearnConfig) -> dict[str, LearnConfig]:
     """Name → policy with something left out or added."""
     single = dataclasses.replace(config, members=1)
-    still = dataclasses.replace(config.tune, drop=0.0, noise=0.0)
+    untaught = untuned(config.reading)
+    from_scratch = dataclasses.replace(
+        config.tune, steps=100, optimizer=dataclasses.replace(config.tune.optimizer, lr_scale=300.0)
+    )
     return {
-        "policy": config,
         "one member": single,
+        "one member, not tuned on labels": dataclasses.replace(single, tune=untuned(config.tune)),
+        "one member, on labels from scratch": dataclasses.replace(single, reading=untaught, tune=from_scratch),
         "one member, components beside the evidence": dataclasses.replace(single, components=12),
-        "one member, components alone": dataclasses.replace(single, components=24, read_evidence=False),
-        "one member, undisturbed inputs": dataclasses.replace(single, tune=still),
         "one member, then GRPO": dataclasses.replace(single, reinforce=ReinforceConfig(steps=40)),
     }
+
+
+def untuned(config: TuneConfig) -> TuneConfig:
+    """The same without a step."""
+    return dataclasses.replace(config, steps=0)
 
 
 def probes(config: LearnConfig, background: Background) -> dict[str, tuple[LearnConfig, Background]]:

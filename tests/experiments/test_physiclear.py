@@ -29,7 +29,7 @@ def test_every_video_is_answered_by_a_policy_that_never_met_its_object(run):
     assert results["data"]["videos"] == 12
     assert [t["title"] for t in results["tables"]][:2] == ["Unseen objects", "Every fold"]
     assert [row[0] for row in results["tables"][0]["rows"]][:2] == ["policy", "probes alone"]
-    assert {r["name"] for r in results["requirements"]} == {"all right", "mean", "OMAE", "training, all folds"}
+    assert {r["name"] for r in results["requirements"]} == {"all right", "mean", "OMAE", "data and training, all folds"}
     assert (directory / "plots" / "confusions.svg").stat().st_size > 1000
 
 

@@ -73,7 +73,7 @@ def test_the_repeated_way_does_the_same_number_of_rollouts():
 def test_options_change_the_cost_and_not_the_step(jobs):
     """Rewards in the graph and on the host, one micro-batch or several, weights of an exact sampler, rematerialised."""
     plain = jobs["this"][1]
-    for name in ("one micro-batch", "remat", "importance weights", "host reward"):
+    for name in ("one micro-batch", "remat", "lean compilation", "importance weights", "host reward"):
         assert jobs[name][1]["reward"] == pytest.approx(float(plain["reward"]), rel=1e-6), name
         assert jobs[name][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=1e-4), name
     assert jobs["bfloat16"][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=0.2)

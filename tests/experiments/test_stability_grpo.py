@@ -11,11 +11,8 @@ from experiments.grpo.failures import PAPER, SCENARIOS, STABLE, Course
 from experiments.running.artifacts import read_json
 from experiments.stability_grpo import Outcome, Side
 from tests.experiments.shrunk import run_shrunk
-from tests.touchr1_jax.quick import compile_quickly
 from tests.touchr1_jax.rl.test_alarms import HEALTHY
 from touchr1_jax.rl.alarms import WINDOW
-
-__all__ = ["compile_quickly"]
 
 TINY = dataclasses.replace(stability_grpo.SMOKE, codes=("F3",), margins=(0.13,))
 
@@ -65,7 +62,7 @@ def exam(**figures: float) -> dict[str, np.ndarray]:
 def course(late: dict[str, float] | None = None, **figures: float) -> Course:
     metrics = {
         "degenerate_share": 0.3,
-        "tactile_credit_share": 0.3,
+        "tactile_credit_share": 0.05,
         "bonus_cancelled_share": 0.0,
         "bonus_telling_share": 0.3,
     }
@@ -81,12 +78,12 @@ FAILED = {
     "F3 grounding without bound": course(grounding=2.0, accuracy=0.5),
     "F4 noise is detected, touch is not read": course(grounding=0.5, accuracy_swap=0.8),
     "F5 the tactile bonus cancels": course({"bonus_cancelled_share": 0.2}),
-    "F6 tactile credit by chance": course(accuracy_swap=0.8),
+    "F6 tactile credit by chance": course({"tactile_credit_share": 0.3}),
     "F7 groups that teach nothing": course({"degenerate_share": 0.9}, accuracy=0.55),
-    "F8 the KL estimate does not hold the policy": course(kl=1.5),
+    "F8 the KL estimate does not hold": course(kl=1.5),
     "F9 entropy blows up": course(entropy=0.9, accuracy=0.5),
     "F9 long steps end in one answer": course(accuracy=0.5),
-    "F10 a stream that never reaches the policy": course(grounding_1=0.0),
+    "F10 a stream that never arrives": course(grounding_1=0.0),
     "F12 time ids stand still": course(shuffled=0.0),
     "F13 the parser is gamed": course(gamed_share=0.9),
 }

@@ -15,6 +15,9 @@ WINDOW = 20
 RARE = 0.02
 """Shares of groups below this are three in a window of 160: too few to judge by."""
 
+WORSE = 0.1
+"""A change of accuracy beyond the chance of a single step: 64 answers have a standard error of .06."""
+
 Metrics = Mapping[str, float]
 
 
@@ -108,14 +111,14 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
-    """F8: the largest penalty of a single token, β times its KL to the reference, in units of the advantage."""
-    del start
-    return now["kl_cost_peak"]
+    """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
+    return now["kl_cost_peak"] if now["accuracy"] < start["accuracy"] - WORSE else None
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
-    """F9: entropy over that of the beginning, while answers are still wrong."""
-    return now["entropy"] / max(start["entropy"], 1e-6) if now["accuracy"] < 0.95 else None
+    """F9: entropy over that of the beginning, while answers are no better than then and not all right."""
+    stuck = now["accuracy"] < min(start["accuracy"] + WORSE, 0.95)
+    return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
 
 
 def entropy_growth(now: Metrics, start: Metrics) -> float | None:

@@ -217,6 +217,8 @@ class GRPOConfig:
     """Keep only matrix products for the backward pass and compute the rest again: less memory, more time."""
     max_logits: int = MAX_LOGITS
     """Logits of a prompt that may exist at once; more tokens than that are scored in blocks (see `models.chunked`)."""
+    lean_compilation: bool = False
+    """Compile by XLA's older code generator on CPUs: half of the memory, in half as long again, for slower steps."""
     bfloat16: bool = False
     """Compute forward passes in bfloat16; parameters, softmax, losses and optimizer stay in float32."""
 

@@ -60,6 +60,9 @@ class Fixed(NamedTuple):
     noise: Float[Array, "K S N D"]
 
 
+LEAN = {"xla_cpu_use_fusion_emitters": False}
+"""The newer generator holds all kernels in MLIR until the last is compiled, .5 GB even for a tiny step."""
+
 NO_MOVE = 1e-2
 """Advantages that a bonus moves by less, a hundredth of a standard deviation, are those without it."""
 
@@ -114,7 +117,7 @@ def make_grpo_step(
     if config.bfloat16:
         agent = dataclasses.replace(agent, cache_dtype=jnp.dtype(jnp.bfloat16))
     engine = _Engine(agent, score, optimizer, config, constraint)
-    return jax.jit(engine.step, donate_argnums=0)
+    return jax.jit(engine.step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
 @dataclasses.dataclass(frozen=True)

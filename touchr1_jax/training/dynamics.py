@@ -13,7 +13,6 @@ of the step that it predicts, and other sensors take part in the prediction.
 """
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -102,19 +101,26 @@ def steps_of(batch: TouchBatch, frames_per_step: int) -> Steps:
     return Steps(index=split(batch.frame_index)[..., 0], force_n=split(force_n)[:, :, :, -1], exists=exists)
 
 
-BLOCK = 2
-"""Contacts that are encoded at once: the activations of the stem then stay in a core's cache on their way to the next
-layer; eight contacts of 32 frames have 25 MB of them, and the encoder waits for memory."""
-
-
 def encode_batch(config: TactileViTConfig, params: Params, batch: TouchBatch) -> Float[Array, "P S T N D"]:
-    """Latents f(x_≤t) of all streams of a batch, block by block: the pooled tokens of each step."""
+    """Latents f(x_≤t) of all streams of a batch: the pooled tokens of each step."""
+    latent: Any = TactileViT(config).apply({"params": params}, *_streams(batch))
+    return latent
+
+
+def encode_each(config: TactileViTConfig, params: Params, batch: TouchBatch) -> Float[Array, "P S T N D"]:
+    """The same, contact by contact, for whoever needs no gradient: twice to three times faster on a CPU.
+
+    The activations of the stem then stay in a core's cache on their way to the next layer; eight contacts of 32 frames
+    have 25 MB of them, and the encoder waits for memory.  A gradient must keep them anyway and gains nothing.
+    """
+    latent: Any = jax.lax.map(lambda x: TactileViT(config).apply({"params": params}, *x), _streams(batch))
+    return latent
+
+
+def _streams(batch: TouchBatch) -> tuple[Array, Array, Array, Array, Array]:
+    """Arguments of the encoder, leading [P, S]."""
     sensors = jnp.broadcast_to(jnp.arange(batch.frames.shape[1]), batch.frames.shape[:2])
-    streams = (batch.frames, batch.force_n, batch.frame_index, batch.frame_mask, sensors)
-    size = math.gcd(BLOCK, len(batch.frames))
-    blocks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), streams)
-    latent: Any = jax.lax.map(lambda block: TactileViT(config).apply({"params": params}, *block), blocks)
-    return latent.reshape(-1, *latent.shape[2:])
+    return batch.frames, batch.force_n, batch.frame_index, batch.frame_mask, sensors
 
 
 def predict_next(
@@ -144,8 +150,7 @@ def dynamics_loss(
     batch = read_frames(config, batch)
     steps = steps_of(batch, config.encoder.frames_per_step)
     latent = encode_batch(config.encoder, params["encoder"], batch)
-    leaked = jax.tree.map(lambda t, p: t + guards.leak * (p - jax.lax.stop_gradient(p)), target, params["encoder"])
-    goal = layer_norm(encode_batch(config.encoder, leaked, batch))
+    goal = layer_norm(_goal(config.encoder, target, params["encoder"], batch, guards.leak))
     error, copied = prediction_errors(predict_next(config, params["predictor"], latent, steps, shown), goal, steps)
     spread, mixed = spread_of(latent, steps.exists), covariance_of(latent, steps.exists)
     variance = jnp.maximum(0.0, 1.0 - spread).mean()
@@ -158,6 +163,16 @@ def dynamics_loss(
         "spread": spread.mean(),
     }
     return error + guards.variance * variance + guards.covariance * mixed, metrics
+
+
+def _goal(
+    config: TactileViTConfig, target: Params, params: Params, batch: TouchBatch, leak: Float[Array, ""] | float
+) -> Float[Array, "P S T N D"]:
+    """Latents of the target; where gradients leak into it, as if a share of its parameters were the encoder's."""
+    if isinstance(leak, float) and leak == 0.0:  # known when the step is compiled: no backward pass is made for it
+        return encode_each(config, target, batch)
+    leaked = jax.tree.map(lambda t, p: t + leak * (p - jax.lax.stop_gradient(p)), target, params)
+    return encode_batch(config, leaked, batch)
 
 
 FLAT = 0.1

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 import jax
 
 from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.compilation import return_memory
 
 
 class Batches(Protocol):
@@ -56,6 +57,8 @@ def fit(
     pending: tuple[int, dict[str, jax.Array]] | None = None
     for t in range(start, config.steps):
         state, metrics = step(state, next(batches))
+        if t == start:
+            return_memory()  # the step is compiled by now
         if pending is not None:
             log(pending[0], fetch(pending[1]))
         pending = (t, metrics)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.policies.baselines import baselines, constant_answers, joint_mode
+from experiments.policies.scores import score, score_study
 from experiments.policies.stages import Evaluated, Probed
 from experiments.policies.study import SFT, Study, load_answers, save_answers
 from sensors_io.schema import ATTRIBUTES
@@ -138,3 +139,17 @@ def test_force_that_gives_hardness_away_is_found_out(study):
 def test_data_without_forces_has_no_force_baseline(study):
     silent = dataclasses.replace(study, data=dataclasses.replace(study.data, has_force=False))
     assert "force_only" not in baselines(silent)
+
+
+def test_a_right_answer_earns_the_whole_published_reward(study):
+    assert score(study, constant_answers(study, TEST))["reward"].mean() == pytest.approx(1)
+
+
+def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
+    scored = score_study(study)
+    assert list(scored.arms) == list(scored.rows)[:1] == [SFT]
+    assert list(scored.baselines) == ["constant", "constant_joint", "constant_middle", "force_only"]
+    assert list(scored.estimates) == [*scored.arms, *scored.baselines]
+    assert len(scored.objects) == 19
+    for name, said in baselines(study).items():
+        assert scored.baselines[name]["acc"].mean == pytest.approx(table(study, said)["acc"])

@@ -40,7 +40,7 @@ def test_scores_by_hand():
 def test_constants_are_the_training_modes():
     fold = np.where(np.isin(OBJECTS, ["o0", "o3"]), 0, 1)
     answers = constants(LABEL, OBJECTS, fold)
-    assert set(map(tuple, answers["constant, each attribute's mode"][fold == 0])) == {(1, 2, 1)}
+    assert set(map(tuple, answers["constant, each attribute's mode"][fold == 0])) == {(1, 0, 1)}
     assert all((rows[:, 2] == 1).all() for rows in answers.values())
 
 

@@ -43,7 +43,7 @@ FAILURES = [
     ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
     ("F7", {"degenerate_share": 0.9}, 0.8),
-    ("F8", {"kl_cost_peak": 3.0}, 3.0),
+    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5}, 3.0),
     ("F9", {"entropy": 0.01}, 0.02),
     ("F9", {"entropy": 2.5}, 2.0),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
@@ -79,6 +79,11 @@ def test_groups_that_are_all_right_are_no_waste():
 
 def test_a_low_entropy_of_right_answers_is_no_collapse():
     assert fired({"entropy": 0.01, "accuracy": 0.99}) == {}
+    assert fired({"entropy": 0.01, "accuracy": 0.85}) == {}
+
+
+def test_a_costly_token_is_no_failure_as_long_as_answers_hold():
+    assert fired({"kl_cost_peak": 3.0}) == {}
 
 
 def test_a_run_without_controls_has_no_alarm_of_them():

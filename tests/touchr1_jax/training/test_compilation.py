@@ -1,12 +1,15 @@
 """Compiled programs are written below the folder, found again, and only inside the block."""
 
+import resource
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from touchr1_jax.training import compilation
-from touchr1_jax.training.compilation import compilations_kept, processor
+from touchr1_jax.training.compilation import compilations_kept, processor, return_memory
 
 
 @pytest.fixture
@@ -19,6 +22,10 @@ def keeping(monkeypatch):
     yield
     jax.config.update("jax_compilation_cache_dir", session)
     compilation_cache.reset_cache()
+
+
+def resident_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
 
 def entries(folder):
@@ -47,6 +54,17 @@ def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
     compiled(0.7)
     assert jax.config.values["jax_compilation_cache_dir"] is None
     assert not entries(tmp_path)
+
+
+def test_freed_memory_goes_back_to_the_system():
+    """A hundred thousand small pieces that stand before one that stays."""
+    pieces = [bytearray(2000) for _ in range(100_000)]
+    last = bytearray(2000)
+    full = resident_mb()
+    del pieces
+    return_memory()
+    assert resident_mb() < full - 100
+    assert len(last) == 2000
 
 
 def test_a_cache_of_the_users_own_stays(keeping, tmp_path):
