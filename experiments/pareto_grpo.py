@@ -8,7 +8,7 @@ score is the mean reward over the last tenth of the steps; the target is reached
 passes it.  Time is the median step of that program, measured in rounds with all other programs, times the steps taken,
 so that neither compilation nor a busy machine counts.
 
-Cost: about eight minutes on one core, most of it compiling for the first time; `--scale smoke` under one.
+Cost: about ten minutes on one core, most of it compiling for the first time; `--scale smoke` under one.
 
 Expected: on policy all clipped surrogates have the same gradient, so that presets differ by how they average and weigh:
 Dr. GRPO and the token means coincide with GRPO up to scale where all completions have one length; dynamic sampling pays
@@ -56,7 +56,7 @@ class ParetoConfig:
     prefix: int = 64
     target: float = 0.9
     """Mean reward of a step that a run should pass; chance is .5."""
-    steps: int = 80
+    steps: int = 60
     timed: int = 5
     """Rounds in which the step of every program is timed."""
     learning_rate: float = 1e-3

@@ -208,7 +208,7 @@ def pictures(
             caption=f"One iteration of {size.prompts} prompts × {size.group} rollouts × {size.length} new tokens; each "
             "engine in a process of its own that starts with nothing compiled.  The dotted line and the crosses are "
             "what this engine must keep.",
-            content=over_prefixes(seconds, memory, LIMITS_S, MEMORY_LIMIT_GB),
+            content=over_prefixes(seconds, memory, {p: s for p, s in LIMITS_S.items() if p in alone}, MEMORY_LIMIT_GB),
         ),
         Picture(
             name="steps",
@@ -227,7 +227,7 @@ def said(ratios: Mapping[str, float]) -> str:
 
 def verdict(alone: Mapping[int, Alone], twice: Mapping[int, Mapping[str, float]], peers: Peers) -> tuple[str, ...]:
     """What an iteration takes, what once-encoded prefixes gain, and how the others fare."""
-    times = ", ".join(f"{median(a.seconds):.2f} s at {prefix}" for prefix, a in alone.items())
+    times = ", ".join(f"{median(a.seconds):.3g} s at {prefix}" for prefix, a in alone.items())
     gains = ", ".join(f"{ratios['repeated prefix']:.1f} × at {prefix}" for prefix, ratios in twice.items())
     spoken = [f"One iteration takes {times}.", f"Repeating the prefix for every rollout takes {gains} as long."]
     for name in dict.fromkeys(name for name, _ in peers):

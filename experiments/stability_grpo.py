@@ -9,7 +9,7 @@ seed fails by a number of that failure alone, written down before the runs (`exp
 stands the `stable` preset at the same knob, and the alarms of both as they would have been raised during training.
 Presets, bounds and knobs were chosen on seeds 100 to 104; seeds 0 to 9 are reported.
 
-Cost: about 20 minutes on one core; `--scale smoke` under one.
+Cost: about 25 minutes on one core; `--scale smoke` about one, most of it compilation.
 
 Expected: every failure can be provoked, `stable` fails in none of the places, and alarms fire before anybody looks.
 """

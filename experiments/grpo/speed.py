@@ -173,6 +173,7 @@ def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int) ->
     job = Job(size, prefix, dataclasses.replace(config_of(size), buckets=buckets), end_share=SHORT, learning_rate=0.0)
     for _ in range(3):
         jax.block_until_ready(job.step())
+    return_memory()
     seconds, resident, lengths = np.empty(steps), [], []
     for t in range(steps):
         began = time.perf_counter()

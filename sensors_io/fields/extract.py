@@ -11,6 +11,7 @@ from sensors_io.fields.contact import ContactConfig, Contacts, changed_contacts,
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.depth import DepthReader, ZeroConfig
 from sensors_io.fields.evidence import Pattern, examine
+from sensors_io.fields.inversion import InverseConfig
 from sensors_io.fields.shear import ShearReader
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.quality import QualityConfig, saturated, time_gap
@@ -26,6 +27,7 @@ class ExtractConfig:
       nodes: of the vector fields along the longer side of the picture.
       gel: modulus, Poisson ratio and thickness; the modulus scales the forces.
       marker_depth_mm: of the pattern below the surface.
+      inverse: how loads are told; `gradient_free` off suits a gel whose thickness and Poisson ratio are known well.
       shear: `modelled` gives what the traction makes by the gel's compliance; `subtracted` the deformation less what
         the pressure makes, which supposes less of the traction and keeps the noise.
       zero, contact, quality: of depth, contact mask and saturation.
@@ -34,6 +36,7 @@ class ExtractConfig:
     nodes: int = 24
     gel: Layer = dataclasses.field(default_factory=lambda: Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5))
     marker_depth_mm: float = 0.5
+    inverse: InverseConfig = dataclasses.field(default_factory=InverseConfig)
     shear: Literal["modelled", "subtracted"] = "modelled"
     zero: ZeroConfig = dataclasses.field(default_factory=ZeroConfig)
     contact: ContactConfig = dataclasses.field(default_factory=ContactConfig)
@@ -180,7 +183,7 @@ class Extractor:
                 marker_depth_mm=self.config.marker_depth_mm,
                 depth_mm=0.0,
             )
-            self._shear = ShearReader(self.config.gel, grid)
+            self._shear = ShearReader(self.config.gel, grid, self.config.inverse)
 
     def _split(
         self, moved: np.ndarray, depth: np.ndarray, contacts: Contacts, valid: np.ndarray
