@@ -213,7 +213,6 @@ def assert_first_step(run, end: GRPOState, metrics: dict[str, jax.Array]) -> Non
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow  # compiles four hundred operations one by one
 def test_step_outside_jit_is_the_compiled_one(run):
     """The Python function itself; its loops are compiled one by one."""
     plain = make_grpo_step(AGENT, score, OPTIMIZER, CONFIG).__wrapped__
