@@ -56,6 +56,7 @@ from experiments.grpo.speed_tables import (
 from experiments.reporting.findings import Findings, Picture
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
+from touchr1_jax.rl.grpo import compiles_leanly
 
 MANY_WORDS = "Two prompts of eight rollouts at the shortest prefix."
 
@@ -113,7 +114,9 @@ def run(config: SpeedConfig, context: Context) -> Findings:
     with tempfile.TemporaryDirectory() as folder:
         first, alone = every_prefix(config, Path(folder), context)
         step = dataclasses.replace(config_of(config.size, config.micro_prompts), lean_compilation=True)
-        lean = in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))
+        lean = {}
+        if compiles_leanly():
+            lean = {"lean": in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))}
         words = many_words(config, Path(folder), context)
     jobs = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
     found = side_by_side(jobs, config.rounds)
@@ -137,7 +140,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
             memory_table(
                 f"Compiling at prefix {lean_at}",
                 "The older code generator needs less memory and makes slower programs.",
-                {"as it is": first[lean_at], "lean": lean},
+                {"as it is": first[lean_at], **lean},
             ),
             *((memory_table(f"A vocabulary of {config.words:,} words", MANY_WORDS, words),) if words else ()),
         ),

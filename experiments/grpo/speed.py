@@ -17,6 +17,7 @@ from experiments.grpo.job import Job, config_of
 from experiments.grpo.size import Size
 from experiments.running.timing import interleaved
 from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import compiles_leanly
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import prompt_words
@@ -133,7 +134,9 @@ def options(
         "short answers": short(plain),
         "short answers, buckets": short(dataclasses.replace(plain, buckets=buckets)),
     }
-    return {"this": Job(size, prefix, plain)} | {name: makers[name]() for name in names}
+    if not compiles_leanly():
+        del makers["lean compilation"]
+    return {"this": Job(size, prefix, plain)} | {name: makers[name]() for name in names if name in makers}
 
 
 def repeated(size: Size, prefix: int, micro_prompts: int) -> dict[str, Job]:

@@ -63,6 +63,9 @@ class Fixed(NamedTuple):
 LEAN = {"xla_cpu_use_fusion_emitters": False}
 """The newer generator holds all kernels in MLIR until the last is compiled, .5 GB even for a tiny step."""
 
+LEAN_BEFORE = (0, 11)
+"""Version of jax from which on there is the newer generator alone."""
+
 NO_MOVE = 1e-2
 """Advantages that a bonus moves by less, a hundredth of a standard deviation, are those without it."""
 
@@ -93,6 +96,11 @@ def start_state(params: Params, optimizer: optax.GradientTransformation, key: Ar
     return GRPOState(params=own, opt_state=optimizer.init(own), step=step, key=key, reference=reference)
 
 
+def compiles_leanly() -> bool:
+    """Whether this jax still has the code generator that `lean_compilation` asks for."""
+    return jax.__version_info__ < LEAN_BEFORE
+
+
 def make_grpo_step(
     agent: Agent,
     score: ScoreFn,
@@ -110,8 +118,13 @@ def make_grpo_step(
       constraint: what completions may say; `None` leaves them free.
 
     Raises:
-      ValueError: an algorithm that samples constrained, without a constraint.
+      ValueError: an algorithm that samples constrained, without a constraint; lean compilation where jax has none.
     """
+    if config.lean_compilation and not compiles_leanly():
+        raise ValueError(
+            f"lean_compilation is True, but jax {jax.__version__} has one code generator only; leave it False, or "
+            f"install jax < {'.'.join(map(str, LEAN_BEFORE))}"
+        )
     if config.algorithm.constrained and constraint is None:
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.bfloat16:
