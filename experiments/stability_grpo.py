@@ -11,8 +11,8 @@ Presets, bounds and knobs were chosen on seeds 100 to 104; seeds 0 to 9 are repo
 
 Cost: about 25 minutes on one core; `--scale smoke` about one, most of it compilation.
 
-Expected: every failure can be provoked, and alarms fire before anybody looks.  `stable` should fail in none of the places;
-where noise of touch is 1.5 (F1) one seed of ten has been seen to.
+Expected: every failure can be provoked, and alarms fire before anybody looks.  `stable` should fail in none of the
+places; where the noise of touch is 1.5 (F1) one seed of ten has been seen to.
 """
 
 import dataclasses
