@@ -4,7 +4,8 @@ Dimensions as in the schema: N frames of a sequence, F of a clip, S sensors, P c
 """
 
 import dataclasses
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import absl.flags
@@ -43,6 +44,39 @@ class ClipConfig:
                 raise SchemaError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
         if not self.sensors or len(set(self.sensors)) != len(self.sensors):
             raise SchemaError(f"sensors is {self.sensors}: at least one, each once; correct the list")
+
+
+class ClipMemory:
+    """Clips that were made once and stay in memory; those that do not fit are made again each time.
+
+    Args:
+      config: shape of the clips.
+      most_bytes: bytes of arrays that may stay.
+    """
+
+    def __init__(self, config: ClipConfig, most_bytes: int) -> None:
+        self.config = config
+        self._most, self._held = most_bytes, 0
+        self._clips: dict[int, dict[str, np.ndarray]] = {}
+        self._lock = threading.Lock()
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the clips that stay."""
+        return self._held
+
+    def get(self, i: int, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """The arrays of contact i, from memory or made now; they must not be written to."""
+        kept = self._clips.get(i)
+        if kept is not None:
+            return kept
+        arrays = make()
+        size = sum(array.nbytes for array in arrays.values())
+        with self._lock:
+            if i not in self._clips and self._held + size <= self._most:
+                self._clips[i] = arrays
+                self._held += size
+        return arrays
 
 
 class Contacts(Protocol):
@@ -122,6 +156,7 @@ def clip_batches(
     drop_remainder: bool = False,
     felt: bool = True,
     augment: AugmentConfig | None = None,
+    memory: ClipMemory | None = None,
     workers: int = 0,
     threads: int = 1,
 ) -> grain.IterDataset:
@@ -140,12 +175,18 @@ def clip_batches(
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
       felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
       augment: random changes of what is felt, for training; a function of `seed` and of the clip's place in the order.
+      memory: where clips stay that are felt and not changed at random; None for nowhere.
       workers: reading processes; 0 reads in threads of this one.  States carry over between equal numbers of workers.
       threads: reading threads of each process.
 
     Raises:
-      SchemaError: no contact, or one that the store does not hold.
+      SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`.
     """
+    if memory is not None and (memory.config != config or workers):
+        raise SchemaError(
+            f"memory keeps {memory.config} of one process: the clips are {config}, read by {workers} worker processes; "
+            "make it for these clips and leave workers at 0"
+        )
     rows = [int(i) for i in indices]
     if not rows:
         raise SchemaError("indices is empty: a pipeline needs at least one contact; choose a split that has some")
@@ -160,7 +201,12 @@ def clip_batches(
     # more than it can count to.  Without a remainder it divides whole numbers, and an endless data set never has one
     whole = drop_remainder or repeat
     reader = _Reader(store, config, felt, augment or AugmentConfig())
-    clips = dataset.random_map(reader.change) if felt and reader.augment.active else dataset.map(reader)
+    if felt and reader.augment.active:
+        clips = dataset.random_map(reader.change)
+    elif felt and memory is not None:
+        clips = dataset.map(lambda i: memory.get(i, lambda: reader(i)))
+    else:
+        clips = dataset.map(reader)
     batches = clips.batch(batch_size, drop_remainder=whole)
     # a batch or two ahead: grain's default of 500 would hold gigabytes of frames
     iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=1 + threads))

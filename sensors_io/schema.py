@@ -228,17 +228,19 @@ def check_arrays(specs: Mapping[str, Spec], arrays: Mapping[str, np.ndarray | No
     sizes: dict[str, tuple[int, str]] = {}
     for name, spec in specs.items():
         array = arrays[name]
-        field = f"{where}: {name}"
         if array is None:
-            _require(spec.optional, field, None, "is required", "record it")
+            _require(spec.optional, f"{where}: {name}", None, "is required", "record it")
             continue
-        shape = f"{np.dtype(spec.dtype)}[{', '.join(spec.dims)}]"
-        got = f"{array.dtype}{list(array.shape)}"
-        ok = array.dtype == spec.dtype and array.ndim == len(spec.dims)
-        _require(ok, field, got, f"must be {shape}", "convert it")
+        # the texts are written where they are wanted alone: the names of dtypes took a quarter of the reading
+        refuse = lambda must, fix, name=name, a=array: _require(
+            False, f"{where}: {name}", f"{a.dtype}{list(a.shape)}", must, fix
+        )
+        if array.dtype != spec.dtype or array.ndim != len(spec.dims):
+            refuse(f"must be {np.dtype(spec.dtype)}[{', '.join(spec.dims)}]", "convert it")
         for dim, size in zip(spec.dims, array.shape, strict=True):
             want, source = (int(dim), "the schema") if dim.isdigit() else sizes.setdefault(dim, (size, name))
-            _require(size == want, field, got, f"dimension {dim} must be {want} as in {source}", "align the arrays")
+            if size != want:
+                refuse(f"dimension {dim} must be {want} as in {source}", "align the arrays")
 
 
 def _require(ok: bool, field: str, value: object, constraint: str, fix: str) -> None:

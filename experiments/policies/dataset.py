@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.pipeline import ClipConfig
+from sensors_io.pipeline import ClipConfig, ClipMemory
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, LEVELS
 
@@ -18,10 +18,12 @@ class Dataset:
     """Contacts on disk and what the stages need to know of them.
 
     `parts` maps each of `PARTS` to contact indices; no object is in two of them.  `label` is int32 [contact, A].
+    Every seed reads the same clips, so `memory` keeps them.
     """
 
     store: RecordStore
     clip: ClipConfig
+    memory: ClipMemory
     parts: dict[str, np.ndarray]
     label: np.ndarray
     object_ids: np.ndarray
@@ -77,14 +79,15 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     return parts
 
 
-def open_dataset(path: Path, clip: ClipConfig, grpo_share: float) -> Dataset:
-    """Open records and split them."""
+def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: float = 0.0) -> Dataset:
+    """Open records and split them; `memory_gib` of their clips stay in memory once they were read."""
     store = RecordStore(path)
     clip = dataclasses.replace(clip, sensors=store.meta.sensors)
     cards = [store.objects[key.object_id] for key in store.contacts]
     return Dataset(
         store=store,
         clip=clip,
+        memory=ClipMemory(clip, round(memory_gib * 2**30)),
         parts=split_parts(store, grpo_share),
         label=np.stack([card.label_row() for card in cards]),
         object_ids=np.array([card.object_id for card in cards]),

@@ -106,6 +106,7 @@ class AnswerFeed(Feed):
             seed=seed,
             felt=not blind,
             augment=augment,
+            memory=data.memory,
         )
         super().__init__(clips, seed)
         self._assembly, self._evidence, self._blind = assembly, evidence, blind

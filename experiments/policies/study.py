@@ -57,12 +57,15 @@ class StudyConfig:
     physiclear: PhysiclearConfig = PhysiclearConfig()
     grpo_share: float = 0.35
     """Share of the training objects that SFT never sees."""
+    clip_memory_gib: float = 1.5
+    """Clips that stay in memory once they were read; all of the default's."""
     model: ModelConfig = ModelConfig()
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
     probe: ProbeConfig = ProbeConfig()
     sft: SFTConfig = SFTConfig()
-    blind: SFTConfig = SFTConfig()
+    blind: SFTConfig = SFTConfig(micro_contacts=16)
+    """Without touch there is no encoder, and micro-batches would only cost."""
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
@@ -81,7 +84,7 @@ SMOKE = StudyConfig(
     seeds=2,
     scenes=SceneConfig(objects=60, sites=1),
     sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8),
+    blind=SFTConfig(steps=12, batch_size=8, micro_contacts=8),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
     grpo_steps=4,
 )
@@ -162,7 +165,7 @@ def open_study_data(config: StudyConfig, context: Context) -> Dataset:
         view_px=config.model.vision.image_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
     )
-    return open_dataset(path, clip, config.grpo_share)
+    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib)
 
 
 @dataclasses.dataclass(frozen=True)

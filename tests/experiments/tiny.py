@@ -54,8 +54,8 @@ STUDY = StudyConfig(
     scenes=SCENES,
     model=MODEL,
     probe=ProbeConfig(folds=2, iterations=4),
-    sft=dataclasses.replace(SFTConfig(), steps=3, batch_size=4),
-    blind=dataclasses.replace(SFTConfig(), steps=2, batch_size=4),
+    sft=SFTConfig(steps=3, batch_size=4),
+    blind=SFTConfig(steps=2, batch_size=4),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,
 )

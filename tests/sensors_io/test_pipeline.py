@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sensors_io.augment import AugmentConfig
-from sensors_io.pipeline import ClipConfig, clip_batches, make_clip
+from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches, make_clip
 from sensors_io.records import RecordStore
 from sensors_io.schema import CLIP_ARRAYS, SENSORS, UNKNOWN, Flag, SchemaError
 from tests.sensors_io import fakes
@@ -38,6 +38,43 @@ def test_an_unfelt_batch_differs_in_its_streams_alone(store):
         np.testing.assert_array_equal(felt[name], unfelt[name])
     assert unfelt["frames"].shape == (7, 4, 4, 1, 1, 3)
     assert not any(unfelt[name].any() for name in ("frames", "force_n", "frame_index", "frame_mask", "stream_mask"))
+
+
+class TestClipMemory:
+    """Batches from memory are those that are read; what does not fit is read again."""
+
+    def feed(self, store, memory, **changes):
+        options = {"batch_size": 3, "seed": 3, "repeat": False} | changes
+        return list(clip_batches(store, range(7), SMALL, **options, memory=memory))
+
+    @pytest.mark.parametrize("kept", [0, 2, 7])
+    def test_batches_are_those_without_it(self, store, kept):
+        one = sum(a.nbytes for a in self.feed(store, None, batch_size=1)[0].values())
+        memory = ClipMemory(SMALL, kept * one)
+        for _ in range(2):
+            for a, b in zip(self.feed(store, memory), self.feed(store, None), strict=True):
+                same(a, b)
+        assert memory.held_bytes == kept * one
+
+    def test_what_is_kept_is_made_once(self):
+        made, memory = [], ClipMemory(SMALL, 10)
+        make = lambda i: lambda: made.append(i) or {"x": np.zeros(4 + i, np.uint8)}
+        for i in (0, 9, 1, 0, 9, 1):
+            assert memory.get(i, make(i))["x"].shape == (4 + i,)
+        assert made == [0, 9, 1, 9]
+
+    def test_random_changes_are_not_kept(self, store):
+        memory = ClipMemory(SMALL, 10**9)
+        self.feed(store, memory, augment=LIVELY)
+        self.feed(store, memory, felt=False)
+        assert memory.held_bytes == 0
+
+    def test_it_belongs_to_its_clips_and_its_process(self, store):
+        other = ClipMemory(ClipConfig(frames=2, image_px=8, view_px=6), 10**9)
+        with pytest.raises(SchemaError, match=r"memory keeps .*frames=2"):
+            self.feed(store, other)
+        with pytest.raises(SchemaError, match="1 worker processes"):
+            self.feed(store, ClipMemory(SMALL, 10**9), workers=1)
 
 
 class TestMakeClip:

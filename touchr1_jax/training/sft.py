@@ -1,11 +1,12 @@
 """Stage 2, supervised fine-tuning: imitate verified answers, the loss on the answer's tokens alone.
 
-Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  Logits of a large vocabulary
-exist for some tokens at a time only.
+Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  The gradient is summed over
+micro-batches of contacts, and logits of a large vocabulary exist for some tokens at a time only.
 """
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,16 +43,27 @@ class SFTState:
 
 
 def make_sft_step(
-    agent: Agent, optimizer: optax.GradientTransformation, *, blind: bool = False, max_logits: int = MAX_LOGITS
+    agent: Agent,
+    optimizer: optax.GradientTransformation,
+    *,
+    blind: bool = False,
+    max_logits: int = MAX_LOGITS,
+    micro_contacts: int | None = None,
 ) -> Callable[[SFTState, SFTBatch], tuple[SFTState, dict[str, Array]]]:
-    """Build the jitted step, (state, batch) → (state, metrics); a blind policy is trained without touch.
+    """Build the jitted step, (state, batch) → (state, metrics).
 
-    `max_logits` may exist at once (see `models.chunked`).
+    Args:
+      agent: policy, prompts, vocabulary.
+      optimizer: applied to the gradient of `sft_loss`.
+      blind: train without touch.
+      max_logits: so many may exist at once (see `models.chunked`).
+      micro_contacts: contacts of a micro-batch, whose working set stays in cache; `None` takes all at once.
     """
 
     def step(state: SFTState, batch: SFTBatch) -> tuple[SFTState, dict[str, Array]]:
-        loss = lambda p: sft_loss(agent, p, batch, blind=blind, max_logits=max_logits)
-        (value, right), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+        (value, right), grads = sft_gradient(
+            agent, state.params, batch, blind=blind, max_logits=max_logits, micro_contacts=micro_contacts
+        )
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics = {"loss": value, "token_accuracy": right, "grad_norm": optax.tree.norm(grads)}
@@ -60,10 +72,54 @@ def make_sft_step(
     return jax.jit(step, donate_argnums=0)
 
 
+def sft_gradient(
+    agent: Agent,
+    params: Params,
+    batch: SFTBatch,
+    *,
+    blind: bool = False,
+    max_logits: int = MAX_LOGITS,
+    micro_contacts: int | None = None,
+) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], Params]:
+    """What `sft_loss` says of the batch, and the gradient of the loss, summed over micro-batches.
+
+    Raises:
+      ValueError: contacts that do not divide into micro-batches.
+    """
+    contacts = batch.tokens.shape[0]
+    micro = contacts if micro_contacts is None else micro_contacts
+    if micro < 1 or contacts % micro:
+        raise ValueError(
+            f"micro_contacts is {micro_contacts}: must divide the {contacts} contacts of a batch; change either"
+        )
+    most = jnp.maximum(jnp.sum(batch.token_mask), 1)
+
+    def share(params: Params, chunk: SFTBatch) -> tuple[Array, Array]:
+        cost, right = sft_sums(agent, params, chunk, blind=blind, max_logits=max_logits)
+        return cost / most, right / most
+
+    def body(total: Any, chunk: SFTBatch) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, jax.value_and_grad(share, has_aux=True)(params, chunk)), None
+
+    zero = jnp.zeros(())
+    start = (zero, zero), jax.tree.map(jnp.zeros_like, params)
+    chunks = jax.tree.map(lambda x: x.reshape(-1, micro, *x.shape[1:]), batch)
+    return jax.lax.scan(body, start, chunks)[0]
+
+
 def sft_loss(
     agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cross-entropy of the answer's tokens, −mean log π(o_t | q, touch, o_<t), and the share predicted right."""
+    most = jnp.maximum(jnp.sum(batch.token_mask), 1)
+    cost, right = sft_sums(agent, params, batch, blind=blind, max_logits=max_logits)
+    return cost / most, right / most
+
+
+def sft_sums(
+    agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """−Σ log π(o_t | q, touch, o_<t) over the answer's tokens, and how many of them are predicted right."""
     features = agent.encode(params, batch.touch, blind=blind)
 
     def answer(features, ids, mask, streams, tokens):
@@ -80,4 +136,4 @@ def sft_loss(
     rows = {"state": states.reshape(-1, states.shape[-1]), "token": batch.tokens.ravel()}
     found = by_blocks(score, rows, width=len(agent.banned), most=max_logits)
     log_prob, right = (found[name].reshape(batch.tokens.shape) for name in ("log_prob", "right"))
-    return -masked.mean(log_prob, batch.token_mask), masked.mean(right, batch.token_mask)
+    return -masked.total(log_prob, batch.token_mask), masked.total(right, batch.token_mask).astype(jnp.float32)

@@ -8,7 +8,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from touchr1_jax.text.template import answer_text, encode_answer
-from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step, sft_loss
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step, sft_gradient, sft_loss
 
 P, Q, T = 2, 2, 12
 AGENT = tiny.SHALLOW
@@ -81,6 +81,24 @@ def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
     scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(all_at_once[1]))
     for a, b in zip(*map(jax.tree.leaves, (few[1], all_at_once[1])), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+
+
+def test_micro_batches_sum_to_the_gradient_of_the_batch(params, batch):
+    """With unequal numbers of answer tokens: the mean is over the tokens of the batch, not of each micro-batch."""
+    uneven = batch.replace(token_mask=batch.token_mask.at[1, 1].set(False).at[0, 0, 5:].set(False))
+    whole, micro = (
+        jax.jit(lambda p, size=size: sft_gradient(AGENT, p, uneven, micro_contacts=size))(params) for size in (None, 1)
+    )
+    np.testing.assert_allclose(micro[0], whole[0], rtol=1e-6)
+    np.testing.assert_allclose(whole[0], loss(params, uneven), rtol=1e-6)
+    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[1]))
+    for a, b in zip(*map(jax.tree.leaves, (micro[1], whole[1])), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+
+
+def test_micro_batches_must_divide_the_batch(params, batch):
+    with pytest.raises(ValueError, match="micro_contacts is 3: must divide the 2 contacts"):
+        sft_gradient(AGENT, params, batch, micro_contacts=3)
 
 
 def test_only_answer_tokens_count(params, batch):
