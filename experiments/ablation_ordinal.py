@@ -136,7 +136,7 @@ def verdict(comparisons: Sequence[Comparison], rows: Mapping[str, Mapping[str, E
 
 def _outside(c: Comparison) -> str:
     low, high = c.ci95
-    beyond = "beyond doubt" if low > 0 or high < 0 else "which may be chance"
+    beyond = "0 lies outside" if low > 0 or high < 0 else "which may be chance"
     return f"[{low:.3g}, {high:.3g}] ({beyond})"
 
 
