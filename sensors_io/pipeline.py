@@ -182,16 +182,8 @@ def clip_batches(
     Raises:
       SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`.
     """
-    if memory is not None and (memory.config != config or workers):
-        raise SchemaError(
-            f"memory keeps {memory.config} of one process: the clips are {config}, read by {workers} worker processes; "
-            "make it for these clips and leave workers at 0"
-        )
-    rows = [int(i) for i in indices]
-    if not rows:
-        raise SchemaError("indices is empty: a pipeline needs at least one contact; choose a split that has some")
-    if min(rows) < 0 or max(rows) >= len(store):
-        raise SchemaError(f"indices reach {min(rows)}..{max(rows)}: must lie in 0..{len(store) - 1}; use this store's")
+    _check_memory(memory, config, workers)
+    rows = _checked_rows(indices, len(store))
     dataset = grain.MapDataset.source(rows).seed(seed)
     if shuffle:
         dataset = dataset.shuffle()
@@ -208,6 +200,11 @@ def clip_batches(
     else:
         clips = dataset.map(reader)
     batches = clips.batch(batch_size, drop_remainder=whole)
+    return _read_ahead(batches, workers, threads)
+
+
+def _read_ahead(batches: grain.MapDataset, workers: int, threads: int) -> grain.IterDataset:
+    """Batches read by threads of this process or by workers."""
     # a batch or two ahead: grain's default of 500 would hold gigabytes of frames
     iterable = batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=1 + threads))
     if not workers:
@@ -215,6 +212,23 @@ def clip_batches(
     if not absl.flags.FLAGS.is_parsed():
         absl.flags.FLAGS.mark_as_parsed()  # grain's workers read flags that only absl programs parse
     return iterable.mp_prefetch(grain.MultiprocessingOptions(num_workers=workers))
+
+
+def _checked_rows(indices: Any, contacts: int) -> list[int]:
+    rows = [int(i) for i in indices]
+    if not rows:
+        raise SchemaError("indices is empty: a pipeline needs at least one contact; choose a split that has some")
+    if min(rows) < 0 or max(rows) >= contacts:
+        raise SchemaError(f"indices reach {min(rows)}..{max(rows)}: must lie in 0..{contacts - 1}; use this store's")
+    return rows
+
+
+def _check_memory(memory: ClipMemory | None, config: ClipConfig, workers: int) -> None:
+    if memory is not None and (memory.config != config or workers):
+        raise SchemaError(
+            f"memory keeps {memory.config} of one process: the clips are {config}, read by {workers} worker processes; "
+            "make it for these clips and leave workers at 0"
+        )
 
 
 @dataclasses.dataclass(frozen=True)
