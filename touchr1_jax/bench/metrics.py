@@ -143,9 +143,9 @@ def accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
     Args:
       answer, label: int [N].
     """
-    _same_shape(answer=answer, label=label)
+    check_same_shape(answer=answer, label=label)
     scored = label != BOTTOM
-    return _scores(100.0 * (answer == label), scored)
+    return keep_scored(100.0 * (answer == label), scored)
 
 
 def balanced_accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
@@ -164,9 +164,20 @@ def mean_accuracy(answer: np.ndarray, label: np.ndarray) -> Scores:
     Args:
       answer, label: int [N, A].
     """
-    _same_shape(answer=answer, label=label)
+    check_same_shape(answer=answer, label=label)
     attribute = np.broadcast_to(np.arange(label.shape[1]), label.shape)
-    return _scores(100.0 * (answer == label), label != BOTTOM, attribute)
+    return keep_scored(100.0 * (answer == label), label != BOTTOM, attribute)
+
+
+def exact_match(answer: np.ndarray, label: np.ndarray) -> Scores:
+    """L2-EM, 100·mean 1[all asked attributes right]; on the same answers no more than the least of their accuracies.
+
+    Args:
+      answer, label: int [N, A]; a question counts where a label is scored.
+    """
+    check_same_shape(answer=answer, label=label)
+    scored = label != BOTTOM
+    return keep_scored(100.0 * ((answer == label) | ~scored).all(axis=1), scored.any(axis=1))
 
 
 def ordinal_mae(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Scores:
@@ -176,9 +187,9 @@ def ordinal_mae(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Sc
       answer, label: int [N, A].
       levels: int [A], the K of each attribute.
     """
-    _same_shape(answer=answer, label=label)
+    check_same_shape(answer=answer, label=label)
     distance = np.where(answer == BOTTOM, levels - 1, np.abs(answer - label))
-    return _scores(distance.astype(float), label != BOTTOM)
+    return keep_scored(distance.astype(float), label != BOTTOM)
 
 
 def cross_sensor_consistency(alone: np.ndarray, label: np.ndarray, streams: np.ndarray) -> Scores:
@@ -210,9 +221,9 @@ def parse_rate(formatted: np.ndarray, answer: np.ndarray, label: np.ndarray) -> 
       formatted: bool [N].
       answer, label: int [N, A].
     """
-    _same_shape(answer=answer, label=label)
+    check_same_shape(answer=answer, label=label)
     parsed = formatted & ((answer != BOTTOM) | (label == BOTTOM)).all(axis=1)
-    return _scores(100.0 * parsed, np.ones(len(parsed), bool))
+    return keep_scored(100.0 * parsed, np.ones(len(parsed), bool))
 
 
 def middle_rate(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Scores:
@@ -222,12 +233,12 @@ def middle_rate(answer: np.ndarray, label: np.ndarray, levels: np.ndarray) -> Sc
       answer, label: int [N, A].
       levels: int [A], odd: only then there is a middle level.
     """
-    _same_shape(answer=answer, label=label)
+    check_same_shape(answer=answer, label=label)
     if np.any(levels % 2 == 0):
         raise ValueError(
             f"levels is {levels.tolist()}: an even number of levels has no middle; leave such attributes out"
         )
-    return _scores(100.0 * (answer == (levels - 1) // 2), label != BOTTOM)
+    return keep_scored(100.0 * (answer == (levels - 1) // 2), label != BOTTOM)
 
 
 def evaluate(answers: Answers, attributes: tuple[str, ...], levels: tuple[int, ...]) -> dict[str, Scores]:
@@ -250,7 +261,7 @@ def evaluate(answers: Answers, attributes: tuple[str, ...], levels: tuple[int, .
         "omae": ordinal_mae(said, label, levels_a),
         "middle_rate": middle_rate(said, label, levels_a),
         "parse_rate": parse_rate(answers.formatted, answers.conclude, answers.label),
-        "reward": _scores(np.asarray(answers.reward, float), np.ones(len(answers.reward), bool)),
+        "reward": keep_scored(np.asarray(answers.reward, float), np.ones(len(answers.reward), bool)),
         "csc_slot": cross_sensor_agreement(answers.perceive, answers.label, answers.streams),
     }
     for i, attribute in enumerate(attributes):
@@ -274,16 +285,17 @@ def _over_pairs(good: np.ndarray, alone: np.ndarray, label: np.ndarray, streams:
     a, b = pairs[:, 0], pairs[:, 1]
     same = good[:, a] & good[:, b] & (alone[:, a] == alone[:, b])
     counts = (streams[:, a] & streams[:, b])[:, :, None] & (label != BOTTOM)[:, None, :]
-    return _scores(100.0 * same, counts)
+    return keep_scored(100.0 * same, counts)
 
 
-def _scores(values: np.ndarray, scored: np.ndarray, strata: np.ndarray | None = None) -> Scores:
+def keep_scored(values: np.ndarray, scored: np.ndarray, strata: np.ndarray | None = None) -> Scores:
     """Keep the scored entries of an array [N, ...] and remember the question each comes from."""
     strata = np.zeros(values.shape, int) if strata is None else strata
     return Scores(values=values[scored], items=np.nonzero(scored)[0], strata=strata[scored])
 
 
-def _same_shape(**arrays: np.ndarray) -> None:
+def check_same_shape(**arrays: np.ndarray) -> None:
+    """Raise a `ValueError` that names the shapes unless all arrays have the same."""
     shapes = {name: array.shape for name, array in arrays.items()}
     if len(set(shapes.values())) > 1:
         raise ValueError(f"shapes are {shapes}: they must be equal; align the arrays")

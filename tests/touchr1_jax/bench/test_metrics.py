@@ -30,6 +30,15 @@ def test_mean_accuracy_weighs_the_attributes_alike():
     assert metrics.mean_accuracy(answer, label).mean() == pytest.approx((200 / 3 + 0) / 2)
 
 
+def test_exact_match_by_hand():
+    label = np.array([[0, 1], [2, 0], [1, -1], [-1, -1]])
+    answer = np.array([[0, 1], [2, 1], [1, 2], [0, 0]])
+    scores = metrics.exact_match(answer, label)
+    assert scores.values.tolist() == [100.0, 0.0, 100.0]
+    assert scores.items.tolist() == [0, 1, 2]  # nothing was asked of the last
+    assert metrics.exact_match(np.full((1, 2), -1), np.array([[0, -1]])).mean() == 0.0
+
+
 def test_ordinal_mae_by_hand():
     label = np.array([[0, 1, 2], [2, 0, -1]])
     answer = np.array([[2, 1, 1], [-1, 0, 1]])  # distances 2, 0, 1, K−1 = 2, 0; the last is not scored
@@ -96,6 +105,13 @@ def test_omae_is_at_least_the_error_rate(case):
     omae = metrics.ordinal_mae(alone[:, 0], label, LEVELS).mean()
     acc = metrics.mean_accuracy(alone[:, 0], label).mean()
     assert omae >= 1 - acc / 100 - 1e-12
+
+
+@given(answered())
+def test_exact_match_is_at_most_the_least_accuracy(case):
+    alone, label = case
+    least = min(metrics.accuracy(alone[:, 0, a], label[:, a]).mean() for a in range(3))
+    assert metrics.exact_match(alone[:, 0], label).mean() <= least + 1e-9
 
 
 @given(answered())

@@ -100,6 +100,39 @@ def test_probability_of_improvement_by_hand():
         statistics.probability_of_improvement(np.ones((2, 1)), np.ones((2, 2)))
 
 
+def test_probability_of_improvement_is_mann_whitneys_statistic():
+    rng = np.random.default_rng(0)
+    better, than = rng.integers(0, 6, (7, 3)).astype(float), rng.integers(0, 5, (4, 3)).astype(float)
+    tasks = [stats.mannwhitneyu(better[:, t], than[:, t]).statistic / (7 * 4) for t in range(3)]
+    assert statistics.probability_of_improvement(better, than) == pytest.approx(np.mean(tasks))
+
+
+def test_interval_of_the_improvement_agrees_with_a_plain_loop():
+    rng = np.random.default_rng(1)
+    better, than = rng.normal(0.5, 1, (5, 2)), rng.normal(0, 1, (4, 2))
+    got = statistics.improvement_interval(better, than, resamples=2000)
+    drawn = [
+        statistics.probability_of_improvement(
+            *(np.stack([rng.choice(a[:, t], len(a)) for t in range(2)], 1) for a in (better, than))
+        )
+        for _ in range(2000)
+    ]
+    assert (got.low, got.high) == pytest.approx(np.quantile(drawn, (0.025, 0.975)), abs=0.03)
+    apart = statistics.improvement_interval(np.ones((3, 1)), np.zeros((3, 1)))
+    assert (apart.low, apart.mean, apart.high) == (1.0, 1.0, 1.0)
+
+
+def test_stratified_bootstrap_agrees_with_a_plain_loop():
+    rng = np.random.default_rng(2)
+    scores = rng.normal(size=(5, 3))
+    got = statistics.stratified_bootstrap_iqm(scores, resamples=3000)
+    drawn = [
+        stats.trim_mean(np.stack([rng.choice(scores[:, t], 5) for t in range(3)], 1), 0.25, axis=None)
+        for _ in range(3000)
+    ]
+    assert (got.low, got.high) == pytest.approx(np.quantile(drawn, (0.025, 0.975)), abs=0.06)
+
+
 def test_sign_flip_test_by_hand():
     assert statistics.sign_flip_test(np.ones(5)) == 2 / 32
     assert statistics.sign_flip_test(np.array([1.0, -1.0])) == 1.0
@@ -120,6 +153,31 @@ def test_sign_flip_p_value_is_symmetric_and_bounded(differences):
     p = statistics.sign_flip_test(d)
     assert min(1.0, 2.0 ** (1 - len(d))) <= p <= 1
     assert p == statistics.sign_flip_test(-d)
+
+
+def test_objects_flip_as_a_whole():
+    ones, objects = np.ones(10), np.repeat(np.arange(5), 2)
+    assert statistics.clustered_sign_flip_test(ones, objects) == 2 / 32  # five objects, not ten answers
+    assert statistics.clustered_sign_flip_test(ones, np.arange(10)) == 2 / 1024
+    assert statistics.clustered_sign_flip_test(np.array([1.0, -1.0, 2.0]), np.array(["a", "a", "b"])) == 1.0
+
+
+def test_flipped_objects_weigh_the_strata_alike():
+    # Stratum 0 holds one answer, stratum 1 four: shares of the mean are ½ and ⅛ each; objects sum to ½ + ⅛, ⅛, ¼.
+    values, strata = np.ones(5), np.array([0, 1, 1, 1, 1])
+    objects = np.array(["a", "a", "b", "c", "c"])
+    p = statistics.clustered_sign_flip_test(values, objects, strata=strata)
+    assert p == statistics.sign_flip_test(np.array([0.625, 0.125, 0.25]))
+    with pytest.raises(ValueError, match="lengths"):
+        statistics.clustered_sign_flip_test(values, objects[:3])
+
+
+def test_flipping_objects_keeps_its_level_where_answers_are_not_independent():
+    rng = np.random.default_rng(0)
+    objects = np.repeat(np.arange(9), 6)
+    effects = rng.normal(size=(300, 9))[:, objects]
+    p = [statistics.clustered_sign_flip_test(d, objects) for d in effects + 0.2 * rng.normal(size=(300, 54))]
+    assert 0.02 <= np.mean(np.array(p) <= 0.05) <= 0.09
 
 
 def test_holm_by_hand():

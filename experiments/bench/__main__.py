@@ -1,0 +1,59 @@
+"""`python -m experiments.bench`: make, annotate, audit and score the questions of the touch bench."""
+
+import sys
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from experiments.bench.card import CardError
+from experiments.bench.commands import Accept, Annotate, AnnotateSheets, Audit, AuditSheet, Generate, Propose, Score
+from experiments.bench.draw import QuotaError
+from experiments.bench.facts import FactsError
+from experiments.bench.sheets import SheetError
+from sensors_io.records import RecordsError
+from sensors_io.schema import SchemaError
+from touchr1_jax.bench.items import ItemError
+from touchr1_jax.bench.json_lines import LinesError
+
+Command = (
+    Annotated[Generate, tyro.conf.subcommand("generate")]
+    | Annotated[Propose, tyro.conf.subcommand("propose")]
+    | Annotated[Accept, tyro.conf.subcommand("accept")]
+    | Annotated[Score, tyro.conf.subcommand("score")]
+    | Annotated[AnnotateSheets, tyro.conf.subcommand("annotate-sheets")]
+    | Annotated[Annotate, tyro.conf.subcommand("annotate")]
+    | Annotated[AuditSheet, tyro.conf.subcommand("audit-sheet")]
+    | Annotated[Audit, tyro.conf.subcommand("audit")]
+)
+
+KNOWN_ERRORS = (
+    CardError,
+    QuotaError,
+    FactsError,
+    ItemError,
+    LinesError,
+    SheetError,
+    RecordsError,
+    SchemaError,
+    OSError,
+)
+"""Whose message says all that a user needs."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; known errors become one line on stderr and exit status 1.
+
+    Args:
+      arguments: the command line; None takes that of the process.
+    """
+    command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
+    try:
+        return command.run()
+    except KNOWN_ERRORS as error:
+        Console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, highlight=False, soft_wrap=True)
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

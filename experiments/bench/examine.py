@@ -1,0 +1,89 @@
+"""Anybody's answers to the bench, scored: texts in, metrics with intervals over objects out."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+from experiments.bench.languages import understand
+from touchr1_jax.bench.averages import AVERAGED, touch_average
+from touchr1_jax.bench.items import Item
+from touchr1_jax.bench.json_lines import LinesError
+from touchr1_jax.bench.metrics import Metric
+from touchr1_jax.bench.scoring import BENCH_METRICS, clusters, score
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+
+RESAMPLES = 2_000
+"""Of each interval: its ends are then good to a tenth of its width."""
+
+Understood = Mapping[str, tuple[int, ...]]
+"""Id of an item → the levels that were read in its answer, −1 for ⊥."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Row:
+    """One metric: what it means, its interval over objects, how many values it is the mean of."""
+
+    name: str
+    metric: Metric
+    interval: Interval
+    values: int
+
+
+def ask_all(items: Iterable[Item], answer: Callable[[Item], str]) -> dict[str, tuple[int, ...]]:
+    """Ask a model every question.
+
+    Args:
+      items: the bench.
+      answer: gives the model's text; it must look at nothing of the item but the question, touches and sensors.
+    """
+    return {item.ask.id: understand(item.ask, answer(item))[1] for item in items}
+
+
+def understood(rows: Iterable[tuple[int, Mapping[str, Any]]], items: Sequence[Item]) -> dict[str, tuple[int, ...]]:
+    """Answers from a file; a question without one is unparsable.
+
+    Args:
+      rows: line numbers and objects {"id", "text"}, as `read_lines` gives them.
+      items: the bench.
+
+    Raises:
+      LinesError: other fields, an unknown id, one that occurs twice, or a text that is none.
+    """
+    by_id, texts = {item.ask.id: item for item in items}, dict[str, str]()
+    for number, tree in rows:
+        if set(tree) != {"id", "text"} or not isinstance(tree["text"], str):
+            raise LinesError(f"line {number} is {dict(tree)!r}: must have id and text, a string; correct it")
+        if tree["id"] not in by_id or tree["id"] in texts:
+            fix = "answer each once" if tree["id"] in texts else "take the ids of the items"
+            raise LinesError(f"line {number}: id is {tree['id']!r}: must be that of an open question; {fix}")
+        texts[tree["id"]] = tree["text"]
+    return ask_all(items, lambda item: texts.get(item.ask.id, ""))
+
+
+def table(items: Sequence[Item], said: Understood, by_sight: Understood | None = None) -> list[Row]:
+    """Every metric that the items define; one about a single object has no interval and is left out.
+
+    Args:
+      items: the bench.
+      said: the answers to all of them.
+      by_sight: those given the picture alone, where they are known: they tell what is a conflict.
+    """
+    rows = []
+    for name, scores in score(items, said, by_sight).items():
+        objects = clusters(items, scores)
+        if len(set(objects)) > 1:
+            span = clustered_bootstrap(scores.values, objects, strata=scores.strata, resamples=RESAMPLES)
+            rows.append(Row(name=name, metric=BENCH_METRICS[name], interval=span, values=len(scores.values)))
+    return rows
+
+
+def parsed(said: Understood) -> float:
+    """Share of the answers all of whose parts were understood."""
+    return sum(-1 not in levels for levels in said.values()) / len(said)
+
+
+def average_line(items: Sequence[Item], said: Understood) -> str:
+    """The average in words, or what is missing for one."""
+    means = {name: scores.mean() for name, scores in score(items, said).items()}
+    missing = [name for name in AVERAGED if name not in means]
+    return f"no average without {', '.join(missing)}" if missing else f"average {touch_average(means):.1f}"

@@ -1,0 +1,70 @@
+"""Tables that people fill in, as CSV files: written blank, read back with every cell checked."""
+
+import csv
+import io
+import os
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+
+
+class SheetError(ValueError):
+    """A sheet that cannot be used; the message names the file, the line, the value, the constraint and the fix."""
+
+
+def write_sheet(path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
+    """Replace a sheet in one step; columns that a row lacks stay blank.
+
+    Raises:
+      SheetError: the file exists and somebody may have filled it in.
+    """
+    path = pathlib.Path(path)
+    if path.exists():
+        raise SheetError(f"{path} exists and may be filled in; move it away, or choose another place")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text.getvalue(), encoding="utf-8")
+    temporary.replace(path)
+
+
+def read_sheet(
+    path: str | os.PathLike[str], key: str, cells: Mapping[str, Sequence[str]], wanted: Iterable[str]
+) -> dict[str, dict[str, str]]:
+    """A filled-in sheet: key → column → word.
+
+    Args:
+      path: the file.
+      key: the column that names the row.
+      cells: column → the words that it may hold.
+      wanted: the keys that must be there, each once.
+
+    Raises:
+      SheetError: another key, one missing or twice, a column missing, or a word that is none of the allowed ones.
+    """
+    path, names = pathlib.Path(path), set(wanted)
+    rows: dict[str, dict[str, str]] = {}
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.DictReader(file)
+        missing = [column for column in (key, *cells) if column not in (reader.fieldnames or ())]
+        if missing:
+            raise SheetError(f"{path} lacks the columns {missing}: must have {key}, {', '.join(cells)}; add them")
+        for row in reader:
+            where, name = f"{path}, line {reader.line_num}", row[key]
+            if name not in names or name in rows:
+                why = "occurs twice" if name in rows else "is not asked for"
+                raise SheetError(f"{where}: {key} {name!r} {why}; each row of the blank sheet belongs there once")
+            rows[name] = {column: _word(where, column, row[column], words) for column, words in cells.items()}
+    absent = sorted(names - set(rows))
+    if absent:
+        raise SheetError(f"{path} lacks {len(absent)} rows, the first {absent[0]!r}; fill in all of the blank sheet")
+    return rows
+
+
+def _word(where: str, column: str, cell: str | None, words: Sequence[str]) -> str:
+    said = (cell or "").strip().lower()
+    if said not in words:
+        raise SheetError(f"{where}: {column} is {cell!r}: must be one of {', '.join(words)}; fill it in")
+    return said

@@ -1,0 +1,132 @@
+"""Metrics of whether touch is used: what is lost without it, and who is believed when sight and touch differ.
+
+The controls of touch: `drop` takes the streams away, `shuffle` permutes their frames, `noise` puts noise of the
+sensor's statistics in their place, `swapped` another object's touch.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from touchr1_jax.bench.metrics import BOTTOM, Scores, accuracy, check_same_shape
+from touchr1_jax.bench.statistics import Interval
+
+CONTROLS = ("drop", "shuffle", "noise", "swapped")
+"""What may stand in for the touch."""
+
+SHUFFLE = "shuffle"
+"""The control that says something only where the answer lies in the order of the frames."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LeastGain:
+    """The control against which touch gains least, the gain in points, and its interval over objects."""
+
+    control: str
+    gain: Interval
+
+
+def tactile_use_gain(real: Scores, control: Scores) -> Scores:
+    """TUG_c, score(T) − score(T_c), as paired differences whose mean is the gain.
+
+    Args:
+      real: scores of the answers given the touch, higher is better.
+      control: those of the same answers given control c.
+
+    Raises:
+      ValueError: the two were not scored on the same answers.
+    """
+    same = np.array_equal(real.items, control.items) and np.array_equal(real.strata, control.strata)
+    if not same:
+        raise ValueError(
+            f"real and control hold {len(real.items)} and {len(control.items)} values: they must be of the same "
+            "answers; score both on the same questions"
+        )
+    return dataclasses.replace(real, values=real.values - control.values)
+
+
+def least_tactile_use(
+    real: Scores,
+    controls: Mapping[str, Scores],
+    ordered: np.ndarray,
+    objects: np.ndarray,
+    *,
+    resamples: int = 10_000,
+    seed: int = 0,
+    level: float = 0.95,
+) -> LeastGain:
+    """The headline, min_c TUG_c over drop, noise and swapped, and shuffle on order-dependent questions only.
+
+    A shuffled press still shows its peak, so `shuffle` counts only where `ordered` says so, and not at all where no
+    question does.  The interval takes the minimum anew in each resample of the objects; it is pessimistic where
+    several controls gain alike, and says of the policy what it claims: no control does better.
+
+    Args:
+      real: as for `tactile_use_gain`.
+      controls: one of `CONTROLS` → its scores.
+      ordered: bool [N], whether the answer lies in the order of the frames.
+      objects: [N], the object of each question.
+
+    Raises:
+      ValueError: a control that is unknown or missing, or fewer than two objects.
+    """
+    if set(controls) != set(CONTROLS):
+        raise ValueError(f"controls are {sorted(controls)}: must be {', '.join(CONTROLS)}; run each of them once")
+    gains = {name: tactile_use_gain(real, controls[name]) for name in CONTROLS}
+    gains[SHUFFLE] = _only(gains[SHUFFLE], ordered)
+    if not len(gains[SHUFFLE].values):
+        del gains[SHUFFLE]
+    names, cluster = np.unique(objects, return_inverse=True)
+    if len(names) < 2:
+        raise ValueError(f"objects holds {len(names)}: an interval over objects needs two; ask about more objects")
+    uniform = np.full(len(names), 1 / len(names))
+    weights = np.random.default_rng(seed).multinomial(len(names), uniform, size=resamples)
+    drawn = np.stack([_drawn_means(gain, cluster[gain.items], weights) for gain in gains.values()])
+    low, high = np.nanquantile(np.fmin.reduce(drawn), ((1 - level) / 2, (1 + level) / 2))
+    least = min(gains, key=lambda name: gains[name].mean())
+    return LeastGain(control=least, gain=Interval(mean=gains[least].mean(), low=float(low), high=float(high)))
+
+
+def conflict_accuracy(answer: np.ndarray, label: np.ndarray, prior: np.ndarray) -> Scores:
+    """Conflict-Acc, 100·mean 1[ŷ = y] over the questions whose visual prior names another level than the label.
+
+    Args:
+      answer, label: int [N].
+      prior: int [N], what the picture alone suggests; ⊥ where it suggests nothing, which is no conflict.
+    """
+    check_same_shape(answer=answer, label=label, prior=prior)
+    conflict = (prior != BOTTOM) & (prior != label)
+    return accuracy(answer, np.where(conflict, label, BOTTOM))
+
+
+def revision_rate(answer: np.ndarray, label: np.ndarray, prior: np.ndarray) -> Scores:
+    """100·mean over the same questions of 1[ŷ ≠ prior]: how often touch changes what sight suggests, right or not.
+
+    Conflict-Acc is at most this rate, since the right answer is a revised one.  ⊥ revises nothing.
+
+    Args:
+      answer, label, prior: int [N], as for `conflict_accuracy`.
+    """
+    scored = conflict_accuracy(answer, label, prior)
+    revised = (answer != prior) & (answer != BOTTOM)
+    return dataclasses.replace(scored, values=100.0 * revised[scored.items])
+
+
+def _only(scores: Scores, questions: np.ndarray) -> Scores:
+    """The values that belong to some of the questions."""
+    keep = questions[scores.items]
+    return Scores(values=scores.values[keep], items=scores.items[keep], strata=scores.strata[keep])
+
+
+def _drawn_means(scores: Scores, cluster: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The metric in every resample of the objects, NaN where a resample has none of its values, [resamples]."""
+    means = []
+    for s in np.unique(scores.strata):
+        at = scores.strata == s
+        sums = np.bincount(cluster[at], weights=scores.values[at], minlength=weights.shape[1])
+        seen = weights @ np.bincount(cluster[at], minlength=weights.shape[1])
+        means.append(np.where(seen > 0, weights @ sums / np.maximum(seen, 1), np.nan))
+    table = np.stack(means)
+    known = np.isfinite(table).sum(axis=0)
+    return np.where(known > 0, np.nansum(table, axis=0) / np.maximum(known, 1), np.nan)

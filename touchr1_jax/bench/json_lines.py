@@ -1,0 +1,43 @@
+"""Files of JSON Lines that are whole or not there."""
+
+import json
+import os
+import pathlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+class LinesError(ValueError):
+    """A file that is no JSON Lines; the message names the line."""
+
+
+def write_lines(path: str | os.PathLike[str], trees: Iterable[Mapping[str, Any]]) -> None:
+    """Replace a file of JSON Lines in one step."""
+    path = pathlib.Path(path)
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w", encoding="utf-8") as file:
+        for tree in trees:
+            file.write(json.dumps(tree, ensure_ascii=False, allow_nan=False) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, Any]]:
+    """Line numbers, from 1, and objects of a file of JSON Lines; blank lines are skipped.
+
+    Raises:
+      LinesError: a line that is no JSON object.
+    """
+    rows = []
+    for number, line in enumerate(pathlib.Path(path).read_text(encoding="utf-8").split("\n"), 1):
+        if not line.strip():
+            continue
+        try:
+            tree = json.loads(line)
+        except json.JSONDecodeError as error:
+            raise LinesError(f"{path}, line {number}: {error}; every line must be one JSON object") from error
+        if not isinstance(tree, dict):
+            raise LinesError(f"{path}, line {number} is {tree!r}: must be a JSON object; write one per line")
+        rows.append((number, tree))
+    return rows

@@ -1,0 +1,200 @@
+"""From answers to the items of the touch bench to its metrics."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from touchr1_jax.bench import metrics
+from touchr1_jax.bench.comparison import order_correlation, swap_consistency, which_has_more
+from touchr1_jax.bench.grounding import conflict_accuracy, revision_rate
+from touchr1_jax.bench.items import Item
+from touchr1_jax.bench.metrics import BOTTOM, METRICS, ORDINAL, PREFIX, Metric, Scores
+
+LEVELS = 3
+"""K of every ordinal attribute."""
+
+
+def _share(title: str, meaning: str, *, beside: bool = False) -> Metric:
+    return Metric(title=title, unit="%", better="higher", format=".1f", meaning=meaning, beside=beside)
+
+
+BENCH_METRICS: Mapping[str, Metric] = {
+    **{f"{p}_acc": METRICS[f"{p}_acc"] for p in PREFIX.values()},
+    **{f"{p}_bacc": METRICS[f"{p}_bacc"] for p in PREFIX.values()},
+    "omae": METRICS["omae"],
+    "l2_em": _share("L2-EM", "questions for several properties all of which are right"),
+    "sfd": _share("SFD", "pairs of which the one that has more is named; chance 50"),
+    "sfd_swap": _share("SFD-swap", "pairs of which the same one is named in both orders, right or not", beside=True),
+    "soi_rho": Metric(
+        title="SOI-ρ",
+        unit="",
+        better="higher",
+        format=".3f",
+        meaning="Spearman's ρ of three objects in order; unparsable counts 0",
+    ),
+    "csc": METRICS["csc"],
+    "csc_agree": METRICS["csc_agree"],
+    "deceptive_acc": _share("Deceptive", "questions about objects that look like others which are right"),
+    "conflict_acc": _share("Conflict", "of those, the ones that sight alone gets wrong which are right"),
+    "revision_rate": Metric(
+        title="Revised",
+        unit="%",
+        better="none",
+        format=".1f",
+        meaning="of the latter, those whose answer differs from that by sight alone, right or not",
+        beside=True,
+    ),
+}
+"""Every metric of the bench, in the order of its table."""
+
+Answers = Mapping[str, Sequence[int]]
+"""Id of an item → the levels that were read in its answer, −1 for ⊥."""
+
+
+def score(items: Sequence[Item], answers: Answers, by_sight: Answers | None = None) -> dict[str, Scores]:
+    """The metrics that the items define, keyed as `BENCH_METRICS`; one without an item is left out.
+
+    Accuracies are of the kind "identify"; OMAE of all answers about one touch by all its sensors but those of
+    "conflict"; CSC of "one_sensor".  `Scores.items` counts the items given, `clusters` tells their objects.
+
+    Args:
+      items: the bench.
+      answers: to all of them.
+      by_sight: to those of "conflict", given the picture alone; they say what the visual prior is.
+
+    Raises:
+      ValueError: an item without an answer, or with too few or too many levels.
+    """
+    _check(items, answers)
+    if by_sight is not None:
+        _check([item for item in items if item.ask.kind == "conflict"], by_sight)
+    kinds = {kind: [i for i, item in enumerate(items) if item.ask.kind == kind] for kind in _SCORED}
+    table = {name: part for kind, rows in kinds.items() if rows for name, part in _SCORED[kind](items, rows, answers)}
+    single = [*kinds["identify"], *kinds["scale"], *kinds["compose"]]
+    distance = _distance(items, single, answers)
+    if len(distance.values):
+        table["omae"] = distance
+    if by_sight is not None and kinds["conflict"]:
+        table |= _against_sight(items, kinds["conflict"], answers, by_sight)
+    return {name: table[name] for name in BENCH_METRICS if name in table and len(table[name].values)}
+
+
+def clusters(items: Sequence[Item], scores: Scores) -> np.ndarray:
+    """The object of each value, for intervals that resample objects, [M]."""
+    return np.array([items[i].ask.cluster for i in scores.items])
+
+
+_Parts = list[tuple[str, Scores]]
+
+
+def _identify(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    parts: _Parts = []
+    for attribute, prefix in PREFIX.items():
+        of = [i for i in rows if items[i].ask.attributes == (attribute,)]
+        if of:
+            said, label = _first(items, of, answers)
+            parts.append((f"{prefix}_acc", _at(of, metrics.accuracy(said, label))))
+            parts.append((f"{prefix}_bacc", _at(of, metrics.balanced_accuracy(said, label))))
+    return parts
+
+
+def _compose(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    width = max(len(items[i].ask.attributes) for i in rows)
+    said, label = np.full((2, len(rows), width), BOTTOM)
+    for n, i in enumerate(rows):
+        count = len(items[i].ask.answer)
+        said[n, :count], label[n, :count] = answers[items[i].ask.id], items[i].ask.answer
+    return [("l2_em", _at(rows, metrics.exact_match(said, label)))]
+
+
+def _compare(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    said, label = _first(items, rows, answers)
+    pair = np.array([items[i].ask.group for i in rows])
+    swapped = np.array([items[i].ask.position == 1 for i in rows])
+    return [
+        ("sfd", _at(rows, which_has_more(said, label))),
+        ("sfd_swap", _at(rows, swap_consistency(said, pair, swapped))),
+    ]
+
+
+def _order(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    return [("soi_rho", _at(rows, order_correlation(*_first(items, rows, answers))))]
+
+
+def _one_sensor(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    groups: dict[str, list[int]] = {}
+    for i in rows:
+        groups.setdefault(items[i].ask.group, []).append(i)
+    width = max(map(len, groups.values()))
+    alone = np.full((len(groups), width, 1), BOTTOM)
+    streams = np.zeros((len(groups), width), bool)
+    for g, members in enumerate(groups.values()):
+        alone[g, : len(members), 0] = [answers[items[i].ask.id][0] for i in members]
+        streams[g, : len(members)] = True
+    firsts = [members[0] for members in groups.values()]
+    label = np.array([items[i].ask.answer for i in firsts])
+    return [
+        ("csc", _at(firsts, metrics.cross_sensor_consistency(alone, label, streams))),
+        ("csc_agree", _at(firsts, metrics.cross_sensor_agreement(alone, label, streams))),
+    ]
+
+
+def _conflict(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+    return [("deceptive_acc", _at(rows, metrics.accuracy(*_first(items, rows, answers))))]
+
+
+def _against_sight(items: Sequence[Item], rows: list[int], answers: Answers, by_sight: Answers) -> dict[str, Scores]:
+    said, label = _first(items, rows, answers)
+    prior, _ = _first(items, rows, by_sight)
+    return {
+        "conflict_acc": _at(rows, conflict_accuracy(said, label, prior)),
+        "revision_rate": _at(rows, revision_rate(said, label, prior)),
+    }
+
+
+_SCORED: Mapping[str, Callable[[Sequence[Item], list[int], Answers], _Parts]] = {
+    "identify": _identify,
+    "scale": lambda items, rows, answers: [],  # its answers count in OMAE
+    "compose": _compose,
+    "compare": _compare,
+    "order": _order,
+    "one_sensor": _one_sensor,
+    "conflict": _conflict,
+}
+
+
+def _distance(items: Sequence[Item], rows: list[int], answers: Answers) -> Scores:
+    triples = [
+        (i, said, label)
+        for i in rows
+        for name, said, label in zip(
+            items[i].ask.attributes, answers[items[i].ask.id], items[i].ask.answer, strict=True
+        )
+        if name in ORDINAL
+    ]
+    at, said, label = (
+        (np.array(column, int) for column in zip(*triples, strict=True)) if triples else [np.zeros(0, int)] * 3
+    )
+    return _at(at.tolist(), metrics.ordinal_mae(said[:, None], label[:, None], np.array([LEVELS])))
+
+
+def _first(items: Sequence[Item], rows: list[int], answers: Answers) -> tuple[np.ndarray, np.ndarray]:
+    """What was said and what is right, of items with one answer, int [rows] each."""
+    said = np.array([answers[items[i].ask.id][0] for i in rows])
+    return said, np.array([items[i].ask.answer[0] for i in rows])
+
+
+def _at(rows: Sequence[int], scores: Scores) -> Scores:
+    """The same scores, counted among all items."""
+    return Scores(values=scores.values, items=np.asarray(rows, int)[scores.items], strata=scores.strata)
+
+
+def _check(items: Sequence[Item], answers: Answers) -> None:
+    for item in items:
+        if item.ask.id not in answers:
+            raise ValueError(f"answers lacks {item.ask.id!r}: every item needs one; give −1 where nothing was said")
+        got, want = len(answers[item.ask.id]), len(item.ask.answer)
+        if got != want:
+            raise ValueError(
+                f"answers[{item.ask.id!r}] has {got} levels: must have {want}; give −1 for what is missing"
+            )
