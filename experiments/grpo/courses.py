@@ -2,9 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Array
 
 from experiments.grpo.examination import examine_program
 from experiments.grpo.failures import Course, Place
@@ -27,6 +29,7 @@ class Courses:
         self._effort = effort
         self._keys = jax.vmap(jax.random.key)(np.asarray(seeds))
         self._start: dict[World, Params] = {}
+        self._before: dict[World, dict[str, Array]] = {}
         self._done: dict[tuple[Variant, Place], Course] = {}
 
     def course(self, variant: Variant, place: Place, *, guarded: bool) -> Course:
@@ -40,9 +43,11 @@ class Courses:
         world, dials = place
         start = self._supervised(world)
         examine = examine_program(self._effort)
+        if world not in self._before:
+            self._before[world] = examine(world, start, start, self._keys)
         end, metrics = reinforce_program(self._effort, variant)(world, dials, start, self._keys)
-        before, after = examine(world, start, start, self._keys), examine(world, end, start, self._keys)
-        course = jax.device_get({"before": before, "after": after, "metrics": metrics})
+        after = examine(world, end, start, self._keys)
+        course = jax.device_get({"before": self._before[world], "after": after, "metrics": metrics})
         return Course(**course)
 
     def _supervised(self, world: World) -> Params:
@@ -66,10 +71,17 @@ def refused(course: Course) -> bool:
     return False
 
 
-def alarms_of(course: Course, seed: int) -> dict[str, float]:
-    """Codes of the alarms that a seed's training raised, each with the first number that fired."""
-    watch, fired = Watch(), dict[str, float]()
+class First(NamedTuple):
+    """The first time that an alarm fired: after which step, counted from 0, and with what number."""
+
+    step: int
+    value: float
+
+
+def alarms_of(course: Course, seed: int) -> dict[str, First]:
+    """Codes of the alarms that a seed's training raised, each with its first."""
+    watch, fired = Watch(), dict[str, First]()
     for t in range(len(course.metrics["reward"][seed])):
         for alarm in watch.see({name: float(value[seed, t]) for name, value in course.metrics.items()}):
-            fired.setdefault(alarm.code, alarm.value)
+            fired.setdefault(alarm.code, First(t, alarm.value))
     return fired

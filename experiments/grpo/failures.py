@@ -117,7 +117,8 @@ def _bonus_cancels(c: Course) -> np.ndarray:
 
 
 def _credit_by_chance(c: Course) -> np.ndarray:
-    return c.metrics["tactile_credit_share"].mean(1) > 0.12
+    """Beyond the rate that R_tu is designed for by two standard errors of all groups, those of 80 steps of 8."""
+    return c.metrics["tactile_credit_share"].mean(1) > 0.146
 
 
 def _idles(c: Course) -> np.ndarray:
@@ -167,7 +168,7 @@ def _lenience(variant: Variant, value: float) -> Place:
     return World(), dials_of(variant)._replace(lenient=0.0 if variant is STABLE else value)
 
 
-GAMMAS = (0.01, 0.04, 0.16, 0.64, 2.56)
+GAMMAS = (0.01, 0.16, 0.64, 2.56)
 
 SCENARIOS = (
     Scenario(
@@ -215,7 +216,7 @@ SCENARIOS = (
         code="F5",
         title="the tactile bonus cancels",
         knob="weight of consistency, 0/1 accuracy",
-        values=(0.3, 0.03, 0.01, 0.0),
+        values=(0.8, 0.3, 0.0),
         criterion="of the groups that the bonus tells apart, more than half have the advantages of before",
         failing=LITERAL,
         place=_turn("consistency"),
@@ -225,8 +226,9 @@ SCENARIOS = (
         code="F6",
         title="tactile credit by chance",
         knob="share of right pictures, useless touch",
-        values=(0.9, 0.6, 0.3, 0.0),
-        criterion="more than 12 % of the groups of a policy that stands still earn credit",
+        values=(1.0, 0.6, 0.0),
+        criterion="more than 14.6 % of the groups of a policy that stands still earn credit: 12 %, and two standard "
+        "errors of 640 groups",
         failing=LITERAL,
         place=_standing_still,
         failed=_credit_by_chance,
@@ -255,7 +257,7 @@ SCENARIOS = (
         code="F9",
         title="entropy blows up",
         knob="weight of the entropy bonus",
-        values=(0.01, 0.03, 0.1, 0.3),
+        values=(0.03, 0.1, 0.3, 1.0),
         criterion="entropy more than .2 nat a token above the start, accuracy more than 10 points below",
         failing=PAPER,
         place=_turn("entropy_weight"),

@@ -17,13 +17,18 @@ COLUMNS = 4
 
 
 class Panel(NamedTuple):
-    """One failure: its code and title, its knob, and the share of seeds failed of both sides at every value."""
+    """One failure: its code and title, its knob, and of both sides the shares of seeds at every value.
+
+    `failing` and `cure` are the seeds that failed, `failing_fired` and `cure_fired` those that raised its alarm.
+    """
 
     title: str
     knob: str
     values: Sequence[float]
     failing: Sequence[float]
     cure: Sequence[float]
+    failing_fired: Sequence[float]
+    cure_fired: Sequence[float]
 
 
 def failed_against_knob(panels: Sequence[Panel]) -> bytes:
@@ -36,13 +41,17 @@ def failed_against_knob(panels: Sequence[Panel]) -> bytes:
         lines = [
             Line2D([], [], color=FAILING, marker="o", ms=4, lw=1.6),
             Line2D([], [], color=CURE, marker="D", ms=3.5, lw=1.6),
+            Line2D([], [], color="0.35", lw=1.2, ls=":"),
         ]
-        figure.legend(lines, ["paper or the named variant", "stable"], loc="outside upper left", ncols=2)
+        names = ["paper or the named variant", "stable", "alarm raised, of either"]
+        figure.legend(lines, names, loc="outside upper left", ncols=3)
         return svg(figure)
 
 
 def _draw(axes: Axes, panel: Panel, *, first: bool) -> None:
     place = np.arange(len(panel.values))
+    axes.plot(place, panel.failing_fired, color=FAILING, lw=1.2, ls=":", clip_on=False)
+    axes.plot(place, panel.cure_fired, color=CURE, lw=1.2, ls=":", clip_on=False)
     axes.plot(place, panel.failing, color=FAILING, marker="o", ms=4, lw=1.6, clip_on=False)
     axes.plot(place, panel.cure, color=CURE, marker="D", ms=3.5, lw=1.6, clip_on=False)
     axes.set_title(panel.title, fontsize=8.5, loc="left")

@@ -1,10 +1,10 @@
 """The self-contained report of a measuring experiment: requirements, tables, pictures in one HTML file."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.reporting.findings import Cell, Findings, Picture, Requirement, Table
+from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.reporting.page import Html, document, image, row, table, tag
 from experiments.reporting.report_parts import appendix, data_and_time, header, number
 from experiments.running.artifacts import write_bytes, write_text
@@ -62,7 +62,7 @@ def _picture(picture: Picture) -> Html:
 
 
 def _table(shown: Table) -> Html:
-    head = [f"{c.name} ({c.unit})" if c.unit else c.name for c in shown.columns]
+    head = [_head(c, [cells[i] for cells in shown.rows]) for i, c in enumerate(shown.columns)]
     rows = [
         row(*(_cell(value, c.format) for value, c in zip(cells, shown.columns, strict=True)), head=1)
         for cells in shown.rows
@@ -75,6 +75,13 @@ def _table(shown: Table) -> Html:
         table(head, rows),
         tag("details", tag("summary", "What the columns mean", class_="note"), *meanings) if meanings else "",
     )
+
+
+def _head(column: Column, cells: Sequence[Cell]) -> Html | str:
+    """The name of a column over its cells: on the left where they are text."""
+    name = f"{column.name} ({column.unit})" if column.unit else column.name
+    text = any(isinstance(cell, str) for cell in cells)
+    return tag("th", name, class_="text") if text else name
 
 
 def _cell(value: Cell, spec: str) -> Html | str:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from experiments import stability_grpo
-from experiments.grpo.courses import alarms_of, refused
+from experiments.grpo.courses import First, alarms_of, refused
 from experiments.grpo.failures import PAPER, SCENARIOS, STABLE, Course
+from experiments.grpo.outcomes import Outcome, Side
+from experiments.grpo.stability_tables import alarm_table, criteria, requirements, summary, verdict
 from experiments.running.artifacts import read_json
-from experiments.stability_grpo import Outcome, Side
 from tests.experiments.shrunk import run_shrunk
 from tests.touchr1_jax.rl.test_alarms import HEALTHY
 from touchr1_jax.rl.alarms import WINDOW
@@ -27,7 +28,9 @@ def test_both_sides_of_every_value_are_reported(directory):
     results = read_json(directory / "results.json")
     (counts,) = results["data"]["failed"].values()
     assert {len(c) for c in counts.values()} == {TINY.most_values}
-    assert len(results["requirements"]) == 3
+    names = [r["name"] for r in results["requirements"]]
+    assert names[0] == "F3 grounding without bound: failed runs of stable"
+    assert "other runs whose alarm fired" in names
     assert (directory / "plots" / "stability_grpo.svg").exists()
 
 
@@ -106,16 +109,40 @@ def test_a_course_that_the_engine_refuses_has_not_failed():
     assert not scenario.failed(dataclasses.replace(broken, refused=True)).any()
 
 
+def side(failed: list[int], fired: list[int]) -> Side:
+    """Ten seeds at each value, of which the first so many failed, and the first so many raised F1 after step 30."""
+    raised = [[{"F1": First(30, 0.4)} if seed < n else {"F7": First(20, 0.9)} for seed in range(10)] for n in fired]
+    return Side(failed=np.array([np.arange(10) < n for n in failed]), raised=raised)
+
+
+OUTCOME = Outcome(
+    scenario=SCENARIOS[0], values=(1.0, 2.0, 3.0), failing=side([0, 1, 6], [1, 0, 6]), cure=side([0, 0, 1], [0, 0, 0])
+)
+
+
 def test_breakdown_points_and_alarm_shares_by_hand():
-    none, one, most = (np.arange(10) < n for n in (0, 1, 6))
-    failing = Side(failed=np.array([none, one, most]), fired=np.array([one, none, most]))
-    cure = Side(failed=np.array([none, none, one]), fired=np.zeros((3, 10), bool))
-    outcome = Outcome(scenario=SCENARIOS[0], values=(1.0, 2.0, 3.0), failing=failing, cure=cure)
-    assert failing.breaks_at(outcome.values) == "2 / 3"
-    assert cure.breaks_at(outcome.values) == "3 / –"
-    assert outcome.harmed == 1
-    assert outcome.power == pytest.approx(6 / 8)
-    assert outcome.false_alarms == pytest.approx(1 / 52)
+    assert OUTCOME.failing.breaks_at(OUTCOME.values) == 2.0
+    assert OUTCOME.failing.breaks_at(OUTCOME.values, 0.5) == 3.0
+    assert OUTCOME.cure.breaks_at(OUTCOME.values) == 3.0
+    assert OUTCOME.cure.breaks_at(OUTCOME.values, 0.5) is None
+    assert (OUTCOME.harmed, OUTCOME.compared) == (1, 20)
+    assert OUTCOME.power == pytest.approx(6 / 8)
+    assert OUTCOME.false_alarms == pytest.approx(1 / 52)
+
+
+def test_tables_and_sentences_say_what_was_counted():
+    assert summary([OUTCOME]).rows[0][2:] == (2.0, 3.0, 3.0, 1, 20, 0.75, pytest.approx(1 / 52))
+    assert criteria([OUTCOME]).rows[0][2:] == ("1: 0 · 2: 1 · 3: 6", "1: 0 · 2: 0 · 3: 1")
+    assert alarm_table([OUTCOME]).rows[0][1:] == ("F1 > 0.25", 8, 6, 0.4, 30.0, 52, 1)
+    assert OUTCOME.sentence.endswith("noise of touch σ, levels: paper breaks at 2, stable at 3")
+    met = {r.name: r.met for r in requirements([OUTCOME])}
+    assert not met["failed runs whose alarm fired"]
+    assert met["other runs whose alarm fired"]
+    said = verdict([OUTCOME], {"paper": [{}] * 10, "stable": [{"F7": First(20, 0.9)}, {}]})
+    assert said[1] == "It failed too in F1 answers drift to the middle level (1 of 20 runs)."
+    assert said[2] == "Alarms fired in 75% of 8 failed runs and in 1.9% of the 52 others."
+    assert said[3] == "Failed in silence: F1 answers drift to the middle level (2)."
+    assert said[4].endswith("paper: none in 10 seeds; stable: F7 in 1 of 2 seeds.")
 
 
 def test_alarms_are_those_of_the_training_log():
@@ -126,7 +153,8 @@ def test_alarms_are_those_of_the_training_log():
     grown = np.where(np.arange(steps) < WINDOW, 0.1, 5.0)[None]
     alarms = alarms_of(dataclasses.replace(rows, metrics={**rows.metrics, "grounding": grown}), 0)
     assert set(alarms) == {"F3"}
-    assert alarms["F3"] > 1
+    assert alarms["F3"].value > 1
+    assert alarms["F3"].step >= WINDOW
 
 
 def test_the_knobs_turn_what_they_say():

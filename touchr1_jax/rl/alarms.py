@@ -1,22 +1,30 @@
 """Alarms: what goes wrong in reinforcement from touch, each seen in the metrics of a run by one small function.
 
-A function gets the means over the last `WINDOW` steps and the metrics of the first step, which are those of the
-policy that training starts from, and returns the number that fired, or `None`.
+A function gets the means over the last `WINDOW` steps and over the first `START`, which are those of the policy that
+training starts from, and returns the number that fired, or `None`.
 The codes F1 … F13 number known failures; F11, the collapse of latent prediction, belongs to another stage.
 """
 
 import collections
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 WINDOW = 20
 """Steps that a mean is over: with 8 prompts of 8 rollouts a share has then a standard error below .02."""
+
+START = 5
+"""Steps that the beginning is the mean of: few enough that the policy is still the one that training starts from, and
+enough that its accuracy has a standard error of .05, where that of one step of 8 prompts is .1."""
 
 RARE = 0.02
 """Shares of groups below this are three in a window of 160: too few to judge by."""
 
 WORSE = 0.1
-"""A change of accuracy beyond the chance of a single step: 64 answers have a standard error of .06."""
+"""A change of accuracy beyond chance: two standard errors of the beginning's."""
+
+NO_LEAD = 0.04
+"""Leads of touch below this are chance: two standard errors of the difference of two means in a window, from 1,280
+answers and from 640 under a control."""
 
 Metrics = Mapping[str, float]
 
@@ -62,7 +70,11 @@ def middle_excess(now: Metrics, start: Metrics) -> float | None:
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:
-    """F2: how much oftener all slots agree than the answer is right."""
+    """F2: how much oftener all slots agree than the answer is right.
+
+    Of honest slots it is at most 0: two that are right with probability a each for itself, and else err either way,
+    agree in a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
+    """
     del start
     return now["echo_share"] - now["accuracy"]
 
@@ -88,13 +100,13 @@ def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
 
 
 def unearned_credit(now: Metrics, start: Metrics) -> float | None:
-    """F6: share of groups with tactile credit, while touch is no better than the best control on average."""
+    """F6: share of groups with tactile credit, while touch has next to no lead over the best control on average."""
     del start
     controls = _controls(now)
     if not controls:
         return None
     lead = now["touch_score"] - max(controls.values())
-    return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= 0 else 0.0)
+    return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= NO_LEAD else 0.0)
 
 
 def _controls(now: Metrics) -> dict[str, float]:
@@ -104,8 +116,12 @@ def _controls(now: Metrics) -> dict[str, float]:
 
 
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
-    """F7: share of groups of equal rewards among those that are not all right; a group that is has nothing to learn."""
-    del start
+    """F7: share of groups of equal rewards among those that are not all right, while answers get no better.
+
+    A group that is all right has nothing to learn.
+    """
+    if now["accuracy"] > start["accuracy"]:
+        return None
     unsolved = 1 - now["all_right_share"]
     return (now["degenerate_share"] - now["all_right_share"]) / unsolved if unsolved > 0 else 0.0
 
@@ -156,8 +172,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         code="F2",
         meaning="slots echo each other instead of reporting",
-        bound=0.4,
-        reason="a constant echo on three uniform levels exceeds its accuracy by .67, a good policy by its error rate",
+        bound=0.1,
+        reason="two standard errors of a window above what honest slots reach, 0; a constant echo reaches .67",
         check=echo_excess,
     ),
     Rule(
@@ -184,8 +200,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         code="F6",
         meaning="tactile credit without a tactile lead",
-        bound=0.12,
-        reason="the false-credit rate that R_tu is designed for",
+        bound=0.17,
+        reason="the false-credit rate that R_tu is designed for, .12, and two standard errors of a window's 160 groups",
         check=unearned_credit,
     ),
     Rule(
@@ -213,8 +229,8 @@ RULES: tuple[Rule, ...] = (
     Rule(
         code="F9",
         meaning="entropy blows up",
-        bound=1.0,
-        reason="1 nat more a token: e times as many words in play as the supervised policy had",
+        bound=0.2,
+        reason="on every token of an answer of 15: three nats, so twenty times as many answers in play as at first",
         check=entropy_growth,
     ),
     Rule(
@@ -243,17 +259,23 @@ RULES: tuple[Rule, ...] = (
 
 
 class Watch:
-    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the first one."""
+    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the mean of the first `START`."""
 
     def __init__(self) -> None:
+        self._first: list[Metrics] = []
         self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
-        self._start: Metrics | None = None
 
     def see(self, metrics: Metrics) -> list[Alarm]:
         """The alarms after one more step, from the end of the first window on."""
         self._last.append(metrics)
-        self._start = metrics if self._start is None else self._start
+        if len(self._first) < START:
+            self._first.append(metrics)
         if len(self._last) < WINDOW:
             return []
-        now = {name: sum(m[name] for m in self._last) / WINDOW for name in metrics}
-        return [alarm for rule in RULES if (alarm := rule.alarm(now, self._start)) is not None]
+        now, start = _mean(self._last), _mean(self._first)
+        return [alarm for rule in RULES if (alarm := rule.alarm(now, start)) is not None]
+
+
+def _mean(steps: Collection[Metrics]) -> Metrics:
+    """Mean over steps that log alike."""
+    return {name: sum(m[name] for m in steps) / len(steps) for name in next(iter(steps))}

@@ -123,8 +123,10 @@ class Stable(Algorithm):
 
     Ours beyond these: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most a
     twentieth of a standard deviation of the reward, so that no γ outbids the answer; entropy is paid for up to .1 nat a
-    token, about what supervised policies have, so that a group keeps differing; an update moves the policy by at most
-    .003 nat a token.
+    token, about what supervised policies have, so that a group keeps differing; an update moves the policy by about
+    .003 nat a token at most; β is .1, a hundred times the published: where touch says little all answers earn alike
+    under a debiased reward, the policy drifts at random until it has one answer left, and only the reference pulls it
+    back.
 
     At margin δ = .13 and 4 rollouts a control, no split of a common distribution over credits 0, .4 and 1 earns R_tu in
     more than 9 % of groups; at the literal δ = .1 a single right answer in eight would pass for touch (18 %).
@@ -132,6 +134,7 @@ class Stable(Algorithm):
 
     batch_sigma: bool = True
     drop_degenerate: bool = True
+    beta: float = 0.1
     kl: KLEstimator = "exact"
     grounding_stop_masked: bool = True
     grounding_cap_nat: float | None = 1.0

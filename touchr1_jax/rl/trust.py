@@ -17,11 +17,12 @@ from touchr1_jax.types import Params
 def within_trust(
     agent: Agent, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
 ) -> tuple[Params, dict[str, Array]]:
-    """Shorten an update so that it moves the policy by at most δ nat a token on the rollouts that it is from.
+    """Shorten an update so that it moves the policy by about δ nat a token at most, on the rollouts that it is from.
 
-    θ = θ₀ + s (θ₁ − θ₀) with s = min(1, √(δ / KL(π₀ ‖ π₁))), as KL grows with the square of a small step.  The KL is
-    the k3 estimate on the rollouts, which π₀ sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477,
-    appendix C), here of any optimizer's, without its line search.
+    θ = θ₀ + s (θ₁ − θ₀) with s = min(1, √(δ / KL(π₀ ‖ π₁))), as KL grows with the square of a small step; a step that
+    is proposed from far beyond ends near δ, on either side of it.  The KL is the k3 estimate on the rollouts, which π₀
+    sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix C), here of any optimizer's,
+    without its line search.
 
     Args:
       agent, config: as in `make_grpo_step`.

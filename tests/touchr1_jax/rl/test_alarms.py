@@ -1,15 +1,16 @@
 """Every alarm fires on its failure, with the number that fired, and is silent on a healthy run."""
 
+import numpy as np
 import pytest
 
-from touchr1_jax.rl.alarms import RULES, WINDOW, Watch
+from touchr1_jax.rl.alarms import RULES, WINDOW, Watch, echo_excess
 
 HEALTHY = {
     "labels_level_0": 20.0,
     "labels_level_1": 20.0,
     "labels_level_2": 20.0,
     "middle_rate": 0.4,
-    "echo_share": 0.8,
+    "echo_share": 0.7,
     "accuracy": 0.7,
     "grounding": 0.1,
     "control_drop": 0.4,
@@ -42,8 +43,8 @@ FAILURES = [
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
     ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
-    ("F7", {"degenerate_share": 0.9}, 0.8),
-    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5}, 3.0),
+    ("F7", {"degenerate_share": 0.9, "accuracy": 0.65}, 0.8),
+    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5, "echo_share": 0.5}, 3.0),
     ("F9", {"entropy": 0.01}, 0.02),
     ("F9", {"entropy": 2.5}, 2.0),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
@@ -77,6 +78,32 @@ def test_groups_that_are_all_right_are_no_waste():
     assert fired({"degenerate_share": 1.0, "all_right_share": 1.0}) == {}
 
 
+def test_constant_groups_are_no_failure_while_answers_get_better():
+    assert fired({"degenerate_share": 0.9, "accuracy": 0.75}) == {}
+
+
+def test_honest_slots_never_agree_oftener_than_they_are_right():
+    """Two that are right with probability a each for itself, and else err either way; at ⅓ and at 1 just as often."""
+    a = np.linspace(1 / 3, 1, 50)
+    agree = a**2 + (1 - a) ** 2 / 2
+    assert (agree <= a + 1e-12).all()
+    excess = [echo_excess({"echo_share": e, "accuracy": x}, {}) for e, x in zip(agree, a, strict=True)]
+    np.testing.assert_allclose([excess[0], excess[-1]], 0, atol=1e-12)
+
+
+def test_a_lucky_first_step_is_not_the_beginning():
+    """One step of 8 prompts is right by chance in .95 where the policy is in .7."""
+    watch = Watch()
+    lucky = HEALTHY | {"accuracy": 0.95}
+    costly = HEALTHY | {"kl_cost_peak": 3.0}
+    assert all(watch.see(m) == [] for m in [lucky, *[costly] * (2 * WINDOW)])
+
+
+def test_credit_for_a_lead_that_is_chance_is_unearned():
+    assert set(fired({"touch_score": 0.48})) == {"F6"}
+    assert fired({"touch_score": 0.5}) == {}
+
+
 def test_a_low_entropy_of_right_answers_is_no_collapse():
     assert fired({"entropy": 0.01, "accuracy": 0.99}) == {}
     assert fired({"entropy": 0.01, "accuracy": 0.85}) == {}
@@ -103,5 +130,5 @@ def test_a_bonus_that_hardly_any_group_earns_is_not_judged():
 
 
 def test_an_alarm_says_what_fired():
-    (alarm,) = (a for a in [RULES[6].alarm(HEALTHY | {"degenerate_share": 0.9}, HEALTHY)] if a)
+    (alarm,) = (a for a in [RULES[6].alarm(HEALTHY | {"degenerate_share": 0.9, "accuracy": 0.65}, HEALTHY)] if a)
     assert str(alarm) == "alarm F7: most groups teach nothing (0.8, bound 0.5)"

@@ -36,7 +36,7 @@ def test_paper_preset():
 def test_stable_preset():
     a = GRPOConfig.stable().algorithm
     assert (a.kl, a.grounding_stop_masked, a.grounding_cap_nat, a.drop_degenerate) == ("exact", True, 1.0, True)
-    assert (a.tactile_use, a.gamma) == (TactileUse.RECOMMENDED, 0.01)
+    assert (a.tactile_use, a.gamma, a.beta) == (TactileUse.RECOMMENDED, 0.01, 0.1)
 
 
 def test_published_variants():
