@@ -6,7 +6,9 @@ ARGS   ?=
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: help setup experiment test test-slow lint format clean
+PYTHONS ?= python3.11 python3.12
+
+.PHONY: help setup experiment test test-slow test-matrix lint format picture clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -29,6 +31,9 @@ test: setup  ## pass the tests (under ten minutes on two cores)
 test-slow: setup  ## pass the tests that take minutes
 	$(BIN)/python -m pytest -q -m slow $(ARGS)
 
+test-matrix:  ## pass the tests on each of PYTHONS, in an environment of its own
+	for python in $(PYTHONS); do $(MAKE) test PYTHON=$$python VENV=.venv-$$python || exit 1; done
+
 lint: setup  ## check style, imports and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -38,5 +43,8 @@ format: setup  ## rewrite the sources in the house format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-clean:  ## remove the environment and caches, keep data/ and runs/
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+picture: setup  ## draw the architecture from the imports
+	$(BIN)/python -m experiments.reporting.architecture
+
+clean:  ## remove the environments and caches, keep data/ and runs/
+	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

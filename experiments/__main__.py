@@ -1,4 +1,4 @@
-"""`python -m experiments`: run, continue and list experiments."""
+"""`python -m experiments`: run, continue, list, start and compare experiments."""
 
 import multiprocessing
 import os

@@ -20,10 +20,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from experiments.policies.answers import Evaluated, reward_of
 from experiments.policies.estimates import compare_over_objects, compare_over_seeds
 from experiments.policies.examples import rollout_examples
 from experiments.policies.scores import PUBLISHED, Table, score_study, study_settings
-from experiments.policies.stages import Evaluated, reward_of
 from experiments.policies.study import BLIND, SFT, SMOKE, Study, StudyConfig, run_study
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context

@@ -12,7 +12,7 @@ import functools
 import numpy as np
 
 from sensors_io.scenes import SceneConfig, contact_key, make_contact, object_cards
-from sensors_io.schema import SENSORS, SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
+from sensors_io.schema import SENSORS, ContactKey, ObjectCard, Sequence, contacts_of_split
 
 
 class LiveScenes:
@@ -50,7 +50,4 @@ class LiveScenes:
         Raises:
           SchemaError: no such split.
         """
-        if split not in SPLITS:
-            raise SchemaError(f"split is {split!r}: must be one of {', '.join(SPLITS)}; rename it")
-        chosen = [i for i, key in enumerate(self.contacts) if self.objects[key.object_id].split == split]
-        return np.array(chosen, np.int64)
+        return contacts_of_split(self.contacts, self.objects, split)

@@ -34,7 +34,7 @@ from sensors_io.codec import (
     encode_sequence,
 )
 from sensors_io.index import INDEX, Index, MissingIndexError, RecordsMeta, RecordsVersionError
-from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
+from sensors_io.schema import ContactKey, ObjectCard, SchemaError, Sequence, contacts_of_split
 from sensors_io.shards import Entries, ShardWriter
 
 __all__ = [
@@ -271,10 +271,7 @@ class RecordStore:
         Raises:
           SchemaError: no such split.
         """
-        if split not in SPLITS:
-            raise SchemaError(f"split is {split!r}: must be one of {', '.join(SPLITS)}; rename it")
-        chosen = [i for i, key in enumerate(self.contacts) if self.objects[key.object_id].split == split]
-        return np.array(chosen, np.int64)
+        return contacts_of_split(self.contacts, self.objects, split)
 
 
 def _lock(root: pathlib.Path) -> IO[str]:

@@ -27,10 +27,29 @@ LEVELS: Mapping[str, int] = {"hardness": 3, "roughness": 3, "protrusion": 3, "ma
 UNKNOWN = -1
 """Label of an attribute that nobody annotated."""
 
-MOTIONS: tuple[str, ...] = ("press", "slide_x", "slide_y", "twist", "roll", "tap", "hold", "free")
-"""The press, the six exploratory motions (our choice: the paper lists none) and unguided hand motion."""
+EXPLORATORY: tuple[str, ...] = ("slide_x", "slide_y", "twist", "roll", "tap", "hold")
+"""The six exploratory motions (our choice: the paper lists none)."""
+
+MOTIONS: tuple[str, ...] = ("press", *EXPLORATORY, "free")
+"""The press, the exploratory motions and unguided hand motion."""
+
+PRESS_FORCE_N = 20.0
+"""Greatest force of the press."""
+
+FORCES_N: tuple[float, ...] = (2.0, 5.0, 10.0)
+"""Normal forces at which an exploratory motion is made."""
 
 SPLITS: tuple[str, ...] = ("train", "val", "test", "unlabelled")
+
+
+class Phase(enum.IntEnum):
+    """What the hand is doing in a frame."""
+
+    APPROACH = 0
+    LOAD = 1
+    HOLD = 2
+    UNLOAD = 3
+    MOVE = 4
 
 
 class Flag(enum.IntFlag):
@@ -77,7 +96,7 @@ FRAME_ARRAYS: Mapping[str, Spec] = {
     "host_time_ns": Spec(np.int64, ("N",)),  # monotonic
     "device_time_ns": Spec(np.int64, ("N",), optional=True),
     "force_time_ns": Spec(np.int64, ("N",), optional=True),
-    "phase": Spec(np.uint8, ("N",)),  # 0 approach, 1 load, 2 hold, 3 unload, 4 move
+    "phase": Spec(np.uint8, ("N",)),  # of `Phase`
     "flags": Spec(np.uint32, ("N",)),  # bits of `Flag`
     "contact_grid": Spec(np.uint16, ("N",), optional=True),  # side of the grid that a generated contact was solved on
 }
@@ -241,6 +260,16 @@ def check_arrays(specs: Mapping[str, Spec], arrays: Mapping[str, np.ndarray | No
             want, source = (int(dim), "the schema") if dim.isdigit() else sizes.setdefault(dim, (size, name))
             if size != want:
                 refuse(f"dimension {dim} must be {want} as in {source}", "align the arrays")
+
+
+def contacts_of_split(contacts: tuple[ContactKey, ...], objects: Mapping[str, ObjectCard], split: str) -> np.ndarray:
+    """Indices of the contacts whose object belongs to a split, int64, ascending.
+
+    Raises:
+      SchemaError: no such split.
+    """
+    _require(split in SPLITS, "split", split, f"must be one of {', '.join(SPLITS)}", "rename it")
+    return np.array([i for i, key in enumerate(contacts) if objects[key.object_id].split == split], np.int64)
 
 
 def _require(ok: bool, field: str, value: object, constraint: str, fix: str) -> None:

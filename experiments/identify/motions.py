@@ -14,17 +14,17 @@ from experiments.identify.geometry import statistics
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import features_of, field_counts
 from sensors_io.live import LiveScenes
-from sensors_io.scenes import SceneConfig, motions
+from sensors_io.scenes import SceneConfig
 from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import slot
-from sensors_io.schema import SENSORS, Sequence
+from sensors_io.schema import SENSORS, Phase, Sequence
 from touchr1_jax.models.tactile_vit import force_features
 
 MOTIONS = ("slide_x", "hold")
 """One that feels friction, one that feels what an object gives back."""
 
-_QUIET = (motions.Phase.APPROACH, motions.Phase.HOLD)
+_QUIET = (Phase.APPROACH, Phase.HOLD)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
     """Frames that are looked at: the untouched first one, then evenly among those in which something changes.
 
     Args:
-      phase: `motions.Phase` of every frame [F].
+      phase: `Phase` of every frame [F].
       moments: how many.
 
     Raises:

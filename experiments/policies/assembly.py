@@ -14,14 +14,14 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rewards import make_rewards
-from touchr1_jax.rl.scoring import ScoreFn, make_score
+from touchr1_jax.rewards import check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.rl.scoring import ScoreFn, check_finite, make_score
 from touchr1_jax.text.constraint import Constraint, compile_constraint
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.parser import Parser, compile_parser
 from touchr1_jax.text.template import PromptLayout, build_layout, prompt_words
 from touchr1_jax.text.tokenizer import Tokenizer, word_level
-from touchr1_jax.types import Params, Target, TouchBatch
+from touchr1_jax.types import Params, Parsed, Target, TouchBatch
 
 Weights = Mapping[str, float]
 
@@ -89,6 +89,36 @@ class Assembly:
             ordinal=jnp.broadcast_to(jnp.asarray(ordinal), asked.shape),
             streams=jnp.asarray(streams),
         )
+
+
+def prove_rewards(arms: Mapping[str, Weights]) -> None:
+    """Try every weighted reward of every arm on an empty answer, so that a misfit shows before anything is made.
+
+    Raises:
+      ValueError: an unknown reward, a weight that is negative or not finite, a reward that can be NaN or infinite.
+      TypeError: a reward that is no floating scalar; a note names the arm.
+    """
+    attributes, sensors = len(TOUCH_LANGUAGE.attributes), len(TOUCH_LANGUAGE.sensors)
+    rewards = make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
+    level, flag = jnp.zeros(attributes, jnp.int32), jnp.array(False)
+    parsed = Parsed(
+        perceive=jnp.zeros((sensors, attributes), jnp.int32),
+        compare=level,
+        conclude=level,
+        formatted=flag,
+        truncated=flag,
+        length=jnp.int32(0),
+    )
+    target = Target(asked=level > 0, label=level, levels=level, ordinal=level > 0, streams=jnp.zeros(sensors, bool))
+    for arm, weights in arms.items():
+        try:
+            check_weights(rewards, weights)
+            jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
+            for name in weights:
+                check_finite(name, rewards[name], sensors, attributes)
+        except (TypeError, ValueError) as error:
+            error.add_note(f"in the weights of arm {arm!r}, {dict(weights)}")
+            raise
 
 
 def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:

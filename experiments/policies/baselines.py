@@ -5,7 +5,8 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.policies.stages import Evaluated, force_only
+from experiments.policies.answers import Evaluated
+from experiments.policies.stages import force_only
 from experiments.policies.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.types import Parsed

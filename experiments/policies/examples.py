@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 
+from experiments.policies.answers import Evaluated, reward_terms
 from experiments.policies.assembly import Weights
-from experiments.policies.stages import Evaluated, reward_terms
 from experiments.policies.study import Study
 from experiments.reporting.results import RolloutExample, Slot
 from sensors_io.pipeline import make_clip

@@ -5,10 +5,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from experiments.policies.answers import Evaluated, reward_of
 from experiments.policies.assembly import Weights
 from experiments.policies.baselines import baselines
 from experiments.policies.estimates import estimate
-from experiments.policies.stages import Evaluated, reward_of
 from experiments.policies.study import SFT, Study, StudyConfig
 from experiments.reporting.results import Estimate
 from sensors_io.schema import ATTRIBUTES

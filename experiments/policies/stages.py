@@ -1,4 +1,4 @@
-"""The stages that experiments are made of: evidence, SFT, encoding, GRPO, evaluation.
+"""The stages that experiments are made of: evidence, SFT, encoding, GRPO.
 
 Each is a function of its configuration and inputs; what it leaves behind lies in the run's directory, so that a stopped
 run goes on from its last checkpoint.
@@ -14,21 +14,18 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from experiments.policies.assembly import Assembly, Weights
+from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import AnswerFeed, QuestionFeed, each, labelled, question_batch, touch_batch
+from experiments.policies.feeds import AnswerFeed, QuestionFeed, touch_batch
 from experiments.policies.watching import watched_log
 from experiments.running.context import Context
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
-from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.greedy import make_answer
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
 from touchr1_jax.rl.guard import check_streams, stream_influence
 from touchr1_jax.rl.scoring import ScoreFn
@@ -38,10 +35,7 @@ from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_prob
 from touchr1_jax.training.loop import LoopConfig, fit
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.training.sft import SFTState, make_sft_step
-from touchr1_jax.types import Params, Parsed
-
-EVAL_BATCH = 64
-"""Questions that are answered at once."""
+from touchr1_jax.types import Params
 
 ENCODE_BATCH = 8
 """Contacts that are encoded at once: eight stay in cache, sixteen take twice the time each."""
@@ -304,92 +298,6 @@ def grpo_program(
 def influence_program(agent: Agent, length: int) -> Any:
     """Compiled `stream_influence`, made once for all arms and seeds."""
     return jax.jit(lambda p, batch, noise, key: stream_influence(agent, p, batch, noise, key, length))
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluated:
-    """Greedy answers to every question about some contacts; question n is about contact `contact[n]`."""
-
-    contact: np.ndarray
-    attribute: np.ndarray
-    streams: np.ndarray
-    tokens: np.ndarray
-    parsed: Parsed
-    label: np.ndarray  # int32 [N, A], −1 where not asked
-    alone: np.ndarray | None  # int32 [N, S, A]
-
-    def answers(self, reward: np.ndarray) -> Answers:
-        """What the metrics read."""
-        return Answers(
-            conclude=np.asarray(self.parsed.conclude),
-            label=self.label,
-            formatted=np.asarray(self.parsed.formatted),
-            reward=reward,
-            streams=self.streams,
-            perceive=np.asarray(self.parsed.perceive),
-            alone=self.alone,
-        )
-
-
-def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
-    """Ask every labelled question about every contact, with all streams and with each stream alone."""
-    contact, attribute = labelled(label)
-    present = np.asarray(features.stream_mask)[contact]
-    ask = answer_program(assembly)
-    said = _ask(ask, assembly, params, features, label, contact, attribute, present)
-    s = present.shape[1]
-    alone = None
-    if present.any() and s > 1:
-        each_alone = [
-            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
-            for i in range(s)
-        ]
-        alone = np.stack([x.parsed.conclude for x in each_alone], 1)
-    return Evaluated(
-        contact=contact,
-        attribute=attribute,
-        streams=present,
-        tokens=said.tokens,
-        parsed=said.parsed,
-        label=np.where(assembly.layout.asked[attribute], label[contact], -1),
-        alone=alone,
-    )
-
-
-@functools.cache
-def answer_program(assembly: Assembly) -> Any:
-    """Compiled greedy answerer, made once."""
-    return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
-
-
-def _ask(ask, assembly, params, features, label, contact, attribute, streams):
-    """Greedy answers to all questions, in blocks of one size so that the program is compiled once."""
-    decoder, blocks = {"decoder": params["decoder"]}, []
-    for rows, real in each(len(contact), EVAL_BATCH):
-        batch = question_batch(assembly, features, label, contact[rows], attribute[rows], streams[rows])
-        blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(decoder, batch)))
-    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
-
-
-def reward_terms(
-    assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray
-) -> dict[str, Float[np.ndarray, "N"]]:
-    """What each weighted reward adds to the total of each answer."""
-    target = assembly.target(done.attribute, done.label, done.streams)
-    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
-    return jax.device_get(score(jax.tree.map(jnp.asarray, done.parsed), target))
-
-
-@functools.cache
-def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
-    """Compiled reward terms of many answers, made once for each set of weights."""
-    rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
-    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
-
-
-def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
-    """Total reward of each answer under the given weights."""
-    return sum(reward_terms(assembly, done, weights, prior).values(), start=np.zeros(len(done.contact), np.float32))
 
 
 def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:

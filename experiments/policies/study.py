@@ -12,16 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble
+from experiments.policies.answers import Evaluated, evaluate_policy
+from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
 from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
-    Evaluated,
     Probed,
     SFTConfig,
     encode_contacts,
-    evaluate_policy,
     gather_evidence,
     noise_bank,
     probe_features,
@@ -123,6 +122,7 @@ def run_study(
       context: the run.
       algorithms: those of the arms that do not use the configured one.
     """
+    prove_rewards(arms)
     configs = {
         arm: dataclasses.replace(config.grpo, algorithm=(algorithms or {}).get(arm, config.grpo.algorithm))
         for arm in arms

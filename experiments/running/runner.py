@@ -1,18 +1,15 @@
 """Find an experiment, resolve its configuration, run or continue it, write its report.
 
     python -m experiments NAME [--scale smoke|default] [--fresh] [overrides]
-    python -m experiments list
+    python -m experiments list | new | compare
 
 An experiment is a module of this package.  It opens with a docstring, whose first line is the question, followed by the
 command, the cost and the expected result, and it defines `EXPERIMENT`.
 """
 
-import ast
 import contextlib
 import dataclasses
-import difflib
 import importlib
-import importlib.util
 import itertools
 import shlex
 import signal
@@ -31,10 +28,16 @@ from experiments.reporting.report_findings import write_findings
 from experiments.reporting.results import Results
 from experiments.running import runs
 from experiments.running.artifacts import jsonable, read_json, write_json
+from experiments.running.catalogue import find, listing
+from experiments.running.commands import COMMANDS, PROG, complain, run_command, say, unknown
 from experiments.running.context import Context
 from touchr1_jax.training.compilation import compilations_kept
 
-PROG = "python -m experiments"
+USAGE = f"""usage: {PROG} NAME [--scale smoke|default] [--fresh] [overrides]
+       {PROG} list [NAME]            what ran, its cost, its result
+       {PROG} new NAME [--reward]    a template that runs
+       {PROG} compare RUN_A RUN_B    two runs, figure by figure
+"""
 
 COMPILED = "compiled"
 """Folder of the cache that holds compiled programs, so that a run like an earlier one compiles next to nothing."""
@@ -90,15 +93,15 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
       package: the package to find experiments in.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments and arguments[0] in COMMANDS:
+        return run_command(arguments, package)
     questions = find(package)
-    if not arguments or arguments[0] in ("list", "-h", "--help"):
-        _print(f"usage: {PROG} NAME [--scale smoke|default] [--fresh] [overrides]\n", listing(questions))
+    if not arguments or arguments[0] in ("-h", "--help"):
+        say(USAGE, listing(questions))
         return 0 if arguments else 2
     name, *rest = arguments
     if name not in questions:
-        close = difflib.get_close_matches(name, questions)
-        hint = f" Did you mean {' or '.join(close)}?" if close else ""
-        _complain(f"There is no experiment {name!r}.{hint}\n{listing(questions)}")
+        complain(f"{unknown(name, questions)}\n{listing(questions)}")
         return 2
     module = importlib.import_module(f"{package}.{name}")
     if module.EXPERIMENT.name != name:
@@ -107,22 +110,6 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
         )
     command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
     return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
-
-
-def find(package: str) -> dict[str, str]:
-    """Name → question of every experiment of a package, without importing any."""
-    spec = importlib.util.find_spec(package)
-    if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError(f"package is {package!r}: no such package; give the one that holds the experiments")
-    sources = sorted(path for folder in spec.submodule_search_locations for path in Path(folder).glob("*.py"))
-    trees = {path.stem: ast.parse(path.read_text(encoding="utf-8")) for path in sources}
-    return {stem: _first_line(ast.get_docstring(tree)) for stem, tree in trees.items() if _defines_experiment(tree)}
-
-
-def listing(questions: Mapping[str, str]) -> str:
-    """One line per experiment."""
-    width = max(map(len, questions), default=0)
-    return "\n".join(["experiments:", *(f"  {name:<{width}}  {question}" for name, question in questions.items())])
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:
@@ -167,11 +154,10 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
             _announce(console, directory, resumed)
             _run(experiment, command.config, Context(directory, command.cache_dir, console), about)
     except runs.RunInUse as error:
-        _complain(str(error))
+        complain(str(error))
         return 1
     except Stopped as stopped:
-        again = shlex.join(part for part in shlex.split(typed) if part != "--fresh")
-        _print(f"\nStopped by {stopped}. Everything so far is in {directory}. To go on: {again}")
+        say(f"\nStopped by {stopped}. Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
         return 128 + stopped.number
     return 0
 
@@ -194,10 +180,10 @@ def _run(experiment: Experiment[Any], config: Any, context: Context, about: str)
 
 def _announce(console: Console, directory: Path, resumed: bool) -> None:
     """Say which of the two happens, and whether the code changed meanwhile."""
-    _print(f"continuing {directory} (--fresh starts anew)" if resumed else f"new run {directory}")
+    say(f"continuing {directory} (--fresh starts anew)" if resumed else f"new run {directory}")
     began, now = read_json(directory / "config.json")["git"], dataclasses.asdict(runs.revision())
     if resumed and began != now:
-        _print(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
+        say(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
 
 
 @contextlib.contextmanager
@@ -227,21 +213,3 @@ def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:
         elif flag.startswith("--scale="):
             named = flag.removeprefix("--scale=")
     return named if named in configs else "default"
-
-
-def _defines_experiment(tree: ast.Module) -> bool:
-    targets = [t for node in tree.body if isinstance(node, ast.Assign) for t in node.targets]
-    targets += [node.target for node in tree.body if isinstance(node, ast.AnnAssign)]
-    return any(isinstance(t, ast.Name) and t.id == "EXPERIMENT" for t in targets)
-
-
-def _first_line(text: str | None) -> str:
-    return text.strip().splitlines()[0] if text else ""
-
-
-def _print(*texts: str) -> None:
-    Console(soft_wrap=True, highlight=False).print(*texts, sep="\n", markup=False)
-
-
-def _complain(text: str) -> None:
-    Console(stderr=True, soft_wrap=True, highlight=False).print(text, markup=False)

@@ -13,6 +13,7 @@ import fcntl
 import importlib.metadata
 import os
 import platform
+import shlex
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,10 +69,17 @@ def newest_unfinished(home: Path, config: Any) -> Path | None:
     Args:
       config: the resolved configuration in JSON's types.
     """
-    for directory in sorted(_runs(home), reverse=True):
+    for directory in sorted(started(home), reverse=True):
         if read_json(directory / "config.json")["config"] == config and not (directory / "results.json").exists():
             return directory
     return None
+
+
+def started(home: Path) -> list[Path]:
+    """The run directories of an experiment; one without `config.json` never started."""
+    if not home.is_dir():
+        return []
+    return [p for p in home.iterdir() if not p.is_symlink() and (p / "config.json").exists()]
 
 
 def create(home: Path, description: dict[str, Any]) -> Path:
@@ -127,11 +135,22 @@ def locked(directory: Path) -> Iterator[None]:
         yield
 
 
-def _runs(home: Path) -> list[Path]:
-    """The run directories of an experiment; one without `config.json` never started."""
-    if not home.is_dir():
-        return []
-    return [p for p in home.iterdir() if not p.is_symlink() and (p / "config.json").exists()]
+def held(directory: Path) -> bool:
+    """Whether a process is working in a run directory; it looks for an instant in which none could begin."""
+    lock = directory / ".lock"
+    if not lock.exists():
+        return False
+    with lock.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def go_on(command: str) -> str:
+    """The command that continues what a command began."""
+    return shlex.join(part for part in shlex.split(command) if part != "--fresh")
 
 
 def _git(root: Path, *arguments: str) -> str | None:

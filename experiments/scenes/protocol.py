@@ -5,10 +5,10 @@ import itertools
 
 import numpy as np
 
-from sensors_io.scenes import SceneConfig, motions, object_cards, schedule
+from sensors_io.scenes import SceneConfig, object_cards, schedule
 from sensors_io.scenes.config import stream
 from sensors_io.scenes.protocol import plan
-from sensors_io.schema import MATERIALS
+from sensors_io.schema import MATERIALS, PRESS_FORCE_N
 
 ORDINAL = ("hardness", "roughness", "protrusion")
 _BINS = 12
@@ -34,9 +34,9 @@ def leaks(config: SceneConfig) -> list[Leak]:
         if slot.motion == "press":
             matched[slot.object_index] = slot.force_n
     designs = {
-        "frames past the limit dropped": np.minimum(made.limits.actual_n, motions.PRESS_FORCE_N),
-        "dropped as if objects were rigid": np.minimum(made.limits.rigid_n, motions.PRESS_FORCE_N),
-        'all kept, flagged (past_limit="flag")': np.full(config.objects, motions.PRESS_FORCE_N),
+        "frames past the limit dropped": np.minimum(made.limits.actual_n, PRESS_FORCE_N),
+        "dropped as if objects were rigid": np.minimum(made.limits.rigid_n, PRESS_FORCE_N),
+        'all kept, flagged (past_limit="flag")': np.full(config.objects, PRESS_FORCE_N),
         "matched (the default)": matched,
     }
     rng = stream(config.seed, "schedule")
@@ -64,7 +64,7 @@ def _labels(config: SceneConfig) -> np.ndarray:
 
 def _leak(name: str, seen: np.ndarray, peak: np.ndarray, labels: np.ndarray) -> Leak:
     accuracy = tuple(100 * _guess(np.log(seen), labels[:, a]) for a in range(len(ORDINAL)))
-    full = float(np.mean(peak >= motions.PRESS_FORCE_N - 1e-6))
+    full = float(np.mean(peak >= PRESS_FORCE_N - 1e-6))
     return Leak(design=name, accuracy=accuracy, median_n=float(np.median(peak)), full_share=full)
 
 

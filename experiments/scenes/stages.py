@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.scenes.rates import Stopwatch
-from sensors_io.scenes import SceneConfig, contact, motions, surface
+from sensors_io.scenes import SceneConfig, contact, surface
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels, record
 from sensors_io.scenes.schedule import Slot
 from sensors_io.scenes.sensors import MODELS, SensorModel
+from sensors_io.schema import FORCES_N
 
 _Scene = tuple[Press, Any, np.ndarray]  # what is touched, by which unit, the key of the noise
 
@@ -77,7 +78,7 @@ def _seconds(call: Callable[[], Any], times: int = 40) -> float:
 
 
 def _scene(config: SceneConfig, index: int, order: int, motion: str) -> _Scene:
-    slot = Slot(object_index=index, site=0, motion=motion, force_n=motions.FORCES_N[1])
+    slot = Slot(object_index=index, site=0, motion=motion, force_n=FORCES_N[1])
     drawn = draw(config, index, slot, order)
     return drawn.press, drawn.unit, drawn.key
 

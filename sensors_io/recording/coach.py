@@ -6,31 +6,18 @@ a prompt, the phase that is under way, and whether to record.
 """
 
 import dataclasses
-import enum
 
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
+from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N, Phase
 
-FORCES_N = (2.0, 5.0, 10.0)
-PRESS_N = 20.0
-MOTIONS = ("slide_x", "slide_y", "twist", "roll", "tap", "hold")
 _MOVING = {
     "slide_x": "slide 4 mm right, 4 mm left, and back",
     "slide_y": "slide 4 mm down, 4 mm up, and back",
     "twist": "twist 30° clockwise, 30° back past the start, and return",
     "roll": "tilt 10° to the right, 10° to the left, and back",
 }
-
-
-class Phase(enum.IntEnum):
-    """Codes of `phase` in the schema."""
-
-    APPROACH = 0
-    LOAD = 1
-    HOLD = 2
-    UNLOAD = 3
-    MOVE = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,8 +84,8 @@ class Advice:
 
 def protocol() -> tuple[Stage, ...]:
     """All contacts at one site: the press, then every motion at every force, gentlest first."""
-    moves = [Stage(motion=m, force_n=f, level=k) for k, f in enumerate(FORCES_N) for m in MOTIONS]
-    return (Stage(motion="press", force_n=PRESS_N), *moves)
+    moves = [Stage(motion=m, force_n=f, level=k) for k, f in enumerate(FORCES_N) for m in EXPLORATORY]
+    return (Stage(motion="press", force_n=PRESS_FORCE_N), *moves)
 
 
 class Coach:

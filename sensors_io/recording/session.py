@@ -20,11 +20,11 @@ from sensors_io.devices.errors import DeviceError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.recording.book import Book, ObjectView, Report
-from sensors_io.recording.coach import Advice, Coach, CoachConfig, FreeCoach, Phase, Stage, protocol
+from sensors_io.recording.coach import Advice, Coach, CoachConfig, FreeCoach, Stage, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import Feed, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.schema import ContactKey, SchemaError
+from sensors_io.schema import ContactKey, Phase, SchemaError
 
 _JOURNALS = ".journals"
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period

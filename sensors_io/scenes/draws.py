@@ -17,6 +17,7 @@ from sensors_io.scenes.press import Path, Press
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
 from sensors_io.scenes.units import UNITS, on_one_day, place, unit_of
+from sensors_io.schema import Phase
 
 SITE_MM = 8.0
 """Sites lie within this distance of the object's centre along both axes: the windows stay on the view of the object."""
@@ -132,7 +133,7 @@ def _hand(config: SceneConfig, what: schedule.Slot) -> motions.Plan:
         slide_mm=still,
         twist_rad=still[:, 0],
         tilt_rad=still,
-        phase=np.full(count, motions.Phase.LOAD, np.uint8),
+        phase=np.full(count, Phase.LOAD, np.uint8),
         time_s=force / what.force_n * config.ramp_s,
     )
 

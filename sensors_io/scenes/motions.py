@@ -7,7 +7,6 @@ the contact inside a 15 mm window and take every contact through full slip and b
 """
 
 import dataclasses
-import enum
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,27 +14,9 @@ from jaxtyping import Array, Float
 
 from sensors_io.scenes import surface
 from sensors_io.scenes.config import require
-
-FORCES_N = (2.0, 5.0, 10.0)
-"""Normal forces at which an exploratory motion is made."""
-
-EXPLORATORY = ("slide_x", "slide_y", "twist", "roll", "tap", "hold")
-"""The six exploratory motions, by their names in the schema."""
-
-PRESS_FORCE_N = 20.0
-"""Greatest force of the plain press."""
+from sensors_io.schema import EXPLORATORY, Phase
 
 _RISE = 1.5  # force grows as depth^1.5 under Hertz: such a ramp is an approach at constant speed
-
-
-class Phase(enum.IntEnum):
-    """What the hand is doing in a frame."""
-
-    APPROACH = 0
-    LOAD = 1
-    HOLD = 2
-    UNLOAD = 3
-    MOVE = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -30,6 +30,7 @@ import numpy as np
 
 from sensors_io.scenes import motions, strength
 from sensors_io.scenes.config import SceneConfig, stream
+from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N
 
 BANDS_N = (2.0, 5.0, 10.0, 15.0, 20.0)
 """Upper edges of the force bands in which frames are counted."""
@@ -112,7 +113,7 @@ def protocol(config: SceneConfig, limits: strength.Limits, cell: np.ndarray) -> 
     """
     rng = stream(config.seed, "schedule")
     bears = limits.rigid_n if config.replaces else np.full(len(cell), np.inf)
-    ceiling = np.minimum(_ceilings(bears, cell, rng), motions.PRESS_FORCE_N)
+    ceiling = np.minimum(_ceilings(bears, cell, rng), PRESS_FORCE_N)
     asked, given = _deal(config.contact_count - config.objects, bears, cell, rng)
     press = [Slot(object_index=i, site=0, motion="press", force_n=float(c)) for i, c in enumerate(ceiling)]
     sites = collections.Counter(dict.fromkeys(range(config.objects), 1))
@@ -146,7 +147,7 @@ def _deal(
 
     A cell gets its share of the tasks, in a run of the cycle of all motions and forces.
     """
-    cycle = [(m, f) for f in motions.FORCES_N for m in motions.EXPLORATORY]
+    cycle = [(m, f) for f in FORCES_N for m in EXPLORATORY]
     names, sizes = np.unique(cell, return_counts=True)
     edges = np.round(np.cumsum(sizes) * count / len(cell)).astype(int)
     start = 0
@@ -191,7 +192,7 @@ def _count(frames: int, limit: np.ndarray, bears: np.ndarray, ceiling: np.ndarra
     """
     shape = (len(ceiling), len(BANDS_N))
     total, past, replaced = (np.zeros(shape, np.int64) for _ in range(3))
-    presses = [(("press", motions.PRESS_FORCE_N), which, most) for which, most in enumerate(ceiling)]
+    presses = [(("press", PRESS_FORCE_N), which, most) for which, most in enumerate(ceiling)]
     moves = [(task, i, task[1] if bears[i] >= _SPARE * task[1] else 0.0) for task, i in asked]
     for (motion, force), which, kept in presses + moves:
         load = _load(motion, force, frames)

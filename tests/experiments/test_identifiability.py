@@ -18,11 +18,11 @@ from experiments.identify.studies import SOURCES, STATIC
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import Felt, Tier, feel, means, see
 from experiments.running.artifacts import read_json
-from sensors_io.scenes import SceneConfig, motions, schedule, surface
+from sensors_io.scenes import SceneConfig, schedule, surface
 from sensors_io.scenes.press import make_kernels
 from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
 from sensors_io.scenes.sequence import make_sequence
-from sensors_io.schema import SENSORS
+from sensors_io.schema import SENSORS, Phase
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit
 
@@ -233,9 +233,7 @@ def test_points_are_clustered_by_object():
 
 
 def test_frames_of_a_motion_are_those_in_which_something_changes():
-    a, load, hold, un = (
-        p.value for p in (motions.Phase.APPROACH, motions.Phase.LOAD, motions.Phase.HOLD, motions.Phase.UNLOAD)
-    )
+    a, load, hold, un = (p.value for p in (Phase.APPROACH, Phase.LOAD, Phase.HOLD, Phase.UNLOAD))
     phase = np.array([a, a, load, load, hold, hold, hold, un, un])
     np.testing.assert_array_equal(identify_motions.look_at(phase, 3), [0, 2, 8])
     np.testing.assert_array_equal(identify_motions.look_at(phase, 5), [0, 2, 3, 7, 8])

@@ -1,5 +1,7 @@
 """Accuracy with ordinal credit under which every constant answer earns the same."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -44,6 +46,11 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
         return masked.mean(earned - bias, target.asked)
 
     return Reward(value)
+
+
+def uniform_prior(levels: Sequence[int]) -> np.ndarray:
+    """A prior under which every level of an attribute is as likely, float32 [A, K]; `levels` are the K of each."""
+    return np.array([[1 / k if level < k else 0.0 for level in range(max(levels))] for k in levels], np.float32)
 
 
 def _constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:

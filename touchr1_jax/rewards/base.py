@@ -49,7 +49,7 @@ def total_reward(
       ValueError: an unknown name, a weight that is negative or not finite, or none above 0.
       TypeError: a reward that is no floating scalar, or whose `applies` is no boolean scalar.
     """
-    _check_weights(rewards, weights)
+    check_weights(rewards, weights)
     values = {name: _scalar(name, "value", rewards[name].value(parsed, target), jnp.floating) for name in weights}
     applies = {name: _scalar(name, "applies", rewards[name].applies(target), jnp.bool_) for name in weights}
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
@@ -59,7 +59,12 @@ def total_reward(
     return sum(parts.values(), start=jnp.float32(0)), parts
 
 
-def _check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -> None:
+def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -> None:
+    """Hold the names and sizes of weights against the rewards that there are.
+
+    Raises:
+      ValueError: an unknown name, a weight that is negative or not finite, or none above 0.
+    """
     for name, weight in weights.items():
         if name not in rewards:
             raise ValueError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")

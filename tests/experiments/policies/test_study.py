@@ -6,9 +6,10 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.policies.answers import Evaluated
 from experiments.policies.baselines import baselines, constant_answers, joint_mode
 from experiments.policies.scores import score, score_study
-from experiments.policies.stages import Evaluated, Probed
+from experiments.policies.stages import Probed
 from experiments.policies.study import SFT, Study, load_answers, save_answers
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny

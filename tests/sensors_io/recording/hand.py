@@ -4,7 +4,7 @@ import numpy as np
 
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.intake import Counts
-from sensors_io.recording.coach import Phase
+from sensors_io.schema import Phase
 
 MS = 1_000_000
 

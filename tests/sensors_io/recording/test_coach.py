@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sensors_io.recording.coach import Coach, CoachConfig, Phase, Stage, protocol
+from sensors_io.recording.coach import Coach, CoachConfig, Stage, protocol
+from sensors_io.schema import Phase
 
 CONFIG = CoachConfig(clear_s=0.1, settle_s=0.1, hold_s=0.2, move_s=0.2)
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import surface
-from sensors_io.scenes.motions import EXPLORATORY, FORCES_N, PRESS_FORCE_N, Pace, Phase, moved, plan
+from sensors_io.scenes.motions import Pace, moved, plan
 from sensors_io.scenes.objects import sample
-from sensors_io.schema import MOTIONS
+from sensors_io.schema import EXPLORATORY, FORCES_N, MOTIONS, PRESS_FORCE_N, Phase
 
 ALL = [("press", PRESS_FORCE_N), *itertools.product(EXPLORATORY, FORCES_N)]
 X = (np.arange(40) + 0.5) * 0.4 - 8.0

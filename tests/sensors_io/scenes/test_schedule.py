@@ -8,6 +8,7 @@ import pytest
 
 from sensors_io.scenes import SceneConfig, motions, schedule
 from sensors_io.scenes.strength import Limits
+from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N
 
 OBJECTS = 360
 CONFIG = SceneConfig(objects=OBJECTS, sequences=4 * 1323, frames=40)
@@ -34,7 +35,7 @@ def test_every_object_is_pressed_once_and_motions_and_forces_are_balanced(made):
     presses = [s.object_index for s in made.slots if s.motion == "press"]
     assert sorted(presses) == list(range(OBJECTS))
     tasks = collections.Counter((s.motion, s.force_n) for s in made.slots if s.motion != "press")
-    assert set(tasks) == {(m, f) for m in motions.EXPLORATORY for f in motions.FORCES_N}
+    assert set(tasks) == {(m, f) for m in EXPLORATORY for f in FORCES_N}
     assert max(tasks.values()) - min(tasks.values()) <= 1
     assert len(made.slots) == CONFIG.contact_count
 
@@ -62,7 +63,7 @@ def test_every_cell_gets_the_same_forces(made):
     for q in (0.1, 0.5, 0.9):
         assert np.ptp([np.quantile(p, q) for p in peaks.values()]) < 0.12 * np.quantile(peaks[0], q)
     for counts in levels.values():
-        assert max(counts.values()) - min(counts.values()) <= len(motions.EXPLORATORY)
+        assert max(counts.values()) - min(counts.values()) <= len(EXPLORATORY)
 
 
 def test_the_ceiling_is_the_worst_cells_quantile_and_never_above_the_own_limit(limits):
@@ -101,7 +102,7 @@ def test_weak_objects_are_refused_by_name(limits):
 
 @pytest.mark.parametrize("frames", [20, 40, 90, 137])
 def test_the_pace_fits_any_length(frames):
-    for motion in ("press", *motions.EXPLORATORY):
+    for motion in ("press", *EXPLORATORY):
         hand = motions.plan(motion, 5.0, schedule.pace(frames))
         assert len(hand) == frames
         assert hand.force_n.max() == pytest.approx(5)
@@ -136,7 +137,7 @@ def test_frames_default_to_the_kind_of_set():
 
 def test_without_replacing_every_press_reaches_the_greatest_force_and_nothing_is_left_out(made, limits):
     flagged = schedule.protocol(dataclasses.replace(CONFIG, past_limit="flag"), limits, _cell())
-    assert {s.force_n for s in flagged.slots if s.motion == "press"} == {motions.PRESS_FORCE_N}
+    assert {s.force_n for s in flagged.slots if s.motion == "press"} == {PRESS_FORCE_N}
     assert flagged.left_out.replaced.sum() == 0
     np.testing.assert_array_equal(flagged.left_out.asked, made.left_out.asked)
     np.testing.assert_array_equal(flagged.left_out.past_limit, made.left_out.past_limit)

@@ -9,7 +9,7 @@ from sensors_io.scenes import SceneConfig, history, make_contact, motions, proto
 from sensors_io.scenes.draws import draw, site_of
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.scenes.sequence import _light, make_sequence
-from sensors_io.schema import SENSORS, Flag
+from sensors_io.schema import SENSORS, Flag, Phase
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
 TAC3D = SENSORS.index("tac3d")
@@ -31,7 +31,7 @@ def hold():
 
 def test_friction_follows_the_slide_and_keeps_to_coulomb(slide):
     hand = motions.plan("slide_x", 2.0, schedule.pace(40))
-    moving = hand.phase == motions.Phase.MOVE
+    moving = hand.phase == Phase.MOVE
     friction = site_of(CONFIG, 3, 1, 0).solid.friction
     assert np.all(np.abs(slide.force_n[:, 0]) <= friction * np.abs(slide.force_n[:, 2]) * 1.1 + 0.15)
     speed = np.gradient(hand.slide_mm[:, 0])

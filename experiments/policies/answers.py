@@ -1,0 +1,107 @@
+"""What a policy answers to questions about some contacts, and what each answer earns."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from experiments.policies.assembly import Assembly, Weights
+from experiments.policies.feeds import each, labelled, question_batch
+from touchr1_jax.bench.metrics import Answers
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rl.greedy import make_answer
+from touchr1_jax.types import Params, Parsed
+
+EVAL_BATCH = 64
+"""Questions that are answered at once."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluated:
+    """Greedy answers to every question about some contacts; question n is about contact `contact[n]`."""
+
+    contact: np.ndarray
+    attribute: np.ndarray
+    streams: np.ndarray
+    tokens: np.ndarray
+    parsed: Parsed
+    label: np.ndarray  # int32 [N, A], −1 where not asked
+    alone: np.ndarray | None  # int32 [N, S, A]
+
+    def answers(self, reward: np.ndarray) -> Answers:
+        """What the metrics read."""
+        return Answers(
+            conclude=np.asarray(self.parsed.conclude),
+            label=self.label,
+            formatted=np.asarray(self.parsed.formatted),
+            reward=reward,
+            streams=self.streams,
+            perceive=np.asarray(self.parsed.perceive),
+            alone=self.alone,
+        )
+
+
+def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
+    """Ask every labelled question about every contact, with all streams and with each stream alone."""
+    contact, attribute = labelled(label)
+    present = np.asarray(features.stream_mask)[contact]
+    ask = answer_program(assembly)
+    said = _ask(ask, assembly, params, features, label, contact, attribute, present)
+    s = present.shape[1]
+    alone = None
+    if present.any() and s > 1:
+        each_alone = [
+            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
+            for i in range(s)
+        ]
+        alone = np.stack([x.parsed.conclude for x in each_alone], 1)
+    return Evaluated(
+        contact=contact,
+        attribute=attribute,
+        streams=present,
+        tokens=said.tokens,
+        parsed=said.parsed,
+        label=np.where(assembly.layout.asked[attribute], label[contact], -1),
+        alone=alone,
+    )
+
+
+@functools.cache
+def answer_program(assembly: Assembly) -> Any:
+    """Compiled greedy answerer, made once."""
+    return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
+
+
+def _ask(ask, assembly, params, features, label, contact, attribute, streams):
+    """Greedy answers to all questions, in blocks of one size so that the program is compiled once."""
+    decoder, blocks = {"decoder": params["decoder"]}, []
+    for rows, real in each(len(contact), EVAL_BATCH):
+        batch = question_batch(assembly, features, label, contact[rows], attribute[rows], streams[rows])
+        blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(decoder, batch)))
+    return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
+
+
+def reward_terms(
+    assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray
+) -> dict[str, Float[np.ndarray, "N"]]:
+    """What each weighted reward adds to the total of each answer."""
+    target = assembly.target(done.attribute, done.label, done.streams)
+    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
+    return jax.device_get(score(jax.tree.map(jnp.asarray, done.parsed), target))
+
+
+@functools.cache
+def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
+    """Compiled reward terms of many answers, made once for each set of weights."""
+    rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
+    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
+
+
+def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
+    """Total reward of each answer under the given weights."""
+    return sum(reward_terms(assembly, done, weights, prior).values(), start=np.zeros(len(done.contact), np.float32))

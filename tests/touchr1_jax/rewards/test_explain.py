@@ -1,0 +1,91 @@
+"""`python -m touchr1_jax.rewards`: an answer's slots, its terms and its total, and what it says to wrong arguments."""
+
+import pytest
+
+from experiments.policies.scores import PUBLISHED as REPORTED
+from touchr1_jax.rewards import make_rewards, uniform_prior
+from touchr1_jax.rewards.__main__ import PUBLISHED, main
+
+ANSWER = "<perceive> gelsight_mini soft xense firm </perceive> <compare> soft </compare> <conclude> firm </conclude>"
+
+
+def cells(line: str) -> list[str]:
+    """What stands between the lines of a table; a line outside of one is a single cell."""
+    inside = line.strip()[1:-1] if line.strip().startswith("│") else line
+    return [cell.strip() for cell in inside.split("│")]
+
+
+def explain(capsys, *arguments: str) -> list[list[str]]:
+    """The rows that are printed for `ANSWER`."""
+    assert main(["explain", "--text", ANSWER, *arguments]) == 0
+    return [cells(line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_every_reward_is_listed_with_what_its_file_says(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(make_rewards(uniform_prior((3, 9))))
+    assert all(line.endswith(".") for line in lines)
+
+
+def test_slots_terms_and_total_by_hand(capsys):
+    """Accuracy .4 for the neighbour; agreement 1 − (0 + ½)/2 = ¾; R = .6 · .4 + .3 · .75 + .1."""
+    rows = explain(capsys, "--label", "hardness", "soft")
+    assert ["perceive xense", "firm"] in rows
+    assert ["perceive tac3d", "⊥"] in rows
+    assert ["conclude", "firm"] in rows
+    assert ["formatted: yes"] in rows
+    assert ["length: 12, truncated: no"] in rows
+    assert ["sensors that touched: gelsight_mini, xense"] in rows
+    assert ["soft", "accuracy", "0.400", "0.6", "+0.240"] in rows
+    assert ["", "consistency", "0.750", "0.3", "+0.225"] in rows
+    assert ["", "total", "", "", "+0.565"] in rows
+
+
+def test_without_a_label_every_level_is_scored(capsys):
+    rows = explain(capsys, "--weights", "exact", "1")
+    assert [row[0] for row in rows if row[1:2] == ["exact"]] == ["soft", "firm", "hard"]
+    assert [row[-1] for row in rows if row[1:2] == ["total"]] == ["+0.000", "+1.000", "+0.000"]
+
+
+def test_a_term_that_does_not_apply_leaves_its_weight_to_the_others(capsys):
+    rows = explain(capsys, "--label", "hardness", "firm", "--sensors", "xense")
+    assert ["", "consistency", "does not apply", "0.3", "+0.000"] in rows
+    assert ["", "total", "", "", "+1.000"] in rows
+
+
+def test_length_and_truncation_are_set(capsys):
+    assert ["length: 7, truncated: yes"] in explain(capsys, "--length", "7", "--truncated")
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("<perceive> soft </perceive> <conclude> soft </conclude>", "<compare> occurs 0 times"),
+        ("<perceive> </perceive> <compare> soft </compare> <conclude> soft </conclude>", "a body is empty"),
+        ("<conclude> soft </conclude> <conclude> soft </conclude>", "<conclude> occurs 2 times"),
+    ],
+)
+def test_a_fault_of_the_format_is_named(capsys, text, fault):
+    assert main(["explain", "--text", text, "--asked", "hardness"]) == 0
+    assert fault in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--text", "soft"], "asked is empty and `conclude` names no level"),
+        (["--text", ANSWER, "--asked", "hardnes"], "attribute 'hardnes' is not in the language; choose from hardness"),
+        (["--text", ANSWER, "--label", "hardness", "squishy"], "must be one of soft, firm, hard; correct the word"),
+        (["--text", ANSWER, "--sensors", "finger"], "sensors holds ['finger']: must be among gelsight_mini"),
+        (["--text", ANSWER, "--weights", "brevty", "1"], "no reward is called 'brevty'; choose from accuracy"),
+        (["--text", ANSWER, "--asked", "hardness", "roughness", "protrusion", "material"], "leaves 243 combinations"),
+    ],
+)
+def test_wrong_arguments_are_named(capsys, arguments, message):
+    assert main(["explain", *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_the_published_weights_are_those_that_reports_use():
+    assert dict(PUBLISHED) == dict(REPORTED)

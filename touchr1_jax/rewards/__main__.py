@@ -1,0 +1,236 @@
+"""`python -m touchr1_jax.rewards`: what the rewards make of one answer.
+
+python -m touchr1_jax.rewards list
+python -m touchr1_jax.rewards explain --text "<perceive> xense soft </perceive> <compare> soft </compare> …"
+python -m touchr1_jax.rewards explain --text "…" --label hardness firm --weights accuracy 0.6 format 0.1
+"""
+
+import dataclasses
+import itertools
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Annotated
+
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from touchr1_jax.rewards import Reward, check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
+from touchr1_jax.text.lexer import tags_of
+from touchr1_jax.text.oracle import Reading, read
+from touchr1_jax.types import Parsed, Target
+
+PUBLISHED: Mapping[str, float] = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
+"""Weights of Touch-R1 (arXiv 2605.27154)."""
+
+UNREAD = "⊥"
+"""Stands for a slot that names no level, or several."""
+
+NOT_DEFINED = "does not apply"
+"""Stands for a value that the question does not define; its weight goes to the other terms."""
+
+MOST_TRUTHS = 100
+"""More combinations of labels than this are no table to read."""
+
+WIDTH = 110
+"""Columns of the output where it is no terminal."""
+
+
+class ExplainError(ValueError):
+    """An argument that does not fit; the message names it, its value, the constraint and the fix."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class List:
+    """Name every reward and what its file says of it."""
+
+    def run(self) -> int:
+        """Print one line per reward and return the exit status."""
+        rewards, console = all_rewards(TOUCH_LANGUAGE), Console(soft_wrap=True, highlight=False)
+        for name, reward in rewards.items():
+            about = (sys.modules[reward.value.__module__].__doc__ or "").strip().partition("\n")[0]
+            console.print(f"{name:<{max(map(len, rewards))}}  {about}", markup=False)
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Show the slots of an answer, the value of every reward, its share of the total, and the total.
+
+    Without `--label` the answer is scored against every label that it could be about.
+    """
+
+    text: str
+    """The answer."""
+    label: dict[str, str] = dataclasses.field(default_factory=dict)
+    """What is true, as in `hardness soft`."""
+    asked: tuple[str, ...] = ()
+    """Attributes asked for; by default the labelled ones, else those that the answer concludes about."""
+    sensors: tuple[str, ...] = ()
+    """Sensors that touched; by default those that the answer reports on."""
+    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Weight of each reward, as in `accuracy 0.6 format 0.1`; by default the published ones."""
+    length: int | None = None
+    """Tokens before the end token; by default the words of the text."""
+    truncated: bool = False
+    """The answer was cut off: no end token came."""
+
+    def run(self) -> int:
+        """Print both tables and return the exit status."""
+        language, console = TOUCH_LANGUAGE, _console()
+        rewards, weights = all_rewards(language), self.weights or PUBLISHED
+        try:
+            check_weights(rewards, weights)
+            reading = read(language, self.text)
+            asked = self._asked(language, reading)
+            streams = self._streams(language, reading)
+            labels = self._labels(language, asked)
+        except ValueError as error:
+            _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
+            return 1
+        parsed = self._parsed(reading)
+        there = [s.name for s, is_there in zip(language.sensors, streams, strict=True) if is_there]
+        console.print(slots_table(language, reading), f"formatted: {format_fault(language, self.text, reading)}")
+        console.print(f"length: {parsed.length}, truncated: {'yes' if self.truncated else 'no'}")
+        console.print(f"sensors that touched: {', '.join(there) or 'none'}")
+        targets = ((words, _target(language, asked, label, streams)) for words, label in labels)
+        console.print(terms_table(rewards, weights, parsed, targets))
+        return 0
+
+    def _asked(self, language: Language, reading: Reading) -> tuple[str, ...]:
+        concluded = [a.name for a, k in zip(language.attributes, reading.conclude, strict=True) if k >= 0]
+        asked = self.asked or tuple(self.label) or tuple(concluded)
+        if not asked:
+            raise ExplainError(
+                "asked is empty and `conclude` names no level, or several of one attribute: "
+                "say what was asked for, as in --asked hardness"
+            )
+        for name in (*asked, *self.label):
+            language.attribute_index(name)
+        return asked
+
+    def _streams(self, language: Language, reading: Reading) -> list[bool]:
+        known = [sensor.name for sensor in language.sensors]
+        unknown = [name for name in self.sensors if name not in known]
+        if unknown:
+            raise ExplainError(f"sensors holds {unknown}: must be among {', '.join(known)}; correct the name")
+        reported = [max(levels) >= 0 for levels in reading.perceive]
+        return [name in self.sensors for name in known] if self.sensors else reported
+
+    def _labels(self, language: Language, asked: Sequence[str]) -> list[tuple[str, list[int]]]:
+        """Every label to score against, in words and as levels, int [A]."""
+        open_levels: list[Sequence[int]] = []
+        for attribute in language.attributes:
+            if attribute.name in self.label:
+                open_levels.append([_level(language, attribute.name, self.label[attribute.name])])
+            else:
+                open_levels.append(range(len(attribute.levels)) if attribute.name in asked else [-1])
+        count = int(np.prod([len(levels) for levels in open_levels]))
+        if count > MOST_TRUTHS:
+            missing = [name for name in asked if name not in self.label]
+            raise ExplainError(
+                f"label lacks {', '.join(missing)}, which leaves {count} combinations: must be at most {MOST_TRUTHS}; "
+                "say what is true, as in --label hardness soft"
+            )
+        return [(_in_words(language, asked, label), list(label)) for label in itertools.product(*open_levels)]
+
+    def _parsed(self, reading: Reading) -> Parsed:
+        return Parsed(
+            perceive=jnp.array(reading.perceive),
+            compare=jnp.array(reading.compare),
+            conclude=jnp.array(reading.conclude),
+            formatted=jnp.array(reading.formatted),
+            truncated=jnp.array(self.truncated),
+            length=jnp.array(len(self.text.split()) if self.length is None else self.length),
+        )
+
+
+def all_rewards(language: Language) -> dict[str, Reward]:
+    """Every reward, debiased for levels that are all as likely."""
+    return make_rewards(uniform_prior([len(attribute.levels) for attribute in language.attributes]))
+
+
+def slots_table(language: Language, reading: Reading) -> Table:
+    """What the answer says, slot by slot; attributes that it never names are left out."""
+    slots = dict(zip((f"perceive {s.name}" for s in language.sensors), reading.perceive, strict=True))
+    slots |= {"compare": reading.compare, "conclude": reading.conclude}
+    named = [a for a in range(len(language.attributes)) if any(levels[a] >= 0 for levels in slots.values())]
+    table = Table("slot", *(language.attributes[a].name for a in named), title="What the answer says")
+    for slot, levels in slots.items():
+        words = (language.attributes[a].levels[levels[a]][0] if levels[a] >= 0 else UNREAD for a in named)
+        table.add_row(slot, *words)
+    return table
+
+
+def terms_table(
+    rewards: Mapping[str, Reward],
+    weights: Mapping[str, float],
+    parsed: Parsed,
+    targets: Iterator[tuple[str, Target]],
+) -> Table:
+    """Value, weight and share of every term, and the total, for each target."""
+    table = Table("if it is", "reward", "value", "weight", "adds", title="What it earns")
+    for words, target in targets:
+        total, parts = total_reward(rewards, weights, parsed, target)
+        for name, weight in weights.items():
+            applies = bool(rewards[name].applies(target))
+            value = f"{float(rewards[name].value(parsed, target)):.3f}" if applies else NOT_DEFINED
+            table.add_row(words, name, value, f"{weight:g}", f"{float(parts[name]):+.3f}")
+            words = ""
+        table.add_row("", "total", "", "", f"{float(total):+.3f}", style="bold", end_section=True)
+    return table
+
+
+def format_fault(language: Language, text: str, reading: Reading) -> str:
+    """Whether an answer is formatted, and why not."""
+    if reading.formatted:
+        return "yes"
+    wrong = [f"{tag} occurs {text.count(tag)} times" for tag in tags_of(language) if text.count(tag) != 1]
+    return "no, " + (", ".join(wrong) or "tags are out of order, a body is empty, or text follows the last tag")
+
+
+def _target(language: Language, asked: Sequence[str], label: Sequence[int], streams: Sequence[bool]) -> Target:
+    return Target(
+        asked=jnp.array([a.name in asked for a in language.attributes]),
+        label=jnp.array(label),
+        levels=jnp.array([len(a.levels) for a in language.attributes]),
+        ordinal=jnp.array([a.ordinal for a in language.attributes]),
+        streams=jnp.array(streams),
+    )
+
+
+def _level(language: Language, name: str, word: str) -> int:
+    levels = language.attributes[language.attribute_index(name)].levels
+    for level, words in enumerate(levels):
+        if word in words:
+            return level
+    known = ", ".join(words[0] for words in levels)
+    raise ExplainError(f"label of {name} is {word!r}: must be one of {known}; correct the word")
+
+
+def _in_words(language: Language, asked: Sequence[str], label: Sequence[int]) -> str:
+    pairs = zip(language.attributes, label, strict=True)
+    return ", ".join(attribute.levels[level][0] for attribute, level in pairs if attribute.name in asked)
+
+
+def _console(stderr: bool = False) -> Console:
+    console = Console(stderr=stderr, highlight=False)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=WIDTH)
+
+
+Command = Annotated[List, tyro.conf.subcommand("list")] | Annotated[Explain, tyro.conf.subcommand("explain")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    command = tyro.cli(
+        Command, args=arguments, prog="python -m touchr1_jax.rewards", config=(tyro.conf.OmitArgPrefixes,)
+    )
+    return command.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
