@@ -1,0 +1,146 @@
+"""Short trainings that any mesh must do alike: one layer, and SFT, GRPO and tactile dynamics of the tiny policy."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.drawn import draw_params
+from touchr1_jax.models.layers import GatedMLP, RMSNorm
+from touchr1_jax.models.predictor import PredictorConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.training.dynamics import DynamicsConfig, make_dynamics_step, start_dynamics
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
+from touchr1_jax.types import Parsed, Target
+
+ROWS, STEPS, TOKENS = 8, 20, 6
+AGENT = tiny.SHALLOW
+OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), STEPS)
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """A jitted step, its first state, what a run never changes, and the items that batches are made of."""
+
+    step: Callable[..., Any]
+    state: Any
+    item: Callable[[int], Any]
+    shared: tuple[Any, ...] = ()
+
+
+def feed(problem: Problem, own: np.ndarray | None = None) -> Any:
+    """Batches of `ROWS` items in random order, or those rows of them that a process reads."""
+    mine = np.arange(ROWS) if own is None else own
+    drawn = grain.MapDataset.range(64).seed(3).shuffle().repeat().batch(ROWS)
+    stack = lambda items: jax.tree.map(lambda *x: np.stack(x), *items)
+    return iter(drawn.map(lambda rows: stack([problem.item(int(i)) for i in rows[mine]])).to_iter_dataset())
+
+
+def contact(i: int) -> Any:
+    """Touch of contact i, without leading axis."""
+    return jax.tree.map(lambda x: np.asarray(x[0]), tiny.touch_batch(i))
+
+
+class Words(nn.Module):
+    """A residual layer between an embedding and a head, named as the rules name them."""
+
+    @nn.compact
+    def __call__(self, token: jax.Array) -> jax.Array:
+        x = nn.Embed(16, 8, name="embedding")(token)
+        return nn.Dense(16, name="head")(x + GatedMLP(32, name="mlp")(RMSNorm(name="norm")(x)))
+
+
+def words() -> Problem:
+    """The number after next, modulo 16: quick to compile."""
+    model = Words()
+    params = draw_params(jax.eval_shape(lambda: model.init(jax.random.key(0), jnp.zeros(1, jnp.int32)))["params"])
+
+    def step(state: SFTState, batch: dict[str, jax.Array]) -> tuple[SFTState, dict[str, jax.Array]]:
+        logits = lambda p: jnp.asarray(model.apply({"params": p}, batch["token"]))
+        cost = lambda p: optax.softmax_cross_entropy_with_integer_labels(logits(p), batch["label"]).mean()
+        value, grads = jax.value_and_grad(cost)(state.params)
+        updates, opt_state = OPTIMIZER.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        return SFTState(params=params, opt_state=opt_state, step=state.step + 1), {"loss": value}
+
+    state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
+    return Problem(jax.jit(step), state, lambda i: {"token": np.int32(i % 16), "label": np.int32((i + 2) % 16)})
+
+
+def sft() -> Problem:
+    """The whole policy, one question a contact, random answers of several lengths."""
+
+    def item(i: int) -> SFTBatch:
+        rng = np.random.default_rng(i)
+        return SFTBatch(
+            touch=contact(i),
+            ids=np.asarray(tiny.LAYOUT.ids[[i % tiny.A]]),
+            mask=np.asarray(tiny.LAYOUT.mask[[i % tiny.A]]),
+            streams=np.ones((1, tiny.S), bool),
+            tokens=rng.choice(tiny.WRITABLE, (1, TOKENS)).astype(np.int32),
+            token_mask=np.arange(TOKENS)[None] <= rng.integers(TOKENS),
+        )
+
+    params = {**tiny.params(loud=0.2), **tiny.shallow_params(loud=0.2)}
+    state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
+    return Problem(make_sft_step(AGENT, OPTIMIZER), state, item)
+
+
+def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+    """Share of tokens that are the label modulo 3."""
+    level = jnp.where(target.asked, tokens[0] % 3, -1)
+    right = jnp.mean(tokens % 3 == jnp.max(target.label))
+    truncated = jnp.all(~jnp.isin(tokens, jnp.asarray(AGENT.end_ids)))
+    parsed = Parsed(
+        perceive=jnp.tile(level, (tiny.S, 1)),
+        compare=level,
+        conclude=level,
+        formatted=tokens[0] > 20,
+        truncated=truncated,
+        length=jnp.sum(tokens > 1),
+    )
+    return right, {"right": right}, parsed
+
+
+def grpo() -> Problem:
+    """The decoder, groups of four; both divergences count."""
+    algorithm = Paper(beta=0.1, gamma=0.05)
+    config = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algorithm=algorithm)
+    optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
+    state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), config)
+    noise = np.random.default_rng(5).normal(size=(3, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size))
+    fixed = Fixed(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
+    item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
+    questions = tiny.question_batch(0, 16)
+    return Problem(make_grpo_step(AGENT, score, optimizer, config), state, item, (fixed,))
+
+
+def dynamics() -> Problem:
+    """Encoder and predictor of stage 1."""
+    config = DynamicsConfig(
+        encoder=dataclasses.replace(tiny.CONFIG.tactile, causal=True),
+        predictor=PredictorConfig(width=16, num_layers=1, num_heads=2),
+    )
+    batch = jax.tree.map(jnp.asarray, tiny.touch_batch(0, 1))
+    shapes = jax.eval_shape(lambda: start_dynamics(config, OPTIMIZER, jax.random.key(0), batch))
+    params = draw_params(shapes.params, loud=0.2)
+    state = shapes.replace(
+        params=params,
+        target=jax.tree.map(jnp.copy, params["encoder"]),
+        opt_state=OPTIMIZER.init(params),
+        step=jnp.int32(0),
+        key=jax.random.key(1),
+    )
+    return Problem(make_dynamics_step(config, OPTIMIZER), state, contact)
+
+
+PROBLEMS: dict[str, Callable[[], Problem]] = {"words": words, "sft": sft, "grpo": grpo, "dynamics": dynamics}

@@ -1,0 +1,106 @@
+"""Bytes on each device: counted by hand against closed forms, and against what the compiler reserves."""
+
+import json
+import os
+import subprocess
+import sys
+
+import optax
+import pytest
+
+from tests.touchr1_jax.distributed.sixteen import DECODER, GRPO, PROMPT, tiny_step
+from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
+from touchr1_jax.distributed.memory import (
+    Compiled,
+    GRPOShape,
+    at_depth,
+    cache_bytes,
+    counted_peak,
+    grpo_bytes,
+    saved_bytes,
+)
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.models.qwen.config import released
+from touchr1_jax.rl.config import GRPOConfig, Paper
+
+H200_BYTES = 141e9
+
+
+def test_arguments_by_hand():
+    """One layer of width 64 in float32 on one device: parameters, two moments and a counter, reference."""
+    shape, step = tiny_step(1, MeshConfig())
+    lines = grpo_bytes(shape, step.state, step.batch, step.fixed)
+    attention = 64 * 64 + 64 + 2 * (64 * 32 + 32) + 64 * 64
+    numbers = 2 * 512 * 64 + attention + 3 * 64 * 256 + 3 * 64
+    assert lines["parameters"] == lines["reference"] == 4 * numbers
+    assert lines["optimizer"] == 2 * 4 * numbers + 4
+    assert lines["noise bank"] == 64 * 2 * 4 * 64 * 4
+
+
+def test_caches_and_saved_products_by_hand():
+    """Per token and layer: two key heads of 16, keys and values; and q, k, v, o, gate, up, down."""
+    shape, _ = tiny_step(2, MeshConfig(fsdp=8, tensor=2))
+    tokens = PROMPT.tokens + 8 * 16
+    assert cache_bytes(shape) == 2 * tokens * 2 * (2 * 1 * 16) * 4
+    products = (64 + 32 + 32 + 2 * 256) // 2 + 2 * 64
+    assert saved_bytes(shape) == 2 * 2 * tokens * 2 * products * 4
+
+
+def test_phases_do_not_add_up():
+    """Of sampling, 3 + 4, and learning, 1 + 2 + 5 + 6, the larger counts."""
+    lines = {
+        "caches while sampling": 3,
+        "logits while sampling": 4,
+        "gradients": 1,
+        "saved for the gradient": 2,
+        "attention while learning": 5,
+        "logits while learning": 6,
+        "parameters": 100,
+    }
+    assert counted_peak(lines) == 114
+
+
+def test_depth_is_a_straight_line():
+    assert at_depth(Compiled(10, 5, 4, 100), Compiled(13, 7, 6, 140), 4) == Compiled(19, 11, 10, 220)
+    assert Compiled(10, 5, 4, 100).peak == 111
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mesh": MeshConfig(fsdp=3)}, "drawn is 16: must be a multiple of data · fsdp = 3"),
+        ({"mesh": MeshConfig(tensor=4)}, "num_kv_heads is 2: must be a multiple of mesh tensor = 4"),
+    ],
+)
+def test_shapes_that_do_not_divide_are_errors(changes, message):
+    with pytest.raises(ValueError, match=message):
+        GRPOShape(**{"decoder": DECODER, "grpo": GRPO, "mesh": MeshConfig(), "prompt_tokens": 9, **changes})
+
+
+def test_the_7b_at_the_papers_shapes_fits_sixteen_h200_by_count():
+    """8 frames of 448² in 4 streams as Qwen2.5-VL cuts them: 4 steps of 256 tokens each; groups of 8, 512 tokens."""
+    config, optimizer = released("7B"), optax.adamw(1e-6)
+    grpo = GRPOConfig(prompts=16, micro_prompts=8, group=8, length=512, remat=True, bfloat16=True, algorithm=Paper())
+    prompt = PromptShape(stream_tokens=1024)
+    shape = GRPOShape(decoder=config.decoder, grpo=grpo, mesh=MeshConfig(fsdp=8, tensor=2), prompt_tokens=prompt.tokens)
+    step = abstract_grpo(config, prompt, shape, optimizer)
+    lines = grpo_bytes(shape, step.state, step.batch, step.fixed)
+    assert lines["parameters"] == pytest.approx(4 * 7.616e9 / 16, rel=1e-3)
+    assert counted_peak(lines) < H200_BYTES / 2
+
+
+@pytest.mark.slow
+def test_compiled_arguments_are_those_counted_and_memory_grows_by_the_layer():
+    """On sixteen simulated devices, in a process of its own; a key of 8 bytes and a step of 4 are not counted."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=16", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "tests.touchr1_jax.distributed.sixteen"]
+    done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, timeout=280, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    compiled = {layers: Compiled(*entry["compiled"]) for layers, entry in found.items()}
+    for layers, entry in found.items():
+        assert compiled[layers].arguments == entry["counted"] + 12
+        assert compiled[layers].aliased > compiled[layers].results - 2000  # metrics have no argument to take over
+    line = at_depth(compiled["1"], compiled["2"], 4)
+    assert line.arguments == compiled["4"].arguments
+    assert line.temporary == pytest.approx(compiled["4"].temporary, rel=0.1)

@@ -1,0 +1,36 @@
+"""What a process puts on the mesh; more than one device is what `test_training` is about."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.placement import local_rows, place_batch, place_state, shard_step
+
+MESH = MeshConfig().build(jax.devices()[:1])
+
+
+def test_a_single_process_reads_all_rows():
+    np.testing.assert_array_equal(local_rows(MESH, 6), np.arange(6))
+
+
+def test_a_placed_batch_is_what_was_read():
+    rows = {"ids": np.arange(12).reshape(6, 2), "mask": np.arange(6) > 3}
+    placed = place_batch(MESH, rows, 6)
+    jax.tree.map(np.testing.assert_array_equal, placed, rows)
+
+
+def test_other_rows_than_its_own_are_an_error():
+    with pytest.raises(ValueError, match=r"batch ids has shape \(4, 2\): must have the 6 rows of `local_rows`"):
+        place_batch(MESH, {"ids": np.zeros((4, 2))}, 6)
+
+
+def test_a_placed_state_has_buffers_of_its_own():
+    """A step gives those of its state away."""
+    state = {"scale": jnp.ones(4), "step": jnp.int32(0), "key": jax.random.key(3)}
+    step = shard_step(lambda s, b: ({**s, "step": s["step"] + 1}, {}), MESH, state, {"ids": np.zeros(2)})
+    after, _ = step(place_state(MESH, state), {"ids": np.zeros(2)})
+    after, _ = step(after, {"ids": np.zeros(2)})
+    assert (int(state["step"]), int(after["step"])) == (0, 2)
+    assert after["key"] == state["key"]

@@ -1,0 +1,122 @@
+"""Put states and batches on a mesh, and compile a step for where they lie.
+
+The steps of all stages, (state, batch, …) → (state, metrics), stay as they are: GSPMD (arXiv 2105.04663) splits the one
+program that they trace to by the shardings of its arguments and results.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+
+from touchr1_jax.distributed.rules import activation_axes, batch_shardings, state_shardings, whole
+from touchr1_jax.models.layers import RMSNorm
+
+LAYERS = (nn.Dense, nn.Embed, RMSNorm)
+"""Layers whose results are held in place; what lies between follows from them."""
+
+OUTPUTS = ("__call__", "attend")
+"""Their methods; by `attend` a table of embeddings computes logits."""
+
+Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
+
+
+def place_state(mesh: Mesh, state: Any) -> Any:
+    """A state on the mesh, on buffers of its own; every process must hold the same.
+
+    What does not fit into one device is made in place instead, by `jax.jit(make, out_shardings=state_shardings(…))`.
+    """
+    own = lambda x, sharding: jnp.copy(jax.device_put(x, sharding))
+    return jax.tree.map(own, state, state_shardings(mesh, state))
+
+
+def place_batch(mesh: Mesh, rows: Any, batch_size: int) -> Any:
+    """A batch on the mesh from the rows that this process has read, those of `local_rows`.
+
+    Args:
+      mesh: where the step runs.
+      rows: tree of arrays, first dimension as long as `local_rows`.
+      batch_size: rows of the whole batch.
+
+    Raises:
+      ValueError: an array of another number of rows.
+    """
+    count = len(local_rows(mesh, batch_size))
+
+    def place(path: tuple[Any, ...], x: Any) -> jax.Array:
+        x = np.asarray(x)
+        if not x.shape or len(x) != count:
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise ValueError(
+                f"batch {name} has shape {x.shape}: must have the {count} rows of `local_rows`; read those"
+            )
+        shape = (batch_size, *x.shape[1:])
+        sharding = batch_shardings(mesh, jax.ShapeDtypeStruct(shape, x.dtype))
+        return jax.make_array_from_process_local_data(sharding, x, shape)
+
+    return jax.tree_util.tree_map_with_path(place, rows)
+
+
+def local_rows(mesh: Mesh, batch_size: int) -> np.ndarray:
+    """Rows of a batch that the devices of this process hold, ascending: all that it need read.
+
+    A pipeline that draws the rows of the whole batch and then reads these gives the same batches whatever the number of
+    processes, so that a run goes on with another number of them.
+
+    Raises:
+      ValueError: as `batch_shardings`.
+    """
+    sharding = batch_shardings(mesh, jax.ShapeDtypeStruct((batch_size,), np.int32))
+    slices = [index[0] for index in sharding.addressable_devices_indices_map((batch_size,)).values()]
+    return np.unique(np.concatenate([np.arange(batch_size)[s] for s in slices]))
+
+
+def shard_step(
+    step: Step,
+    mesh: Mesh,
+    state: Any,
+    batch: Any,
+    *shared: Any,
+    compiler_options: Mapping[str, Any] | None = None,
+) -> jax.stages.Wrapped:
+    """The step compiled for the mesh, (state, batch, *shared) → (state, metrics); the state's buffers are donated.
+
+    Args:
+      step: a stage's step, jitted or not.
+      mesh: where it runs.
+      state, batch, shared: arguments, or their shapes and dtypes; `shared` is what a run never changes.
+      compiler_options: of `jax.jit`; those that the step was made with do not carry over.
+
+    Raises:
+      ValueError: as `state_shardings` and `batch_shardings`.
+    """
+    placed = state_shardings(mesh, state)
+    given = (placed, batch_shardings(mesh, batch), *(state_shardings(mesh, x) for x in shared))
+    plain = inspect.unwrap(step)  # a jitted step would bring along a trace from before, or of another mesh
+
+    def on_mesh(*arguments: Any) -> tuple[Any, dict[str, jax.Array]]:
+        with split_activations(mesh):
+            return plain(*arguments)
+
+    results = (placed, whole(mesh))
+    options = None if compiler_options is None else dict(compiler_options)
+    return jax.jit(on_mesh, in_shardings=given, out_shardings=results, donate_argnums=0, compiler_options=options)
+
+
+def split_activations(mesh: Mesh) -> AbstractContextManager[None]:
+    """Within this context what every layer computes lies as `rules.activation_axes` says."""
+
+    def constrain(call: Callable[..., Any], args: Any, kwargs: Any, context: nn.module.InterceptorContext) -> Any:
+        y = call(*args, **kwargs)
+        if not isinstance(context.module, LAYERS) or context.method_name not in OUTPUTS:
+            return y
+        layer = "head" if context.method_name == "attend" else str(context.module.name)
+        return jax.lax.with_sharding_constraint(y, NamedSharding(mesh, activation_axes(layer, y.ndim)))
+
+    return nn.intercept_methods(constrain)
