@@ -13,24 +13,28 @@ other diameters and presses at known depth were no part of any fit.  The weight 
 held-out balls.  The zero level, the degrees' rule and the threshold of a contact were set with the known depths,
 feelanyforce, gelslam and FOTS in view: those rows are not blind.
 
-Ten minutes on one core with DIR (`smoke` half a minute).  Expected: the polynomial whose constants vary over the
+Six minutes on one core with DIR (`smoke` half a minute).  Expected: the polynomial whose constants vary over the
 picture is as good as the perceptron and several times as fast; published integrators are off by up to a factor of two.
 """
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
 
 from experiments.fields import (
     depth_balls,
+    depth_contact,
     depth_data,
     depth_known,
     depth_presses,
     motion_dense,
+    motion_drift,
     motion_evidence,
     motion_frames,
     motion_layers,
     motion_markers,
     motion_shear,
+    motion_subjects,
 )
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Findings, Requirement
@@ -54,7 +58,7 @@ class FieldsConfig:
       generated_presses: of each generated ball.
       strange_lamps: whether balls are also generated under lamps of which the calibration's model knows nothing.
       motion: whether the panels of motion are drawn too.
-      markers: settings of the panel of markers.
+      markers, drift: settings of the panels of markers and of their drift.
       dense_motions: motions of the dense panel.
       shear: settings of the panel of shear.
       judged: pictures of each folder that the evidence of markers is judged on.
@@ -68,6 +72,7 @@ class FieldsConfig:
     strange_lamps: bool = True
     motion: bool = True
     markers: motion_markers.MarkerConfig = dataclasses.field(default_factory=motion_markers.MarkerConfig)
+    drift: motion_drift.DriftConfig = dataclasses.field(default_factory=motion_drift.DriftConfig)
     dense_motions: int = 4
     shear: motion_shear.ShearConfig = dataclasses.field(default_factory=motion_shear.ShearConfig)
     judged: int = 20
@@ -76,14 +81,11 @@ class FieldsConfig:
 
 def run(config: FieldsConfig, context: Context) -> Findings:
     """Measure field by field, gather."""
-    context.say("depth: integrators, generated balls")
-    panels = [depth_known.poisson_panel(config.rounds), *generated_panels(config)]
-    if config.data_dir is not None:
-        context.say("depth: recordings")
-        panels += recorded_panels(config, config.data_dir)
-    if config.motion:
-        context.say("motion: markers, dense fields, shear")
-        panels += motion_panels(config)
+    panels: list[Panel] = []
+    for name, make in panels_of(config).items():
+        context.say(name)
+        with context.timed(name.replace(", ", "_").replace(" ", "_")):
+            panels += make()
     return Findings(
         verdict=tuple(sentence for panel in panels for sentence in panel.verdict),
         requirements=tuple(r for panel in panels for r in panel.requirements),
@@ -91,6 +93,22 @@ def run(config: FieldsConfig, context: Context) -> Findings:
         pictures=tuple(p for panel in panels for p in panel.pictures),
         settings={"recordings": "none" if config.data_dir is None else "read", "cores": 1},
     )
+
+
+def panels_of(config: FieldsConfig) -> dict[str, Callable[[], list[Panel]]]:
+    """What is measured, in the order of the report: name → how to make its panels."""
+    root = config.data_dir
+    makes: dict[str, Callable[[], list[Panel]]] = {
+        "integrators": lambda: [depth_known.poisson_panel(config.rounds)],
+        "generated balls": lambda: generated_panels(config),
+    }
+    if root is not None:
+        makes |= {
+            "real balls": lambda: real_balls(config, root),
+            "known depth": lambda: [depth_known.known_panel(root, config.seed)],
+            "failed contact": lambda: [depth_contact.contact_panel(root, config.seed)],
+        }
+    return makes | (motion_panels(config) if config.motion else {})
 
 
 def generated_panels(config: FieldsConfig) -> list[Panel]:
@@ -126,8 +144,8 @@ def other_balls(config: FieldsConfig, optics: depth_presses.Optics, source: str)
     return made, depth_balls.other_ball_panel(made, others, source)
 
 
-def recorded_panels(config: FieldsConfig, root: pathlib.Path) -> list[Panel]:
-    """Everything about depth that needs recordings."""
+def real_balls(config: FieldsConfig, root: pathlib.Path) -> list[Panel]:
+    """Recorded presses of the calibration's ball, and of another where there are any."""
     gelslam = depth_data.gelslam(root)
     panels = [depth_balls.real_panel(gelslam, "gelslam", config.folds, config.rounds, config.seed)]
     other = root / "gelslam" / "9.500mm"
@@ -137,21 +155,24 @@ def recorded_panels(config: FieldsConfig, root: pathlib.Path) -> list[Panel]:
         )
         made = depth_balls.calibrated(gelslam, config.seed)
         panels.append(depth_balls.other_ball_panel(made, {"9.5 mm": bigger}, "gelslam"))
-    return [*panels, depth_known.known_panel(root, config.seed), depth_known.contact_panel(root)]
-
-
-def motion_panels(config: FieldsConfig) -> list[Panel]:
-    """Markers, dense fields, shear and force, and what tells a marker gel from a bare one."""
-    rests = motion_frames.gels(config.data_dir)
-    panels = [
-        motion_markers.panel(config.markers, rests),
-        motion_dense.panel(config.dense_motions, config.rounds, rests),
-        motion_shear.panel(config.shear, config.data_dir),
-        motion_layers.panel(config.shear),
-    ]
-    if config.data_dir is not None:
-        panels.append(motion_evidence.panel(config.data_dir, config.judged))
     return panels
+
+
+def motion_panels(config: FieldsConfig) -> dict[str, Callable[[], list[Panel]]]:
+    """Markers and their drift, dense fields, shear and force, and what tells a marker gel from a bare one."""
+    root, rests = config.data_dir, motion_frames.gels(config.data_dir)
+    subjects = [motion_subjects.subject(rest) for rest in rests]
+    real = [s for s in subjects if s.rest.real] or subjects[:1]
+    makes: dict[str, Callable[[], list[Panel]]] = {
+        "markers": lambda: [motion_markers.panel(config.markers, subjects)],
+        "drift": lambda: [motion_drift.panel(config.drift, real)],
+        "dense fields": lambda: [motion_dense.panel(config.dense_motions, config.rounds, rests)],
+        "shear": lambda: [motion_shear.panel(config.shear, root)],
+        "wrong layers": lambda: [motion_layers.panel(config.shear)],
+    }
+    if root is not None:
+        makes["patterns"] = lambda: [motion_evidence.panel(root, config.judged)]
+    return makes
 
 
 EXPERIMENT = Experiment(

@@ -4,7 +4,7 @@
 
 Each folder of ball presses in DIR is calibrated by itself, with no labels and one setting, and the fields of some of
 its pictures are drawn: change of colour, depth, contact, deformation where the gel has markers.  A folder that cannot
-be calibrated says why.  Four minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
+be calibrated says why.  Five minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
 marker-less Minis calibrate to ten micrometres or so; DIGIT and marker gels are refused depth or flagged, not guessed.
 """
 

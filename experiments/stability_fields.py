@@ -32,7 +32,7 @@ from experiments.running.runner import Experiment
 from sensors_io.schema import Flag
 
 METHODS = (
-    "this, affine",
+    "this",
     "this, LK alone",
     "LK to rest",
     "LK frame to frame",

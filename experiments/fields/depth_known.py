@@ -1,4 +1,4 @@
-"""The depth panel, part two: integrators on analytic slopes, presses at known depth, pictures without contact."""
+"""The depth panel, part two: integrators on analytic slopes, presses at known depth."""
 
 import pathlib
 from collections.abc import Callable
@@ -11,8 +11,6 @@ from experiments.fields.depth_methods import one_sided_dirichlet, published_pois
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Cell, Column, Requirement, Table
 from experiments.running.timing import interleaved
-from sensors_io import quality
-from sensors_io.fields.contact import ContactConfig, steepest_change
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader
@@ -146,48 +144,3 @@ def known_panel(root: pathlib.Path, seed: int) -> Panel:
             ),
         ),
     )
-
-
-def contact_panel(root: pathlib.Path) -> Panel:
-    """Which pictures and rows the filters reject, one setting for all recordings."""
-    config = ContactConfig()
-    frames, background = depth_data.feelanyforce(root)
-    presses = {"gelslam": depth_data.gelslam(root), "FOTS": depth_data.fots(root)}
-    steep = {"feelanyforce": [steepest_change(f, background, PITCH_MM, config.smoothing_mm) for f in frames]}
-    for name, p in presses.items():
-        steep[name] = [steepest_change(f, p.background, p.mm_per_px, config.smoothing_mm) for f in p.pictures]
-    rejected = {name: sum(s < config.steepness for s in values) for name, values in steep.items()}
-    rows = depth_data.feelanyforce_rows(root)
-    empty, flagged = np.isnan(rows).all(1), quality.incomplete(rows)
-    wrong = float(np.count_nonzero(flagged != empty))
-    real = sum(rejected[name] for name in presses)
-    return Panel(
-        verdict=(
-            f"{rejected['feelanyforce']} of {len(frames)} pictures without contact are rejected, {real} of "
-            f"{sum(map(len, presses.values()))} real contacts; {int((flagged & empty).sum())} of {int(empty.sum())} "
-            "empty rows are flagged.",
-        ),
-        requirements=(
-            _count("pictures without contact that pass", len(frames) - rejected["feelanyforce"]),
-            _count("real contacts that are rejected", real),
-            _count("rows flagged wrongly or not", wrong),
-        ),
-        tables=(
-            Table(
-                title="Failed contact",
-                columns=(
-                    Column(name="recording"),
-                    Column(name="pictures", format="d"),
-                    Column(name="rejected", format="d"),
-                    Column(name="flattest", unit="levels/mm", format=".1f", meaning="least steepest change"),
-                    Column(name="steepest", unit="levels/mm", format=".1f"),
-                ),
-                rows=tuple((n, len(v), rejected[n], float(min(v)), float(max(v))) for n, v in steep.items()),
-                note=f"A contact changes some channel by {config.steepness:g} grey levels/mm somewhere.",
-            ),
-        ),
-    )
-
-
-def _count(name: str, value: float) -> Requirement:
-    return Requirement(name=name, measured=float(value), bound=0.0, better="lower")

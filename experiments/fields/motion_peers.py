@@ -25,11 +25,11 @@ Make = Callable[[np.ndarray, np.ndarray, int], Follower]
 """From picture at rest, points and half side of the windows."""
 
 
-def ours(affine: bool) -> Make:
-    """The package's tracker, with or without the affine fit."""
+def ours(affine: bool, smooth: bool) -> Make:
+    """The package's tracker, with or without the affine fit and smoothing."""
 
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
-        tracker = Tracker(rest, points, half_px, TrackingConfig(affine=affine))
+        tracker = Tracker(rest, points, half_px, TrackingConfig(affine=affine, smooth=smooth))
 
         def follow(grey: np.ndarray) -> np.ndarray:
             tracked = tracker.track(grey)
@@ -130,8 +130,9 @@ def mean_shift(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
 
 
 FOLLOWERS: dict[str, Make] = {
-    "this, affine": ours(True),
-    "this, LK alone": ours(False),
+    "this": ours(affine=True, smooth=True),
+    "this, affine alone": ours(affine=True, smooth=False),
+    "this, LK alone": ours(affine=False, smooth=False),
     "LK to rest": lucas_kanade_to_rest,
     "LK frame to frame": lucas_kanade_between_frames,
     "DIS ultrafast": dense_inverse_search(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),

@@ -18,7 +18,7 @@ from sensors_io.fields.compliance import total_force as total_traction
 from sensors_io.fields.helmholtz import decompose
 from sensors_io.fields.inversion import InverseConfig, LayerInverse
 from sensors_io.fields.shear import ShearAndForce, ShearReader
-from sensors_io.force import at_frames, estimate_lag
+from sensors_io.force import ForceError, at_frames, estimate_lag
 from sensors_io.scenes.sensors import DMTAC_X, TAC3D, XENSE, SensorModel
 
 MAIN, WITH_GRADIENT = "layer model, gradient-free", "layer model, all of the motion"
@@ -139,16 +139,18 @@ def recorded_rows(data_dir: pathlib.Path) -> list[tuple[Cell, ...]]:
     """The same on the vendor's recordings; `force` there is the vendor's estimate, not a measured one.
 
     It comes later than the displacement that it belongs to.  By how much is told by the *other* recordings, so that
-    the held-out blocks stay unseen.
+    the held-out blocks stay unseen; where none of them tells, by the recording itself, and the row says so.
     """
     recordings = [_recorded(path) for path in sorted((data_dir / "tac3d").glob("*.npz"))]
     rows: list[tuple[Cell, ...]] = []
     for one in recordings:
-        others = [other.lag_s for other in recordings if other is not one]
+        others = [other.lag_s for other in recordings if other is not one and other.lag_s is not None]
         inputs = {"": (one.displacement_mm, one.force_n), ", with the inverted load": (one.loaded(), one.force_n)}
         if others:
             lag_s = float(np.mean(others))
             inputs[f", force read {-1e3 * lag_s:.0f} ms later"] = one.aligned(lag_s)
+        elif one.lag_s is not None:
+            inputs[f", force read {-1e3 * one.lag_s:.0f} ms later, by its own lag"] = one.aligned(one.lag_s)
         for how, (fields, force) in inputs.items():
             model = total_force.fit(fields, force)
             rows.append((f"{one.name}{how}", len(force), *map(float, model.held_out_rmse), *_size(force)))
@@ -165,10 +167,13 @@ class _Recorded:
     time_ns: np.ndarray
 
     @functools.cached_property
-    def lag_s(self) -> float:
-        """By how much displacement comes later than force, from their rates of change."""
+    def lag_s(self) -> float | None:
+        """By how much displacement comes later than force, from their rates of change; `None` where these disagree."""
         moved = np.sqrt((self.displacement_mm**2).mean((1, 2)))
-        return estimate_lag(self.time_ns, moved, self.time_ns, np.linalg.norm(self.force_n, axis=1)).seconds
+        try:
+            return estimate_lag(self.time_ns, moved, self.time_ns, np.linalg.norm(self.force_n, axis=1)).seconds
+        except ForceError:
+            return None
 
     def aligned(self, lag_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Displacement, and the force of its own time, where readings cover it."""
@@ -274,7 +279,7 @@ def _regression_table(rows: Sequence[tuple[Cell, ...]]) -> Table:
         columns=(Column(name="recording"), Column(name="frames", format="d"), *axes, *sizes),
         rows=tuple(rows),
         note="On vendor recordings the force is the vendor's estimate, which comes later than its displacement; by how "
-        "much is estimated on the other recording. Pressing is z < 0.",
+        "much is estimated on the other recording where it tells. Pressing is z < 0.",
     )
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 REST_PICTURES = 16
 """Pictures that the background is the mean of: one alone would add its noise to that of every later one."""
 
-_FIXED_POINT = 80  # iterations of f = b(p + f); strain 0.5 leaves 1e-24
+_FIXED_POINT, _UNCHANGED_PX = 80, 1e-9  # iterations of f = b(p + f) at most, and the change that ends them
 _LIGHT_GREY, _LIGHT_WIDTH = 25.0, 0.18  # coloured shading of a contact: grey levels, and share of the shorter side
 _SETTLED = 0.55, 0.45  # centre of the contact, over width and height
 
@@ -53,7 +53,9 @@ class Motion:
         """f at points (x, y) […, 2]."""
         moved = np.zeros(points.shape)
         for _ in range(_FIXED_POINT):
-            moved = self.backward(points + moved)
+            before, moved = moved, self.backward(points + moved)
+            if np.abs(moved - before).max() < _UNCHANGED_PX:
+                break
         return moved
 
     def times(self, share: float) -> "Motion":
@@ -103,10 +105,10 @@ class Film:
         self._rest = rest.astype(np.float64)
         self._light = _contact_light(rest.shape)
 
-    def at_rest(self) -> np.ndarray:
+    def at_rest(self, pictures: int = REST_PICTURES) -> np.ndarray:
         """The unmoved gel, the mean of some pictures as a background is recorded, RGB uint8."""
-        pictures = [self.exposed(self._rest) for _ in range(REST_PICTURES)]
-        return np.asarray(np.round(np.mean(pictures, 0)), np.uint8)
+        seen = [self.exposed(self._rest) for _ in range(pictures)]
+        return np.asarray(np.round(np.mean(seen, 0)), np.uint8)
 
     def under(self, motion: Motion, light: float = 1.0, exposure: float = 1.0) -> np.ndarray:
         """The gel under a motion, RGB uint8.
@@ -127,7 +129,7 @@ class Film:
 
     def exposed(self, picture: np.ndarray) -> np.ndarray:
         """A clean picture as the camera gives it, RGB uint8."""
-        noisy = picture + self._noise_grey * self._rng.standard_normal(picture.shape)
+        noisy = picture + self._noise_grey * self._rng.standard_normal(picture.shape, picture.dtype.type)
         return np.round(np.clip(noisy, 0, 255)).astype(np.uint8)
 
 

@@ -51,9 +51,11 @@ def _depth(figure: Figure, axes: Axes, row: Row, mm_per_px: float) -> None:
     window = (0, width * mm_per_px, height * mm_per_px, 0)
     if row.depth_mm is None:
         axes.imshow(row.contact, cmap="Greys", extent=window)
+        axes.set_title("contact, by colour", fontsize=7)
     else:
         shown = axes.imshow(row.depth_mm, cmap="cividis", vmin=0, extent=window)
-        figure.colorbar(shown, ax=axes, label="depth, mm")
+        figure.colorbar(shown, ax=axes)
+        axes.set_title("depth, mm", fontsize=7)
     if row.contact.any() and not row.contact.all():
         axes.contour(
             *(np.linspace(0, n * mm_per_px, n) for n in (width, height)), row.contact, [0.5], colors="w", linewidths=0.8

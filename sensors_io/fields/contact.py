@@ -9,6 +9,13 @@ EDGE_SHARE = 0.5
 """Of a contact's greatest depth: that at the edge of a ball's contact on a half-space (Hertz), whatever its size."""
 
 
+STEEP = 0.08
+"""Slope that untouched gel stays below: a contact reaches it at its rim, a zero level that drifts nowhere."""
+
+RIM_CELL_PX = 4
+"""Side of the cells whose slope is judged: noise makes single pixels steep anywhere."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactConfig:
     """Hysteresis of the contact mask, and what change of the picture makes a contact.
@@ -16,6 +23,7 @@ class ContactConfig:
     Args:
       low_mm, high_mm: an indented region deeper than `low_mm` counts if it reaches `high_mm` somewhere.
       least_mm2: smaller regions are specks.
+      rim: slope that the depth of a contact reaches somewhere.
       steepness: grey levels per millimetre that the smoothed change must reach somewhere for a contact.
       smoothing_mm: standard deviation of that smoothing.
     """
@@ -23,13 +31,14 @@ class ContactConfig:
     low_mm: float = 0.03
     high_mm: float = 0.06
     least_mm2: float = 0.05
+    rim: float = STEEP
     steepness: float = 10.0
     smoothing_mm: float = 0.3
 
     def __post_init__(self) -> None:
         if not 0 < self.low_mm <= self.high_mm:
             raise ValueError(f"low_mm is {self.low_mm}, high_mm {self.high_mm}: must be 0 < low ≤ high; lower low_mm")
-        for name in ("least_mm2", "steepness", "smoothing_mm"):
+        for name in ("least_mm2", "rim", "steepness", "smoothing_mm"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; raise it")
 
@@ -44,9 +53,12 @@ class Contacts:
 
 
 def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig | None = None) -> Contacts:
-    """Contact by hysteresis: in each connected region deeper than `low_mm` that reaches `high_mm`,
+    """Contact by hysteresis: in each connected region deeper than `low_mm` that reaches `high_mm` and slopes by `rim`,
 
         the pixels with u ≥ max(low_mm, ½ max u)
+
+    A ball of radius R that sinks in by u slopes by √(u/R) at its rim (Hertz), over a cell by somewhat less: one of
+    10 mm is seen from 0.1 mm or so.  A flat face slopes at its edges, and is missed where the picture shows none.
 
     Args:
       depth_mm: float32 [H, W], 0 where nothing touches.
@@ -55,6 +67,7 @@ def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig 
     """
     config = config or ContactConfig()
     count, labels, stats, _ = cv2.connectedComponentsWithStats((depth_mm > config.low_mm).astype(np.uint8))
+    steep = _slope(depth_mm, mm_per_px) >= config.rim
     mask, kept, border = np.zeros(depth_mm.shape, bool), 0, False
     for label in range(1, count):
         x, y, w, h, area = stats[label]
@@ -63,13 +76,23 @@ def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig 
         box = np.s_[y : y + h, x : x + w]
         inside = labels[box] == label
         peak = float(depth_mm[box][inside].max())
-        if peak < config.high_mm:
+        if peak < config.high_mm or not steep[box][inside].any():
             continue
         touched = inside & (depth_mm[box] >= EDGE_SHARE * peak)
         mask[box] |= touched
         kept += 1
         border |= _meets_border(touched, (x, y), depth_mm.shape)
     return Contacts(mask=mask, count=kept, at_border=border)
+
+
+def _slope(depth_mm: np.ndarray, mm_per_px: float) -> np.ndarray:
+    """Length of the gradient of the depth, averaged over cells of `RIM_CELL_PX`, float32 [H, W]."""
+    height, width = depth_mm.shape
+    size = (max(2, width // RIM_CELL_PX), max(2, height // RIM_CELL_PX))
+    cells = cv2.resize(depth_mm, size, interpolation=cv2.INTER_AREA)
+    down, across = np.gradient(cells, mm_per_px * height / size[1], mm_per_px * width / size[0])
+    slope: np.ndarray = cv2.resize(np.hypot(down, across), (width, height), interpolation=cv2.INTER_NEAREST)
+    return slope
 
 
 def changed_contacts(

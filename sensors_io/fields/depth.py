@@ -6,7 +6,7 @@ import functools
 import cv2
 import numpy as np
 
-from sensors_io.fields.contact import ContactConfig, Contacts, find_contacts
+from sensors_io.fields.contact import STEEP, ContactConfig, Contacts, find_contacts
 from sensors_io.fields.poisson import neumann
 from sensors_io.fields.slopes import SlopeReader
 from sensors_io.fields.types import Calibration
@@ -25,7 +25,7 @@ class ZeroConfig:
       bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant.
     """
 
-    steep: float = 0.08
+    steep: float = STEEP
     margin_mm: float = 3.0
     bent: float = 0.4
     tilted: float = 0.15

@@ -41,7 +41,8 @@ class ThinPlate:
         plane = _plane(self._at)
         inverse = np.linalg.inv(np.block([[kernel, plane], [plane.T, np.zeros((3, 3))]]))
         self._coefficients = inverse[:, : len(points)]
-        self._bending = inverse[: len(points), : len(points)]
+        bending = inverse[: len(points), : len(points)]
+        self._bending = (bending + bending.T) / 2  # symmetric but for rounding
 
     def __len__(self) -> int:
         return len(self._at)
@@ -50,6 +51,11 @@ class ThinPlate:
     def pitch_px(self) -> float:
         """Typical distance of a point to its nearest neighbour."""
         return self._unit
+
+    @property
+    def roughness(self) -> np.ndarray:
+        """B [P, P]: d·B d is the bending energy of the spline through displacements d [P] along one axis."""
+        return self._bending
 
     def matrix(self, at_px: np.ndarray) -> np.ndarray:
         """M at points (x, y) [Q, 2]: displacements [P, …] → displacements [Q, …], float32 [Q, P]."""

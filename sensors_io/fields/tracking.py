@@ -1,6 +1,6 @@
 """Points of a gel followed through pictures, each picture matched straight to the one at rest, so that nothing drifts.
 
-One frame goes through five steps:
+One frame goes through six steps:
 
     1. Lucas–Kanade from the picture at rest, started where the points were last seen; a picture of another exposure
        is brought to that of the one at rest first
@@ -9,6 +9,7 @@ One frame goes through five steps:
     3. the affine fit of `patches`, which takes strain and light into account
     4. the gates: back to the picture at rest within a pixel, alike, whole, as the others predict
     5. points that fail are flagged and placed where the spline of the others puts them, from where they are found again
+    6. all are brought to the smoothest field that their noise warrants (`smoothing`)
 
 Sources: Lucas & Kanade 1981 in Bouguet's pyramid; Kroeger et al., ECCV 2016 (DIS); Kalal et al., ICPR 2010 (forward
 and back).
@@ -22,6 +23,7 @@ import numpy as np
 
 from sensors_io.fields.neighbours import Neighbours
 from sensors_io.fields.patches import Patches
+from sensors_io.fields.smoothing import Smoother
 from sensors_io.fields.spline import ThinPlate
 
 LEAST_POINTS = 4
@@ -49,7 +51,7 @@ class TrackingConfig:
       safe_strain: the same, below which a piece is taken for right, to grow from.
       surprise: greatest difference from what all other points predict, over the points' pitch.
       reseed_share: of points that fail, above which a new start is looked for.
-      affine: whether step 3 is taken.
+      affine, smooth: whether steps 3 and 6 are taken.
     """
 
     back_px: float = 1.0
@@ -60,6 +62,7 @@ class TrackingConfig:
     surprise: float = 0.2
     reseed_share: float = 0.02
     affine: bool = True
+    smooth: bool = True
 
     def __post_init__(self) -> None:
         for name in ("back_px", "likeness", "spread_px", "strain", "safe_strain", "surprise", "reseed_share"):
@@ -101,6 +104,7 @@ class Tracker:
         self._side = 2 * half_px + 1
         self._start = np.ascontiguousarray(points_px, np.float32)
         self.spline = ThinPlate(self._start)
+        self._smoothed = Smoother(self.spline)
         self._patches = Patches(reference, self._start, half_px)
         self._neighbours = Neighbours(self._start)
         self._reference = np.ascontiguousarray(reference)
@@ -228,10 +232,11 @@ class Tracker:
         return found & ~self.spline.inconsistent(moved, found, self._config.surprise * self.spline.pitch_px)
 
     def _completed(self, points: np.ndarray, found: np.ndarray) -> np.ndarray:
-        """Lost points where the spline puts them; all at rest where too few are found for a spline."""
+        """Steps 5 and 6; all points at rest where too few are found for a spline."""
         if found.sum() < LEAST_POINTS:
             return self._start
-        return self._start + self.spline.filled(points - self._start, found)
+        moved = self.spline.filled(points - self._start, found)
+        return self._start + (self._smoothed(moved) if self._config.smooth else moved)
 
     def _check(self, picture: np.ndarray) -> None:
         if picture.dtype != np.uint8 or picture.shape != self._reference.shape:

@@ -1,4 +1,4 @@
-"""The depth part of the chart of fields, shrunk, and the peers' faults that it must show."""
+"""The chart of fields, shrunk, and the peers' faults that it must show."""
 
 import dataclasses
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from experiments import pareto_fields
-from experiments.fields import depth_known
+from experiments.fields import depth_known, motion_drift, motion_frames, motion_markers
 from experiments.fields.depth_methods import MAPS
 from experiments.fields.depth_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
+from experiments.fields.motion_frames import Rest
+from experiments.fields.motion_subjects import Subject, subject
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 from sensors_io.calibration.circles import find_circles
@@ -86,3 +88,39 @@ def test_truth_at_known_depth_is_the_indenter():
     flat, inside = depth_known.depth_data.known_truth("prism", 0.25, (320, 320))
     assert np.unique(flat).tolist() == [0.25]
     assert inside.sum() == 71 * 107
+
+
+def roof(slope: int = 2, half: int = 8) -> Subject:
+    """A picture g (|x − c| + |y − c|) and one window about its centre c."""
+    y, x = np.mgrid[:48, :320]
+    grey = 40 + slope * (np.minimum(np.abs(x - 24), 20) + np.minimum(np.abs(y - 24), 20))
+    picture = np.repeat(grey[..., None], 3, -1).astype(np.uint8)
+    rest = Rest(name="roof", picture=picture, real=False)
+    return Subject(rest=rest, points_px=np.array([[24.0, 24.0]]), half_px=half, dot_radius_px=8.0)
+
+
+def test_the_least_error_of_a_window_is_that_of_its_gradient():
+    """Σ I_x² = Σ I_y² = g² 2h (2h + 1), Σ I_x I_y = 0; the noise of both pictures counts."""
+    slope, half = 2, 8
+    noise = (motion_drift.NOISE_GREY**2 + 1 / 12) * (0.299**2 + 0.587**2 + 0.114**2) + 1 / 12
+    expected = np.sqrt(np.log(2) * 2 * 2 * noise / (slope**2 * 2 * half * (2 * half + 1)))
+    assert motion_drift.bound_px(roof(slope, half), light_and_strain=False) == pytest.approx(expected, rel=1e-3)
+    assert motion_drift.bound_px(roof(slope, half), light_and_strain=True) > expected
+
+
+def test_what_a_method_calls_lost_has_no_error():
+    error = np.append(np.linspace(0, 1, 19), [np.inf, np.inf])
+    assert motion_markers.known(error) == (pytest.approx(10 / 18), None)
+
+
+def test_what_is_anchored_does_not_drift(monkeypatch):
+    monkeypatch.setattr(motion_drift, "PERIOD", 6)
+    config = motion_drift.DriftConfig(cycles=(1, 10), pairs=3)
+    panel = motion_drift.panel(config, [subject(motion_frames.gels(None)[0])])
+    growth = panel.requirements[1]
+    assert growth.met, growth
+    ours, alone, *_, peer = panel.tables[0].rows
+    assert ours[2] < alone[2]
+    assert peer[2] - peer[1] > 3 * abs(ours[2] - ours[1])
+    with pytest.raises(ValueError, match="must hold 1 and 10"):
+        motion_drift.DriftConfig(cycles=(1, 2))

@@ -73,6 +73,26 @@ def test_hysteresis_keeps_no_shallow_region_and_no_speck() -> None:
     assert not find_contacts(speck, PITCH, config).mask.any()
 
 
+def test_a_zero_level_that_drifts_is_no_contact() -> None:
+    """A corner that rises by 0.1 mm over 10 mm beside a bump of 0.5 mm: one contact, away from the border."""
+    y, x = np.mgrid[:160, :214] * 0.1
+    drift = (0.1 * np.clip((x + y - 27) / 10, 0, 1)).astype(np.float32)
+    bump = (0.5 * np.exp(-((x - 8) ** 2 + (y - 7) ** 2) / 2)).astype(np.float32)
+    found = find_contacts(drift + bump, 0.1)
+    assert (found.count, found.at_border) == (1, False)
+    assert find_contacts(drift, 0.1).count == 0
+    assert find_contacts(drift, 0.1, ContactConfig(rim=0.01)).at_border
+
+
+@pytest.mark.parametrize(("sunk_mm", "count"), [(0.15, 1), (0.05, 0)])
+def test_a_ball_of_ten_millimetres_is_touched_from_a_rim_of_eight_hundredths(sunk_mm: float, count: int) -> None:
+    """√(u/R) = 0.08 at u = 0.064 mm; the thresholds of depth let both pass."""
+    contact_mm = np.sqrt(sunk_mm * 10.0)
+    y, x = np.mgrid[:240, :320].astype(float)
+    depth, _, _ = indentation((x - 160) * PITCH, (y - 120) * PITCH, contact_mm, 10.0)
+    assert find_contacts(depth.astype(np.float32), PITCH, ContactConfig(high_mm=0.04)).count == count
+
+
 @pytest.mark.parametrize(("folder", "press", "pitch"), [("gelslam", "press_9", 0.1902), ("FOTS", "press_20", 0.2043)])
 def test_real_contacts_are_contacts_and_drift_is_none(folder: str, press: str, pitch: float) -> None:
     background = read_picture(DATA / folder / "background.png")
