@@ -18,7 +18,7 @@ jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions
 hypothesis.settings.register_profile("shared", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("shared")
 
-QUICKLY = "--xla_cpu_use_fusion_emitters=false"
+QUICKLY = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
 """Flag of XLA: of its two ways to write a fused loop the older one, as long as there is one, compiles twice as fast."""
 
 PROGRAMS = "TOUCHR1_TEST_PROGRAMS"
@@ -37,7 +37,7 @@ def pytest_configure(config: pytest.Config) -> None:
     Most of XLA's optimisations are left out: they take longer here than all the arithmetic.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if QUICKLY not in flags and jax.__version_info__ < (0, 11):  # XLA reads them when it compiles its first program
+    if QUICKLY not in flags:  # XLA reads them when it compiles its first program
         os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
     if PROGRAMS not in os.environ:  # else this is a worker of a session that has its folder
         folder = tempfile.TemporaryDirectory(prefix="touchr1-programs-")
