@@ -97,9 +97,6 @@ PRETRAIN_FRAMES, SFT_QA, RL_QA = 1_000_000, 240_000, 120_000
 REWARD_WEIGHTS: Mapping[str, float] = {"accuracy": 0.6, "cross-sensor consistency": 0.3, "format": 0.1}
 """Section 3.2, the equation of the total reward."""
 
-OBJECTIVE_TERMS = ("GRPO on the total reward", "γ · tactile grounding")
-"""Section 3.2, the equation of the overall objective."""
-
 ADVERTISED_TERMS = ("accuracy", "cross-sensor consistency", "format", "tactile use")
 """Abstract and introduction: what credit is said to be given for."""
 

@@ -41,15 +41,6 @@ def fots(root: pathlib.Path) -> BallPresses:
     return BallPresses(pictures=pictures, background=background, radius_mm=4.70 / 2, mm_per_px=1 / 19.58)
 
 
-def shapemap(root: pathlib.Path) -> BallPresses:
-    """49 presses of a ball of 4.0 mm into a third GelSight Mini; its background was taken under other settings."""
-    folder = root / "gsmini_shapemap" / "calib_ball"
-    files = sorted(folder.glob("*.jpg"))
-    background = read_picture(folder / "frame_0.png")
-    pictures = np.stack([read_picture(path) for path in files])
-    return BallPresses(pictures=pictures, background=background, radius_mm=2.0, mm_per_px=0.08)
-
-
 def feelanyforce(root: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     """25 pictures of a GelSight Mini that nothing touches, and its background."""
     folder = root / "feelanyforce"
