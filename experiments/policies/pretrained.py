@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.policies.arrays import flat, nested
 from experiments.running.artifacts import jsonable, write_bytes
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params
@@ -38,7 +39,7 @@ def save_encoder(path: Path, encoder: PretrainedEncoder) -> None:
     """Publish an encoder atomically, as an `.npz` file."""
     about = {"config": encoder.config, "sensors": encoder.sensors, "notes": encoder.notes}
     arrays: dict[str, Any] = {_ABOUT: np.frombuffer(json.dumps(jsonable(about)).encode(), np.uint8)}
-    arrays |= _flat(encoder.params)
+    arrays |= flat(encoder.params)
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
@@ -58,29 +59,10 @@ def load_encoder(path: Path) -> PretrainedEncoder:
         if _ABOUT not in file:
             raise ValueError(f"encoder is {path}: it has no entry {_ABOUT!r}; give a file that pretrain_encoder wrote")
         about = json.loads(file[_ABOUT].tobytes())
-        params = _nested({name: jnp.asarray(file[name]) for name in file.files if name != _ABOUT})
+        params = nested({name: file[name] for name in file.files if name != _ABOUT})
     known = {f.name for f in dataclasses.fields(TactileViTConfig)}
     if set(about["config"]) != known:
         odd = sorted(set(about["config"]) ^ known)
         raise ValueError(f"encoder {path} has a config that differs in {odd}: it is of another version; train it again")
     config = TactileViTConfig(**about["config"])
     return PretrainedEncoder(config=config, sensors=tuple(about["sensors"]), params=params, notes=about["notes"])
-
-
-def _flat(tree: Params, prefix: str = "") -> dict[str, np.ndarray]:
-    flat: dict[str, np.ndarray] = {}
-    for name, value in tree.items():
-        here = f"{prefix}{name}"
-        flat |= _flat(value, f"{here}/") if isinstance(value, dict) else {here: np.asarray(value)}
-    return flat
-
-
-def _nested(flat: dict[str, Any]) -> Params:
-    tree: dict[str, Any] = {}
-    for path, value in flat.items():
-        *folders, name = path.split("/")
-        here = tree
-        for folder in folders:
-            here = here.setdefault(folder, {})
-        here[name] = value
-    return tree

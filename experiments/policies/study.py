@@ -16,6 +16,7 @@ from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
+from experiments.policies.shared import shared_sft
 from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
     Probed,
@@ -65,6 +66,8 @@ class StudyConfig:
     sft: SFTConfig = SFTConfig()
     blind: SFTConfig = SFTConfig(micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
+    share_sft: bool = True
+    """Take SFT checkpoints from the cache where an experiment with the same data, settings and code made them."""
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
@@ -191,8 +194,7 @@ class _Seed:
 
     def _train(self) -> None:
         config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
-        stage, tactile = f"sft/{seed}", self.tactile
-        params = run_sft(assembly, data, self.evidence, config.sft, context, seed=seed, stage=stage, tactile=tactile)
+        params = self._sft(config.sft, f"sft/{seed}", tactile=self.tactile)
         encode = functools.partial(encode_contacts, assembly, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(assembly.agent, params, data, seed=seed)
@@ -215,11 +217,23 @@ class _Seed:
         self._ask(BLIND, self._blind)
 
     def _blind(self) -> Evaluated:
-        config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
-        stage = f"blind/{seed}"
-        params = run_sft(assembly, data, self.evidence, config.blind, context, seed=seed, stage=stage, blind=True)
-        features = encode_contacts(assembly, params, data, data.parts["test"], context, blind=True)
-        return evaluate_policy(assembly, params, features, self._label("test"))
+        params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
+        features = encode_contacts(self.assembly, params, self.data, self.data.parts["test"], self.context, blind=True)
+        return evaluate_policy(self.assembly, params, features, self._label("test"))
+
+    def _sft(self, sft: SFTConfig, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
+        make = shared_sft if self.config.share_sft else run_sft
+        return make(
+            self.assembly,
+            self.data,
+            self.evidence,
+            sft,
+            self.context,
+            seed=self.seed,
+            stage=stage,
+            blind=blind,
+            tactile=tactile,
+        )
 
     def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:
         if not self._path(name).exists():

@@ -13,16 +13,23 @@ from touchr1_jax.rl.kl import estimated_kl
 from touchr1_jax.rl.objective import Experience, token_terms
 from touchr1_jax.types import Params
 
+NEAR = 1.5
+"""A KL of up to this many δ is near enough: where KL is quadratic one shortening ends at 1."""
+
+MOST = 4
+"""Measurements of one update at most; each is a forward pass over the rollouts."""
+
 
 def within_trust(
     agent: Agent, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
 ) -> tuple[Params, dict[str, Array]]:
-    """Shorten an update so that it moves the policy by about δ nat a token at most, on the rollouts that it is from.
+    """Shorten an update until it moves the policy by about δ nat a token at most, on the rollouts that it is from.
 
-    θ = θ₀ + s (θ₁ − θ₀) with s = min(1, √(δ / KL(π₀ ‖ π₁))), as KL grows with the square of a small step; a step that
-    is proposed from far beyond ends near δ, on either side of it.  The KL is the k3 estimate on the rollouts, which π₀
-    sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix C), here of any optimizer's,
-    without its line search.
+    θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
+    grows with the square of a small step, so that once is enough for a step that is little too long, and not for one
+    from far beyond, where KL has flattened.  An update that was short enough is measured once.  The KL is the k3
+    estimate on the rollouts, which π₀ sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix
+    C), here of any optimizer's, with this fixed point for its line search.
 
     Args:
       agent, config: as in `make_grpo_step`.
@@ -35,11 +42,25 @@ def within_trust(
     Returns:
       The parameters θ, and `update_kl`, the KL that was proposed, and `update_scale`, s.
     """
-    moved = log_probs(agent, config, after, learn)
-    kl = jnp.mean(masked.mean(estimated_kl(learn.rollout.log_prob, moved, "k3"), learn.rollout.mask, axis=-1))
-    scale = jnp.minimum(1.0, jnp.sqrt(delta / jnp.maximum(kl, delta)))
-    params = jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
-    return params, {"update_kl": kl, "update_scale": scale}
+    between = lambda scale: jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
+
+    def moved_by(scale: Float[Array, ""]) -> Float[Array, ""]:
+        moved = log_probs(agent, config, between(scale), learn)
+        return jnp.mean(masked.mean(estimated_kl(learn.rollout.log_prob, moved, "k3"), learn.rollout.mask, axis=-1))
+
+    def too_long(carry: tuple[Array, Array, Array]) -> Array:
+        _, kl, measured = carry
+        return (kl > NEAR * delta) & (measured < MOST)
+
+    def shortened(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        scale, kl, measured = carry
+        scale = scale * jnp.sqrt(delta / kl)
+        return scale, moved_by(scale), measured + 1
+
+    whole = jnp.ones(())
+    proposed = moved_by(whole)
+    scale, _, _ = jax.lax.while_loop(too_long, shortened, (whole, proposed, jnp.ones((), jnp.int32)))
+    return between(scale), {"update_kl": proposed, "update_scale": scale}
 
 
 def log_probs(agent: Agent, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:

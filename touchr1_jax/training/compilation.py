@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import hashlib
 import platform
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -26,13 +27,14 @@ def compilations_kept(directory: Path) -> Iterator[None]:
     processor lie in another folder, for they may hold instructions that this one lacks, so that all machines may share
     the directory.  A cache that was set before, as by `JAX_COMPILATION_CACHE_DIR`, stays the one that is used.
 
-    An entry that a killed process left half-written is reported by JAX and compiled again; it goes with the folder.
+    An entry that a killed process left half-written is removed first: JAX would refuse to write any other beside it.
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         yield
         return
     folder = directory / processor()
     folder.mkdir(parents=True, exist_ok=True)
+    remove_half_written(folder)
     settings = {
         "jax_compilation_cache_dir": str(folder),
         "jax_compilation_cache_max_size": MOST_BYTES,
@@ -44,6 +46,23 @@ def compilations_kept(directory: Path) -> Iterator[None]:
         yield
     finally:
         _set(before)
+
+
+def remove_half_written(folder: Path, older_than_s: float = 60.0) -> int:
+    """Remove entries of a cache that lack the time of their last use, which JAX writes last; their number.
+
+    Args:
+      folder: where the entries lie.
+      older_than_s: younger ones may be in the making.
+    """
+    before, removed = time.time() - older_than_s, 0
+    for entry in folder.glob("*-cache"):
+        used = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
+        with contextlib.suppress(FileNotFoundError):  # another process removed it meanwhile
+            if not used.exists() and entry.stat().st_mtime < before:
+                entry.unlink()
+                removed += 1
+    return removed
 
 
 def return_memory() -> None:

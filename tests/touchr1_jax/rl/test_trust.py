@@ -14,7 +14,7 @@ from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.losses import grounding_bonus
 from touchr1_jax.rl.objective import Experience
 from touchr1_jax.rl.rollout import SampleConfig
-from touchr1_jax.rl.trust import log_probs, within_trust
+from touchr1_jax.rl.trust import NEAR, log_probs, within_trust
 
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
@@ -55,16 +55,20 @@ def test_a_short_update_stays(shorten):
         np.testing.assert_allclose(a, b + 1e-3 * d, atol=1e-6)
 
 
-def test_a_long_update_ends_near_its_bound(shorten):
-    """Where KL is quadratic the shortened step has exactly δ; from afar it is of that order or below."""
-    _, long = shorten(0.1)
+@pytest.mark.parametrize("size", [0.1, 3.0], ids=["a little too long", "far too long"])
+def test_a_long_update_ends_near_its_bound(shorten, size):
+    """Where KL is quadratic once is enough; from afar, where it is flat, the first shortening is far from it."""
+    _, long = shorten(size)
     assert long["update_kl"] > 2 * DELTA
-    _, again = shorten(0.1 * long["update_scale"])
-    assert 0.3 * DELTA < again["update_kl"] < 2 * DELTA
-    _, wild = shorten(3.0)
-    assert wild["update_scale"] < 0.2
-    _, again = shorten(3.0 * wild["update_scale"])
-    assert again["update_kl"] < wild["update_kl"] / 5
+    assert long["update_scale"] < 1
+    _, again = shorten(size * long["update_scale"])
+    assert 0.3 * DELTA < again["update_kl"] <= NEAR * DELTA
+    assert again["update_scale"] == 1
+
+
+def test_a_far_update_is_shortened_more_than_once(shorten):
+    _, far = shorten(3.0)
+    assert far["update_scale"] < 0.9 * np.sqrt(DELTA / far["update_kl"])
 
 
 def test_grounding_pays_up_to_its_budget():

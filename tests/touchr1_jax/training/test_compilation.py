@@ -1,5 +1,6 @@
 """Compiled programs are written below the folder, found again, and only inside the block."""
 
+import os
 import resource
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from touchr1_jax.training import compilation
-from touchr1_jax.training.compilation import compilations_kept, processor, return_memory
+from touchr1_jax.training.compilation import compilations_kept, processor, remove_half_written, return_memory
 
 
 @pytest.fixture
@@ -54,6 +55,20 @@ def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
     compiled(0.7)
     assert jax.config.values["jax_compilation_cache_dir"] is None
     assert not entries(tmp_path)
+
+
+def test_a_half_written_entry_does_not_stop_the_keeping(keeping, tmp_path):
+    """A killed process left the program without the time of its use: JAX would warn and never write again."""
+    with compilations_kept(tmp_path):
+        compiled(0.5)
+    folder = tmp_path / processor()
+    (whole,) = folder.glob("*-cache")
+    young, old = folder / "jit_young-cache", folder / "jit_old-cache"
+    for path in (young, old):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    assert remove_half_written(folder) == 1
+    assert entries(tmp_path) == sorted(p.relative_to(tmp_path) for p in (whole, young))
 
 
 def test_freed_memory_goes_back_to_the_system():
