@@ -114,9 +114,9 @@ def run(config: SpeedConfig, context: Context) -> Findings:
     with tempfile.TemporaryDirectory() as folder:
         first, alone = every_prefix(config, Path(folder), context)
         step = dataclasses.replace(config_of(config.size, config.micro_prompts), lean_compilation=True)
-        lean = {}
+        lean: dict[int, Alone] = {}
         if compiles_leanly():
-            lean = {"lean": in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))}
+            lean = {lean_at: in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))}
         words = many_words(config, Path(folder), context)
     jobs = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
     found = side_by_side(jobs, config.rounds)
@@ -130,7 +130,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
     peers = measure_peers(config, context)
     return Findings(
         verdict=verdict(alone, twice, peers),
-        requirements=requirements(alone, first, peers, course, parser_seconds(config.size)),
+        requirements=requirements(alone, first, lean, peers, course, parser_seconds(config.size)),
         pictures=pictures(config.size, alone, first, peers, course),
         tables=(
             alone_table(config.size, alone, first),
@@ -140,7 +140,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
             memory_table(
                 f"Compiling at prefix {lean_at}",
                 "The older code generator needs less memory and makes slower programs.",
-                {"as it is": first[lean_at], **lean},
+                {"as it is": first[lean_at], **({"lean": lean[lean_at]} if lean else {})},
             ),
             *((memory_table(f"A vocabulary of {config.words:,} words", MANY_WORDS, words),) if words else ()),
         ),

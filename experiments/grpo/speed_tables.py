@@ -24,13 +24,19 @@ Peers = Mapping[tuple[str, int], PeerTimes]
 
 
 def requirements(
-    alone: Mapping[int, Alone], first: Mapping[int, Alone], peers: Peers, course: Course, parser_s: float
+    alone: Mapping[int, Alone],
+    first: Mapping[int, Alone],
+    lean: Mapping[int, Alone],
+    peers: Peers,
+    course: Course,
+    parser_s: float,
 ) -> tuple[Requirement, ...]:
     """The bounds on time, memory, compilations and drift.
 
     Args:
       alone: by prefix, in processes that read their programs from the cache.
       first: by prefix, in processes that compile them.
+      lean: by prefix, in processes that compile them leanly.
       peers: the other engines.
       course: many steps.
       parser_s: seconds that the parser takes.
@@ -41,6 +47,8 @@ def requirements(
         *_ratios(alone, peers),
         *_memory(alone, "with compiled programs in the cache"),
         *_memory(first, "compiling"),
+        *(_memory(lean, "compiling leanly") if lean else ()),
+        *_times(lean, ", compiled leanly"),
         Requirement(name="parser's share of an iteration", measured=parser_s / shortest, bound=0.02, better="lower"),
         Requirement(
             name="programs for one shape",
@@ -52,10 +60,10 @@ def requirements(
     )
 
 
-def _times(alone: Mapping[int, Alone]) -> list[Requirement]:
+def _times(alone: Mapping[int, Alone], how: str = "") -> list[Requirement]:
     return [
         Requirement(
-            name=f"iteration at prefix {prefix}",
+            name=f"iteration at prefix {prefix}{how}",
             measured=median(alone[prefix].seconds),
             bound=limit,
             better="lower",

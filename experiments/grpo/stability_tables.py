@@ -54,7 +54,9 @@ def summary(outcomes: Sequence[Outcome]) -> Table:
 
 def criteria(outcomes: Sequence[Outcome]) -> Table:
     """What counts as failed, and how many seeds did at each value."""
-    listed = lambda o, side: " · ".join(f"{v:g}: {n}" for v, n in zip(o.values, side.failed.sum(1), strict=True))
+    listed = lambda o, side: " · ".join(
+        f"{v:g}:\N{NO-BREAK SPACE}{n}" for v, n in zip(o.values, side.failed.sum(1), strict=True)
+    )
     rows: list[tuple[Cell, ...]] = [
         (o.name, o.scenario.criterion, listed(o, o.failing), listed(o, o.cure)) for o in outcomes
     ]
