@@ -147,4 +147,6 @@ def _plain(values: Sequence[float]) -> Estimate:
 
 DEFAULT = StudyConfig()
 
-EXPERIMENT = Experiment(name="ablation_ordinal", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(
+    name="ablation_ordinal", config=DEFAULT, scales={"smoke": SMOKE}, run=run, curves=CURVES, spreads=True
+)

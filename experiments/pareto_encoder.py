@@ -5,7 +5,8 @@
 Prompts of 8 frames by four sensors at 112².  Every variant saves in one way: fewer tokens by joining frames, frames
 chosen by salience, patches chosen by contact, the quiet rest merged, fewer pixels, another width, fields instead of
 pictures; the reference has 256 tokens a stream.  Each is trained by stage 1 on the same contacts in the same order and
-read by linear probes on unseen objects; forward passes are timed interleaved, on the cores that the process has.
+read by linear probes on unseen objects; forward passes are timed interleaved, on the cores that the process has.  The
+fastest within a point of the reference is chosen on the validation objects; what is reported is of the test objects.
 
 Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
 
@@ -54,9 +55,18 @@ class Config:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Measured:
-    """One variant: probes' answers [n, 3], seconds of a batch of `TIMED` prompts, Gflop of it."""
+    """One variant.
+
+    Args:
+      variant: the encoder.
+      choosing: whether its probes are right about the validation contacts, bool [m, 3].
+      right: the same about the test contacts, bool [n, 3].
+      seconds: of a batch of `TIMED` prompts.
+      gflop: of it.
+    """
 
     variant: Variant
+    choosing: np.ndarray
     right: np.ndarray
     seconds: float
     gflop: float
@@ -83,8 +93,15 @@ def run(config: Config, context: Context) -> Findings:
         v.name: forward(v.config.dynamics(len(data.clip.sensors)), encoders[v.name], prompts(v, data)) for v in ladder
     }
     seconds = medians({**programs, "product": matrix_product()}, config.rounds)
+    between = len(data.parts["val"])
     measured = {
-        v.name: Measured(variant=v, right=right[v.name], seconds=seconds[v.name], gflop=programs[v.name].gflop)
+        v.name: Measured(
+            variant=v,
+            choosing=right[v.name][:between],
+            right=right[v.name][between:],
+            seconds=seconds[v.name],
+            gflop=programs[v.name].gflop,
+        )
         for v in ladder
     }
     peak = matrix_product().gflop / seconds["product"]
@@ -99,15 +116,16 @@ def run(config: Config, context: Context) -> Findings:
 
 
 def learn(config: Config, variant: Variant, data: Dataset, context: Context, name: str) -> tuple[Params, np.ndarray]:
-    """The trained encoder, and whether its probes are right about the test contacts."""
+    """The trained encoder, and whether its probes are right about the validation and then the test contacts."""
     store = FieldsOnly(data.store) if variant.fields else data.store
     rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
     state = pretrain(variant.config, store, rows, data.clip, context, stage=stage, seed=SEED)
     answers = context.directory / "probes" / f"{name}.npy"
     if not answers.exists():
         clip = clip_of(variant.config, data.clip)
-        test = dataclasses.replace(watched(data, "test", config.touch), store=store, clip=clip)
-        found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, test)
+        both = np.concatenate([data.parts["val"], data.parts["test"]])
+        unseen = dataclasses.replace(watched(data, "test", config.touch), store=store, clip=clip, read_rows=both)
+        found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen)
         answers.parent.mkdir(exist_ok=True)
         np.save(answers, found)
     right = np.load(answers)
@@ -123,9 +141,9 @@ def prompts(variant: Variant, data: Dataset) -> TouchBatch:
 
 
 def choose(measured: Mapping[str, Measured]) -> Measured:
-    """The fastest of those whose probes are at most a point below the reference's; the reference among them."""
-    bound = measured[REFERENCE].accuracy - MOST_LOSS
-    return max((m for m in measured.values() if m.accuracy >= bound), key=lambda m: m.rate)
+    """The fastest of those whose probes are at most a point below the reference's on the validation contacts."""
+    bound = measured[REFERENCE].choosing.mean() - MOST_LOSS / 100
+    return max((m for m in measured.values() if m.choosing.mean() >= bound), key=lambda m: m.rate)
 
 
 def loss(m: Measured, measured: Mapping[str, Measured], objects: np.ndarray) -> Interval:

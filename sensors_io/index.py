@@ -64,6 +64,7 @@ class Index:
         Raises:
           MissingIndexError, RecordsVersionError, CorruptRecordsError: there is none, it is another version's, or it is
             damaged.
+          RecordsError: it cannot be read.
         """
         path = root / INDEX
         if not path.is_file():
@@ -75,6 +76,10 @@ class Index:
             found = (tree["format"], tree["version"])
             if found in [(FORMAT, version) for version in READABLE]:
                 return cls._from_tree(tree)
+        except OSError as error:
+            raise RecordsError(
+                f"{path} cannot be read ({error}); make it readable, or copy it again from its source"
+            ) from error
         except (KeyError, TypeError, ValueError) as error:
             raise CorruptRecordsError(f"{path} is damaged ({error!r}); delete {root} and write it again") from error
         raise RecordsVersionError(

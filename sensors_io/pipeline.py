@@ -154,6 +154,7 @@ def clip_batches(
     shuffle: bool = True,
     repeat: bool = True,
     drop_remainder: bool = False,
+    own: Any = None,
     felt: bool = True,
     augment: AugmentConfig | None = None,
     memory: ClipMemory | None = None,
@@ -173,6 +174,7 @@ def clip_batches(
       shuffle: False keeps the order of `indices`.
       repeat: False ends after one epoch.
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
+      own: rows of each batch that are read, where machines share it; None for all.  States are those of the whole.
       felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
       augment: random changes of what is felt, for training; a function of `seed` and of the clip's place in the order.
       memory: where clips stay that are felt and not changed at random; None for nowhere.
@@ -180,7 +182,8 @@ def clip_batches(
       threads: reading threads of each process.
 
     Raises:
-      SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`.
+      SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`; rows
+        that a batch does not have.
     """
     _check_memory(memory, config, workers)
     rows = _checked_rows(indices, len(store))
@@ -199,8 +202,32 @@ def clip_batches(
         clips = dataset.map(lambda i: memory.get(i, lambda: reader(i)))
     else:
         clips = dataset.map(reader)
-    batches = clips.batch(batch_size, drop_remainder=whole)
-    return _read_ahead(batches, workers, threads)
+    return _read_ahead(_batched(clips, batch_size, own, whole), workers, threads)
+
+
+def _batched(clips: grain.MapDataset, batch_size: int, own: Any, whole: bool) -> grain.MapDataset:
+    """Batches of clips, or those rows of each that this machine reads."""
+    if own is None:
+        return clips.batch(batch_size, drop_remainder=whole)
+    rows = _checked_own(own, batch_size, whole)
+    return _OwnRows(clips, batch_size, rows).batch(len(rows), drop_remainder=True)
+
+
+class _OwnRows(grain.MapDataset):
+    """Of every `batch_size` elements those at `own`; the others are never made."""
+
+    def __init__(self, parent: grain.MapDataset, batch_size: int, own: list[int]) -> None:
+        super().__init__(parent)
+        self._size, self._own = batch_size, own
+
+    def __len__(self) -> int:
+        return len(self._parent) // self._size * len(self._own)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return self.slice(index)
+        batch, place = divmod(index, len(self._own))
+        return self._parent[batch * self._size + self._own[place]]
 
 
 def _read_ahead(batches: grain.MapDataset, workers: int, threads: int) -> grain.IterDataset:
@@ -220,6 +247,16 @@ def _checked_rows(indices: Any, contacts: int) -> list[int]:
         raise SchemaError("indices is empty: a pipeline needs at least one contact; choose a split that has some")
     if min(rows) < 0 or max(rows) >= contacts:
         raise SchemaError(f"indices reach {min(rows)}..{max(rows)}: must lie in 0..{contacts - 1}; use this store's")
+    return rows
+
+
+def _checked_own(own: Any, batch_size: int, whole: bool) -> list[int]:
+    rows = [int(i) for i in own]
+    if not rows or rows != sorted({*rows} & {*range(batch_size)}) or not whole:
+        raise SchemaError(
+            f"own is {rows} of batches of {batch_size}, {'all whole' if whole else 'the last perhaps smaller'}: must "
+            f"be ascending rows 0..{batch_size - 1} of whole batches; ask for them, and for repeat or drop_remainder"
+        )
     return rows
 
 

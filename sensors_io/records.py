@@ -81,7 +81,12 @@ class RecordWriter:
         if contacts_per_shard < 1:
             raise ValueError(f"contacts_per_shard is {contacts_per_shard}: must be ≥ 1; raise it")
         self._root = pathlib.Path(path)
-        self._root.mkdir(parents=True, exist_ok=True)
+        try:
+            self._root.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise RecordsExistError(
+                f"{self._root} leads to a file: must be a directory; choose another path"
+            ) from error
         self._per_shard = contacts_per_shard
         self._lock = _lock(self._root)
         try:

@@ -69,6 +69,7 @@ class Flag(enum.IntFlag):
     INCOMPLETE = 1024  # a measured value of this row is missing
     REFUSED = 2048  # a field was asked for that this input cannot carry
     ERROR_UNMET = 4096  # generated on the best grid there is, which does not promise the error asked for
+    NO_ZERO_LEVEL = 8192  # hardly any gel looks untouched, so that absolute depth hangs on nothing
 
 
 class SchemaError(ValueError):

@@ -60,9 +60,12 @@ EXPERIMENTS_LAYERS = (
     {"grpo"},
     {"fields"},
     {"loading"},
+    {"scale"},
     {"encoder"},
     {"recordings"},
     {"bench"},
+    {"ladder"},
+    {"faults"},
 )
 """The same; an experiment itself is one file beside them, which nobody imports."""
 

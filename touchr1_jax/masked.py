@@ -47,18 +47,6 @@ def std(
     return jnp.where(varies, jnp.sqrt(jnp.where(varies, variance, 1)), 0)
 
 
-def whiten(
-    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, epsilon: float, ddof: int = 0
-) -> Array:
-    """Standardised elements, (x − mean) / (std + ε), and 0 where not selected.
-
-    Args:
-      epsilon: keeps the quotient finite; in the units of x.
-    """
-    centred = jnp.where(mask, x, 0) - mean(x, mask, axis, keepdims=True)
-    return jnp.where(mask, centred / (std(x, mask, axis, ddof=ddof, keepdims=True) + epsilon), 0)
-
-
 def maximum(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, empty: float) -> Array:
     """Largest selected element; `empty` where none is selected."""
     return _extreme(jnp.max, -jnp.inf, x, mask, axis, empty)

@@ -68,9 +68,9 @@ def table(items: Sequence[Item], said: Understood, by_sight: Understood | None =
       said: the answers to all of them.
       by_sight: those given the picture alone, where they are known: they tell what is a conflict.
     """
-    rows = []
-    for name, scores in score(items, said, by_sight).items():
-        objects = clusters(items, scores)
+    rows, asks = [], [item.ask for item in items]
+    for name, scores in score(asks, said, by_sight).items():
+        objects = clusters(asks, scores)
         if len(set(objects)) > 1:
             span = clustered_bootstrap(scores.values, objects, strata=scores.strata, resamples=RESAMPLES)
             rows.append(Row(name=name, metric=BENCH_METRICS[name], interval=span, values=len(scores.values)))
@@ -84,6 +84,6 @@ def parsed(said: Understood) -> float:
 
 def average_line(items: Sequence[Item], said: Understood) -> str:
     """The average in words, or what is missing for one."""
-    means = {name: scores.mean() for name, scores in score(items, said).items()}
+    means = {name: scores.mean() for name, scores in score([item.ask for item in items], said).items()}
     missing = [name for name in AVERAGED if name not in means]
     return f"no average without {', '.join(missing)}" if missing else f"average {touch_average(means):.1f}"

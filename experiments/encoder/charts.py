@@ -51,7 +51,7 @@ def _draw(axes: Axes, lines: Sequence[Line], names: Mapping[str, str], *, dots: 
         axes.plot(steps, values, marker="o" if dots else "", ms=4, label=label, **style)
 
 
-BOUNDED = {"flat_share": "flat dimensions, share", "rank_share": "effective rank, share of width", "skill": "skill"}
+BOUNDED = {"kept": "told apart, over untrained", "rank_share": "effective rank, share of width", "skill": "skill"}
 """Panels of the courses of collapse, by the name of the alarm."""
 
 
@@ -75,7 +75,8 @@ def collapse_courses(courses: Mapping[str, Mapping[str, np.ndarray]], block_step
             axes.axhline(BOUNDS[metric][0], color="k", lw=0.9, ls=":")
             axes.set_title(title, fontsize=9.5, loc="left")
             axes.set_xlabel("step")
-        panels[0].set_ylim(-0.03, 1.03)
+        panels[0].set_yscale("log")
+        panels[0].yaxis.set_major_formatter("{x:g}")
         panels[1].set_ylim(0, 1)
         panels[2].set_ylim(-1, 1)
         handles, labels = panels[0].get_legend_handles_labels()

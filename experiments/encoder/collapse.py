@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.training.dynamics import (
-    FLAT,
     DynamicsConfig,
     DynamicsState,
     Guards,
@@ -22,11 +21,10 @@ from touchr1_jax.training.dynamics import (
     predict_next,
     prediction_errors,
     residuals,
-    spread_of,
     start_dynamics,
     steps_of,
 )
-from touchr1_jax.training.probes import contact_features, rank_me
+from touchr1_jax.training.probes import contact_features, rank_me, told_apart
 from touchr1_jax.types import TouchBatch
 
 
@@ -42,24 +40,27 @@ class Arm:
 
 @struct.dataclass
 class Look:
-    """What is measured of an encoder on held-out contacts; three names are those of the alarms.
-
-    `telling` is the difference between contacts over the size of the latents, √(mean (z − z̄)² / mean z²), z̄ the mean
-    over contacts: the share that is left for a decoder that normalises what it reads.
-    """
+    """What is measured of an encoder on held-out contacts; `telling` is `probes.told_apart`."""
 
     telling: Float[Array, ""]
-    flat_share: Float[Array, ""]
     rank_share: Float[Array, ""]
     skill: Float[Array, ""]
 
 
 @struct.dataclass
 class Course:
-    """One run: measurements after every block of steps, and the features of all contacts before and after."""
+    """One run.
 
-    start: Look
+    Args:
+      untrained, looks: measurements on the contacts that are watched, before training and after every block of steps.
+      start, end: measurements on the contacts that judge the run.
+      before, after: features of all contacts but those watched.
+    """
+
+    untrained: Look
     looks: Look
+    start: Look
+    end: Look
     before: Float[Array, "n D"]
     after: Float[Array, "n D"]
 
@@ -71,6 +72,7 @@ def make_runner(
     config: DynamicsConfig,
     contacts: TouchBatch,
     train: Bool[np.ndarray, "n"],
+    watched: TouchBatch,
     *,
     batch_size: int,
     blocks: int,
@@ -81,7 +83,8 @@ def make_runner(
     Args:
       config: networks.
       contacts: all contacts, in memory.
-      train: which of them are trained on; the others are measured on.
+      train: which of them are trained on; the others judge a run when it has ended.
+      watched: contacts of other objects, which the alarms are read on during training.
       batch_size: contacts of a step, drawn with replacement.
       blocks, block_steps: measurements, and steps between them.
     """
@@ -96,11 +99,18 @@ def make_runner(
         def block(state: DynamicsState, drawn: Int[Array, "steps batch"]) -> tuple[DynamicsState, Look]:
             step = lambda s, i: (dynamics_update(config, optimizer, guards, s, _take(contacts, i))[0], None)
             state, _ = jax.lax.scan(step, state, drawn)
-            return state, look_at(config, state, held)
+            return state, look_at(config, state, watched)
 
         end, looks = jax.lax.scan(block, start, draws)
         features = functools.partial(_features, config, contacts)
-        return Course(start=look_at(config, start, held), looks=looks, before=features(start), after=features(end))
+        return Course(
+            untrained=look_at(config, start, watched),
+            looks=looks,
+            start=look_at(config, start, held),
+            end=look_at(config, end, held),
+            before=features(start),
+            after=features(end),
+        )
 
     return jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
 
@@ -113,12 +123,9 @@ def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> 
     seen = encode_batch(config.encoder, state.params["encoder"], batch)
     predicted = predict_next(config, state.params["predictor"], seen, steps, batch.stream_mask)
     error, copied = prediction_errors(predicted, goal, steps)
-    rows = residuals(latent, steps.exists)
-    size = jnp.sum(jnp.where(steps.exists[..., None, None], latent, 0.0) ** 2)
     return Look(
-        telling=jnp.sqrt(jnp.sum(rows**2) / size),
-        flat_share=jnp.mean(spread_of(latent, steps.exists) < FLAT),
-        rank_share=rank_me(rows) / latent.shape[-1],
+        telling=told_apart(latent, steps.exists),
+        rank_share=rank_me(residuals(latent, steps.exists)) / latent.shape[-1],
         skill=1.0 - error / jnp.maximum(copied, COPY_FLOOR),
     )
 

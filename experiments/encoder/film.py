@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.encoder.pretrain import ClipFeed, train_stage
+from experiments.encoder.pretrain import ClipFeed
 from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import touch_batch
 from experiments.policies.pretrained import PretrainedEncoder
 from experiments.running.context import Context
+from experiments.running.loops import run_loop
 from sensors_io.pipeline import clip_batches
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
@@ -61,4 +62,4 @@ def train_film(
         params = {**state.params, "encoder": jax.tree.map(jnp.array, start.for_sensors(data.clip.sensors).params)}
         state = dataclasses.replace(state, params=params)
     step, loop = make_video_step(video, optimizer), LoopConfig(steps=config.steps, save_every=config.save_every)
-    return train_stage(step, state, feed, loop, context, stage).params
+    return run_loop(step, state, feed, loop, context, stage).params

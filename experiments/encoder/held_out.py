@@ -27,7 +27,7 @@ from touchr1_jax.training.dynamics import (
     steps_of,
 )
 from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import contact_features, probe_right, rank_me
+from touchr1_jax.training.probes import contact_features, probe_right, rank_me, told_apart
 from touchr1_jax.types import Params, TouchBatch
 
 BATCH = 32
@@ -74,6 +74,7 @@ class Assessment:
     Args:
       error, copied, constant: [n] mean error of the prediction, of the last latent, of each step's mean latent.
       right: [n, 3] whether the probe is right about hardness, roughness, protrusion.
+      told_apart: what contacts differ by, over the size of the latents.
       flat_share: share of latent dimensions that hardly vary between contacts.
       rank_share: effective rank over width.
     """
@@ -82,6 +83,7 @@ class Assessment:
     copied: np.ndarray
     constant: np.ndarray
     right: np.ndarray
+    told_apart: float
     flat_share: float
     rank_share: float
 
@@ -103,6 +105,7 @@ class Assessment:
             "skill_over_mean": float(1 - self.error.mean() / max(float(self.constant.mean()), 1e-9)),
             **by_name,
             "probe": self.accuracy,
+            "told_apart": self.told_apart,
             "flat_share": self.flat_share,
             "rank_share": self.rank_share,
         }
@@ -125,6 +128,7 @@ def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched) -> 
         copied=seen["copied"][~fitted],
         constant=np.asarray(constant),
         right=probe_right(features, watched.ordinal_labels(), fitted, watched.probe),
+        told_apart=float(told_apart(seen["latent"], exists)),
         flat_share=float(jnp.mean(spread < FLAT)),
         rank_share=_rank_share(seen["latent"], exists),
     )

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -14,11 +13,11 @@ from experiments.encoder.held_out import Watched, assess
 from experiments.policies.feeds import Feed, touch_batch
 from experiments.policies.pretrained import PretrainedEncoder
 from experiments.running.context import Context
+from experiments.running.loops import run_loop
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.dynamics import (
     DynamicsConfig,
     DynamicsState,
@@ -27,7 +26,7 @@ from touchr1_jax.training.dynamics import (
     make_dynamics_step,
     start_dynamics,
 )
-from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.probes import collapse_alarms
 from touchr1_jax.types import TouchBatch
@@ -128,8 +127,8 @@ def pretrain(
     measure(state, 0)
     for end in range(config.probe_every, config.steps + config.probe_every, config.probe_every):
         loop = LoopConfig(steps=min(end, config.steps), save_every=config.probe_every)
-        state = train_stage(step, state, feed, loop, context, stage)
-        measure(state, loop.steps)
+        state = run_loop(step, state, feed, loop, context, stage)
+        measure(state, loop.steps, end - config.probe_every)
     return state
 
 
@@ -174,36 +173,24 @@ def dynamics_program(
     return made, make_dynamics_step(networks, made, guards)
 
 
-def train_stage(
-    step: Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]],
-    state: Any,
-    feed: Feed,
-    loop: LoopConfig,
+def _measure(
+    networks: DynamicsConfig,
     context: Context,
     stage: str,
-) -> Any:
-    """`fit` with the run's checkpoints, log and progress bar, from the newest checkpoint where there is one."""
-    with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
-        start = min(checkpoints.latest() or 0, loop.steps)
-        with context.progress(stage, loop.steps, start) as advance:
-
-            def log(t: int, metrics: Mapping[str, float]) -> None:
-                context.log(stage, t, **metrics)
-                advance()
-
-            return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
-
-
-def _measure(
-    networks: DynamicsConfig, context: Context, stage: str, watched: Watched | None, state: DynamicsState, step: int
+    watched: Watched | None,
+    state: DynamicsState,
+    step: int,
+    before: int = 0,
 ) -> None:
-    """Log what the encoder knows after so many steps, and the alarms that it raises; once for a run."""
+    """Log what the encoder knows after so many steps, and the alarms since the step measured before; once for a run."""
     if watched is None or context.done(f"{stage}/at{step}"):
         return
     found = assess(networks, state, watched).summary()
     if step:  # a random encoder is what the probes are held against, and has no lead over itself
-        found["probe_lead"] = found["probe"] - context.load_stage(f"{stage}/at0")["probe"]
-        for alarm in collapse_alarms(found):
+        start = context.load_stage(f"{stage}/at0")
+        found |= {"probe_lead": found["probe"] - start["probe"], "kept": found["told_apart"] / start["told_apart"]}
+    if before:
+        for alarm in collapse_alarms(context.load_stage(f"{stage}/at{before}"), found):
             context.say(f"{stage}, step {step}: {alarm}")
     context.log(stage, step, **found)
     context.say(f"{stage}, step {step}: " + ", ".join(f"{name} {value:.3g}" for name, value in found.items()))

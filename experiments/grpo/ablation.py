@@ -31,11 +31,21 @@ class Ablation:
     example: str = ""
     """The arm whose rollouts are shown; empty for the last."""
 
+    @property
+    def drawn(self) -> dict[str, tuple[str, ...]]:
+        """Of each phase the scalars that are drawn."""
+        return {"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": self.curves}
+
 
 def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig]:
     """The experiment that trains and compares the arms, at the default scale and at `smoke`."""
     return Experiment(
-        name=name, config=StudyConfig(), scales={"smoke": SMOKE}, run=functools.partial(run_ablation, ablation)
+        name=name,
+        config=StudyConfig(),
+        scales={"smoke": SMOKE},
+        run=functools.partial(run_ablation, ablation),
+        curves=ablation.drawn,
+        spreads=True,
     )
 
 
@@ -52,7 +62,7 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> R
         comparisons=tuple(comparisons),
         verdict=verdict(ablation, comparisons, scored.estimates),
         data=study.data.summary(),
-        curves={"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": ablation.curves},
+        curves=ablation.drawn,
         examples=rollout_examples(study, shown, ablation.arms[shown]),
     )
 
@@ -66,9 +76,15 @@ def settings(ablation: Ablation, config: StudyConfig) -> dict[str, str | float]:
 
 def compared(ablation: Ablation, rows: Mapping[str, Mapping[str, Estimate]], seeds: int) -> list[Comparison]:
     """The pairs, and every arm against SFT, paired by seed; needs two seeds at least."""
+    return compared_pairs([*ablation.pairs, *((arm, SFT) for arm in ablation.arms)], rows, seeds)
+
+
+def compared_pairs(
+    pairs: Sequence[tuple[str, str]], rows: Mapping[str, Mapping[str, Estimate]], seeds: int
+) -> list[Comparison]:
+    """Each pair in every metric of `COMPARED` that its first arm has, paired by seed; needs two seeds at least."""
     if seeds < 2:
         return []
-    pairs = [*ablation.pairs, *((arm, SFT) for arm in ablation.arms)]
     return [
         compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric])
         for a, b in pairs

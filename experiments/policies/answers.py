@@ -46,20 +46,22 @@ class Evaluated:
         )
 
 
-def evaluate_policy(assembly: Assembly, params: Params, features: Features, label: np.ndarray) -> Evaluated:
-    """Ask every labelled question about every contact, with all streams and with each stream alone."""
+def evaluate_policy(
+    assembly: Assembly, params: Params, features: Features, label: np.ndarray, *, alone: bool = True
+) -> Evaluated:
+    """Ask every labelled question about every contact, with all streams and, unless `alone` is off, with each alone."""
     contact, attribute = labelled(label)
     present = np.asarray(features.stream_mask)[contact]
     ask = answer_program(assembly)
     said = _ask(ask, assembly, params, features, label, contact, attribute, present)
     s = present.shape[1]
-    alone = None
-    if present.any() and s > 1:
+    single = None
+    if alone and present.any() and s > 1:
         each_alone = [
             _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
             for i in range(s)
         ]
-        alone = np.stack([x.parsed.conclude for x in each_alone], 1)
+        single = np.stack([x.parsed.conclude for x in each_alone], 1)
     return Evaluated(
         contact=contact,
         attribute=attribute,
@@ -67,7 +69,7 @@ def evaluate_policy(assembly: Assembly, params: Params, features: Features, labe
         tokens=said.tokens,
         parsed=said.parsed,
         label=np.where(assembly.layout.asked[attribute], label[contact], -1),
-        alone=alone,
+        alone=single,
     )
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.policies.answers import Evaluated
+from experiments.policies.assembly import Assembly
 from experiments.policies.stages import force_only
 from experiments.policies.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -46,10 +47,26 @@ def joint_mode(label: np.ndarray) -> np.ndarray:
 
 def constant_answers(study: Study, level: np.ndarray) -> Evaluated:
     """Well-formatted answers that give contact i the levels `level[i]` [contact, A] in every slot."""
-    asked = study.answers[SFT][0]
-    said = np.where(study.assembly.layout.asked[asked.attribute], level[asked.contact], -1).astype(np.int32)
+    return level_answers(study.assembly, study.answers[SFT][0], level)
+
+
+def level_answers(
+    assembly: Assembly, asked: Evaluated, level: np.ndarray, alone: np.ndarray | None = None
+) -> Evaluated:
+    """Well-formatted answers with given levels to the questions that a policy was asked.
+
+    Args:
+      assembly: of the study.
+      asked: answers of any policy; its questions and labels are taken.
+      level: int [contact, A], what `compare` and `conclude` say.
+      alone: int [contact, S, A], what each sensor says in `perceive` and by itself; `level` where it is `None`.
+    """
+    wanted = assembly.layout.asked[asked.attribute]
+    said = np.where(wanted, level[asked.contact], -1).astype(np.int32)
     n, sensors = asked.streams.shape
-    perceive = np.where(asked.streams[:, :, None], said[:, None], -1)
+    single = np.repeat(level[:, None], sensors, 1) if alone is None else alone
+    single = np.where(wanted[:, None], single[asked.contact], -1).astype(np.int32)
+    perceive = np.where(asked.streams[:, :, None], single, -1)
     return Evaluated(
         contact=asked.contact,
         attribute=asked.attribute,
@@ -64,5 +81,5 @@ def constant_answers(study: Study, level: np.ndarray) -> Evaluated:
             length=jnp.zeros(n, jnp.int32),
         ),
         label=asked.label,
-        alone=np.repeat(said[:, None], sensors, 1) if sensors > 1 else None,
+        alone=single if sensors > 1 else None,
     )

@@ -5,9 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.reporting.results import Comparison, Estimate, require
+from experiments.reporting.checks import require
+from experiments.reporting.results import Comparison, Estimate
 from touchr1_jax.bench import statistics
-from touchr1_jax.bench.metrics import METRICS, Scores
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.bench.scoring import REPORTED
 
 
 def estimate(per_seed: Sequence[Scores], objects: np.ndarray, *, resamples: int = 2_000, seed: int = 0) -> Estimate:
@@ -37,7 +39,7 @@ def compare_over_seeds(metric: str, arm: str, against: str, a: Estimate, b: Esti
     require(counts[0] == counts[1], f"{arm} and {against}", counts, "must have the same seeds", "run the missing ones")
     difference = np.subtract(a.per_seed, b.per_seed)
     interval = statistics.student_interval(difference)
-    better = METRICS[metric].better
+    better = REPORTED[metric].better
     columns = [np.asarray(side.per_seed)[:, None] * (-1.0 if better == "lower" else 1.0) for side in (a, b)]
     return Comparison(
         metric=metric,

@@ -83,7 +83,8 @@ class AnswerFeed(Feed):
 
     `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
     most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the
-    label.  `augment` changes what is felt at random; the evidence stays that of the unchanged contact.
+    label.  `augment` changes what is felt at random; the evidence stays that of the unchanged contact.  Where several
+    processes share a batch, each reads the rows `own` of it.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class AnswerFeed(Feed):
         seed: int,
         blind: bool = False,
         augment: AugmentConfig | None = None,
+        own: np.ndarray | None = None,
     ) -> None:
         clips = clip_batches(
             data.store,
@@ -104,21 +106,25 @@ class AnswerFeed(Feed):
             data.clip,
             batch_size=batch_size,
             seed=seed,
+            own=own,
             felt=not blind,
             augment=augment,
             memory=data.memory,
         )
         super().__init__(clips, seed)
+        self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own
         self._assembly, self._evidence, self._blind = assembly, evidence, blind
         self._questions = questions
 
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> SFTBatch:
-        """Write the answers of one batch of clips."""
+        """Write the answers of one batch of clips; what is drawn for them is drawn for the whole batch."""
         layout, (p, a), q = self._assembly.layout, element["label"].shape, self._questions
-        chosen = np.argsort(rng.random((p, a)), 1)[:, :q]
-        present = np.repeat(element["stream_mask"], q, 0)
+        chosen = np.argsort(rng.random((self._batch_size, a)), 1)[self._own, :q]
+        present = np.ones((self._batch_size, element["stream_mask"].shape[1]), bool)
+        present[self._own] = element["stream_mask"]
+        present = np.repeat(present, q, 0)
         streams = np.zeros_like(present) if self._blind else random_streams(present, 0.5, rng)
-        streams = streams.reshape(p, q, -1)
+        streams = streams.reshape(self._batch_size, q, -1)[self._own]
         pairs = [
             self._answer(element["contact"][i], chosen[i, j], element["label"][i], streams[i, j])
             for i in range(p)
@@ -155,7 +161,10 @@ class AnswerFeed(Feed):
 
 
 class QuestionFeed(Feed):
-    """GRPO batches: encoded contacts in random order, each with the question for one attribute."""
+    """GRPO batches: encoded contacts in random order, each with the question for one attribute.
+
+    Where several processes share a batch, each makes the rows `own` of it.
+    """
 
     def __init__(
         self,
@@ -166,18 +175,21 @@ class QuestionFeed(Feed):
         batch_size: int,
         seed: int,
         full_share: float = 0.75,
+        own: np.ndarray | None = None,
     ) -> None:
         contact, attribute = labelled(label)
         order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
         super().__init__(order.to_iter_dataset(), seed)
         self._assembly, self._features, self._label = assembly, features, label
         self._contact, self._attribute, self._full_share = contact, attribute, full_share
+        self._own = np.arange(batch_size) if own is None else own
 
     def make(self, element: np.ndarray, rng: np.random.Generator) -> GRPOBatch:
         """Gather the features of one batch of questions."""
         contact, attribute = self._contact[element], self._attribute[element]
         streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
-        return question_batch(self._assembly, self._features, self._label, contact, attribute, streams)
+        own = self._own
+        return question_batch(self._assembly, self._features, self._label, contact[own], attribute[own], streams[own])
 
 
 def labelled(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:

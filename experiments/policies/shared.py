@@ -59,6 +59,7 @@ def shared_sft(
       assembly, data, evidence, config, context, seed, stage, blind, tactile: as in `run_sft`.
     """
     values = {"config": config, "model": assembly.model, "clip": data.clip, "seed": seed, "blind": blind}
+    values["mesh"] = context.devices.shape
     felt = {} if tactile is None else {f"tactile/{name}": x for name, x in flat(tactile).items()}
     arrays = {"evidence": evidence, "rows": data.parts["sft"], "label": data.label, **felt}
     path = context.cache_dir / "sft" / f"{fingerprint(values, arrays)}.npz"
@@ -67,7 +68,7 @@ def shared_sft(
         with context.timed(stage):
             return _found(path, context, stage)
     params = run_sft(assembly, data, evidence, config, context, seed=seed, stage=stage, blind=blind, tactile=tactile)
-    _publish(path, params, _logged(context, stage))
+    context.team.once(lambda: _publish(path, params, _logged(context, stage)))
     return params
 
 

@@ -67,4 +67,4 @@ def _make(context: Context, title: str, make: Callable[[Callable[[int, int], Non
                 bar[0](done - seen)
             seen = done
 
-        make(tell)
+        context.team.once(lambda: make(tell))

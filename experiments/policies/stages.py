@@ -19,6 +19,7 @@ from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import AnswerFeed, QuestionFeed, touch_batch
 from experiments.policies.watching import watched_log
 from experiments.running.context import Context
+from experiments.running.loops import plain_log, run_loop
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -30,9 +31,8 @@ from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
 from touchr1_jax.rl.guard import check_streams, stream_influence
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.text.constraint import Constraint
-from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
-from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.training.sft import SFTState, make_sft_step
 from touchr1_jax.types import Params
@@ -78,8 +78,12 @@ class Probed:
 
 
 def probe_features(data: Dataset, context: Context) -> Probed:
-    """Summarise all contacts once; every seed shares it."""
-    rows = np.arange(len(data.store))
+    """Summarise all contacts once; every seed shares it, and every process does its part."""
+    found = context.team.shared_out(np.arange(len(data.store)), lambda rows: _features(data, rows, context))
+    return Probed(**found)
+
+
+def _features(data: Dataset, rows: np.ndarray, context: Context) -> dict[str, np.ndarray]:
     clips = clip_batches(
         data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False, memory=data.memory
     )
@@ -90,7 +94,8 @@ def probe_features(data: Dataset, context: Context) -> Probed:
             present.append(clip["stream_mask"])
             force.append(clip["force_n"].reshape(len(clip["force_n"]), -1))
             advance(len(clip["contact"]))
-    return Probed(streams=np.concatenate(streams), present=np.concatenate(present), force=np.concatenate(force))
+    parts = {"streams": streams, "present": present, "force": force}
+    return {name: np.concatenate(part) for name, part in parts.items()}
 
 
 def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
@@ -135,6 +140,7 @@ def run_sft(
         seed=seed,
         blind=blind,
         augment=config.augment,
+        own=context.devices.rows(config.batch_size),
     )
     optimizer, step = sft_program(assembly.agent, config, blind)
     clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
@@ -142,7 +148,9 @@ def run_sft(
     if tactile is not None:
         params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
-    return _fit(step, state, feed, LoopConfig(steps=config.steps, save_every=config.save_every), context, stage).params
+    loop = LoopConfig(steps=config.steps, save_every=config.save_every)
+    step, state, batches = context.devices.spread(step, state, feed, config.batch_size)
+    return context.devices.whole(_fit(step, state, batches, loop, context, stage).params)
 
 
 @functools.cache
@@ -158,28 +166,20 @@ def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.Gra
 def _fit(
     step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str, *, watched: bool = False
 ) -> Any:
-    """`fit` with the run's checkpoints, log and progress bar; a watched stage logs alarms too."""
-    with Checkpoints(context.checkpoint_dir(stage)) as checkpoints, context.timed(stage):
-        start = checkpoints.latest() or 0
-        context.rewind(stage, start)
-        write = watched_log(context, stage, start) if watched else functools.partial(_write, context, stage)
-        with context.progress(stage, loop.steps, start) as advance:
-
-            def log(t: int, metrics: dict[str, float]) -> None:
-                write(t, metrics)
-                advance()
-
-            return fit(step, state, feed, loop, checkpoints=checkpoints, log=log)
-
-
-def _write(context: Context, stage: str, t: int, metrics: dict[str, float]) -> None:
-    context.log(stage, t, **metrics)
+    """`run_loop`; a watched stage logs alarms too."""
+    return run_loop(step, state, feed, loop, context, stage, make_log=watched_log if watched else plain_log)
 
 
 def encode_contacts(
     assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool = False
 ) -> Features:
-    """Encode contacts once and keep the features on the host, in the order of `rows`."""
+    """Encode contacts once, each process its part, and keep the features on the host, in the order of `rows`."""
+    return context.team.shared_out(rows, lambda own: _encoded(assembly, params, data, own, context, blind=blind))
+
+
+def _encoded(
+    assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool
+) -> Features:
     clips = clip_batches(
         data.store,
         rows,
@@ -270,17 +270,18 @@ def run_grpo(
     Raises:
       ValueError: a stream whose touch does not reach the policy.
     """
-    new_feed = lambda: QuestionFeed(assembly, features, label, batch_size=config.drawn, seed=seed)
+    new_feed = functools.partial(QuestionFeed, assembly, features, label, batch_size=config.drawn, seed=seed)
     constraint = assembly.constraint if config.algorithm.constrained else None
     optimizer, step = grpo_program(assembly.agent, score, config, loop.steps, constraint)
     decoder = {"decoder": params["decoder"]}
     influence = influence_program(assembly.agent, config.length)
     check_streams(*jax.device_get(influence(decoder, next(new_feed()), noise, jax.random.key(seed))))
-    feed = new_feed()
+    feed = new_feed(own=context.devices.rows(config.drawn))
     state = start_state(decoder, optimizer, jax.random.key(seed), config)
     fixed = Fixed(reference=decoder, noise=noise)
-    end = _fit(lambda s, b: step(s, b, fixed), state, feed, loop, context, stage, watched=True)
-    return {**params, **end.params}
+    step, state, batches = context.devices.spread(step, state, feed, config.drawn, fixed)
+    end = _fit(step, state, batches, loop, context, stage, watched=True)
+    return {**params, **context.devices.whole(end.params)}
 
 
 @functools.cache

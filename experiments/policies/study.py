@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array
 
 from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_rewards
@@ -34,6 +35,7 @@ from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import SceneConfig
 from sensors_io.schema import UNKNOWN, Flag
+from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.training.evidence import ProbeConfig
@@ -94,8 +96,48 @@ SMOKE = StudyConfig(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Trained:
+    """A trained policy of one seed, and all that is needed to ask it in another way.
+
+    Attributes:
+      assembly, data, config, context, seed: those of the study.
+      params: of the policy.
+      test: encoded test contacts; `noise` is the encoded noise bank of its encoder.
+      said: its answers about them.
+      grpo_label: labels that GRPO may ask about, int32 [contact of the GRPO part, A].
+    """
+
+    assembly: Assembly
+    data: Dataset
+    config: StudyConfig
+    context: Context
+    seed: int
+    params: Params
+    test: Features
+    noise: Array
+    said: Evaluated
+    grpo_label: np.ndarray
+
+    @property
+    def label(self) -> np.ndarray:
+        """Labels of the test contacts, int32 [contact, A]."""
+        return self.data.label[self.data.parts["test"]]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Way:
+    """Another way to ask the policy named `of`, SFT or an arm: `ask` answers about the test contacts."""
+
+    of: str
+    ask: Callable[[Trained], Evaluated]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
-    """What a study knows when it is done; `answers[name][seed]` are the answers about the test contacts."""
+    """What a study knows when it is done; `answers[name][seed]` are the answers about the test contacts.
+
+    `further[name][seed]` are those that were got in another way.
+    """
 
     config: StudyConfig
     data: Dataset
@@ -104,6 +146,7 @@ class Study:
     prior: np.ndarray
     arms: Mapping[str, Weights]
     answers: Mapping[str, Sequence[Evaluated]]
+    further: Mapping[str, Sequence[Evaluated]] = dataclasses.field(default_factory=dict)
 
     @property
     def test_label(self) -> np.ndarray:
@@ -116,6 +159,7 @@ def run_study(
     arms: Mapping[str, Weights],
     context: Context,
     algorithms: Mapping[str, AnyAlgorithm] | None = None,
+    ways: Mapping[str, Way] | None = None,
 ) -> Study:
     """Make the data, train every arm of every seed, ask every policy.
 
@@ -124,8 +168,14 @@ def run_study(
       arms: reward weights of each arm.
       context: the run.
       algorithms: those of the arms that do not use the configured one.
+      ways: other ways to ask SFT and the arms, by the names of their answers.
+
+    Raises:
+      ValueError: a way that asks a policy that is not there, or has the name of one; what `prove_rewards` raises.
     """
     prove_rewards(arms)
+    ways = ways or {}
+    _check_ways(ways, arms)
     configs = {
         arm: dataclasses.replace(config.grpo, algorithm=(algorithms or {}).get(arm, config.grpo.algorithm))
         for arm in arms
@@ -137,12 +187,30 @@ def run_study(
     evidence = gather_evidence(data, probed, config.probe)
     prior = data.prior()
     scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
-    answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND)}
+    answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
     for seed in range(config.seeds):
-        one = _Seed(config, data, assembly, tactile, evidence, scores, configs, context, seed)
+        one = _Seed(config, data, assembly, tactile, evidence, scores, configs, ways, context, seed)
         for name, said in one.answers().items():
             answers[name].append(said)
-    return Study(config=config, data=data, assembly=assembly, probed=probed, prior=prior, arms=arms, answers=answers)
+    further = {name: answers.pop(name) for name in ways}
+    return Study(
+        config=config,
+        data=data,
+        assembly=assembly,
+        probed=probed,
+        prior=prior,
+        arms=arms,
+        answers=answers,
+        further=further,
+    )
+
+
+def _check_ways(ways: Mapping[str, Way], arms: Mapping[str, Weights]) -> None:
+    for name, way in ways.items():
+        if way.of not in (SFT, *arms):
+            raise ValueError(f"way {name!r} asks {way.of!r}: must be one of {', '.join((SFT, *arms))}; correct it")
+        if name in (SFT, BLIND, *arms):
+            raise ValueError(f"way {name!r} has the name of a policy: its answers would take their place; rename it")
 
 
 def starting_model(config: StudyConfig, sensors: tuple[str, ...]) -> tuple[ModelConfig, Params | None]:
@@ -182,12 +250,13 @@ class _Seed:
     evidence: np.ndarray
     scores: Mapping[str, ScoreFn]
     configs: Mapping[str, GRPOConfig]
+    ways: Mapping[str, Way]
     context: Context
     seed: int
 
     def answers(self) -> dict[str, Evaluated]:
         """Answers of all policies of this seed, from disk where they are there."""
-        names = (SFT, *self.scores, BLIND)
+        names = (SFT, *self.scores, BLIND, *self.ways)
         if not all(self._path(name).exists() for name in names):
             self._train()
         return {name: load_answers(self._path(name)) for name in names}
@@ -199,6 +268,7 @@ class _Seed:
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(assembly.agent, params, data, seed=seed)
         self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
+        self._ask_further(SFT, params, test, noise)
         for arm, score in self.scores.items():
             tuned = run_grpo(
                 assembly,
@@ -214,6 +284,7 @@ class _Seed:
                 stage=f"grpo/{arm}/{seed}",
             )
             self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
+            self._ask_further(arm, tuned, test, noise)
         self._ask(BLIND, self._blind)
 
     def _blind(self) -> Evaluated:
@@ -238,7 +309,26 @@ class _Seed:
     def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:
         if not self._path(name).exists():
             with self.context.timed(f"ask/{name}/{self.seed}"):
-                save_answers(self._path(name), evaluate())
+                said = evaluate()
+                self.context.team.once(lambda: save_answers(self._path(name), said))
+
+    def _ask_further(self, name: str, params: Params, test: Features, noise: Array) -> None:
+        """Ask a policy in all other ways that are wanted of it."""
+        for title, way in self.ways.items():
+            if way.of == name:
+                trained = Trained(
+                    assembly=self.assembly,
+                    data=self.data,
+                    config=self.config,
+                    context=self.context,
+                    seed=self.seed,
+                    params=params,
+                    test=test,
+                    noise=noise,
+                    said=load_answers(self._path(name)),
+                    grpo_label=self._grpo_label(),
+                )
+                self._ask(title, functools.partial(way.ask, trained))
 
     def _label(self, part: str) -> np.ndarray:
         return self.data.label[self.data.parts[part]]

@@ -5,6 +5,7 @@ from typing import Any
 
 from experiments.running.context import Context, read_metrics
 from touchr1_jax.rl.alarms import Watch
+from touchr1_jax.training.loop import SKIPPED
 
 _FIELDS = ("stage", "step")
 _ALARM = "alarm_"
@@ -24,6 +25,8 @@ def watched_log(context: Context, stage: str, start: int) -> Callable[[int, dict
     watch, told = Watch(), set[str]()
 
     def see(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
+        if SKIPPED in metrics:  # its update was left out, and what was not finite is missing
+            return {}
         alarms = watch.see(metrics)
         for alarm in alarms:
             if aloud and alarm.code not in told:

@@ -26,12 +26,15 @@ class EvidenceConfig:
     Args:
       families: of numbers, each with a probe of its own; `scenes` is what scenes teach of a touch.
       ridge: λ; the kernel's diagonal is 1.
+      scene_ridge: λ of the probes that learn from scenes.  Ten times that of the others: they are read on another
+        world than they are fitted on, and with λ = 1 the answers about real objects hang on which scenes were drawn.
       clip: standard deviations beyond which a number says no more.
       folds: parts of the training objects, each read by probes on the others.
     """
 
     families: tuple[str, ...] = ("scenes",)
     ridge: float = 1.0
+    scene_ridge: float = 10.0
     clip: float = 4.0
     folds: int = 10
 

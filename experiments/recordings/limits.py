@@ -1,11 +1,15 @@
 """What limits the answers: how they grow with the number of objects, and how far the labels can be told at all."""
 
+import math
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Int
 
 from experiments.recordings.descriptions import Described
 from experiments.recordings.evidence import standardise
 from experiments.recordings.learning import Background, LearnConfig, evidence_alone
+from experiments.recordings.policy import LEVELS
 from experiments.recordings.validation import Row, intervals
 from touchr1_jax.bench.statistics import Interval
 
@@ -39,8 +43,40 @@ def growth(
     }
 
 
-def label_limits(config: LearnConfig, videos: Described, background: Background) -> list[Row]:
+def objects_for(errors: Mapping[int, float], bound: float) -> float:
+    """Objects to learn from for which the error falls to a bound, by the power law through what was measured.
+
+        ln e(n) = a − b ln n by least squares;   n = exp((a − ln bound) / b)
+
+    The form of learning curves in Hestness et al. 2017, taken without a floor; one that exists makes this too few.
+
+    Args:
+      errors: objects learned from → error, at two numbers of objects or more.
+      bound: error to reach, > 0.
+
+    Returns:
+      Objects: the fewest at which the bound was measured, else extrapolated; infinite where the error does not fall.
+    """
+    reached = [n for n, error in errors.items() if error <= bound]
+    if reached:
+        return min(reached)
+    slope, start = np.polyfit(np.log(list(errors)), np.log(list(errors.values())), 1)
+    return math.exp((math.log(bound) - start) / slope) if slope < 0 else math.inf
+
+
+def vote(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> Int[np.ndarray, "n A"]:
+    """For every video the level that its object's videos are answered most often, the lowest of equals."""
+    voted = answer.copy()
+    for name in np.unique(objects):
+        mine = objects == name
+        voted[mine] = [np.bincount(column, minlength=LEVELS).argmax() for column in answer[mine].T]
+    return voted
+
+
+def label_limits(config: LearnConfig, videos: Described, background: Background, fold: np.ndarray) -> list[Row]:
     """Answers that bound what can be told.
+
+    - *vote*: the answers of the probes, those of an object's videos pooled.  What is wrong then is no matter of trials.
 
     - *the object was touched before*: probes on all other videos, those of the same object among them.  What is wrong
       then is wrong because trials of one object differ more than objects of different labels do.
@@ -51,7 +87,10 @@ def label_limits(config: LearnConfig, videos: Described, background: Background)
     for i in range(len(videos.names)):
         rest = videos.rows(np.flatnonzero(np.arange(len(videos.names)) != i))
         known[i] = evidence_alone(config, rest, background, videos.rows(np.array([i])))
+    answer = cross_answers(config, videos, background, fold)
     return [
+        Row(name="probes", answer=answer),
+        Row(name="probes, vote over all videos of an object", answer=vote(answer, videos.objects)),
         Row(name="probes, the object was touched before", answer=known),
         Row(
             name="labels of the nearest other object", answer=videos.label[_nearest_other(videos, config.evidence.clip)]

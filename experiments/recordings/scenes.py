@@ -79,11 +79,11 @@ def sense(
       scenes: what they learn from.
       world: descriptions of videos that say what is usual in the real world; no label is needed.
       x: descriptions of the videos asked about.
-      config: ridge and clip.
+      config: scene ridge and clip.
     """
     count = len(scenes.x)
     known = np.arange(len(world) + len(x)) < len(world)
     real = standardise(np.concatenate([world, x]).astype(np.float64), known, config.clip)[len(world) :]
     made = standardise(scenes.x.astype(np.float64), np.ones(count, bool), config.clip)
     both, fit = np.concatenate([made, real]), np.arange(count + len(x)) < count
-    return kernel_ridge(both, fit, np.full(count, 1 / count), scenes.target, config.ridge)[count:]
+    return kernel_ridge(both, fit, np.full(count, 1 / count), scenes.target, config.scene_ridge)[count:]

@@ -89,6 +89,9 @@ def probes(config: LearnConfig, background: Background) -> dict[str, tuple[Learn
     bare = dataclasses.replace(background, unlabelled=background.unlabelled[:0])
     reading = lambda *names: dataclasses.replace(config, evidence=dataclasses.replace(config.evidence, families=names))
     own = tuple(dict.fromkeys(families()))
+    harder = dataclasses.replace(
+        config, evidence=dataclasses.replace(config.evidence, scene_ridge=config.evidence.ridge)
+    )
     tenth = dataclasses.replace(
         background, scenes=Scenes(x=background.scenes.x[::10], target=background.scenes.target[::10])
     )
@@ -96,6 +99,7 @@ def probes(config: LearnConfig, background: Background) -> dict[str, tuple[Learn
         "probe of what scenes teach": (config, background),
         "the same, a tenth of the scenes": (config, tenth),
         "the same, no unlabelled videos": (config, bare),
+        "the same, scenes' ridge as the others'": (harder, background),
         "probes of the description, no scenes": (reading(*own), background),
         "both": (reading(*own, "scenes"), background),
         **{f"probe of {name} alone, no scenes": (reading(name), background) for name in own},

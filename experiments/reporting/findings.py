@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from experiments.reporting.results import require
+from experiments.reporting.checks import require
 from experiments.running.artifacts import jsonable
 
 Cell = str | float | int | bool | None
@@ -27,6 +27,10 @@ class Requirement:
     def met(self) -> bool:
         """Whether the figure keeps its bound."""
         return self.measured <= self.bound if self.better == "lower" else self.measured >= self.bound
+
+    def to_json(self) -> dict[str, Any]:
+        """Its fields, and whether it is met."""
+        return dataclasses.asdict(self) | {"met": self.met}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +108,7 @@ class Findings:
           description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
         """
         git = description["git"]
-        requirements = [dataclasses.asdict(r) | {"met": r.met} for r in self.requirements]
+        requirements = [r.to_json() for r in self.requirements]
         return {
             "experiment": description["experiment"],
             "scale": description["scale"],

@@ -30,9 +30,10 @@ thead th { font-weight: 600; border-bottom: 2px solid var(--ink); vertical-align
 tbody tr { border-bottom: 1px solid var(--line); }
 tbody tr.first { border-top: 2px solid var(--line); }
 tbody th { font-weight: 500; }
+tbody th:first-child { white-space: normal; }
 tr.baseline th, tr.baseline td { color: var(--quiet); }
 td.text, th.text { text-align: left; }
-td.text { white-space: normal; min-width: 14rem; }
+td.text { white-space: normal; min-width: 11rem; }
 .ci { display: block; color: var(--quiet); font-size: .75rem; font-weight: 400; }
 .better { color: var(--quiet); font-weight: 400; }
 .swatch { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .45em; }
@@ -48,6 +49,10 @@ figcaption { color: var(--quiet); font-size: .875rem; max-width: 46rem; }
 .strip { display: block; width: 100%; }
 .forces { display: grid; color: var(--quiet); font-size: .72rem; text-align: center;
   font-variant-numeric: tabular-nums; }
+.fields { display: flex; flex-wrap: wrap; gap: 0 1rem; }
+.fields figure { margin: .4rem 0; }
+.field { width: 11rem; border-radius: .2rem; }
+td .trace { margin: 0; padding: .3rem .5rem; }
 .trace { background: var(--wash); border-radius: .3rem; padding: .7rem .9rem; margin: .7rem 0; white-space: pre-wrap;
   overflow-wrap: anywhere; font: .875rem/1.7 ui-monospace, "SF Mono", Menlo, Consolas, "DejaVu Sans Mono", monospace; }
 mark { color: inherit; border-radius: .2rem; padding: .08rem .2rem; }
@@ -107,8 +112,10 @@ def image(content: bytes, kind: str, alt: str, class_: str = "picture") -> Html:
     return Html(f'<img class="{html.escape(class_)}" src="{source}" alt="{html.escape(alt)}">')
 
 
-def document(title: str, *body: Html) -> str:
-    """A whole page."""
-    meta = Html('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">')
-    head = tag("head", meta, tag("title", title), tag("style", Html(STYLE)))
+def document(title: str, *body: Html, reload_s: int | None = None) -> str:
+    """A whole page; with `reload_s` a browser reads it again every so many seconds."""
+    meta = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    if reload_s is not None:
+        meta += f'<meta http-equiv="refresh" content="{reload_s}">'
+    head = tag("head", Html(meta), tag("title", title), tag("style", Html(STYLE)))
     return f'<!DOCTYPE html>\n<html lang="en">{head}{tag("body", *body)}</html>\n'

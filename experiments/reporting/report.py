@@ -6,12 +6,13 @@ from typing import Any
 
 from experiments.reporting import charts
 from experiments.reporting.page import Html, document, image, row, table, tag
-from experiments.reporting.report_parts import appendix, data_and_time, header, number
+from experiments.reporting.report_findings import picture_section, requirement_section, table_section
+from experiments.reporting.report_parts import appendix, curve_figure, curve_section, data_and_time, header, number
 from experiments.reporting.report_rollouts import rollouts
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.artifacts import write_bytes, write_text
 from experiments.running.context import read_metrics
-from touchr1_jax.bench.metrics import METRICS
+from touchr1_jax.bench.scoring import REPORTED
 
 ARROW = {"higher": " ↑", "lower": " ↓", "none": ""}
 
@@ -29,7 +30,10 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     page = document(
         f"{description['experiment']} · {description['scale']}",
         _header(results, question, rest.strip(), description),
+        requirement_section(results.requirements),
         _answers(results, colour),
+        *[picture_section(directory, p) for p in results.pictures],
+        *[table_section(t) for t in results.tables],
         _comparisons(results),
         _middle(directory, results, colour),
         _curves(directory, results, colour),
@@ -44,7 +48,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
 def is_best(metric: str, arm: str, results: Results) -> bool:
     """Whether an arm has the best mean of all arms and every other arm is behind it by a paired interval without 0."""
-    better = METRICS[metric].better
+    better = REPORTED[metric].better
     rivals = {name: values[metric].mean for name, values in results.arms.items() if metric in values}
     others = [name for name in rivals if name != arm]
     if better == "none" or arm not in rivals or not others:
@@ -74,7 +78,7 @@ def _answers(results: Results, colour: Mapping[str, str]) -> Html:
     tables = []
     for beside in (False, True):
         present = {m for values in (*results.arms.values(), *results.baselines.values()) for m in values}
-        metrics = [name for name, metric in METRICS.items() if metric.beside == beside and name in present]
+        metrics = [name for name, metric in REPORTED.items() if metric.beside == beside and name in present]
         if metrics:
             tables.append(tag("h3", "Beside them") if beside else "")
             tables.append(_metric_table(metrics, results, colour))
@@ -85,7 +89,7 @@ def _answers(results: Results, colour: Mapping[str, str]) -> Html:
 def _metric_table(metrics: list[str], results: Results, colour: Mapping[str, str]) -> Html:
     head = [
         "",
-        *(tag("span", METRICS[m].title, tag("span", ARROW[METRICS[m].better], class_="better")) for m in metrics),
+        *(tag("span", REPORTED[m].title, tag("span", ARROW[REPORTED[m].better], class_="better")) for m in metrics),
     ]
     rows = [
         row(_named(arm, colour), *(_cell(m, values.get(m), is_best(m, arm, results)) for m in metrics), head=1)
@@ -100,12 +104,12 @@ def _metric_table(metrics: list[str], results: Results, colour: Mapping[str, str
 def _cell(metric: str, value: Estimate | None, best: bool) -> Html | str:
     if value is None:
         return "–"
-    shown = tag("b" if best else "span", number(value.mean, METRICS[metric].format))
-    return tag("td", shown, tag("span", _interval(value.ci95, METRICS[metric].format), class_="ci"))
+    shown = tag("b" if best else "span", number(value.mean, REPORTED[metric].format))
+    return tag("td", shown, tag("span", _interval(value.ci95, REPORTED[metric].format), class_="ci"))
 
 
 def _legend(metrics: list[str]) -> Html:
-    lines = [f"{METRICS[m].title}{_unit(METRICS[m].unit)}: {METRICS[m].meaning}." for m in metrics]
+    lines = [f"{REPORTED[m].title}{_unit(REPORTED[m].unit)}: {REPORTED[m].meaning}." for m in metrics]
     return tag(
         "details", tag("summary", "What the columns mean", class_="note"), *[tag("p", x, class_="note") for x in lines]
     )
@@ -142,7 +146,7 @@ def _comparisons(results: Results) -> Html:
 
 
 def _comparison(metric: str, pair: str, found: Mapping[str, Comparison], first: bool) -> Html:
-    shown, seeds = METRICS[metric], found.get("seeds")
+    shown, seeds = REPORTED[metric], found.get("seeds")
     spec = "+" + shown.format
     return row(
         shown.title + ARROW[shown.better] if first else "",
@@ -180,19 +184,15 @@ def _middle(directory: Path, results: Results, colour: Mapping[str, str]) -> Htm
 
 
 def _curves(directory: Path, results: Results, colour: Mapping[str, str]) -> Html:
-    figures = []
+    figures = {}
     for phase, scalars in charts.curves_by_phase(read_metrics(directory)).items():
         wanted = results.curves.get(phase, tuple(scalars))
         drawn = {name: scalars[name] for name in wanted if name in scalars}
         if drawn:
             svg = charts.training_curves(drawn, colour)
             write_bytes(directory / "plots" / f"curves_{phase}.svg", svg)
-            picture = image(svg, "svg+xml", f"Training curves of {phase}: {', '.join(drawn)}")
-            figures += [tag("h3", phase), tag("figure", picture)]
-    if not figures:
-        return Html("")
-    note = "Thin: one line per seed. Bold: mean over seeds, averaged over a twentieth of the points."
-    return tag("section", tag("h2", "Training curves"), tag("p", note, class_="note"), *figures)
+            figures[phase] = curve_figure(phase, tuple(drawn), svg)
+    return curve_section("Training curves", figures)
 
 
 def _named(arm: str, colour: Mapping[str, str]) -> Html:

@@ -21,14 +21,12 @@ def write_findings(directory: Path, findings: Findings, *, about: str, descripti
       description: content of the run's `config.json`.
     """
     question, _, rest = about.strip().partition("\n")
-    for picture in findings.pictures:
-        write_bytes(directory / "plots" / f"{picture.name}.{picture.kind}", picture.content)
     page = document(
         f"{description['experiment']} · {description['scale']}",
         header(question, rest.strip(), description, findings.settings, findings.verdict),
-        _requirements(findings.requirements),
-        *[_picture(p) for p in findings.pictures],
-        *[_table(t) for t in findings.tables],
+        requirement_section(findings.requirements),
+        *[picture_section(directory, p) for p in findings.pictures],
+        *[table_section(t) for t in findings.tables],
         data_and_time(findings.data, findings.timing),
         appendix(description),
     )
@@ -37,7 +35,8 @@ def write_findings(directory: Path, findings: Findings, *, about: str, descripti
     return path
 
 
-def _requirements(requirements: tuple[Requirement, ...]) -> Html:
+def requirement_section(requirements: tuple[Requirement, ...]) -> Html:
+    """Figures against their bounds; empty where there are none."""
     if not requirements:
         return Html("")
     sign = {"lower": "≤", "higher": "≥"}
@@ -56,12 +55,15 @@ def _requirements(requirements: tuple[Requirement, ...]) -> Html:
     return tag("section", tag("h2", "Requirements"), table(head, rows))
 
 
-def _picture(picture: Picture) -> Html:
+def picture_section(directory: Path, picture: Picture) -> Html:
+    """A picture under its title, and its file in the run's `plots/`."""
+    write_bytes(directory / "plots" / f"{picture.name}.{picture.kind}", picture.content)
     shown = image(picture.content, MEDIA[picture.kind], picture.title)
     return tag("section", tag("h2", picture.title), tag("figure", shown, tag("figcaption", picture.caption)))
 
 
-def _table(shown: Table) -> Html:
+def table_section(shown: Table) -> Html:
+    """A table under its title, with what its columns mean."""
     head = [_head(c, [cells[i] for cells in shown.rows]) for i, c in enumerate(shown.columns)]
     rows = [
         row(*(_cell(value, c.format) for value, c in zip(cells, shown.columns, strict=True)), head=1)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from experiments.reporting.page import Html, row, table, tag
+from experiments.reporting.page import Html, image, row, table, tag
 
 
 def header(
@@ -35,7 +35,21 @@ def header(
     )
 
 
-def data_and_time(data: Mapping[str, Any], timing: Mapping[str, float]) -> Html:
+def curve_figure(phase: str, names: Sequence[str], svg: bytes) -> Html:
+    """The training curves of one phase."""
+    return tag("figure", image(svg, "svg+xml", f"Training curves of {phase}: {', '.join(names)}"))
+
+
+def curve_section(title: str, figures: Mapping[str, Html]) -> Html:
+    """The figure of each phase, nothing where there is none."""
+    if not figures:
+        return Html("")
+    note = "Thin: one line per seed. Bold: mean over seeds, averaged over a twentieth of the points."
+    phases = [part for phase, figure in figures.items() for part in (tag("h3", phase), figure)]
+    return tag("section", tag("h2", title), tag("p", note, class_="note"), *phases)
+
+
+def data_and_time(data: Mapping[str, Any], timing: Mapping[str, float], title: str = "Data and time") -> Html:
     """Tables of the data and of the seconds of each stage, summed over seeds."""
     seconds: dict[str, list[float]] = {}
     for stage, value in timing.items():
@@ -48,7 +62,7 @@ def data_and_time(data: Mapping[str, Any], timing: Mapping[str, float]) -> Html:
         if times
         else Html(""),
     ]
-    return tag("section", tag("h2", "Data and time"), tag("div", *parts, class_="columns"))
+    return tag("section", tag("h2", title), tag("div", *parts, class_="columns"))
 
 
 def appendix(description: Mapping[str, Any]) -> Html:

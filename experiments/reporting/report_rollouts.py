@@ -48,8 +48,10 @@ def _card(example: RolloutExample, colour: Mapping[str, str]) -> Html:
         tag("h3", *swatch, f"{example.arm} · {example.object_id}"),
         tag("p", tag("b", "Question "), example.question),
         tag("div", *view, strips, class_="touch"),
+        *_fields(example),
         highlighted(example.trace, example.slots),
         tag("p", tag("b", "Label "), example.label),
+        *_instead(example),
         _reward(example),
         class_="rollout",
     )
@@ -67,6 +69,29 @@ def _strip(sensor: str, example: RolloutExample) -> Html:
         pushes = [tag("span", f"{-float(force[2]):.1f} N") for force in example.force_n[sensor]]
         parts.append(tag("div", *pushes, class_="forces", style=f"grid-template-columns:repeat({len(pushes)},1fr)"))
     return tag("figure", *parts)
+
+
+def _fields(example: RolloutExample) -> list[Html]:
+    """The drawn fields side by side, none where there are none."""
+    if not example.fields:
+        return []
+    shown = [
+        tag("figure", image(_png(picture), "png", f"Fields of {sensor}", class_="field"), tag("figcaption", sensor))
+        for sensor, picture in example.fields.items()
+    ]
+    note = "Strongest press: indentation in colour, from dark to bright; displacement of the gel as arrows."
+    return [tag("div", *shown, class_="fields"), tag("p", note, class_="note")]
+
+
+def _instead(example: RolloutExample) -> list[Html]:
+    """What is said when the touch is taken away or replaced, none where that was not asked."""
+    if not example.instead:
+        return []
+    rows = [
+        row(name, tag("td", highlighted(said.text, said.slots), class_="text"), head=1)
+        for name, said in example.instead.items()
+    ]
+    return [table(["In the place of the touch", tag("th", "what is said then", class_="text")], rows)]
 
 
 def _reward(example: RolloutExample) -> Html:

@@ -7,18 +7,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from experiments.reporting.checks import require
+from experiments.reporting.findings import Picture, Requirement, Table
 from experiments.running.artifacts import jsonable
-from touchr1_jax.bench.metrics import METRICS
+from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")
 """Settings without which no report can be read."""
 
 Slot = tuple[int, int, str]
 """Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
-
-
-class ResultsError(ValueError):
-    """Results that must not be published; the message names the field, the value, the constraint and the fix."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,6 +49,25 @@ class Comparison:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Trace:
+    """A text and its parsed pieces, in order and disjoint.
+
+    Raises:
+      ResultsError: pieces that overlap, are out of order or end past the text.
+    """
+
+    text: str
+    slots: tuple[Slot, ...]
+
+    def __post_init__(self) -> None:
+        end = 0
+        for slot in self.slots:
+            ok = end <= slot[0] <= slot[1] <= len(self.text)
+            require(ok, "slots", slot, f"must follow {end} and end by {len(self.text)}", "sort and separate them")
+            end = slot[1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutExample:
     """One answer to look at, with the touch behind it.
 
@@ -62,6 +79,8 @@ class RolloutExample:
       frames: sensor → uint8 [F, H, W, 3], RGB.
       force_n: sensor → float [F, 3].
       view: uint8 [H, W, 3] RGB picture of the object, or `None`.
+      fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
+      instead: what stood in the place of the touch → what was then said.
     """
 
     arm: str
@@ -75,13 +94,11 @@ class RolloutExample:
     frames: Mapping[str, np.ndarray]
     force_n: Mapping[str, np.ndarray]
     view: np.ndarray | None = None
+    fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        end = 0
-        for slot in self.slots:
-            ok = end <= slot[0] <= slot[1] <= len(self.trace)
-            require(ok, "slots", slot, f"must follow {end} and end by {len(self.trace)}", "sort and separate them")
-            end = slot[1]
+        Trace(text=self.trace, slots=self.slots)
         for sensor, frames in self.frames.items():
             ok = frames.dtype == np.uint8 and frames.ndim == 4 and frames.shape[-1] == 3
             got = f"{frames.dtype}{list(frames.shape)}"
@@ -96,6 +113,8 @@ class Results:
       arms, baselines: name → metric → estimate; all arms have the same seeds, baselines may differ.
       settings: what a reader must know first; `preset` and `lr_scale` at least.
       verdict: sentences that answer the experiment's question from the figures.
+      requirements: figures with bounds.
+      tables, pictures: what there is to say beyond estimates and comparisons, in the order of the report.
       data, timing: sizes of the data, seconds; anything that JSON can hold.
       curves: phase → names of the logged scalars to draw; a phase not named is drawn whole.
       examples: a few rollouts; they go into the report, not into `results.json`.
@@ -109,8 +128,11 @@ class Results:
     settings: Mapping[str, Any]
     comparisons: tuple[Comparison, ...] = ()
     verdict: tuple[str, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
+    tables: tuple[Table, ...] = ()
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     timing: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    pictures: tuple[Picture, ...] = ()
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     examples: tuple[RolloutExample, ...] = ()
 
@@ -133,12 +155,14 @@ class Results:
         Args:
           description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
         """
-        shown = ("arms", "baselines", "comparisons", "verdict", "settings", "timing", "data")
+        shown = ("arms", "baselines", "comparisons", "verdict", "tables", "settings", "timing", "data")
         git = description["git"]
+        requirements = [r.to_json() for r in self.requirements]
         return {
             "experiment": description["experiment"],
             "scale": description["scale"],
             "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
+            "requirements": jsonable(requirements, where="requirements"),
             **{name: jsonable(getattr(self, name), where=name) for name in shown},
             "config": description["config"],
         }
@@ -168,16 +192,12 @@ def _check_row(name: str, row: Mapping[str, Estimate]) -> None:
 
 
 def _check_metric(field: str, metric: str) -> None:
-    require(metric in METRICS, field, metric, f"must be one of {', '.join(METRICS)}", "rename it or add it to METRICS")
+    require(
+        metric in REPORTED, field, metric, f"must be one of {', '.join(REPORTED)}", "rename it or add it to METRICS"
+    )
 
 
 def _check_interval(field: str, mean: float, ci95: tuple[float, float]) -> None:
     finite = all(math.isfinite(x) for x in (mean, *ci95))
     require(finite, field, (mean, ci95), "must be finite", "leave an undefined metric out")
     require(ci95[0] <= ci95[1], f"{field}.ci95", ci95, "must be (low, high)", "swap its ends")
-
-
-def require(ok: bool, field: str, value: object, constraint: str, fix: str) -> None:
-    """Raise `ResultsError` unless `ok`."""
-    if not ok:
-        raise ResultsError(f"{field} is {value!r}: {constraint}; {fix}")

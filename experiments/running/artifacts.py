@@ -12,6 +12,14 @@ from typing import Any
 import numpy as np
 
 
+class DamagedFileError(ValueError):
+    """A file of a run that is not what was written."""
+
+
+class UnwrittenError(OSError):
+    """A file that did not reach the disk; what was there before is still there."""
+
+
 def jsonable(value: Any, where: str = "value") -> Any:
     """The same value in JSON's own types: dataclasses and mappings become objects, tuples and arrays lists.
 
@@ -41,7 +49,11 @@ def jsonable(value: Any, where: str = "value") -> Any:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Publish a file atomically: write a temporary sibling, flush it to the disk, then put it in its place."""
+    """Publish a file atomically: write a temporary sibling, flush it to the disk, then put it in its place.
+
+    Raises:
+      UnwrittenError: it did not reach the disk.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -50,6 +62,10 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        raise UnwrittenError(
+            f"{path} cannot be written ({error}): free some space or make its folder writable, then go on"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -65,8 +81,17 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file."""
-    return json.loads(path.read_text(encoding="utf-8"))
+    """The value of a JSON file.
+
+    Raises:
+      DamagedFileError: it holds no JSON.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DamagedFileError(
+            f"{path} is damaged ({error}): put a copy back, or move the run that it belongs to away and start it anew"
+        ) from error
 
 
 def point_link(link: Path, target: str) -> None:

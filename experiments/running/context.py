@@ -9,14 +9,17 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from experiments.running.artifacts import jsonable, read_json, write_json, write_text
-from experiments.running.progress import Advance, progress
+from experiments.running.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
+from experiments.running.distributed import ALONE, Devices, Team
+from experiments.running.progress import Advance, Loop, progress
+from experiments.running.stopping import Stopping
+from experiments.running.watcher import Watcher
 
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
@@ -25,10 +28,14 @@ class MetricLog:
     """`metrics.jsonl`: one line per logged step, the same file whether or not the run was ever interrupted.
 
     Lines hold no clock, so that an interrupted and an uninterrupted run can be compared byte for byte.
+
+    Args:
+      path: of the file.
+      watchers: told of every line.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
+        self._path, self._watchers = path, watchers
         self._seen: set[str] = set()
         lines = _whole_lines(path)
         write_text(path, "".join(lines))  # drops a line that a crash tore
@@ -38,11 +45,13 @@ class MetricLog:
         """Drop the lines of a stage at or past a step: they are about to be computed again."""
         self._seen.add(stage)
         lines = _whole_lines(self._path)
-        kept = [line for line in lines if not _at_or_past(line, stage, step)]
+        kept = [line for line in lines if _before(_row(line, self._path), stage, step)]
         if len(kept) < len(lines):
             self._file.close()
             write_text(self._path, "".join(kept))
             self._file = self._path.open("a", encoding="utf-8")
+        for watcher in self._watchers:
+            watcher.rewound(stage, step)
 
     def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
         """Add one line and hand it to the operating system.
@@ -55,9 +64,11 @@ class MetricLog:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
         if stage not in self._seen:
             self.rewind(stage, step)
-        row = jsonable({"stage": stage, "step": step, **scalars}, where=f"{stage} step {step}")
-        self._file.write(json.dumps(row) + "\n")
+        values = jsonable(scalars, where=f"{stage} step {step}")
+        self._file.write(json.dumps({"stage": stage, "step": step, **values}) + "\n")
         self._file.flush()
+        for watcher in self._watchers:
+            watcher.logged(stage, step, values)
 
     def close(self) -> None:
         """Flush the file to the disk and close it."""
@@ -74,13 +85,31 @@ class Context:
       directory: `runs/NAME/STAMP`.
       cache_dir: data shared between runs; whatever is stored there must be named by the hash of what made it.
       console: where people read along.
+      watchers: told of every logged line and of every loop.
+      stopping: hears the signals that ask the run to stop; one of its own hears none.
+      team: the processes of the run, of which the first alone writes.
+      devices: where training steps run.
     """
 
-    def __init__(self, directory: Path, cache_dir: Path, console: Console) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        cache_dir: Path,
+        console: Console,
+        watchers: Sequence[Watcher] = (),
+        stopping: Stopping | None = None,
+        team: Team = ALONE,
+        devices: Devices | None = None,
+    ) -> None:
         self.directory = directory
         self.cache_dir = cache_dir
         self.console = console
-        self._log = MetricLog(directory / "metrics.jsonl")
+        self.stopping = stopping or Stopping()
+        self.team = team
+        self.devices = devices or Devices()
+        self._watchers = watchers
+        self._loops: list[Loop] = []
+        self._log = MetricLog(directory / "metrics.jsonl", watchers) if team.leads else None
 
     def say(self, text: str) -> None:
         """Print one line to the reader."""
@@ -95,20 +124,40 @@ class Context:
         Raises:
           ValueError: a scalar is not finite: the run diverged, or a mean was taken over nothing.
         """
-        self._log.append(_checked(stage), step, scalars)
+        _checked(stage)
+        if self._log is not None:
+            self._log.append(stage, step, scalars)
 
     def rewind(self, stage: str, step: int) -> None:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
-        self._log.rewind(_checked(stage), step)
+        _checked(stage)
+        if self._log is not None:
+            self._log.rewind(stage, step)
 
-    def progress(self, title: str, total: int, completed: int = 0) -> contextlib.AbstractContextManager[Advance]:
+    @contextlib.contextmanager
+    def progress(self, title: str, total: int, completed: int = 0) -> Iterator[Advance]:
         """A progress bar for one loop; `completed` are the steps done before this session."""
-        return progress(self.console, title, total, completed)
+        loop = Loop(title, total, completed)
+        self._loops.append(loop)
+        try:
+            self._looping()
+            with progress(self.console, loop, self._looping) as advance:
+                yield advance
+        finally:
+            self._loops.remove(loop)
+        self._looping()
+
+    def _looping(self) -> None:
+        for watcher in self._watchers:
+            watcher.looping(self._loops)
 
     def checkpoint_dir(self, stage: str) -> Path:
         """The directory of a stage's checkpoints, created."""
         path = (self.directory / "checkpoints" / _checked(stage)).absolute()
-        path.mkdir(parents=True, exist_ok=True)
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UnwrittenError(f"{path} cannot be made ({error}): move away what is in its place") from error
         return path
 
     def done(self, stage: str) -> bool:
@@ -117,7 +166,7 @@ class Context:
 
     def save_stage(self, stage: str, result: Any) -> None:
         """Publish the result of a finished stage as JSON; from now on the stage is done."""
-        write_json(self._stage_file(stage), result)
+        self.team.once(lambda: write_json(self._stage_file(stage), result))
 
     def load_stage(self, stage: str) -> Any:
         """The saved result of a finished stage, in JSON's types.
@@ -138,9 +187,13 @@ class Context:
         try:
             yield
         finally:
-            seconds = self.timing()
-            seconds[stage] = seconds.get(stage, 0.0) + time.monotonic() - start
-            write_json(self._timing_file, seconds)
+            self.add_time(stage, time.monotonic() - start)
+
+    def add_time(self, name: str, seconds: float) -> None:
+        """Add to the wall time that is kept under a name, in `timing`, over interruptions too."""
+        if self.team.leads:
+            kept = self.timing()
+            write_json(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
 
     def timing(self) -> dict[str, float]:
         """Wall seconds of every timed stage so far."""
@@ -148,7 +201,10 @@ class Context:
 
     def close(self) -> None:
         """Close the log; the runner calls this."""
-        self._log.close()
+        if self._log is not None:
+            self._log.close()
+        for watcher in self._watchers:
+            watcher.closed()
 
     @property
     def _timing_file(self) -> Path:
@@ -161,7 +217,8 @@ class Context:
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """The logged lines of a run, in order."""
-    return [json.loads(line) for line in _whole_lines(directory / "metrics.jsonl")]
+    path = directory / "metrics.jsonl"
+    return [_row(line, path) for line in _whole_lines(path)]
 
 
 def _whole_lines(path: Path) -> list[str]:
@@ -171,9 +228,18 @@ def _whole_lines(path: Path) -> list[str]:
     return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
 
 
-def _at_or_past(line: str, stage: str, step: int) -> bool:
-    row = json.loads(line)
-    return row["stage"] == stage and row["step"] >= step
+def _row(line: str, path: Path) -> dict[str, Any]:
+    try:
+        row: dict[str, Any] = json.loads(line)
+    except ValueError as error:
+        raise DamagedFileError(
+            f"{path} is damaged ({error} in {line[:80]!r}): put a copy back, or start the run anew with --fresh"
+        ) from error
+    return row
+
+
+def _before(row: dict[str, Any], stage: str, step: int) -> bool:
+    return row["stage"] != stage or row["step"] < step
 
 
 def _checked(stage: str) -> str:

@@ -53,7 +53,7 @@ class Past:
         """Sentences of the verdict, led by how many requirements were met; how to go on where there is none."""
         if self.results is None:
             return (f"to go on: {runs.go_on(self.description['command'])}",) if self.state == "unfinished" else ()
-        held = [r["met"] for r in self.results.get("requirements", ())]  # trained arms have none
+        held = [r["met"] for r in self.results.get("requirements", ())]  # older runs of trained arms have none
         met = [f"{sum(held)} of {len(held)} requirements met."] if held else []
         return (*met, *self.results["verdict"])
 
@@ -80,6 +80,19 @@ def read_run(directory: Path) -> Past:
 def runs_of(home: Path) -> list[Past]:
     """Every run under `runs/NAME`, the newest first."""
     return [read_run(directory) for directory in sorted(runs.started(home), reverse=True)]
+
+
+def seconds_of_last(home: Path, config: Any) -> float | None:
+    """Wall seconds of the newest finished run under `runs/NAME` with this configuration, or `None`.
+
+    Args:
+      config: the resolved configuration in JSON's types.
+    """
+    for directory in sorted(runs.started(home), reverse=True):
+        finished = (directory / "results.json").exists()
+        if finished and read_json(directory / "config.json")["config"] == config:
+            return read_run(directory).seconds
+    return None
 
 
 def locate(name: str, runs_dir: Path) -> Path:

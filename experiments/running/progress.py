@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from rich.console import Console
@@ -28,6 +28,43 @@ class Advance(Protocol):
     def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
+class Loop:
+    """How far a loop has come.
+
+    Args:
+      title: what is going on.
+      total: steps of the whole loop.
+      completed: steps that an earlier session did; they do not count into the rate.
+    """
+
+    def __init__(self, title: str, total: int, completed: int = 0) -> None:
+        self.title, self.total, self.completed, self.note = title, total, completed, ""
+        self._began = self._first_call = (completed, time.monotonic())
+
+    def advance(self, steps: int, note: str = "") -> None:
+        """So many more steps are done."""
+        self.completed, self.note = self.completed + steps, note
+        if self._first_call is self._began:
+            self._first_call = (self.completed, time.monotonic())
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since it began in this session."""
+        return time.monotonic() - self._began[1]
+
+    @property
+    def rate(self) -> float:
+        """Steps per second; what the first call took does not count once there are others, for it compiled."""
+        completed, since = self._first_call if self.completed > self._first_call[0] else self._began
+        elapsed_s = time.monotonic() - since
+        return (self.completed - completed) / elapsed_s if elapsed_s > 0 else 0.0
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds to its end at this rate, `None` before the first step."""
+        return (self.total - self.completed) / self.rate if self.rate > 0 else None
+
+
 class RateColumn(ProgressColumn):
     """Steps per second over the recent steps."""
 
@@ -38,23 +75,31 @@ class RateColumn(ProgressColumn):
 
 
 @contextlib.contextmanager
-def progress(console: Console, title: str, total: int, completed: int = 0) -> Iterator[Advance]:
+def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
     """Show the progress of one loop.
 
     Args:
       console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
-      title: what is going on.
-      total: steps of the whole loop.
-      completed: steps that an earlier session did; they do not count into the rate.
+      loop: advanced by what this yields.
+      after: called after each advance.
     """
     if console.is_terminal:
         with _bar(console) as bar:
-            task = bar.add_task(title, total=total, completed=completed, note="")
-            yield lambda steps=1, note="": bar.update(task, advance=steps, note=note)
+            task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
+            yield _advance(loop, lambda: bar.update(task, completed=loop.completed, note=loop.note), after)
     else:
-        plain = _Plain(console, title, total, completed)
-        yield plain
-        plain.close()
+        plain = _Plain(console, loop)
+        yield _advance(loop, plain.look, after)
+        plain.print()
+
+
+def _advance(loop: Loop, *shows: Callable[[], None]) -> Advance:
+    def advance(steps: int = 1, note: str = "") -> None:
+        loop.advance(steps, note)
+        for show in shows:
+            show()
+
+    return advance
 
 
 def _bar(console: Console) -> Progress:
@@ -74,25 +119,19 @@ def _bar(console: Console) -> Progress:
 class _Plain:
     """The same figures as lines of text."""
 
-    def __init__(self, console: Console, title: str, total: int, completed: int) -> None:
-        self._console, self._title, self._total = console, title, total
-        self._completed = self._first = completed
-        self._start = self._printed = time.monotonic()
-        self._note = ""
-
-    def __call__(self, steps: int = 1, note: str = "") -> None:
-        self._completed, self._note = self._completed + steps, note
-        if time.monotonic() - self._printed >= PLAIN_EVERY_S:
-            self._print()
-
-    def close(self) -> None:
-        self._print()
-
-    def _print(self) -> None:
+    def __init__(self, console: Console, loop: Loop) -> None:
+        self._console, self._loop = console, loop
         self._printed = time.monotonic()
-        elapsed = self._printed - self._start
-        rate = (self._completed - self._first) / elapsed if elapsed > 0 else 0.0
-        left = f", {(self._total - self._completed) / rate:.0f} s left" if rate > 0 else ""
-        note = f"  {self._note}" if self._note else ""
-        line = f"{self._title}: {self._completed}/{self._total}, {rate:.3g}/s, {elapsed:.0f} s{left}{note}"
+
+    def look(self) -> None:
+        """Print a line if the last one is old."""
+        if time.monotonic() - self._printed >= PLAIN_EVERY_S:
+            self.print()
+
+    def print(self) -> None:
+        """Print a line."""
+        self._printed, loop = time.monotonic(), self._loop
+        left = "" if loop.left_s is None else f", {loop.left_s:.0f} s left"
+        note = f"  {loop.note}" if loop.note else ""
+        line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {loop.elapsed_s:.0f} s{left}{note}"
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)

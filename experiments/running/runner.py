@@ -1,6 +1,6 @@
 """Find an experiment, resolve its configuration, run or continue it, write its report.
 
-    python -m experiments NAME [--scale smoke|default] [--fresh] [overrides]
+    python -m experiments NAME [--scale smoke|default] [--fresh] [--tensorboard] [--distributed] [overrides]
     python -m experiments list | new | compare
 
 An experiment is a module of this package.  It opens with a docstring, whose first line is the question, followed by the
@@ -12,35 +12,61 @@ import dataclasses
 import importlib
 import itertools
 import shlex
-import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
 from rich.console import Console
 
 from experiments.reporting.findings import Findings
+from experiments.reporting.live import LivePage
 from experiments.reporting.report import write_report
 from experiments.reporting.report_findings import write_findings
 from experiments.reporting.results import Results
-from experiments.running import runs
-from experiments.running.artifacts import jsonable, read_json, write_json
+from experiments.running import events, runs
+from experiments.running.artifacts import DamagedFileError, jsonable, read_json, write_json
 from experiments.running.catalogue import find, listing
 from experiments.running.commands import COMMANDS, PROG, complain, run_command, say, unknown
 from experiments.running.context import Context
+from experiments.running.distributed import Launch, NoTeam, Team, devices_of, joined
+from experiments.running.history import seconds_of_last
+from experiments.running.stopping import Stopped, Stopping
+from experiments.running.watcher import Watcher
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.records import RecordsError
+from sensors_io.schema import SchemaError
+from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
+from touchr1_jax.training.loop import NonFiniteGradientError
 
-USAGE = f"""usage: {PROG} NAME [--scale smoke|default] [--fresh] [overrides]
+USAGE = f"""usage: {PROG} NAME [--scale smoke|default] [--fresh] [--tensorboard] [--distributed] [overrides]
        {PROG} list [NAME]            what ran, its cost, its result
        {PROG} new NAME [--reward]    a template that runs
        {PROG} compare RUN_A RUN_B    two runs, figure by figure
 """
 
+EVENTS = "events"
+"""Folder of a run that holds its TensorBoard events."""
+
+EVENTS_HELP = f"Write TensorBoard events beside metrics.jsonl: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
+
 COMPILED = "compiled"
 """Folder of the cache that holds compiled programs, so that a run like an earlier one compiles next to nothing."""
+
+KNOWN_ERRORS = (
+    runs.RunInUse,
+    RecordsError,
+    SchemaError,
+    ImportSourceError,
+    CheckpointError,
+    NonFiniteGradientError,
+    DamagedFileError,
+    NoTeam,
+    OSError,
+)
+"""Whose message says all that a user needs; others come with their traceback."""
 
 C = TypeVar("C")
 
@@ -55,12 +81,16 @@ class Experiment(Generic[C]):
       run: computes results (trained arms) or findings (measurements); it must skip the stages that `Context.done` names
         and continue from checkpoints.
       scales: further configurations by name, `smoke` for one that takes under two minutes.
+      curves: of each phase the scalars to draw while it runs; of a phase that is not named, the first few.
+      spreads: whether its training runs on the devices of all processes; others know one device.
     """
 
     name: str
     config: C
     run: Callable[[C, Context], Results | Findings]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
+    curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    spreads: bool = False
 
     def __post_init__(self) -> None:
         if "default" in self.scales:
@@ -75,14 +105,6 @@ class Experiment(Generic[C]):
     def configs(self) -> dict[str, C]:
         """Every scale's configuration."""
         return {"default": self.config, **self.scales}
-
-
-class Stopped(BaseException):
-    """A signal asked the run to stop; no `except Exception` may swallow it."""
-
-    def __init__(self, number: int) -> None:
-        super().__init__(signal.Signals(number).name)
-        self.number = number
 
 
 def main(arguments: Sequence[str] | None = None, package: str = "experiments") -> int:
@@ -108,12 +130,16 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
         raise ValueError(
             f"{package}.{name} names its experiment {module.EXPERIMENT.name!r}: must be {name!r}; rename it"
         )
-    command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
+    try:
+        command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
+    except ValueError as error:  # a configuration refuses its own values
+        complain(f"{type(error).__name__}: {error}")
+        return 2
     return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:
-    """Resolve the command line: `.scale`, `.fresh`, `.runs_dir`, `.cache_dir` and the overridden `.config`.
+    """Resolve the command line: `.scale`, `.fresh`, `.tensorboard`, two directories and the overridden `.config`.
 
     The scale is picked out first, since it chooses the defaults that everything else overrides.
 
@@ -126,35 +152,54 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
         [
             ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Whose defaults to start from.")]),
             ("fresh", Annotated[bool, tyro.conf.arg(help="Start anew beside an unfinished run.")]),
+            ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)]),
             ("runs_dir", Annotated[Path, tyro.conf.arg(help="Where runs are kept.")]),
             ("cache_dir", Annotated[Path, tyro.conf.arg(help="Where data and compiled programs are kept.")]),
+            ("launch", Annotated[Launch, tyro.conf.arg(name="")]),
             ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")]),
         ],
         kw_only=True,
         frozen=True,
     )
     scale = _scale(arguments, configs)
-    default = command(scale=scale, fresh=False, runs_dir=Path("runs"), cache_dir=Path("data"), config=configs[scale])
+    default = command(
+        scale=scale,
+        fresh=False,
+        tensorboard=False,
+        runs_dir=Path("runs"),
+        cache_dir=Path("data"),
+        launch=Launch(),
+        config=configs[scale],
+    )
     prog = f"{PROG} {experiment.name}"
     return tyro.cli(command, args=arguments, default=default, prog=prog, description=about)
 
 
 def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
     """Run or continue an experiment; returns the exit code, 128 + n after signal n."""
-    console = Console()
-    config = jsonable(command.config, where="config")
-    home = command.runs_dir / experiment.name
-    directory = None if command.fresh else runs.newest_unfinished(home, config)
-    resumed = directory is not None
-    if directory is None:
-        directory = runs.create(home, runs.describe(experiment.name, command.scale, config, typed))
+    if command.tensorboard and not events.installed():
+        complain(events.HINT)
+        return 2
+    if not experiment.spreads and command.launch != Launch():
+        complain(f"{experiment.name} knows one process and one device; leave --distributed and --mesh out")
+        return 2
+    stopping = Stopping()
+    directory = None
     try:
-        with _signals(), runs.locked(directory), compilations_kept(command.cache_dir / COMPILED):
-            runs.point_latest(directory)
-            _announce(console, directory, resumed)
-            _run(experiment, command.config, Context(directory, command.cache_dir, console), about)
-    except runs.RunInUse as error:
-        complain(str(error))
+        team = joined(command.launch)
+        chosen, resumed = team.agreed(lambda: _directory(experiment, command, typed))
+        directory = Path(chosen)
+        with stopping.listening(), _held(directory, team), compilations_kept(command.cache_dir / COMPILED):
+            if team.leads:
+                runs.point_latest(directory)
+                _announce(directory, resumed)
+                _run(experiment, command, directory, about, stopping, team)
+            else:
+                _follow(experiment, command, directory, stopping, team)
+    except KNOWN_ERRORS as error:
+        complain(f"{type(error).__name__}: {error}")
+        if directory is not None:
+            say(f"Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
         return 1
     except Stopped as stopped:
         say(f"\nStopped by {stopped}. Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
@@ -162,11 +207,57 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
     return 0
 
 
-def _run(experiment: Experiment[Any], config: Any, context: Context, about: str) -> None:
-    """Compute, then publish the report and, last, `results.json`, which marks the run as finished."""
-    with contextlib.closing(context), context.timed("total"):
-        results = experiment.run(config, context)
-    description = read_json(context.directory / "config.json")
+def _held(directory: Path, team: Team) -> contextlib.AbstractContextManager[None]:
+    """The run's lock, which the process that writes holds for all."""
+    return runs.locked(directory) if team.leads else contextlib.nullcontext()
+
+
+def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[str, bool]:
+    """The run's directory, and whether it is an unfinished one that goes on."""
+    config = jsonable(command.config, where="config")
+    home = command.runs_dir / experiment.name
+    unfinished = None if command.fresh else runs.newest_unfinished(home, config)
+    if unfinished is not None:
+        return str(unfinished), True
+    return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
+
+
+def _follow(experiment: Experiment[Any], command: Any, directory: Path, stopping: Stopping, team: Team) -> None:
+    """Compute with the process that writes."""
+    devices = devices_of(command.launch)
+    context = Context(directory, command.cache_dir, Console(quiet=True), (), stopping, team, devices)
+    with contextlib.closing(context):
+        experiment.run(command.config, context)
+
+
+def _run(
+    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, team: Team
+) -> None:
+    """Compute and publish; whatever ends a run before that is what its page says last."""
+    description = read_json(directory / "config.json")
+    page = LivePage(
+        directory,
+        about=about,
+        description=description,
+        curves=experiment.curves,
+        usual_s=seconds_of_last(directory.parent, description["config"]),
+    )
+    try:
+        watchers: list[Watcher] = [page]
+        if command.tensorboard:
+            watchers.append(events.Events(directory / EVENTS))
+        devices = devices_of(command.launch)
+        context = Context(directory, command.cache_dir, Console(), watchers, stopping, team, devices)
+        with contextlib.closing(context), context.timed("total"):
+            results = experiment.run(command.config, context)
+        _publish(results, context, description, about)
+    except BaseException as error:
+        page.end(error)
+        raise
+
+
+def _publish(results: Results | Findings, context: Context, description: Mapping[str, Any], about: str) -> None:
+    """Write the report and, last, `results.json`, which marks the run as finished."""
     results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
     if isinstance(results, Findings):
         report = write_findings(context.directory, results, about=about, description=description)
@@ -178,30 +269,13 @@ def _run(experiment: Experiment[Any], config: Any, context: Context, about: str)
         context.say(sentence)
 
 
-def _announce(console: Console, directory: Path, resumed: bool) -> None:
-    """Say which of the two happens, and whether the code changed meanwhile."""
+def _announce(directory: Path, resumed: bool) -> None:
+    """Say which of the two happens, where to watch, and whether the code changed meanwhile."""
     say(f"continuing {directory} (--fresh starts anew)" if resumed else f"new run {directory}")
+    say(f"to watch: {directory / 'report.html'}")
     began, now = read_json(directory / "config.json")["git"], dataclasses.asdict(runs.revision())
     if resumed and began != now:
         say(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[None]:
-    """Turn the first SIGINT or SIGTERM into `Stopped`; a second one acts as if nobody listened."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        for n in numbers:
-            signal.signal(n, signal.SIG_DFL)
-        raise Stopped(number)
-
-    before = {n: signal.signal(n, stop) for n in numbers}
-    try:
-        yield
-    finally:
-        for n, handler in before.items():
-            signal.signal(n, handler)
 
 
 def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:

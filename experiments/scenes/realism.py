@@ -7,7 +7,7 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.reporting.results import ResultsError, require
+from experiments.reporting.checks import ResultsError, require
 from sensors_io.calibration import circles
 from sensors_io.calibration.presses import BallPresses as Recorded
 from sensors_io.scenes import fitting, mini_optics, optics, photometric

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.reporting.checks import require
 from experiments.reporting.findings import Cell, Column, Table
-from experiments.reporting.results import require
 from sensors_io.scenes import history
 
 RECORDING = "example_1_AD2-0065L.npz"

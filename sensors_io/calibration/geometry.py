@@ -15,6 +15,7 @@ twice as much.
 """
 
 import dataclasses
+import hashlib
 import json
 import pathlib
 from typing import Any, Self
@@ -77,24 +78,26 @@ class Geometry:
         edges = (corners[1:] - corners[0]) / 2
         return float(np.sqrt(abs(np.linalg.det(edges))))
 
-    def rectify(self, picture: np.ndarray, *, mm_per_px: float, size_px: tuple[int, int]) -> np.ndarray:
-        """The picture as an undistorted view straight from above, about the same middle; 0 outside of it.
+    def view(self, *, mm_per_px: float, size_px: tuple[int, int]) -> "View":
+        """An undistorted view straight from above, about the same middle.
 
         Args:
-          picture: [H, W] or [H, W, 3] of the size of this geometry.
-          mm_per_px: of the result.
-          size_px: rows and columns of the result.
-
-        Raises:
-          GeometryError: a picture of another size.
+          mm_per_px: of the view.
+          size_px: rows and columns of the view.
         """
-        if picture.shape[:2] != tuple(self.size_px):
-            raise GeometryError(f"picture is {picture.shape[:2]}: must be {self.size_px}; calibrate this mode")
         rows, columns = size_px
         middle = self.to_mm(np.array([self.size_px[1] - 1, self.size_px[0] - 1]) / 2)
         x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
         at = self.to_px(middle + mm_per_px * np.stack([x, y], -1)).astype(np.float32)
-        return cv2.remap(picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        return View(size_px=self.size_px, mm_per_px=mm_per_px, at=at)
+
+    @property
+    def hash(self) -> str:
+        """First 16 hex digits of the SHA-256 of everything that decides where a pixel lies."""
+        digest = hashlib.sha256(json.dumps(list(self.size_px)).encode())
+        for array in (self.centre_px, self.radial, self.homography):
+            digest.update(np.ascontiguousarray(array, np.float64).tobytes())
+        return digest.hexdigest()[:16]
 
     def save(self, path: pathlib.Path) -> None:
         """Write it as JSON, whole or not at all."""
@@ -123,6 +126,36 @@ class Geometry:
             )
         except (ValueError, KeyError, TypeError) as error:
             raise GeometryError(f"{path} holds no geometry ({error!r}); calibrate again") from error
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """Straightens pictures of one camera; where each pixel comes from is told once.
+
+    Args:
+      size_px: rows and columns of the camera's pictures.
+      mm_per_px: pitch of the straight ones.
+      at: where each of their pixels lies in the camera's, float32 [H, W, 2], (x, y).
+    """
+
+    size_px: tuple[int, int]
+    mm_per_px: float
+    at: np.ndarray
+
+    def __call__(self, picture: np.ndarray) -> np.ndarray:
+        """The straight picture, 0 where the camera does not look.
+
+        Args:
+          picture: [H, W] or [H, W, 3], of the camera's size.
+
+        Raises:
+          GeometryError: a picture of another size.
+        """
+        if picture.shape[:2] != tuple(self.size_px):
+            raise GeometryError(
+                f"picture is {picture.shape[:2]}: must be {self.size_px}; measure the geometry in this mode"
+            )
+        return cv2.remap(picture, self.at[..., 0], self.at[..., 1], cv2.INTER_LINEAR)
 
 
 def find_pins(picture: np.ndarray, background: np.ndarray, *, rows: int, columns: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from rich.table import Table
 from sensors_io.calibration.calibrate import CalibrateConfig, CalibrationReport, calibrate
 from sensors_io.calibration.presses import BallPresses
 from sensors_io.commands.console import OUT
+from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.sources import Pictures, read_picture, read_pictures
 from sensors_io.fields.types import Calibration
 
@@ -28,10 +29,12 @@ class Calibrate:
     """Picture of the gel at rest."""
     ball_diameter_mm: float
     """Of the ball."""
-    mm_per_px: float
-    """Pitch of the pixels."""
     out: pathlib.Path
     """File of the calibration."""
+    mm_per_px: float | None = None
+    """Pitch of the pixels; the geometry's where there is one."""
+    geometry: pathlib.Path | None = None
+    """File that `geometry` wrote: the pictures are straightened first, and `extract` must then be given it too."""
     sensor: str = "gelsight_mini"
     """Name of the sensor."""
     config: Annotated[CalibrateConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=CalibrateConfig)
@@ -39,14 +42,16 @@ class Calibrate:
     def run(self) -> int:
         background = read_picture(self.background)
         pictures = _without(read_pictures(self.balls, self.sensor), background)
+        straight = Straightening.of(self.geometry, self.mm_per_px, (background.shape[0], background.shape[1]))
         presses = BallPresses(
-            pictures=pictures.frames,
-            background=background,
+            pictures=np.stack([straight(frame) for frame in pictures.frames]),
+            background=straight(background),
             radius_mm=self.ball_diameter_mm / 2,
-            mm_per_px=self.mm_per_px,
+            mm_per_px=straight.mm_per_px,
         )
         OUT.print(f"{len(presses)} pictures; finding circles, fitting, leaving out each fifth in turn …")
         made, report = calibrate(presses, pictures.names, self.sensor, self.config)
+        made = straight.signed(made)
         made.save(self.out)
         OUT.print(report_table(made, report))
         OUT.print(f"wrote {self.out}, hash {made.hash}", highlight=False)

@@ -11,6 +11,7 @@ import tyro
 from rich.table import Table
 
 from sensors_io.commands.console import OUT, progress_bar
+from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.extract import ExtractConfig, Extractor, joined
 from sensors_io.fields.sources import SourceError, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
@@ -38,7 +39,9 @@ class Extract:
     calibration: pathlib.Path | None = None
     """File that `calibrate` wrote; without it there is neither depth nor shear."""
     mm_per_px: float | None = None
-    """Pitch of the pixels; the calibration's where there is one."""
+    """Pitch of the pixels; the calibration's or the geometry's where there is one."""
+    geometry: pathlib.Path | None = None
+    """File that `geometry` wrote, by which pictures are made straight first; the one that `calibrate` was given."""
     config: Annotated[ExtractConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ExtractConfig)
 
     def run(self) -> int:
@@ -47,15 +50,18 @@ class Extract:
             raise CalibrationError(
                 f"{self.calibration} is for {calibration.sensor!r}, not {self.sensor!r}: must be equal; set --sensor"
             )
-        extractor = Extractor(read_picture(self.background), self._pitch(calibration), calibration, self.config)
+        rest = read_picture(self.background)
+        straight = self._straightening(calibration, (rest.shape[0], rest.shape[1]))
+        extractor = Extractor(straight(rest), straight.mm_per_px, calibration, self.config)
         pictures = read_pictures(self.inputs, self.sensor)
-        if pictures.frames.shape[1:] != extractor.background.shape:
-            sizes = f"{pictures.frames.shape[1:3]} and {extractor.background.shape[:2]}"
+        if pictures.frames.shape[1:] != rest.shape:
+            sizes = f"{pictures.frames.shape[1:3]} and {rest.shape[:2]}"
             raise SourceError(f"pictures and background have sizes {sizes}: must be equal; crop them alike")
         parts = []
         with progress_bar("frames") as progress:
             for i, frame in enumerate(pictures.frames):
-                parts.append(extractor.read(frame, gap=bool(pictures.gap[i]), apart=bool(pictures.apart[i])))
+                gap, apart = bool(pictures.gap[i]), bool(pictures.apart[i])
+                parts.append(extractor.read(straight(frame), gap=gap, apart=apart))
                 progress(i + 1, len(pictures))
         fields = joined(parts)
         write_whole(self.out, encoded(fields, pictures.names, "" if calibration is None else calibration.hash))
@@ -63,12 +69,14 @@ class Extract:
         OUT.print(f"wrote {self.out}", highlight=False)
         return 0
 
-    def _pitch(self, calibration: Calibration | None) -> float:
-        if self.mm_per_px is not None:
-            return self.mm_per_px
-        if calibration is None:
-            raise CalibrationError("mm_per_px is not given: must be known without a calibration; set --mm-per-px")
-        return calibration.mm_per_px
+    def _straightening(self, calibration: Calibration | None, size_px: tuple[int, int]) -> Straightening:
+        pitch = self.mm_per_px
+        if pitch is None and calibration is not None:
+            pitch = calibration.mm_per_px
+        straight = Straightening.of(self.geometry, pitch, size_px)
+        if calibration is not None:
+            straight.check(calibration)
+        return straight
 
 
 def encoded(fields: Fields, names: tuple[str, ...], calibration: str) -> bytes:

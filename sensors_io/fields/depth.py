@@ -22,13 +22,31 @@ class ZeroConfig:
     Args:
       steep: slope beyond which a cell belongs to a contact or its rim.
       margin_mm: around such cells, nothing is taken for untouched: the gel sinks there too.
-      bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant.
+      bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant,
+        and no zero level is known.
     """
 
     steep: float = STEEP
     margin_mm: float = 3.0
     bent: float = 0.4
     tilted: float = 0.15
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Surface:
+    """The gel's surface in one picture.
+
+    Args:
+      depth_mm: indentation, float32 [H, W].
+      contacts: where it is touched.
+      untouched: share of the cells that the zero level was told from.
+      zero_known: whether they are enough for a plane; else depth is good up to a constant, a tilt and a bend.
+    """
+
+    depth_mm: np.ndarray
+    contacts: Contacts
+    untouched: float
+    zero_known: bool
 
 
 class DepthReader:
@@ -49,11 +67,42 @@ class DepthReader:
 
     def __call__(self, picture: np.ndarray) -> tuple[np.ndarray, Contacts]:
         """Indentation, float32 [H, W] mm, and its contacts, of one picture, uint8 [H, W, 3] RGB."""
+        surface = self.read(picture)
+        return surface.depth_mm, surface.contacts
+
+    def read(self, picture: np.ndarray) -> Surface:
+        """The surface of one picture, uint8 [H, W, 3] RGB."""
         down_x, down_y = self._slopes(picture)
-        pitch = self.calibration.mm_per_px
+        pitch, slope = self.calibration.mm_per_px, np.hypot(down_x, down_y)
         depth = neumann(down_x, down_y, pitch)
-        depth -= zero_level(depth, np.hypot(down_x, down_y), pitch, self._zero)
-        return depth, find_contacts(depth, pitch, self._contact)
+        depth -= zero_level(depth, slope, pitch, self._zero)
+        share = float(untouched_cells(slope, pitch, self._zero).mean())
+        return Surface(
+            depth_mm=depth,
+            contacts=find_contacts(depth, pitch, self._contact),
+            untouched=share,
+            zero_known=share >= self._zero.tilted,
+        )
+
+
+def untouched_cells(slope: np.ndarray, mm_per_px: float, config: ZeroConfig) -> np.ndarray:
+    """Cells of `CELL_PX` that no steep cell is near, bool [H // CELL_PX, W // CELL_PX].
+
+    Args:
+      slope: float32 [H, W], the length of the slopes.
+      mm_per_px: pitch.
+      config: what is steep, and how far its surroundings reach.
+    """
+    steep = cv2.resize(slope, _cells(slope), interpolation=cv2.INTER_AREA) > config.steep
+    side = 2 * round(config.margin_mm / (mm_per_px * CELL_PX)) + 1
+    reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    still: np.ndarray = cv2.dilate(steep.astype(np.uint8), reach) == 0
+    return still
+
+
+def _cells(field: np.ndarray) -> tuple[int, int]:
+    """Columns and rows of cells."""
+    return max(1, field.shape[1] // CELL_PX), max(1, field.shape[0] // CELL_PX)
 
 
 def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config: ZeroConfig) -> np.ndarray:
@@ -69,11 +118,9 @@ def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config
     Returns:
       float32 [H, W].  Where nothing is untouched, the constant is that of the shallowest twentieth of the cells.
     """
-    rows, columns = (max(1, n // CELL_PX) for n in depth_mm.shape)
-    coarse, steep = (cv2.resize(a, (columns, rows), interpolation=cv2.INTER_AREA) for a in (depth_mm, slope))
-    cells = 2 * round(config.margin_mm / (mm_per_px * CELL_PX)) + 1
-    reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (cells, cells))
-    still = cv2.dilate((steep > config.steep).astype(np.uint8), reach) == 0
+    columns, rows = _cells(depth_mm)
+    coarse = cv2.resize(depth_mm, (columns, rows), interpolation=cv2.INTER_AREA)
+    still = untouched_cells(slope, mm_per_px, config)
     share = float(still.mean())
     degree = 2 if share >= config.bent else 1 if share >= config.tilted else 0
     if not still.any():

@@ -101,9 +101,13 @@ class Extractor:
           apart: whether nothing says that it follows the picture before, as with stills: markers are looked for
             anywhere, with no flag.
         """
-        depth, contacts = self._touched(picture)
+        surface = None if self._depth is None else self._depth.read(picture)
+        depth = None if surface is None else surface.depth_mm
+        contacts = self._contacts(picture) if surface is None else surface.contacts
         found: dict[str, np.ndarray] = {} if depth is None else {"depth_mm": depth}
         flags = self._flags(picture, contacts) | (Flag.TIME_GAP if gap else Flag.NONE)
+        if surface is not None and not surface.zero_known:
+            flags |= Flag.NO_ZERO_LEVEL
         if self._deformation is not None:
             moved = self._deformation.read(picture, gap or apart)
             flags |= moved.flags
@@ -139,11 +143,9 @@ class Extractor:
         late = time_gap(host_time_ns, self.config.quality).tolist()
         return joined([self.read(frame, gap=gap) for frame, gap in zip(frames, late, strict=True)])
 
-    def _touched(self, picture: np.ndarray) -> tuple[np.ndarray | None, Contacts]:
-        """Depth where there is a calibration, and contacts by depth, else by colour."""
-        if self._depth is not None:
-            return self._depth(picture)
-        return None, changed_contacts(picture, self.background, self.mm_per_px, self.config.contact)
+    def _contacts(self, picture: np.ndarray) -> Contacts:
+        """Contacts by colour, where no depth tells them."""
+        return changed_contacts(picture, self.background, self.mm_per_px, self.config.contact)
 
     def _flags(self, picture: np.ndarray, contacts: Contacts) -> Flag:
         contact = self.config.contact

@@ -34,6 +34,7 @@ def test_arms_and_pairs_fit_together(name):
     assert MODULES[name].EXPERIMENT.name == name
 
 
+@pytest.mark.slow
 def test_every_arm_of_tactile_use_is_trained_by_its_own_algorithm(tmp_path, cache_dir):
     directory = run("ablation_tactile_use", tmp_path, cache_dir)
     results = read_json(directory / "results.json")

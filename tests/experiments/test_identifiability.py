@@ -61,6 +61,7 @@ def check(results):
     ]
 
 
+@pytest.mark.slow
 def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
     """What takes long to compile is replaced by random features."""
     rng = np.random.default_rng(0)

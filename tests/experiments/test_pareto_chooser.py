@@ -33,6 +33,7 @@ def directory(tmp_path_factory):
     return directory
 
 
+@pytest.mark.slow
 def test_results_hold_every_error_asked_for(directory):
     results = read_json(directory / "results.json")
     summary, families, generated, costs, law = (table["rows"] for table in results["tables"])
@@ -45,6 +46,7 @@ def test_results_hold_every_error_asked_for(directory):
     assert len(results["requirements"]) == 3 * len(TINY.asked)
 
 
+@pytest.mark.slow
 def test_the_chart_is_drawn(directory):
     assert b"</svg>" in (directory / "plots" / "chooser.svg").read_bytes()
 

@@ -69,7 +69,9 @@ class _Ball:
         return height - np.sqrt(3.155**2 - touch[2] ** 2), *slopes
 
 
-@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "perceptron" else name for name in MAPS]
+)
 def test_every_map_reads_a_press(name):
     presses = generated_presses(6.31, 8, 0)
     touches = find_circles(presses).touches

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import pareto_tangential
-from experiments.reporting.results import ResultsError
+from experiments.reporting.checks import ResultsError
 from experiments.running.artifacts import read_json
 from experiments.tangential import checks as tangential_checks
 from experiments.tangential import loops as tangential_loops
@@ -36,6 +36,7 @@ def contacts():
     return bench, *tangential_scenes.sample(bench, 1, 0, 0)
 
 
+@pytest.mark.slow
 def test_every_method_has_a_row(directory):
     tables = read_json(directory / "results.json")["tables"]
     for table, methods in zip(tables, pareto_tangential.methods().values(), strict=False):
@@ -44,6 +45,7 @@ def test_every_method_has_a_row(directory):
     assert {p.name for p in (directory / "plots").iterdir()} == {"pareto_tangential.svg", "promise.svg"}
 
 
+@pytest.mark.slow
 def test_a_tighter_setting_errs_less(directory):
     tables = read_json(directory / "results.json")["tables"]
     for table in tables[:4]:
@@ -55,6 +57,7 @@ def test_a_tighter_setting_errs_less(directory):
         assert median[f"{PLAIN} 80"] < median[f"{PLAIN} 5"] < median["full slip"]
 
 
+@pytest.mark.slow
 def test_closed_forms_are_kept(directory):
     names = {r["name"] for r in read_json(directory / "results.json")["requirements"]}
     assert {"Cattaneo–Mindlin, slide off by", "Lubkin, torque off by"} <= names
@@ -161,6 +164,7 @@ def test_a_lag_of_the_force_makes_a_negative_loop_and_a_loss_a_positive_one(tmp_
         tangential_loops.loop_table(tmp_path / "nowhere")
 
 
+@pytest.mark.slow
 def test_coupling_is_measured_on_gels_with_markers(directory):
     results = read_json(directory / "results.json")
     (table,) = (t for t in results["tables"] if t["title"].startswith("What coupling changes"))

@@ -29,6 +29,7 @@ def folder(tmp_path, monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_a_folder_becomes_a_row_and_a_picture(folder, tmp_path):
     arguments = ["real_sensors", "--scale", "smoke", "--data-dir", str(tmp_path / "data"), "--runs-dir", str(tmp_path)]
     assert main(arguments) == 0

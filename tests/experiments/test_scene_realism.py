@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.reporting.results import ResultsError
+from experiments.reporting.checks import ResultsError
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 from experiments.scenes import realism

@@ -101,6 +101,7 @@ def test_seeds_share_a_program_and_nothing_else():
     assert one.compilations == two.compilations == 1
 
 
+@pytest.mark.slow
 def test_many_steps_take_every_length_in_one_program():
     size = dataclasses.replace(speed_grpo.SMOKE.steps_size, vocab_size=16, hidden_size=16)
     course = many_steps(size, 16, (4, 8), 200)

@@ -19,12 +19,14 @@ def directory(tmp_path_factory):
     return run_shrunk(stability_contact, TINY, home)
 
 
+@pytest.mark.slow
 def test_every_requirement_is_kept(directory):
     results = read_json(directory / "results.json")
     assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"]} == {}
     assert results["data"]["good scenes"] >= 10
 
 
+@pytest.mark.slow
 def test_every_case_is_reported_and_the_maps_are_drawn(directory):
     results = read_json(directory / "results.json")
     assert [row[0] for row in results["tables"][0]["rows"]] == [case.name for case in suite(TINY.grid)]
@@ -44,6 +46,7 @@ def test_cases_are_finite_and_named_once(grid):
     assert all(np.all(np.isfinite(c.gap_mm)) for c in cases)
 
 
+@pytest.mark.slow
 def test_adhesion_is_flagged_where_it_counts(directory):
     (table,) = (t for t in read_json(directory / "results.json")["tables"] if t["title"].startswith("Adhesion"))
     assert len(table["rows"]) == 12

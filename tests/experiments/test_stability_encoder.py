@@ -41,13 +41,13 @@ def test_every_cure_names_an_arm():
 
 
 def test_failure_is_told_by_what_is_left_and_alarms_by_measurements():
-    """Seed 0 is well, seed 1 goes flat at the second measurement and keeps a third of what told contacts apart."""
+    """Seed 0 falls and recovers, seed 1 falls for good and keeps a third of what told contacts apart."""
     looks = {
-        "flat_share": np.array([[0.9, 0.1], [0.4, 0.7]]),  # what a fresh encoder shows raises no alarm
-        "rank_share": np.full((2, 2), 0.5),
-        "skill": np.full((2, 2), 0.3),
+        "kept": np.array([[0.2, 0.3, 0.9], [0.9, 0.4, 0.3]]),  # what a fresh encoder shows raises no alarm
+        "rank_share": np.full((2, 3), 0.5),
+        "skill": np.full((2, 3), 0.3),
     }
     outcome = Outcome(arm=ARMS[0], looks=looks, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
     np.testing.assert_array_equal(outcome.failed, [False, True])
     np.testing.assert_array_equal(outcome.alarmed, [False, True])
-    assert outcome.first_alarm(1) == 1
+    assert outcome.first_alarm(1) == 2

@@ -32,12 +32,14 @@ def directory(tmp_path_factory):
     return directory
 
 
+@pytest.mark.slow
 def test_nothing_of_ours_breaks_in_silence(directory):
     results = read_json(directory / "results.json")
     assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"]} == {}
     assert set(results["data"]["silent"]) == set(TINY.methods)
 
 
+@pytest.mark.slow
 def test_the_curves_are_drawn(directory):
     assert {p.name for p in (directory / "plots").iterdir()} >= {"stability_tracking.svg", "stability_shear.svg"}
 

@@ -1,5 +1,7 @@
 """Clips and their batches: shapes and masks by hand, order by seed, resumed = uninterrupted."""
 
+import copy
+
 import cv2
 import numpy as np
 import pytest
@@ -191,6 +193,14 @@ class TestAugmentedClip:
             make_clip(contact(0), fakes.card(0), SMALL, augment=AugmentConfig(mirror=1))
 
 
+def iter_state(batches, read):
+    """The state of an iterator after some batches."""
+    iterator = iter(batches)
+    for _ in range(read):
+        next(iterator)
+    return iterator.get_state()
+
+
 class TestClipBatches:
     def batches(self, store, **changes):
         return clip_batches(store, range(len(store)), SMALL, **{"batch_size": 3, "seed": 5} | changes)
@@ -278,6 +288,32 @@ class TestClipBatches:
         finally:
             first.close()
             second.close()
+
+    @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
+    def test_machines_that_share_batches_read_them_together(self, store, augment):
+        """Random changes too are those of the whole batch, and a state of one machine is a state of all."""
+        options = {"batch_size": 5, "augment": augment}
+        whole = iter(self.batches(store, **options))
+        want = [next(whole) for _ in range(6)]
+        for own in ([0, 1], [2, 4]):
+            part = iter(self.batches(store, own=own, **options))
+            for batch in want[:3]:
+                same(next(part), {name: x[own] for name, x in batch.items()})
+            part.set_state(iter_state(self.batches(store, **options), 5))
+            same(next(part), {name: x[own] for name, x in want[5].items()})
+
+    def test_a_machine_reads_no_rows_but_its_own(self, store, monkeypatch):
+        read, fresh = [], copy.copy(store)  # threads that read ahead for earlier tests may still read the other one
+        monkeypatch.setattr(fresh, "contact", lambda i, **options: read.append(i) or store.contact(i, **options))
+        list(self.batches(fresh, own=[1], shuffle=False, repeat=False, drop_remainder=True))
+        assert read == [1, 4]
+
+    @pytest.mark.parametrize("own", [[], [1, 0], [0, 3], [-1]])
+    def test_rows_that_a_batch_does_not_have_are_named(self, store, own):
+        with pytest.raises(SchemaError, match=r"own is .* of batches of 3, all whole: must be ascending rows 0\.\.2"):
+            self.batches(store, own=own)
+        with pytest.raises(SchemaError, match="the last perhaps smaller"):
+            self.batches(store, own=[0], repeat=False)
 
     def test_bad_indices_are_named(self, store):
         with pytest.raises(SchemaError, match="indices is empty: a pipeline needs at least one contact"):

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from touchr1_jax.bench.metrics import BOTTOM, Scores, accuracy, check_same_shape
-from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.bench.statistics import Interval, draw_clusters, drawn_means
 
 CONTROLS = ("drop", "shuffle", "noise", "swapped")
 """What may stand in for the touch."""
@@ -77,12 +77,8 @@ def least_tactile_use(
     gains[SHUFFLE] = _only(gains[SHUFFLE], ordered)
     if not len(gains[SHUFFLE].values):
         del gains[SHUFFLE]
-    names, cluster = np.unique(objects, return_inverse=True)
-    if len(names) < 2:
-        raise ValueError(f"objects holds {len(names)}: an interval over objects needs two; ask about more objects")
-    uniform = np.full(len(names), 1 / len(names))
-    weights = np.random.default_rng(seed).multinomial(len(names), uniform, size=resamples)
-    drawn = np.stack([_drawn_means(gain, cluster[gain.items], weights) for gain in gains.values()])
+    cluster, weights = draw_clusters(objects, resamples=resamples, seed=seed)
+    drawn = np.stack([drawn_means(g.values, cluster[g.items], g.strata, weights) for g in gains.values()])
     low, high = np.nanquantile(np.fmin.reduce(drawn), ((1 - level) / 2, (1 + level) / 2))
     least = min(gains, key=lambda name: gains[name].mean())
     return LeastGain(control=least, gain=Interval(mean=gains[least].mean(), low=float(low), high=float(high)))
@@ -117,16 +113,3 @@ def _only(scores: Scores, questions: np.ndarray) -> Scores:
     """The values that belong to some of the questions."""
     keep = questions[scores.items]
     return Scores(values=scores.values[keep], items=scores.items[keep], strata=scores.strata[keep])
-
-
-def _drawn_means(scores: Scores, cluster: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The metric in every resample of the objects, NaN where a resample has none of its values, [resamples]."""
-    means = []
-    for s in np.unique(scores.strata):
-        at = scores.strata == s
-        sums = np.bincount(cluster[at], weights=scores.values[at], minlength=weights.shape[1])
-        seen = weights @ np.bincount(cluster[at], minlength=weights.shape[1])
-        means.append(np.where(seen > 0, weights @ sums / np.maximum(seen, 1), np.nan))
-    table = np.stack(means)
-    known = np.isfinite(table).sum(axis=0)
-    return np.where(known > 0, np.nansum(table, axis=0) / np.maximum(known, 1), np.nan)

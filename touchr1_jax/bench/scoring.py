@@ -7,7 +7,7 @@ import numpy as np
 from touchr1_jax.bench import metrics
 from touchr1_jax.bench.comparison import order_correlation, swap_consistency, which_has_more
 from touchr1_jax.bench.grounding import conflict_accuracy, revision_rate
-from touchr1_jax.bench.items import Item
+from touchr1_jax.bench.items import Ask
 from touchr1_jax.bench.metrics import BOTTOM, METRICS, ORDINAL, PREFIX, Metric, Scores
 
 LEVELS = 3
@@ -36,6 +36,14 @@ BENCH_METRICS: Mapping[str, Metric] = {
     "csc_agree": METRICS["csc_agree"],
     "deceptive_acc": _share("Deceptive", "questions about objects that look like others which are right"),
     "conflict_acc": _share("Conflict", "of those, the ones that sight alone gets wrong which are right"),
+    "avg": Metric(
+        title="Avg",
+        unit="",
+        better="higher",
+        format=".1f",
+        meaning="mean of H, R, P, Mat, 100(1 − OMAE/2), L2-EM, SFD, 100·max(ρ, 0) and CSC; not the paper's, which no "
+        "formula gives; a constant has about 29",
+    ),
     "revision_rate": Metric(
         title="Revised",
         unit="%",
@@ -47,114 +55,117 @@ BENCH_METRICS: Mapping[str, Metric] = {
 }
 """Every metric of the bench, in the order of its table."""
 
+REPORTED: Mapping[str, Metric] = {**METRICS, **BENCH_METRICS}
+"""Every metric that a report may show: of answers about single touches, and of the bench."""
+
 Answers = Mapping[str, Sequence[int]]
 """Id of an item → the levels that were read in its answer, −1 for ⊥."""
 
 
-def score(items: Sequence[Item], answers: Answers, by_sight: Answers | None = None) -> dict[str, Scores]:
+def score(asks: Sequence[Ask], answers: Answers, by_sight: Answers | None = None) -> dict[str, Scores]:
     """The metrics that the items define, keyed as `BENCH_METRICS`; one without an item is left out.
 
     Accuracies are of the kind "identify"; OMAE of all answers about one touch by all its sensors but those of
-    "conflict"; CSC of "one_sensor".  `Scores.items` counts the items given, `clusters` tells their objects.
+    "conflict"; CSC of "one_sensor".  `Scores.items` counts the questions given, `clusters` tells their objects.
 
     Args:
-      items: the bench.
+      asks: the bench's questions.
       answers: to all of them.
       by_sight: to those of "conflict", given the picture alone; they say what the visual prior is.
 
     Raises:
       ValueError: an item without an answer, or with too few or too many levels.
     """
-    _check(items, answers)
+    _check(asks, answers)
     if by_sight is not None:
-        _check([item for item in items if item.ask.kind == "conflict"], by_sight)
-    kinds = {kind: [i for i, item in enumerate(items) if item.ask.kind == kind] for kind in _SCORED}
-    table = {name: part for kind, rows in kinds.items() if rows for name, part in _SCORED[kind](items, rows, answers)}
+        _check([ask for ask in asks if ask.kind == "conflict"], by_sight)
+    kinds = {kind: [i for i, ask in enumerate(asks) if ask.kind == kind] for kind in _SCORED}
+    table = {name: part for kind, rows in kinds.items() if rows for name, part in _SCORED[kind](asks, rows, answers)}
     single = [*kinds["identify"], *kinds["scale"], *kinds["compose"]]
-    distance = _distance(items, single, answers)
+    distance = _distance(asks, single, answers)
     if len(distance.values):
         table["omae"] = distance
     if by_sight is not None and kinds["conflict"]:
-        table |= _against_sight(items, kinds["conflict"], answers, by_sight)
+        table |= _against_sight(asks, kinds["conflict"], answers, by_sight)
     return {name: table[name] for name in BENCH_METRICS if name in table and len(table[name].values)}
 
 
-def clusters(items: Sequence[Item], scores: Scores) -> np.ndarray:
+def clusters(asks: Sequence[Ask], scores: Scores) -> np.ndarray:
     """The object of each value, for intervals that resample objects, [M]."""
-    return np.array([items[i].ask.cluster for i in scores.items])
+    return np.array([asks[i].cluster for i in scores.items])
 
 
 _Parts = list[tuple[str, Scores]]
 
 
-def _identify(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+def _identify(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
     parts: _Parts = []
     for attribute, prefix in PREFIX.items():
-        of = [i for i in rows if items[i].ask.attributes == (attribute,)]
+        of = [i for i in rows if asks[i].attributes == (attribute,)]
         if of:
-            said, label = _first(items, of, answers)
+            said, label = _first(asks, of, answers)
             parts.append((f"{prefix}_acc", _at(of, metrics.accuracy(said, label))))
             parts.append((f"{prefix}_bacc", _at(of, metrics.balanced_accuracy(said, label))))
     return parts
 
 
-def _compose(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
-    width = max(len(items[i].ask.attributes) for i in rows)
+def _compose(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+    width = max(len(asks[i].attributes) for i in rows)
     said, label = np.full((2, len(rows), width), BOTTOM)
     for n, i in enumerate(rows):
-        count = len(items[i].ask.answer)
-        said[n, :count], label[n, :count] = answers[items[i].ask.id], items[i].ask.answer
+        count = len(asks[i].answer)
+        said[n, :count], label[n, :count] = answers[asks[i].id], asks[i].answer
     return [("l2_em", _at(rows, metrics.exact_match(said, label)))]
 
 
-def _compare(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
-    said, label = _first(items, rows, answers)
-    pair = np.array([items[i].ask.group for i in rows])
-    swapped = np.array([items[i].ask.position == 1 for i in rows])
+def _compare(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+    said, label = _first(asks, rows, answers)
+    pair = np.array([asks[i].group for i in rows])
+    swapped = np.array([asks[i].position == 1 for i in rows])
     return [
         ("sfd", _at(rows, which_has_more(said, label))),
         ("sfd_swap", _at(rows, swap_consistency(said, pair, swapped))),
     ]
 
 
-def _order(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
-    return [("soi_rho", _at(rows, order_correlation(*_first(items, rows, answers))))]
+def _order(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+    return [("soi_rho", _at(rows, order_correlation(*_first(asks, rows, answers))))]
 
 
-def _one_sensor(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
+def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
     groups: dict[str, list[int]] = {}
     for i in rows:
-        groups.setdefault(items[i].ask.group, []).append(i)
+        groups.setdefault(asks[i].group, []).append(i)
     width = max(map(len, groups.values()))
     alone = np.full((len(groups), width, 1), BOTTOM)
     streams = np.zeros((len(groups), width), bool)
     for g, members in enumerate(groups.values()):
-        alone[g, : len(members), 0] = [answers[items[i].ask.id][0] for i in members]
+        alone[g, : len(members), 0] = [answers[asks[i].id][0] for i in members]
         streams[g, : len(members)] = True
     firsts = [members[0] for members in groups.values()]
-    label = np.array([items[i].ask.answer for i in firsts])
+    label = np.array([asks[i].answer for i in firsts])
     return [
         ("csc", _at(firsts, metrics.cross_sensor_consistency(alone, label, streams))),
         ("csc_agree", _at(firsts, metrics.cross_sensor_agreement(alone, label, streams))),
     ]
 
 
-def _conflict(items: Sequence[Item], rows: list[int], answers: Answers) -> _Parts:
-    return [("deceptive_acc", _at(rows, metrics.accuracy(*_first(items, rows, answers))))]
+def _conflict(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+    return [("deceptive_acc", _at(rows, metrics.accuracy(*_first(asks, rows, answers))))]
 
 
-def _against_sight(items: Sequence[Item], rows: list[int], answers: Answers, by_sight: Answers) -> dict[str, Scores]:
-    said, label = _first(items, rows, answers)
-    prior, _ = _first(items, rows, by_sight)
+def _against_sight(asks: Sequence[Ask], rows: list[int], answers: Answers, by_sight: Answers) -> dict[str, Scores]:
+    said, label = _first(asks, rows, answers)
+    prior, _ = _first(asks, rows, by_sight)
     return {
         "conflict_acc": _at(rows, conflict_accuracy(said, label, prior)),
         "revision_rate": _at(rows, revision_rate(said, label, prior)),
     }
 
 
-_SCORED: Mapping[str, Callable[[Sequence[Item], list[int], Answers], _Parts]] = {
+_SCORED: Mapping[str, Callable[[Sequence[Ask], list[int], Answers], _Parts]] = {
     "identify": _identify,
-    "scale": lambda items, rows, answers: [],  # its answers count in OMAE
+    "scale": lambda asks, rows, answers: [],  # its answers count in OMAE
     "compose": _compose,
     "compare": _compare,
     "order": _order,
@@ -163,13 +174,11 @@ _SCORED: Mapping[str, Callable[[Sequence[Item], list[int], Answers], _Parts]] = 
 }
 
 
-def _distance(items: Sequence[Item], rows: list[int], answers: Answers) -> Scores:
+def _distance(asks: Sequence[Ask], rows: list[int], answers: Answers) -> Scores:
     triples = [
         (i, said, label)
         for i in rows
-        for name, said, label in zip(
-            items[i].ask.attributes, answers[items[i].ask.id], items[i].ask.answer, strict=True
-        )
+        for name, said, label in zip(asks[i].attributes, answers[asks[i].id], asks[i].answer, strict=True)
         if name in ORDINAL
     ]
     at, said, label = (
@@ -178,10 +187,10 @@ def _distance(items: Sequence[Item], rows: list[int], answers: Answers) -> Score
     return _at(at.tolist(), metrics.ordinal_mae(said[:, None], label[:, None], np.array([LEVELS])))
 
 
-def _first(items: Sequence[Item], rows: list[int], answers: Answers) -> tuple[np.ndarray, np.ndarray]:
+def _first(asks: Sequence[Ask], rows: list[int], answers: Answers) -> tuple[np.ndarray, np.ndarray]:
     """What was said and what is right, of items with one answer, int [rows] each."""
-    said = np.array([answers[items[i].ask.id][0] for i in rows])
-    return said, np.array([items[i].ask.answer[0] for i in rows])
+    said = np.array([answers[asks[i].id][0] for i in rows])
+    return said, np.array([asks[i].answer[0] for i in rows])
 
 
 def _at(rows: Sequence[int], scores: Scores) -> Scores:
@@ -189,12 +198,10 @@ def _at(rows: Sequence[int], scores: Scores) -> Scores:
     return Scores(values=scores.values, items=np.asarray(rows, int)[scores.items], strata=scores.strata)
 
 
-def _check(items: Sequence[Item], answers: Answers) -> None:
-    for item in items:
-        if item.ask.id not in answers:
-            raise ValueError(f"answers lacks {item.ask.id!r}: every item needs one; give −1 where nothing was said")
-        got, want = len(answers[item.ask.id]), len(item.ask.answer)
+def _check(asks: Sequence[Ask], answers: Answers) -> None:
+    for ask in asks:
+        if ask.id not in answers:
+            raise ValueError(f"answers lacks {ask.id!r}: every item needs one; give −1 where nothing was said")
+        got, want = len(answers[ask.id]), len(ask.answer)
         if got != want:
-            raise ValueError(
-                f"answers[{item.ask.id!r}] has {got} levels: must have {want}; give −1 for what is missing"
-            )
+            raise ValueError(f"answers[{ask.id!r}] has {got} levels: must have {want}; give −1 for what is missing")

@@ -75,6 +75,45 @@ def clustered_bootstrap(
     return Interval(mean=float(np.mean(sums.sum(0) / counts.sum(0))), low=float(low), high=float(high))
 
 
+def draw_clusters(objects: np.ndarray, *, resamples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Resamples of whole objects that several metrics share, so that a function of them has an interval.
+
+    Args:
+      objects: [N], the object of each question.
+
+    Returns:
+      The number of each question's object, int [N], and how often each resample holds each object, [resamples, C].
+
+    Raises:
+      ValueError: fewer than two objects.
+    """
+    names, cluster = np.unique(objects, return_inverse=True)
+    if len(names) < 2:
+        raise ValueError(f"objects holds {len(names)}: an interval over objects needs two; ask about more objects")
+    uniform = np.full(len(names), 1 / len(names))
+    return cluster, np.random.default_rng(seed).multinomial(len(names), uniform, size=resamples)
+
+
+def drawn_means(values: np.ndarray, cluster: np.ndarray, strata: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """A metric in every resample that `draw_clusters` drew, NaN where a resample holds none of its values, [resamples].
+
+    Args:
+      values: float [M].
+      cluster: int [M], the number of each value's object.
+      strata: int [M], see `metrics.Scores`.
+      weights: int [resamples, C].
+    """
+    means = []
+    for s in np.unique(strata):
+        at = strata == s
+        sums = np.bincount(cluster[at], weights=values[at], minlength=weights.shape[1])
+        seen = weights @ np.bincount(cluster[at], minlength=weights.shape[1])
+        means.append(np.where(seen > 0, weights @ sums / np.maximum(seen, 1), np.nan))
+    table = np.stack(means)
+    known = np.isfinite(table).sum(axis=0)
+    return np.where(known > 0, np.nansum(table, axis=0) / np.maximum(known, 1), np.nan)
+
+
 def student_interval(values: np.ndarray, *, level: float = 0.95) -> Interval:
     """x̄ ± t_{n−1, (1+level)/2} · s/√n over n independent training runs; give paired differences to compare two arms.
 

@@ -1,6 +1,7 @@
 """A GRPO step of a Qwen2.5-VL policy in shapes alone, to be compiled without weights or data."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import optax
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
 from touchr1_jax.distributed.placement import shard_step
 from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lora import LoraAgent, LoraConfig, Trainable, adapt, init_adapters
 from touchr1_jax.models.policy import Features, Slots
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
@@ -19,7 +21,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
-from touchr1_jax.types import Target
+from touchr1_jax.types import Params, Target
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,8 @@ class AbstractStep(NamedTuple):
     state: GRPOState
     batch: GRPOBatch
     fixed: Fixed
+    base: Params | None = None
+    """Frozen parameters, an argument too, where the state holds adapters."""
 
 
 def abstract_grpo(
@@ -52,6 +56,7 @@ def abstract_grpo(
     shape: GRPOShape,
     optimizer: optax.GradientTransformation,
     *,
+    lora: LoraConfig | None = None,
     attributes: int = 4,
     draws: int = 64,
 ) -> AbstractStep:
@@ -62,6 +67,7 @@ def abstract_grpo(
       prompt: what stands in a prompt.
       shape: sizes of the step; its decoder is the config's.
       optimizer: whose state is counted.
+      lora: adapters to train on a decoder that is frozen in bfloat16; `None` trains the decoder.
       attributes: of a question's target.
       draws: size of the bank of noise.
     """
@@ -81,8 +87,6 @@ def abstract_grpo(
     length = prompt.tokens
     batch = GRPOBatch(features=features, ids=of((p, length), jnp.int32), mask=of((p, length), bool), target=target)
     decoder = {"decoder": abstract_params(config)["decoder"]}
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    state = jax.eval_shape(lambda params, k: start_state(params, optimizer, k, shape.grpo), decoder, key)
     agent = Agent(
         policy=qwen_policy(config, TactileViTConfig(sensors=s)),
         slots=_slots(prompt),
@@ -91,16 +95,44 @@ def abstract_grpo(
         pad_id=0,
         cache_dtype=jnp.dtype(kind),
     )
-    return AbstractStep(agent, state, batch, Fixed(reference=decoder, noise=of((draws, s, n, d), kind)))
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    base: Params | None = None
+    params: Params = decoder
+    if lora is not None:
+        base = jax.tree.map(lambda x: of(x.shape, jnp.bfloat16), decoder)
+        params = Trainable(adapters=jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key), towers={})
+        agent = adapt(agent, base, lora)
+    state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
+    return AbstractStep(agent, state, batch, Fixed(reference=params, noise=of((draws, s, n, d), kind)), base)
 
 
 def compile_grpo(
-    abstract: AbstractStep, shape: GRPOShape, score: ScoreFn, optimizer: optax.GradientTransformation
+    abstract: AbstractStep,
+    shape: GRPOShape,
+    score: ScoreFn,
+    optimizer: optax.GradientTransformation,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Compiled:
-    """Compile the step for the shape's mesh, of as many devices as this process sees."""
-    mesh = shape.mesh.build(jax.devices()[: shape.mesh.devices])
-    step = make_grpo_step(abstract.agent, score, optimizer, shape.grpo)
-    arguments = (abstract.state, abstract.batch, abstract.fixed)
+    """Compile the step for the shape's mesh.
+
+    Args:
+      abstract: from `abstract_grpo`.
+      shape: sizes of the step.
+      score: reward of one rollout.
+      optimizer: as in `abstract_grpo`.
+      devices: those of a topology that is only compiled for; by default as many as needed of this process's.
+    """
+    mesh = shape.mesh.build((jax.devices() if devices is None else devices)[: shape.mesh.devices])
+    arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.fixed)
+
+    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, base: Params | None = None):
+        agent = abstract.agent
+        if isinstance(agent, LoraAgent):
+            agent = dataclasses.replace(agent, base=base)
+        return make_grpo_step(agent, score, optimizer, shape.grpo)(state, batch, fixed)
+
+    if abstract.base is not None:
+        arguments = (*arguments, abstract.base)
     return compiled_bytes(shard_step(step, mesh, *arguments), *arguments)
 
 

@@ -19,6 +19,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.grpo import Fixed, GRPOState
 from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.types import Params
 
 GIB = 2**30
 HALF, FLOAT = 2, 4
@@ -59,9 +60,10 @@ def compiled_bytes(step: jax.stages.Wrapped, *arguments: Any) -> Compiled:
     )
 
 
-def at_depth(one: Compiled, two: Compiled, layers: int) -> Compiled:
-    """The figures of a decoder of `layers` equal layers from those of one and of two: a + b · layers."""
-    return Compiled(*(first + (layers - 1) * (second - first) for first, second in zip(one, two, strict=True)))
+def at_depths(found: Mapping[int, Compiled], layers: int) -> Compiled:
+    """The figures of a decoder of `layers` equal layers from those of two depths: a + b · layers."""
+    (n, shallow), (m, deep) = sorted(found.items())
+    return Compiled(*(a + (layers - n) * (b - a) // (m - n) for a, b in zip(shallow, deep, strict=True)))
 
 
 def held_bytes(mesh: MeshConfig, tree: Any) -> int:
@@ -112,19 +114,27 @@ class GRPOShape:
         return HALF if self.grpo.bfloat16 else FLOAT
 
 
-def grpo_bytes(shape: GRPOShape, state: GRPOState, batch: GRPOBatch, fixed: Fixed) -> dict[str, int]:
+def grpo_bytes(
+    shape: GRPOShape, state: GRPOState, batch: GRPOBatch, fixed: Fixed, base: Params | None = None
+) -> dict[str, int]:
     """Bytes of a GRPO step on each device, line by line; shapes in place of arrays will do.
 
     Forward passes gather a layer's weights where they use them and drop them: two layers are there at a time, the next
     one on its way, and the heads of all policies that are compared.  Of two gradients one is the sum over
     micro-batches.  With `remat` the backward pass keeps matrix products alone; without it about twice that.
+
+    Args:
+      shape: sizes of the step.
+      state, batch, fixed: its arguments.
+      base: frozen parameters under low-rank adapters, which are then what the state holds.
     """
     held = lambda tree: held_bytes(shape.mesh, tree)
-    layer = sum(x.size for x in jax.tree.leaves(state.params["decoder"]["layers_0"])) // shape.mesh.tensor
-    head = shape.decoder.vocab_size * shape.decoder.hidden_size // shape.mesh.tensor
+    layer = layer_weights(shape.decoder) // shape.mesh.tensor
+    head = head_weights(shape.decoder) // shape.mesh.tensor
     half = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.bfloat16), state.params)
     rows = shape.mesh.data * shape.mesh.fsdp
     return {
+        "frozen base": held(base),
         "parameters": held(state.params),
         "optimizer": held(state.opt_state),
         "reference": held(fixed.reference),
@@ -141,7 +151,7 @@ def grpo_bytes(shape: GRPOShape, state: GRPOState, batch: GRPOBatch, fixed: Fixe
     }
 
 
-ARGUMENTS = ("parameters", "optimizer", "reference", "noise bank", "batch")
+ARGUMENTS = ("frozen base", "parameters", "optimizer", "reference", "noise bank", "batch")
 """Lines of `grpo_bytes` that are arguments of the step, and must be what the compiler says."""
 
 SAMPLING = ("caches while sampling", "logits while sampling")
@@ -155,6 +165,17 @@ def counted_peak(lines: Mapping[str, int]) -> int:
     return sum(lines.values()) - min(either)
 
 
+def layer_weights(decoder: DecoderConfig) -> int:
+    """Numbers in the matrices of one layer."""
+    c = decoder
+    return c.hidden_size * ((2 * c.num_heads + 2 * c.num_kv_heads) * c.head_dim + 3 * c.intermediate_size)
+
+
+def head_weights(decoder: DecoderConfig) -> int:
+    """Numbers in the matrix that makes logits."""
+    return decoder.hidden_size * decoder.vocab_size
+
+
 def cache_bytes(shape: GRPOShape) -> int:
     """Keys and values of the prompts and of their rollouts, of all layers."""
     c = shape.decoder
@@ -163,8 +184,8 @@ def cache_bytes(shape: GRPOShape) -> int:
 
 
 def saved_bytes(shape: GRPOShape) -> int:
-    """What the backward pass keeps of each token and layer: seven matrix products; twice, where the perturbed branch
-    has a gradient too."""
+    """What the backward pass keeps of each token and layer: its input, and all matrix products but the last, which the
+    next layer's input holds; twice, where the perturbed branch has a gradient too."""
     c, algorithm = shape.decoder, shape.grpo.algorithm
     split = (c.num_heads + 2 * c.num_kv_heads) * c.head_dim + 2 * c.intermediate_size
     products = split // shape.mesh.tensor + 2 * c.hidden_size

@@ -32,8 +32,14 @@ def place_state(mesh: Mesh, state: Any) -> Any:
 
     What does not fit into one device is made in place instead, by `jax.jit(make, out_shardings=state_shardings(…))`.
     """
-    own = lambda x, sharding: jnp.copy(jax.device_put(x, sharding))
-    return jax.tree.map(own, state, state_shardings(mesh, state))
+    return jax.tree.map(_placed, state, state_shardings(mesh, state))
+
+
+def _placed(x: Any, sharding: NamedSharding) -> jax.Array:
+    if not jnp.issubdtype(jnp.asarray(x).dtype, jax.dtypes.prng_key):
+        return jnp.copy(jax.device_put(x, sharding))
+    data = _placed(jax.random.key_data(x), sharding)  # keys cannot be put on devices of other processes, their bits can
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
 
 
 def place_batch(mesh: Mesh, rows: Any, batch_size: int) -> Any:

@@ -80,16 +80,54 @@ class DecoderLayer(nn.Module):
         x = x + self.o_proj(attended)
         return x + self.mlp(self.norm_mlp(x))
 
+    def over_prompt(
+        self, x: Float[Array, "n D"], rotation: Rotation, mask: Bool[Array, "L"], before: LayerCache | None = None
+    ) -> tuple[Float[Array, "n D"], LayerCache]:
+        """The last n of L prompt tokens, and the keys of all L; `before` holds those of the first L − n."""
+        q, own = self.project(x, rotation)
+        cache = _joined(before, own)
+        return self.finish(x, attend_causally(q, cache, mask)), cache
+
+    def over_end(
+        self, x: Float[Array, "n D"], rotation: Rotation, mask: Bool[Array, "L"], before: LayerCache | None = None
+    ) -> tuple[Float[Array, "1 D"], LayerCache]:
+        """As `over_prompt`, but the last token alone is answered."""
+        q, own = self.project(x, rotation)
+        cache = _joined(before, own)
+        return self.finish(x[-1:], attend(q[-1:], [KeySource(cache.k, cache.v, mask)])), cache
+
+    def over_completion(
+        self, x: Float[Array, "T D"], rotation: Rotation, past: LayerCache, mask: Bool[Array, "L"]
+    ) -> Float[Array, "T D"]:
+        """All tokens of a completion under the prompt whose keys are `past`."""
+        q, own = self.project(x, rotation)
+        causal = jnp.tril(jnp.ones((len(x), len(x)), bool))
+        return self.finish(x, attend(q, [KeySource(past.k, past.v, mask), KeySource(own.k, own.v, causal)]))
+
+
+Rematerialised = nn.remat(
+    DecoderLayer,
+    policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+    methods=("over_prompt", "over_end", "over_completion"),
+)
+"""A layer of which the backward pass keeps matrix products with weights alone.  Layer by layer: the recomputation waits
+for the gradient of its layer, where that of all layers at once may begin with all of them and hold what it makes."""
+
 
 class Decoder(nn.Module):
-    """Causal language model with an explicit cache: `prefill` a prompt, then `extend` it or `decode` token by token."""
+    """Causal language model with an explicit cache: `prefill` a prompt, then `extend` it or `decode` token by token.
+
+    With `remat` its backward passes keep less and compute more; values, gradients and parameters are the same.
+    """
 
     config: DecoderConfig
+    remat: bool = False
 
     def setup(self) -> None:
         c = self.config
+        layer = Rematerialised if self.remat else DecoderLayer
         self.embedding = nn.Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
-        self.layers = [DecoderLayer(c) for _ in range(c.num_layers)]
+        self.layers = [layer(c) for _ in range(c.num_layers)]
         self.norm = RMSNorm(c.norm_epsilon)
         if not c.tie_embedding:
             self.head = nn.Dense(c.vocab_size, use_bias=False)
@@ -126,13 +164,10 @@ class Decoder(nn.Module):
         """
         x, rotation, caches = x[start:], self._rotation(positions[:, start:]), []
         for i, layer in enumerate(self.layers):
-            q, own = layer.project(x, rotation)
-            cache = own if known is None else _continued(known.layers[i], own, start)
+            before = None if known is None else jax.tree.map(lambda rows: rows[:, :start], known.layers[i])
+            last = i == len(self.layers) - 1  # the completion needs all of its keys, but only the last token's answer
+            x, cache = (layer.over_end if last else layer.over_prompt)(x, rotation, mask, before)
             caches.append(cache)
-            if i < len(self.layers) - 1:
-                x = layer.finish(x, attend_causally(q, cache, mask))
-            else:  # the completion needs every key of the last layer, but only the last token's answer
-                x = layer.finish(x[-1:], attend(q[-1:], [KeySource(cache.k, cache.v, mask)]))
         return x[0], PrefixCache(tuple(caches), mask, _after(positions, mask))
 
     def states(
@@ -142,8 +177,7 @@ class Decoder(nn.Module):
         rotation = self._rotation(positions)
         caches = []
         for layer in self.layers:
-            q, cache = layer.project(x, rotation)
-            x = layer.finish(x, attend_causally(q, cache, mask))
+            x, cache = layer.over_prompt(x, rotation, mask)
             caches.append(cache)
         return x, PrefixCache(tuple(caches), mask, _after(positions, mask))
 
@@ -152,10 +186,8 @@ class Decoder(nn.Module):
         t = tokens.shape[0]
         x = self.embed(tokens)
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + jnp.arange(t), (3, t)))
-        causal = jnp.tril(jnp.ones((t, t), bool))
         for layer, past in zip(self.layers, prefix.layers, strict=True):
-            q, own = layer.project(x, rotation)
-            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(own.k, own.v, causal)]))
+            x = layer.over_completion(x, rotation, past, prefix.mask)
         return x
 
     def decode(
@@ -181,22 +213,27 @@ class Decoder(nn.Module):
 PREFILL_ROWS = 128
 """Queries that a prompt answers at a time: each block skips the keys after it, and its scores stay in cache."""
 
+PREFILL_BLOCKS = 8
+"""Blocks of a prompt at most, for each is compiled by itself; eight compute an eighth more than what counts."""
+
 
 def attend_causally(q: Float[Array, "n KV R d"], cache: LayerCache, mask: Bool[Array, "L"]) -> Float[Array, "n hd"]:
     """Attention of the last n of L prompt tokens over the tokens up to themselves that exist, in blocks of queries."""
     before, blocks = cache.k.shape[1] - q.shape[0], []
-    for begin in range(0, q.shape[0], PREFILL_ROWS):
-        end = min(begin + PREFILL_ROWS, q.shape[0])
+    rows = max(PREFILL_ROWS, -(-q.shape[0] // PREFILL_BLOCKS))
+    for begin in range(0, q.shape[0], rows):
+        end = min(begin + rows, q.shape[0])
         keys = before + end
         seen = jnp.tri(end - begin, keys, before + begin, dtype=bool) & mask[:keys]
         blocks.append(attend(q[begin:end], [KeySource(cache.k[:, :keys], cache.v[:, :keys], seen)]))
     return jnp.concatenate(blocks)
 
 
-def _continued(known: LayerCache, own: LayerCache, start: int) -> LayerCache:
-    """Rows before `start` of one cache, then all of another."""
-    join = lambda old, new: jnp.concatenate([old[:, :start], new], 1)
-    return LayerCache(join(known.k, own.k), join(known.v, own.v))
+def _joined(before: LayerCache | None, own: LayerCache) -> LayerCache:
+    """Rows of one cache, then those of another."""
+    if before is None:
+        return own
+    return LayerCache(jnp.concatenate([before.k, own.k], 1), jnp.concatenate([before.v, own.v], 1))
 
 
 def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, ""]:

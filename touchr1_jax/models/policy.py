@@ -68,6 +68,7 @@ class Policy(nn.Module):
     """Parameters and forward passes of the policy; see the module docstring for the order of the calls."""
 
     config: PolicyConfig
+    remat: bool = False  # of the decoder's layers
 
     def setup(self) -> None:
         c = self.config
@@ -76,7 +77,7 @@ class Policy(nn.Module):
         self.tactile_in = nn.Dense(2 * c.decoder.hidden_size)
         self.tactile_out = nn.Dense(c.decoder.hidden_size)
         self.vision = c.vision.tower(c.decoder.hidden_size)
-        self.decoder = Decoder(c.decoder)
+        self.decoder = Decoder(c.decoder, self.remat)
 
     def encode_streams(self, frames, force_n, frame_index, frame_mask, sensor) -> Float[Array, "*n N D"]:
         """Tactile tokens of any batch of streams, at the decoder's width; arguments as in `TactileViT`."""

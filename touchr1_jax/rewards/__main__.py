@@ -93,7 +93,10 @@ class Explain:
             return 1
         parsed = self._parsed(reading)
         there = [s.name for s, is_there in zip(language.sensors, streams, strict=True) if is_there]
-        console.print(slots_table(language, reading), f"formatted: {format_fault(language, self.text, reading)}")
+        console.print(slots_table(language, reading))
+        if max(map(max, (*reading.perceive, reading.compare, reading.conclude))) < 0:
+            console.print(f"no slot names a level; the words that do: {level_words(language)}", soft_wrap=True)
+        console.print(f"formatted: {format_fault(language, self.text, reading)}")
         console.print(f"length: {parsed.length}, truncated: {'yes' if self.truncated else 'no'}")
         console.print(f"sensors that touched: {', '.join(there) or 'none'}")
         targets = ((words, _target(language, asked, label, streams)) for words, label in labels)
@@ -163,6 +166,11 @@ def slots_table(language: Language, reading: Reading) -> Table:
         words = (language.attributes[a].levels[levels[a]][0] if levels[a] >= 0 else UNREAD for a in named)
         table.add_row(slot, *words)
     return table
+
+
+def level_words(language: Language) -> str:
+    """One word for every level of every attribute."""
+    return "; ".join(f"{a.name} {', '.join(words[0] for words in a.levels)}" for a in language.attributes)
 
 
 def terms_table(

@@ -95,8 +95,6 @@ def objective_gradient(
       first: whether `params` are those before any update from this experience; asked only under an importance cap,
         where the learner's own log-probabilities are then the old ones.  The parts hold them as `old`, [P, G, T].
     """
-    chunks = config.prompts // config.micro_prompts
-    cut = lambda x: x.reshape(chunks, config.micro_prompts, *x.shape[1:])
     algorithm = config.algorithm
 
     def loss(params: Params, chunk: Experience) -> tuple[Array, dict[str, Array]]:
@@ -111,12 +109,27 @@ def objective_gradient(
         more, terms = jax.grad(loss, has_aux=True)(params, chunk)
         return jax.tree.map(jnp.add, grads, more), terms
 
-    grads, terms = jax.lax.scan(body, jax.tree.map(jnp.zeros_like, params), jax.tree.map(cut, experience))
+    grads, terms = jax.lax.scan(body, jax.tree.map(jnp.zeros_like, params), micro_batches(config, experience))
     parts = {name: _gathered(name, value) for name, value in terms.items() if name != "old"}
     if "old" in terms:
-        parts["old"] = terms["old"].reshape(experience.old.shape)
+        parts["old"] = in_order(terms["old"])
     parts["kl_cost_peak"] = algorithm.beta * parts["kl_peak"]
-    return grads, parts | _grounding_by_stream(terms["grounding"].reshape(-1), experience)
+    return grads, parts | _grounding_by_stream(in_order(terms["grounding"]), experience)
+
+
+def micro_batches(config: GRPOConfig, tree: Any) -> Any:
+    """Arrays [P, …] cut into [P / `micro_prompts`, `micro_prompts`, …], neighbours into different micro-batches.
+
+    Where devices share the prompts, neighbours on each of them, every device so has its part of every micro-batch.
+    """
+    size = config.micro_prompts
+    cut = lambda x: x.reshape(size, x.shape[0] // size, *x.shape[1:])  # not −1: a prompt without a view has 0 tokens
+    return jax.tree.map(lambda x: cut(x).swapaxes(0, 1), tree)
+
+
+def in_order(x: Array) -> Array:
+    """An array [P, …] again from its micro-batches."""
+    return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
 
 
 def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
@@ -236,14 +249,14 @@ def vocabulary_terms(
 def scorer(agent: Agent, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]) -> Callable[..., Scored]:
     """The function (params, features, known, start) → `Scored` of one prompt's completions, as configured."""
 
-    def score(start: int, params: Params, features: Features, known: PrefixCache | None) -> Scored:
+    if config.remat:
+        agent = dataclasses.replace(agent, policy=agent.policy.clone(remat=True))
+
+    def score(params: Params, features: Features, known: PrefixCache | None = None, start: int = 0) -> Scored:
         p = at_precision(config, params)
         return Scored(*agent.group_states(p, features, batch.ids, batch.mask, tokens, known, start))
 
-    def configured(params: Params, features: Features, known: PrefixCache | None = None, start: int = 0) -> Scored:
-        return _remat(config, functools.partial(score, start))(params, features, known)
-
-    return configured
+    return score
 
 
 def _remat(config: GRPOConfig, f: Callable[..., Any]) -> Callable[..., Any]:

@@ -10,7 +10,7 @@ from touchr1_jax import masked
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.kl import estimated_kl
-from touchr1_jax.rl.objective import Experience, token_terms
+from touchr1_jax.rl.objective import Experience, in_order, micro_batches, token_terms
 from touchr1_jax.types import Params
 
 NEAR = 1.5
@@ -68,4 +68,4 @@ def log_probs(agent: Agent, config: GRPOConfig, params: Params, learn: Experienc
     algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
     plain = dataclasses.replace(config, algorithm=algorithm)
     of_prompt = lambda e: token_terms(agent, plain, params, params, e)["log_prob"]
-    return jax.lax.map(of_prompt, learn, batch_size=config.micro_prompts)
+    return in_order(jax.lax.map(jax.vmap(of_prompt), micro_batches(config, learn)))

@@ -1,11 +1,41 @@
-"""Checkpoints by Orbax: state, data iterator and step together, published atomically, the newest N kept."""
+"""Checkpoints by Orbax: state, data iterator and step together, published atomically; the newest N and the best kept.
 
+Every array is saved with a digest and held to it when it comes back, for a flipped bit on a disk raises no error of its
+own.  A damaged checkpoint is set aside, and an older one takes its place.
+"""
+
+import itertools
+import json
+import math
+import sys
+import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
+from jaxtyping import Array, UInt32
+from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
+
+MOST_SAID = 240
+"""Characters of a library's error that a message quotes."""
+
+_MIX = 0x9E3779B1
+"""2³² over the golden ratio, odd: multiples of it spread over all 32 bits (Knuth, TAOCP 3, §6.4)."""
+
+_FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError)
+"""What Orbax and TensorStore raise where bytes cannot be read or written: they name no class of their own."""
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be written or read; the message names the path, the problem and the fix."""
+
+
+class DamagedCheckpointError(CheckpointError):
+    """Files that are not what was saved."""
 
 
 class Restored(NamedTuple):
@@ -16,39 +46,223 @@ class Restored(NamedTuple):
     data: Any
 
 
-class Checkpoints:
-    """The checkpoints of one stage; a context manager that waits for the last save."""
+def _complain(text: str) -> None:
+    sys.stderr.write(f"{text}\n")
 
-    def __init__(self, directory: Path, keep: int = 2) -> None:
-        self._manager = ocp.CheckpointManager(
-            directory.absolute(), options=ocp.CheckpointManagerOptions(max_to_keep=keep, create=True)
+
+class Checkpoints:
+    """The checkpoints of one stage; a context manager that waits for the last save.
+
+    What a killed process left half-written is removed.
+
+    Args:
+      directory: where they lie; created if need be.
+      keep: how many of the newest stay.
+      better: which held-out scores are better, to keep the best scored checkpoint too; `None` where none has a score.
+      say: told of damage that was got round; standard error by default.
+
+    Raises:
+      CheckpointError: the directory cannot be read or written.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        keep: int = 2,
+        *,
+        better: Literal["higher", "lower"] | None = None,
+        say: Callable[[str], None] = _complain,
+    ) -> None:
+        if keep < 1:
+            raise ValueError(f"keep is {keep}: must be at least 1; raise it")
+        self._directory, self._scored, self._say = directory.absolute(), better is not None, say
+        policy = LatestN(keep)
+        if better is not None:
+            best = BestN(get_metric_fn=_score, reverse=better == "lower", n=1, keep_checkpoints_without_metrics=False)
+            policy = AnyPreservationPolicy([policy, best])
+        options = ocp.CheckpointManagerOptions(
+            preservation_policy=policy,
+            best_fn=_score if better is not None else None,
+            best_mode="min" if better == "lower" else "max",
+            create=True,
+            cleanup_tmp_directories=True,
         )
+        try:
+            self._manager = ocp.CheckpointManager(self._directory, options=options)
+        except _FAILURES as error:
+            raise CheckpointError(
+                f"{self._directory}: its checkpoints cannot be opened ({_brief(error)}); make the folder writable, or "
+                "move it away to train this stage from its beginning"
+            ) from error
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._manager.wait_until_finished()
-        self._manager.close()
+        try:
+            self._manager.wait_until_finished()
+        except _FAILURES as error:
+            raise self._unsaved(error) from error
+        finally:
+            self._manager.close()
 
-    def save(self, step: int, state: Any, data: Any) -> None:
+    def save(self, step: int, state: Any, data: Any, score: float | None = None) -> None:
         """Save a pytree of arrays and a JSON value as checkpoint `step`; writing goes on in the background.
 
         The arrays are copied first: the writer must not read buffers that the next step takes over by donation.
+
+        Args:
+          step: its number.
+          state: arrays.
+          data: any JSON value.
+          score: held-out score; only where `better` is set.
+
+        Raises:
+          CheckpointError: this checkpoint, or the one before it, does not reach the disk.
+          ValueError: a score that is not finite, or one without `better`.
         """
+        if score is not None and not (self._scored and math.isfinite(score)):
+            raise ValueError(f"score is {score}: must be finite, and `better` must be set; score held-out data")
         state = jax.tree.map(jnp.copy, state)
-        args = ocp.args.Composite(state=ocp.args.StandardSave(state), data=ocp.args.JsonSave({"data": data}))
-        self._manager.save(step, args=args)
+        held = {"data": data, "digests": _digests(state)}
+        args = ocp.args.Composite(
+            state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
+        )
+        try:
+            self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
+        except _FAILURES as error:
+            raise self._unsaved(error) from error
 
     def latest(self) -> int | None:
-        """Step of the newest checkpoint."""
+        """Step of the newest checkpoint, intact or not."""
         return self._manager.latest_step()
 
     def restore(self, like: Any) -> Restored | None:
-        """The newest checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none."""
-        step = self._manager.latest_step()
-        if step is None:
-            return None
+        """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none.
+
+        Damaged ones are renamed, to `damaged-STEP`, and told of.
+
+        Raises:
+          CheckpointError: it holds another tree or other shapes.
+          DamagedCheckpointError: all are damaged.
+        """
+        damaged: list[int] = []
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            try:
+                return self._read(step, like)
+            except DamagedCheckpointError as error:
+                damaged.append(step)
+                self._say(f"{error}; it is kept as {self._set_aside(step).name}")
+        if damaged:
+            raise DamagedCheckpointError(
+                f"{self._directory}: no checkpoint is intact, {damaged} are damaged and were set aside as damaged-*; "
+                "put copies back, or start again to train this stage from its beginning"
+            )
+        return None
+
+    def best(self, like: Any) -> Restored | None:
+        """The checkpoint of the best score, or `None` where none has a score.
+
+        Raises:
+          CheckpointError: it is damaged, or holds another tree or other shapes.
+        """
+        step = self._manager.best_step() if self._scored else None
+        return None if step is None else self._read(step, like)
+
+    def _read(self, step: int, like: Any) -> Restored:
+        where = self._directory / str(step)
+        try:
+            found = self._restored(step, like)
+            held = {name: found.data[name] for name in ("data", "digests")}
+            intact = found.data["crc32"] == _crc32(held)
+        except _FAILURES as error:
+            if self._readable(step):
+                raise CheckpointError(
+                    f"{where} holds another state than the one that is trained: {_brief(error)}; go back to the code "
+                    "and the configuration that saved it, or move it away to train this stage from its beginning"
+                ) from error
+            raise DamagedCheckpointError(f"{where} cannot be read ({_brief(error)})") from error
+        if not intact:
+            raise DamagedCheckpointError(f"{where}: the checksum of its data does not hold")
+        changed = [name for name, value in _digests(found.state).items() if held["digests"].get(name) != value]
+        if changed:
+            raise DamagedCheckpointError(f"{where}: the digest of {', '.join(changed)} does not hold")
+        return Restored(step, found.state, held["data"])
+
+    def _restored(self, step: int, like: Any = None) -> Any:
         args = ocp.args.Composite(state=ocp.args.StandardRestore(like), data=ocp.args.JsonRestore())
-        found = self._manager.restore(step, args=args)
-        return Restored(step, found.state, found.data["data"])
+        return self._manager.restore(step, args=args)
+
+    def _readable(self, step: int) -> bool:
+        """Whether it can be read as whatever it is."""
+        try:
+            self._restored(step)
+        except _FAILURES:
+            return False
+        return True
+
+    def _set_aside(self, step: int) -> Path:
+        names = itertools.chain([f"damaged-{step}"], (f"damaged-{step}-{i}" for i in itertools.count(2)))
+        aside = next(path for name in names if not (path := self._directory / name).exists())
+        if jax.process_index() == 0:
+            (self._directory / str(step)).rename(aside)
+        multihost_utils.sync_global_devices(f"set aside {aside}")
+        self._manager.reload()
+        return aside
+
+    def _unsaved(self, error: Exception) -> CheckpointError:
+        return CheckpointError(
+            f"{self._directory}: the last checkpoint did not reach the disk ({_brief(error)}); the one before it is "
+            "whole: free some space or make the folder writable, then go on"
+        )
+
+
+@jax.jit
+def digest(state: Any) -> UInt32[Array, "leaf"]:
+    """One number for each array of a pytree, Σ_i w_i b_i mod 2³² with bits b_i and odd weights w_i of their places.
+
+    A changed element always changes it: an odd weight has an inverse.  Sums of integers come out the same in any order,
+    so that it does not depend on how, or on how many devices, the arrays lie.
+
+    Args:
+      state: arrays, PRNG keys among them, of any shape.
+    """
+    return jnp.stack([_digest(x) for x in jax.tree.leaves(state)])
+
+
+def _digest(x: Array) -> UInt32[Array, ""]:
+    if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    if x.dtype == jnp.bool_:
+        x = x.astype(jnp.uint8)
+    size = min(x.dtype.itemsize, 4)
+    bits = jax.lax.bitcast_convert_type(x, jnp.dtype(f"uint{8 * size}")).astype(jnp.uint32)
+    place, stride = jnp.zeros(bits.shape, jnp.uint32), 1
+    for axis in reversed(range(bits.ndim)):
+        place += jax.lax.broadcasted_iota(jnp.uint32, bits.shape, axis) * jnp.uint32(stride % 2**32)
+        stride *= bits.shape[axis]
+    return jnp.sum(bits * (place * jnp.uint32(_MIX) | 1), dtype=jnp.uint32)
+
+
+def _digests(state: Any) -> dict[str, int]:
+    """The digest of each array by its path, the same in every process."""
+    numbers = digest(state)
+    if not (numbers.is_fully_addressable or numbers.is_fully_replicated):
+        numbers = multihost_utils.process_allgather(numbers, tiled=True)
+    paths = (path for path, _ in jax.tree.leaves_with_path(state))
+    names = (jax.tree_util.keystr(path, simple=True, separator="/") for path in paths)
+    return dict(zip(names, numbers.tolist(), strict=True))
+
+
+def _crc32(value: Any) -> int:
+    return zlib.crc32(json.dumps(value).encode())
+
+
+def _score(metrics: dict[str, float]) -> float:
+    return metrics["score"]
+
+
+def _brief(error: Exception) -> str:
+    """The beginning of what a library has to say, which may go on for pages."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text[:MOST_SAID]}" if text else type(error).__name__

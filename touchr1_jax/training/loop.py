@@ -1,13 +1,22 @@
-"""The training loop of every stage: fetch, step, log one step late, checkpoint, resume."""
+"""The training loop of every stage: fetch, step, log one step late, checkpoint, resume, stop when asked."""
 
 import dataclasses
+import math
+import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import return_memory
+from touchr1_jax.training.optimizer import count_skipped
+
+Log = Callable[[int, dict[str, float]], None]
+"""Receives (step, metrics) in order; steps count from 0."""
+
+SKIPPED = "skipped"
+"""Metric of a step that left its update out: how many did so far.  Other steps have none of this name."""
 
 
 class Batches(Protocol):
@@ -19,12 +28,46 @@ class Batches(Protocol):
     def set_state(self, state: Any) -> None: ...
 
 
+class NonFiniteGradientError(RuntimeError):
+    """The gradient was NaN or infinite too often to go on."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LoopConfig:
-    """Number of steps, and every how many steps a checkpoint is saved."""
+    """Number of steps, every how many a checkpoint is saved, and how many updates in a row may be left out.
+
+    An update is left out where its gradient is not finite (see `optimizer.skip_nonfinite`).
+    """
 
     steps: int
     save_every: int = 50
+    most_skipped: int = 10
+
+    def __post_init__(self) -> None:
+        for field, least in (("steps", 0), ("save_every", 1), ("most_skipped", 1)):
+            value = getattr(self, field)
+            if value < least:
+                raise ValueError(f"{field} is {value}: must be at least {least}; raise it")
+
+
+@dataclasses.dataclass
+class LoopTime:
+    """Wall time of a loop's steps in one session from the second one on, for the first compiles.
+
+    Attributes:
+      steps: how many they were.
+      total_s: what they took, saving included.
+      input_s: the part of it in which the device had nothing to do because the next batch was not there.
+    """
+
+    steps: int = 0
+    total_s: float = 0.0
+    input_s: float = 0.0
+
+    @property
+    def input_share(self) -> float:
+        """Share of the time that waited for data; 0 where no step was timed."""
+        return self.input_s / self.total_s if self.total_s else 0.0
 
 
 def fit(
@@ -34,7 +77,11 @@ def fit(
     config: LoopConfig,
     *,
     checkpoints: Checkpoints,
-    log: Callable[[int, dict[str, float]], None],
+    log: Log,
+    start: int | None = None,
+    stopping: Callable[[], bool] = lambda: False,
+    held_out: Callable[[Any], float] | None = None,
+    times: LoopTime | None = None,
 ) -> Any:
     """Run `step` to `config.steps`, continuing from the newest checkpoint where there is one.
 
@@ -45,30 +92,105 @@ def fit(
       step: jitted (state, batch) → (state, metrics); it may donate its state.
       state: where a run without a checkpoint begins.
       batches: training data.
-      config: how long, and how often to save.
+      config: how long, how often to save, and when to give up.
       checkpoints: where to save.
-      log: receives (step, metrics) in order; steps count from 0.
+      log: receives (step, metrics) in order; of a step whose update was left out the finite metrics and `SKIPPED`.
+      start: the step that `state` and `batches` stand at, from `resume`; `None` resumes here.
+      stopping: asked after every step; once it says yes the state is saved and returned as it is.
+      held_out: score of a state on held-out data, taken whenever a checkpoint is due; `checkpoints` keep the best.
+      times: receives where the time went.
+
+    Raises:
+      NonFiniteGradientError: more than `config.most_skipped` updates in a row were left out.
     """
-    restored = checkpoints.restore(state)
-    start = 0
-    if restored is not None:
-        start, state = restored.step, restored.state
-        batches.set_state(restored.data)
-    pending: tuple[int, dict[str, jax.Array]] | None = None
+    if start is None:
+        start, state = resume(state, batches, checkpoints)
+    times = LoopTime() if times is None else times
+    lines = _LateLines(log, config.most_skipped, _skipped_before(state))
     for t in range(start, config.steps):
-        state, metrics = step(state, next(batches))
+        began = time.perf_counter()
+        batch = next(batches)
+        waited_s = time.perf_counter() - began if lines.idle() else 0.0
+        state, metrics = step(state, batch)
         if t == start:
             return_memory()  # the step is compiled by now
-        if pending is not None:
-            log(pending[0], fetch(pending[1]))
-        pending = (t, metrics)
-        if (t + 1) % config.save_every == 0 or t + 1 == config.steps:
-            log(t, fetch(metrics))
-            pending = None
-            checkpoints.save(t + 1, state, batches.get_state())
+        lines.put(_Line(t, metrics, count_skipped(state)))
+        due = (t + 1) % config.save_every == 0 or t + 1 == config.steps
+        leaving = stopping()
+        if due or leaving:
+            lines.flush()
+            score = held_out(state) if due and held_out is not None else None
+            checkpoints.save(t + 1, state, batches.get_state(), score)
+        if t > start:
+            times.steps += 1
+            times.total_s += time.perf_counter() - began
+            times.input_s += waited_s
+        if leaving:
+            break
     return state
+
+
+def resume(state: Any, batches: Batches, checkpoints: Checkpoints) -> tuple[int, Any]:
+    """Step and state of the newest intact checkpoint, to which the batches are set; 0 and `state` without one."""
+    restored = checkpoints.restore(state)
+    if restored is None:
+        return 0, state
+    batches.set_state(restored.data)
+    return restored.step, restored.state
 
 
 def fetch(metrics: dict[str, jax.Array]) -> dict[str, float]:
     """Scalars of a metrics dictionary as Python floats."""
     return {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
+class _Line(NamedTuple):
+    """A step, its metrics, and `count_skipped` after it."""
+
+    step: int
+    metrics: dict[str, jax.Array]
+    skipped: jax.Array | None
+
+
+class _LateLines:
+    """Logs each step once the next one is dispatched, and judges the updates that were left out."""
+
+    def __init__(self, log: Log, most_skipped: int, skipped: int) -> None:
+        self._log, self._most, self._skipped = log, most_skipped, skipped
+        self._pending: _Line | None = None
+
+    def idle(self) -> bool:
+        """Whether the device is done with the last step."""
+        arrays: list[Any] = [] if self._pending is None else list(self._pending.metrics.values())
+        return all(array.is_ready() for array in arrays)
+
+    def put(self, line: _Line) -> None:
+        """Log the line before this one."""
+        self.flush()
+        self._pending = line
+
+    def flush(self) -> None:
+        """Log what is pending."""
+        if self._pending is None:
+            return
+        (t, metrics, counts), self._pending = self._pending, None
+        values = fetch(metrics)
+        if counts is None:
+            self._log(t, values)
+            return
+        skipped, in_a_row = (int(n) for n in jax.device_get(counts))
+        if skipped > self._skipped:
+            values = {name: x for name, x in values.items() if math.isfinite(x)} | {SKIPPED: float(skipped)}
+        self._skipped = skipped
+        self._log(t, values)
+        if in_a_row > self._most:
+            raise NonFiniteGradientError(
+                f"step {t}: the gradient was not finite in {in_a_row} updates in a row, {skipped} in all; at most "
+                f"{self._most} in a row may be left out: lower the learning rate, or look at what the batches from "
+                f"step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
+            )
+
+
+def _skipped_before(state: Any) -> int:
+    counts = count_skipped(state)
+    return 0 if counts is None else int(counts[0])

@@ -1,8 +1,12 @@
-"""The optimizers of the stages."""
+"""The optimizers of the stages.  All of them leave out an update whose gradient is not finite, and count it."""
 
 import dataclasses
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Int
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,6 +30,51 @@ class OptimizerConfig:
         return self.learning_rate * self.lr_scale
 
 
+class Skipping(NamedTuple):
+    """State of `skip_nonfinite`: that of the wrapped optimizer, updates left out so far, and in a row until now."""
+
+    inner: optax.OptState
+    skipped: Int[Array, ""]
+    in_a_row: Int[Array, ""]
+
+
+def skip_nonfinite(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """The optimizer, which keeps its state and moves nothing where the gradient's norm is NaN or infinite.
+
+    As `optax.apply_if_finite`, but by selection instead of a branch: a branch keeps old and new moments at once, a
+    selection is written over the old ones.  It never gives in; whoever runs the steps stops, see `count_skipped`.
+
+    Args:
+      optimizer: any whose state consists of arrays.
+    """
+
+    def init(params: Any) -> Skipping:
+        return Skipping(optimizer.init(params), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+
+    def update(grads: Any, state: Skipping, params: Any = None) -> tuple[Any, Skipping]:
+        finite = jnp.isfinite(optax.tree.norm(grads))
+        updates, inner = optimizer.update(grads, state.inner, params)
+        pick = lambda new, old: jnp.where(finite, new, old)
+        return jax.tree.map(lambda u: pick(u, jnp.zeros_like(u)), updates), Skipping(
+            inner=jax.tree.map(pick, inner, state.inner),
+            skipped=state.skipped + ~finite,
+            in_a_row=jnp.where(finite, 0, state.in_a_row + 1),
+        )
+
+    return optax.GradientTransformation(init, update)
+
+
+def count_skipped(state: Any) -> Int[Array, "2"] | None:
+    """Updates that were left out so far and in a row until now, or `None` where no optimizer of a state counts them.
+
+    Args:
+      state: any pytree; an array of its own comes back, for a step may take the state's buffers over.
+    """
+    nodes = jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, Skipping))
+    counts = [jnp.stack([node.skipped, node.in_a_row]) for node in nodes if isinstance(node, Skipping)]
+    return sum(counts[1:], counts[0]) if counts else None
+
+
 def falling_adamw(
     learning_rate: float, final_share: float, steps: int, max_grad_norm: float
 ) -> optax.GradientTransformation:
@@ -34,7 +83,8 @@ def falling_adamw(
     The learning rate falls linearly to `final_share` of itself over `steps` updates; 1 keeps it constant.
     """
     schedule = optax.linear_schedule(learning_rate, final_share * learning_rate, steps)
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adamw(schedule, weight_decay=0.0))
+    adamw = optax.adamw(schedule, weight_decay=0.0)
+    return skip_nonfinite(optax.chain(optax.clip_by_global_norm(max_grad_norm), adamw))
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformation:
@@ -43,7 +93,5 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.peak, warmup, max(steps, warmup + 1), end_value=config.peak * config.final_share
     )
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
-        optax.adamw(schedule, b2=config.b2, weight_decay=config.weight_decay),
-    )
+    adamw = optax.adamw(schedule, b2=config.b2, weight_decay=config.weight_decay)
+    return skip_nonfinite(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adamw))

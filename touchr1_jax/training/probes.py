@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax import masked
 from touchr1_jax.masked import AnyArray
 from touchr1_jax.rl.alarms import Alarm
-from touchr1_jax.training.dynamics import FLAT
+from touchr1_jax.training.dynamics import residuals
 from touchr1_jax.training.evidence import ProbeConfig, probe_log_probs
 
 ORDINAL_LEVELS = 3
@@ -61,23 +61,41 @@ def rank_me(rows: Float[Array, "n D"]) -> Float[Array, ""]:
     return jnp.exp(-jnp.sum(jnp.where(share > 0, share * jnp.log(jnp.where(share > 0, share, 1.0)), 0.0)))
 
 
-BOUNDS: Mapping[str, tuple[float, bool, str]] = {
-    "flat_share": (0.5, False, f"most dimensions vary by less than {FLAT} between contacts"),
-    "rank_share": (0.1, True, "effective rank below a tenth of the width"),
-    "skill": (0.0, True, "prediction no better than copying the last latent"),
-    "probe_lead": (0.0, True, "linear probe no better than on a random encoder"),
+def told_apart(latent: Float[AnyArray, "P S T N D"], exists: Bool[AnyArray, "P S T"]) -> Float[Array, ""]:
+    """What contacts differ by over the size of the latents, √(Σ (z − z̄)² / Σ z²), z̄ of one sensor, step and token.
+
+    The share that is left for a decoder that normalises what it reads: the scale of the latents does not enter.
+    """
+    size = jnp.sum(jnp.where(exists[..., None, None], latent, 0.0) ** 2)
+    return jnp.sqrt(jnp.sum(residuals(jnp.asarray(latent), jnp.asarray(exists)) ** 2) / size)
+
+
+BOUNDS: Mapping[str, tuple[float, str]] = {
+    "kept": (0.5, "contacts differ by less than half of what they did before training"),
+    "rank_share": (0.1, "effective rank below a tenth of the width"),
+    "skill": (0.0, "prediction no better than copying the last latent"),
+    "probe_lead": (0.0, "linear probe no better than on a random encoder"),
 }
-"""Metric → bound, whether it fires at or below the bound instead of above, meaning."""
+"""Metric → bound at which or below which it fires, meaning.
+
+`kept` is `told_apart` over what it was before training.  A bound on the spread itself, such as a share of dimensions
+below .1, strikes also where latents are merely small.
+"""
 
 
-def collapse_alarms(metrics: Mapping[str, float]) -> list[Alarm]:
-    """F11: signs that latent prediction has collapsed, among the metrics that were measured.
+def collapse_alarms(before: Mapping[str, float], now: Mapping[str, float]) -> list[Alarm]:
+    """F11: signs that latent prediction has collapsed: a bound passed at two readings in a row, and not recovering.
+
+        m_{t−1} ≤ bound,   m_t ≤ bound,   m_t ≤ m_{t−1}
+
+    A moving target falls below its bound for some dozen steps of a sound run, and rises again.
 
     Args:
-      metrics: any of the names of `BOUNDS`; others are ignored.
+      before: the reading before, of the trained encoder; any of the names of `BOUNDS`, others are ignored.
+      now: the present reading.
     """
     return [
-        Alarm(code="F11", meaning=meaning, value=metrics[name], bound=bound)
-        for name, (bound, below, meaning) in BOUNDS.items()
-        if name in metrics and (metrics[name] <= bound if below else metrics[name] > bound)
+        Alarm(code="F11", meaning=meaning, value=now[name], bound=bound)
+        for name, (bound, meaning) in BOUNDS.items()
+        if name in before and name in now and now[name] <= before[name] <= bound
     ]

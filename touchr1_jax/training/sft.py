@@ -83,6 +83,8 @@ def sft_gradient(
 ) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], Params]:
     """What `sft_loss` says of the batch, and the gradient of the loss, summed over micro-batches.
 
+    Neighbours are in different micro-batches: where devices share the contacts, each then has some of every one.
+
     Raises:
       ValueError: contacts that do not divide into micro-batches.
     """
@@ -103,8 +105,8 @@ def sft_gradient(
 
     zero = jnp.zeros(())
     start = (zero, zero), jax.tree.map(jnp.zeros_like, params)
-    chunks = jax.tree.map(lambda x: x.reshape(-1, micro, *x.shape[1:]), batch)
-    return jax.lax.scan(body, start, chunks)[0]
+    cut = lambda x: x.reshape(micro, contacts // micro, *x.shape[1:]).swapaxes(0, 1)
+    return jax.lax.scan(body, start, jax.tree.map(cut, batch))[0]
 
 
 def sft_loss(
@@ -133,7 +135,10 @@ def sft_sums(
 
     per_question = jax.vmap(answer, in_axes=(None, 0, 0, 0, 0))
     states = jax.vmap(per_question)(features, batch.ids, batch.mask, batch.streams, batch.tokens)
-    rows = {"state": states.reshape(-1, states.shape[-1]), "token": batch.tokens.ravel()}
-    found = by_blocks(score, rows, width=len(agent.banned), most=max_logits)
+    contacts = len(batch.tokens)
+    rows = {"state": states.reshape(contacts, -1, states.shape[-1]), "token": batch.tokens.reshape(contacts, -1)}
+    # contact by contact, each its share of the bound: blocks over all of them would cut across the devices
+    most = max(1, max_logits // contacts)
+    found = jax.vmap(lambda r: by_blocks(score, r, width=len(agent.banned), most=most))(rows)
     log_prob, right = (found[name].reshape(batch.tokens.shape) for name in ("log_prob", "right"))
     return -masked.total(log_prob, batch.token_mask), masked.total(right, batch.token_mask).astype(jnp.float32)

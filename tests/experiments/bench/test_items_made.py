@@ -60,7 +60,7 @@ def test_every_rationale_is_an_answer_in_the_language(items):
         assert reading.formatted
         assert concluded == item.ask.answer
     answers = {item.ask.id: understand(item.ask, item.rationale)[1] for item in items}
-    table = {name: scores.mean() for name, scores in score(items, answers).items()}
+    table = {name: scores.mean() for name, scores in score([item.ask for item in items], answers).items()}
     assert table["omae"] == 0
     assert table["csc"] == table["sfd"] == table["l2_em"] == 100
 

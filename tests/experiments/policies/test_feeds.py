@@ -158,6 +158,16 @@ def test_a_state_resumes_exactly(request, kind):
     assert equal(rest[:1], [leaves(next(feed))])
 
 
+@pytest.mark.parametrize("kind", ["answers", "questions"])
+def test_processes_that_share_batches_make_them_together(request, kind):
+    """What is drawn is drawn for the whole batch, so that it does not matter who makes which rows."""
+    make = request.getfixturevalue(kind)
+    for own in (np.array([0, 2]), np.array([1])):
+        part, whole = make(own=own), make()
+        for _ in range(3):
+            assert equal([leaves(next(part))], [[x[own] for x in leaves(next(whole))]])
+
+
 def leaves(batch) -> list[np.ndarray]:
     return [np.asarray(leaf) for leaf in jax.tree.leaves(batch)]
 

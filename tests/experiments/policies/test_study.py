@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from experiments.policies.answers import Evaluated
-from experiments.policies.baselines import baselines, constant_answers, joint_mode
+from experiments.policies.baselines import baselines, constant_answers, joint_mode, level_answers
 from experiments.policies.scores import score, score_study
 from experiments.policies.stages import Probed
-from experiments.policies.study import SFT, Study, load_answers, save_answers
+from experiments.policies.study import SFT, Study, Way, load_answers, run_study, save_answers
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
 from touchr1_jax.bench.metrics import evaluate
@@ -154,3 +154,23 @@ def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
     assert len(scored.objects) == 19
     for name, said in baselines(study).items():
         assert scored.baselines[name]["acc"].mean == pytest.approx(table(study, said)["acc"])
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "message"), [("more", "ordinal", "asks 'ordinal'"), ("sft", "sft", "has the name of a policy")]
+)
+def test_another_way_asks_a_policy_that_is_there_under_a_name_of_its_own(context, name, of, message):
+    way = Way(of=of, ask=lambda trained: trained.said)
+    with pytest.raises(ValueError, match=message):
+        run_study(tiny.STUDY, {}, context, ways={name: way})
+
+
+def test_answers_by_single_sensors_are_their_own(study):
+    alone = np.tile([0, 1, 2, 0], (5, 4, 1))
+    alone[:, 0] = TEST
+    said = level_answers(study.assembly, study.answers[SFT][0], TEST, alone)
+    scores = table(study, said)
+    assert scores["acc"] == 100
+    assert np.array_equal(said.alone[:, 0].max(1), said.label.max(1))
+    present = np.asarray(said.streams)
+    assert (np.asarray(said.parsed.perceive)[~present] == -1).all()

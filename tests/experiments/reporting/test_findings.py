@@ -5,9 +5,9 @@ import json
 
 import pytest
 
+from experiments.reporting.checks import ResultsError
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.reporting.report_findings import write_findings
-from experiments.reporting.results import ResultsError
 from tests.experiments.reporting.test_report import DESCRIPTION, HOSTILE, VOID, read
 
 FAST = Requirement(name="frame", measured=2.0, bound=2.5, better="lower", unit="ms")

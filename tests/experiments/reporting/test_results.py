@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
-from experiments.reporting.results import Comparison, Estimate, Results, ResultsError
+from experiments.reporting.checks import ResultsError
+from experiments.reporting.results import Comparison, Estimate, Results
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import accuracy, ordinal_mae
 

@@ -93,7 +93,7 @@ def test_progress_writes_plain_lines_where_there_is_no_terminal(context, monkeyp
 
 def test_progress_draws_a_bar_on_a_terminal():
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    with progress.progress(console, "grpo", 2) as advance:
+    with progress.progress(console, progress.Loop("grpo", 2)) as advance:
         advance(2, "reward 0.5")
     assert "2/2" in console.file.getvalue()
     assert "reward 0.5" in console.file.getvalue()

@@ -69,6 +69,7 @@ def test_few_presses_are_refused(presses: BallPresses) -> None:
         calibrate(few, names(few), "x", QUICK)
 
 
+@pytest.mark.slow
 def test_a_picture_without_contact_is_left_out_and_named(presses: BallPresses) -> None:
     blank = dataclasses.replace(presses, pictures=np.concatenate([presses.pictures, presses.background[None]]))
     _, report = calibrate(blank, names(blank), "x", QUICK)

@@ -23,6 +23,7 @@ def test_centres_and_radii_are_found(presses: BallPresses) -> None:
     assert found.misfit.max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_speck_moves_no_circle(presses: BallPresses) -> None:
     pictures = presses.pictures.copy()
     pictures[:, 30:34, 60:64] = 255
@@ -30,6 +31,7 @@ def test_a_speck_moves_no_circle(presses: BallPresses) -> None:
     np.testing.assert_allclose(np.median(np.abs(found.touches.stacked() - TOUCHES), 0), 0, atol=0.4)
 
 
+@pytest.mark.slow
 def test_drifting_lamps_move_no_circle(presses: BallPresses) -> None:
     brighter = np.clip(presses.pictures.astype(int) + np.array([12, -8, 5]), 0, 255).astype(np.uint8)
     found = find_circles(dataclasses.replace(presses, pictures=brighter))

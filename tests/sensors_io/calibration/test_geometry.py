@@ -74,9 +74,8 @@ def test_a_real_board():
     fitted = fit_geometry(found, pitch_mm=2.5, size_px=sample.shape)
     assert fitted.held_out_mm < 0.07
     assert fitted.mm_per_px * sample.shape[1] / 640 == pytest.approx(0.0510, rel=0.03)
-    again = find_pins(
-        *(fitted.rectify(image, mm_per_px=0.08, size_px=(220, 290)) for image in (sample, rest)), rows=7, columns=9
-    )
+    view = fitted.view(mm_per_px=0.08, size_px=(220, 290))
+    again = find_pins(view(sample), view(rest), rows=7, columns=9)
     steps = np.diff(again, axis=1)[..., 0] * 0.08
     assert np.abs(steps - 2.5).max() < 0.35
     assert abs(steps.mean() - 2.5) < 0.03
@@ -103,8 +102,8 @@ def test_bad_boards_are_refused():
         find_pins(picture(points), empty, rows=9, columns=7)
     with pytest.raises(GeometryError, match="must be ≥ 4×4"):
         fit_geometry(points[:3], pitch_mm=1.6, size_px=SIZE)
-    with pytest.raises(GeometryError, match="calibrate this mode"):
-        lens().rectify(empty[:-1], mm_per_px=0.1, size_px=(10, 10))
+    with pytest.raises(GeometryError, match="measure the geometry in this mode"):
+        lens().view(mm_per_px=0.1, size_px=(10, 10))(empty[:-1])
 
 
 def test_presses_of_a_ball_to_known_depths_give_the_scale():

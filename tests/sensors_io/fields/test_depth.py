@@ -8,7 +8,7 @@ import pytest
 
 from sensors_io.calibration.presses import indentation
 from sensors_io.fields.contact import ContactConfig, changed_contacts, find_contacts, steepest_change
-from sensors_io.fields.depth import ZeroConfig, zero_level
+from sensors_io.fields.depth import ZeroConfig, untouched_cells, zero_level
 from sensors_io.fields.sources import read_picture
 
 PITCH = 0.0634
@@ -43,6 +43,15 @@ def test_a_contact_that_fills_the_window_takes_its_shallowest_part_for_zero() ->
     level = zero_level(depth, np.ones_like(depth), PITCH, ZeroConfig())
     assert np.ptp(level) < 1e-6
     assert level[0, 0] == pytest.approx(0.22, abs=0.02)
+
+
+def test_cells_near_a_slope_are_not_untouched() -> None:
+    """One steep column of cells of 8 px takes the margin on either side with it."""
+    slope = np.zeros((80, 400), np.float32)
+    slope[:, 200:208] = 1.0
+    still = untouched_cells(slope, 0.125, ZeroConfig(margin_mm=3.0))  # cells of 1 mm
+    assert still.shape == (10, 50)
+    assert still.all(0).tolist() == [abs(column - 25) > 3 for column in range(50)]
 
 
 @pytest.mark.parametrize("contact_mm", [0.8, 1.5, 2.0])

@@ -66,6 +66,14 @@ def test_a_bare_gel_gives_depth_and_is_refused_shear() -> None:
     assert "deformation_mm, shear_mm" in extractor.refused[0]
 
 
+def test_a_picture_that_leaves_no_gel_untouched_has_no_zero_level() -> None:
+    """A gel that slopes everywhere is flagged; one that is pressed in the middle, or not at all, is not."""
+    ramp = np.clip(bare() + np.array([25.0, 0.0, 0.0]), 0, 255).astype(np.uint8)  # n_x = 0.16 at every pixel
+    fields = Extractor(bare(), 0.1, calibration(bare())).extract(np.stack([bare(), touched(bare()), ramp]))
+    assert [bool(f & Flag.NO_ZERO_LEVEL) for f in fields.flags.tolist()] == [False, False, True]
+    assert not Extractor(bare(), 0.1).read(ramp).flags[0] & Flag.NO_ZERO_LEVEL  # without depth nothing hangs on it
+
+
 def test_a_marker_gel_without_calibration_gives_its_motion_and_is_refused_depth() -> None:
     extractor = Extractor(dotted(), 0.1)
     assert extractor.evidence.pattern is Pattern.MARKERS

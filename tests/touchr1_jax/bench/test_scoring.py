@@ -7,11 +7,12 @@ from tests.touchr1_jax.bench.sample_items import items
 from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.bench.scoring import BENCH_METRICS, clusters, score
 
-RIGHT = {i.ask.id: i.ask.answer for i in items()}
+ASKS = tuple(i.ask for i in items())
+RIGHT = {ask.id: ask.answer for ask in ASKS}
 
 
 def test_who_is_right_scores_all():
-    table = score(items(), RIGHT)
+    table = score(ASKS, RIGHT)
     means = {name: scores.mean() for name, scores in table.items()}
     assert means["omae"] == 0
     assert means["soi_rho"] == 1
@@ -22,7 +23,7 @@ def test_who_is_right_scores_all():
 
 
 def test_who_says_nothing_scores_nothing():
-    table = score(items(), {name: [-1] * len(answer) for name, answer in RIGHT.items()})
+    table = score(ASKS, {name: [-1] * len(answer) for name, answer in RIGHT.items()})
     assert table["omae"].mean() == 2.0
     assert table["soi_rho"].mean() == 0.0
     assert all(scores.mean() == 0 for name, scores in table.items() if name != "omae")
@@ -30,7 +31,7 @@ def test_who_says_nothing_scores_nothing():
 
 def test_each_metric_reads_its_kind():
     said = RIGHT | {"h": (0,), "s": (2,), "c": (0, 1), "p1": (0,), "o": (2,), "t": (0,), "d": (1,)}
-    table = {name: scores.mean() for name, scores in score(items(), said).items()}
+    table = {name: scores.mean() for name, scores in score(ASKS, said).items()}
     assert table["h_acc"] == 0.0
     assert table["mat_acc"] == 100.0
     assert table["omae"] == pytest.approx((2 + 1 + 0 + 1) / 4)  # h, s, and both parts of c
@@ -42,26 +43,26 @@ def test_each_metric_reads_its_kind():
 
 
 def test_values_know_their_objects():
-    table = score(items(), RIGHT)
-    assert clusters(items(), table["sfd"]).tolist() == ["a", "a"]  # both orders of a pair are one object's
-    assert clusters(items(), table["deceptive_acc"]).tolist() == ["c"]
-    assert clusters(items(), table["omae"]).tolist() == ["a", "b", "a", "a"]
+    table = score(ASKS, RIGHT)
+    assert clusters(ASKS, table["sfd"]).tolist() == ["a", "a"]  # both orders of a pair are one object's
+    assert clusters(ASKS, table["deceptive_acc"]).tolist() == ["c"]
+    assert clusters(ASKS, table["omae"]).tolist() == ["a", "b", "a", "a"]
 
 
 def test_conflict_is_where_sight_is_wrong():
-    sees = lambda level, said: {n: s.mean() for n, s in score(items(), RIGHT | {"d": (said,)}, {"d": (level,)}).items()}
+    sees = lambda level, said: {n: s.mean() for n, s in score(ASKS, RIGHT | {"d": (said,)}, {"d": (level,)}).items()}
     assert {"conflict_acc", "revision_rate"} & set(sees(0, 0)) == set()  # sight is right: no conflict
     assert (sees(2, 0)["conflict_acc"], sees(2, 0)["revision_rate"]) == (100.0, 100.0)
     assert (sees(2, 1)["conflict_acc"], sees(2, 1)["revision_rate"]) == (0.0, 100.0)
     assert (sees(2, 2)["conflict_acc"], sees(2, 2)["revision_rate"]) == (0.0, 0.0)
     with pytest.raises(ValueError, match="lacks 'd'"):
-        score(items(), RIGHT, {})
+        score(ASKS, RIGHT, {})
 
 
 def test_metrics_without_items_are_left_out():
-    few = [i for i in items() if i.ask.kind == "scale"]
+    few = [ask for ask in ASKS if ask.kind == "scale"]
     assert list(score(few, RIGHT)) == ["omae"]
-    assert score([i for i in items() if i.ask.id == "m"], RIGHT).keys() == {"mat_acc", "mat_bacc"}
+    assert score([ask for ask in ASKS if ask.id == "m"], RIGHT).keys() == {"mat_acc", "mat_bacc"}
 
 
 def test_every_averaged_metric_is_scored():
@@ -70,6 +71,6 @@ def test_every_averaged_metric_is_scored():
 
 def test_answers_are_complete():
     with pytest.raises(ValueError, match="lacks 'h'"):
-        score(items(), {name: answer for name, answer in RIGHT.items() if name != "h"})
+        score(ASKS, {name: answer for name, answer in RIGHT.items() if name != "h"})
     with pytest.raises(ValueError, match=r"answers\['c'\] has 1 levels"):
-        score(items(), RIGHT | {"c": np.array([1])})
+        score(ASKS, RIGHT | {"c": np.array([1])})

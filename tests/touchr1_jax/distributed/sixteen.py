@@ -11,6 +11,7 @@ from touchr1_jax.distributed.abstract import AbstractStep, PromptShape, abstract
 from touchr1_jax.distributed.memory import ARGUMENTS, GRPOShape, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 
@@ -30,12 +31,12 @@ PROMPT = PromptShape(streams=tiny.S, stream_tokens=4, view_tokens=4, text_tokens
 GRPO = GRPOConfig(prompts=16, micro_prompts=16, group=8, length=16, remat=True, max_logits=16 * 512)
 
 
-def tiny_step(layers: int, mesh: MeshConfig) -> tuple[GRPOShape, AbstractStep]:
+def tiny_step(layers: int, mesh: MeshConfig, lora: LoraConfig | None = None) -> tuple[GRPOShape, AbstractStep]:
     """A step of a decoder of so many layers."""
     decoder = dataclasses.replace(DECODER, num_layers=layers)
     ids = {"vision_start_id": 500, "vision_end_id": 501, "image_id": 502, "video_id": 503}
     shape = GRPOShape(decoder=decoder, grpo=GRPO, mesh=mesh, prompt_tokens=PROMPT.tokens)
-    return shape, abstract_grpo(QwenConfig(decoder=decoder, vision=VISION, **ids), PROMPT, shape, OPTIMIZER)
+    return shape, abstract_grpo(QwenConfig(decoder=decoder, vision=VISION, **ids), PROMPT, shape, OPTIMIZER, lora=lora)
 
 
 def main() -> None:

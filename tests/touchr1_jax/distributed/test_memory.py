@@ -13,13 +13,14 @@ from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import (
     Compiled,
     GRPOShape,
-    at_depth,
+    at_depths,
     cache_bytes,
     counted_peak,
     grpo_bytes,
     saved_bytes,
 )
 from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.rl.config import GRPOConfig, Paper
 
@@ -61,7 +62,8 @@ def test_phases_do_not_add_up():
 
 
 def test_depth_is_a_straight_line():
-    assert at_depth(Compiled(10, 5, 4, 100), Compiled(13, 7, 6, 140), 4) == Compiled(19, 11, 10, 220)
+    assert at_depths({2: Compiled(13, 7, 6, 140), 1: Compiled(10, 5, 4, 100)}, 4) == Compiled(19, 11, 10, 220)
+    assert at_depths({1: Compiled(10, 5, 4, 100), 3: Compiled(16, 9, 8, 180)}, 4) == Compiled(19, 11, 10, 220)
     assert Compiled(10, 5, 4, 100).peak == 111
 
 
@@ -89,6 +91,19 @@ def test_the_7b_at_the_papers_shapes_fits_sixteen_h200_by_count():
     assert counted_peak(lines) < H200_BYTES / 2
 
 
+def test_adapters_on_a_frozen_base_by_hand():
+    """Of one layer of width 64: the base in bfloat16, and factors of rank 2 with two moments and a reference."""
+    shape, plain = tiny_step(1, MeshConfig())
+    step = tiny_step(1, MeshConfig(), LoraConfig(rank=2))[1]
+    lines = grpo_bytes(shape, step.state, step.batch, step.fixed, step.base)
+    whole = grpo_bytes(shape, plain.state, plain.batch, plain.fixed)
+    factors = 2 * (2 * (64 + 64) + 2 * (64 + 32) + 3 * (64 + 256))
+    assert lines["frozen base"] == whole["parameters"] / 2
+    assert lines["parameters"] == lines["reference"] == 4 * factors
+    assert lines["optimizer"] == 2 * 4 * factors + 4
+    assert whole["frozen base"] == 0
+
+
 @pytest.mark.slow
 def test_compiled_arguments_are_those_counted_and_memory_grows_by_the_layer():
     """On sixteen simulated devices, in a process of its own; a key of 8 bytes and a step of 4 are not counted."""
@@ -101,6 +116,6 @@ def test_compiled_arguments_are_those_counted_and_memory_grows_by_the_layer():
     for layers, entry in found.items():
         assert compiled[layers].arguments == entry["counted"] + 12
         assert compiled[layers].aliased > compiled[layers].results - 2000  # metrics have no argument to take over
-    line = at_depth(compiled["1"], compiled["2"], 4)
+    line = at_depths({1: compiled["1"], 2: compiled["2"]}, 4)
     assert line.arguments == compiled["4"].arguments
     assert line.temporary == pytest.approx(compiled["4"].temporary, rel=0.1)

@@ -101,6 +101,16 @@ def test_gradients_are_those_through_the_merged_parameters(base):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
 
 
+def test_layers_that_are_computed_twice_are_adapted_both_times(base):
+    """Values and gradients of a policy that keeps little for its backward pass."""
+    params = Trainable(adapters=loud(init_adapters(jax.random.key(0), base, LORA)), towers={})
+    agent = adapt(AGENT, base, LORA)
+    lean = dataclasses.replace(agent, policy=agent.policy.clone(remat=True))
+    total = lambda a: jax.value_and_grad(lambda p: jnp.sum(jnp.sin(logits(a, p)[..., tiny.WRITABLE])))(params)
+    for a, b in zip(jax.tree.leaves(total(lean)), jax.tree.leaves(total(agent)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(jnp.abs(b).max()))
+
+
 def test_only_named_layers_of_named_towers_are_adapted(base):
     config = dataclasses.replace(LORA, layers=("v_proj",))
     assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/layers_0/v_proj"}

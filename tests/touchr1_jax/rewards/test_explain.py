@@ -71,6 +71,14 @@ def test_a_fault_of_the_format_is_named(capsys, text, fault):
     assert fault in capsys.readouterr().out
 
 
+def test_words_of_another_language_are_answered_with_those_that_count(capsys):
+    text = "<perceive> xense weich </perceive> <compare> weich </compare> <conclude> weich </conclude>"
+    assert main(["explain", "--text", text, "--label", "hardness", "soft"]) == 0
+    said = capsys.readouterr().out
+    assert "no slot names a level; the words that do: hardness soft, firm, hard; roughness " in said
+    assert "formatted: yes" in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

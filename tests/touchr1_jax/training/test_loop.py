@@ -1,12 +1,14 @@
 """Stopping and going on is the same as never stopping, bit for bit."""
 
+import time
+
 import jax
 import numpy as np
 import pytest
 
-from tests.touchr1_jax.training.stepping import feed, start, step
+from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import LoopConfig, fetch, fit
+from touchr1_jax.training.loop import SKIPPED, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
 
 STEPS = 10
 CONFIG = LoopConfig(steps=STEPS, save_every=3)
@@ -116,3 +118,106 @@ def test_a_longer_run_goes_on_from_a_shorter_one(tmp_path):
 
 def test_metrics_become_floats():
     assert fetch({"a": jax.numpy.float32(0.5), "b": jax.numpy.int32(3)}) == {"a": 0.5, "b": 3.0}
+
+
+class TestSkipping:
+    """The loss has a NaN in the batches that hold a negative number."""
+
+    def run(self, directory, poisoned: set[int], most_skipped: int = 2, steps: int = STEPS):
+        lines = []
+        config = LoopConfig(steps=steps, save_every=3, most_skipped=most_skipped)
+        with Checkpoints(directory) as checkpoints:
+            log = lambda t, m: lines.append((t, m))
+            state = fit(guarded_step, guarded_start(), Poisoned(poisoned), config, checkpoints=checkpoints, log=log)
+        return state, lines
+
+    def test_a_bad_update_is_left_out_and_counted(self, tmp_path):
+        state, lines = self.run(tmp_path, {2, 5, 6})
+        assert [t for t, m in lines if SKIPPED in m] == [2, 5, 6]
+        assert [m[SKIPPED] for _, m in lines if SKIPPED in m] == [1, 2, 3]
+        assert all(np.isfinite(list(m.values())).all() for _, m in lines)
+        assert "loss" not in lines[2][1]
+        assert all(np.isfinite(x).all() for x in arrays(state))
+        assert int(state.opt_state.inner[0].count) == STEPS - 3
+
+    def test_too_many_in_a_row_stop_training(self, tmp_path):
+        with pytest.raises(NonFiniteGradientError, match=r"step 7: .* 3 updates in a row, 4 in all.*from step 5 on"):
+            self.run(tmp_path, {1, 5, 6, 7})
+        with Checkpoints(tmp_path) as checkpoints:
+            assert checkpoints.latest() == 6  # whose own update was left out: it holds what came before
+
+    def test_the_count_goes_on_after_a_break(self, tmp_path):
+        """A session that begins between bad updates stops at the step at which an uninterrupted one stops."""
+        self.run(tmp_path, {4, 5}, steps=6)
+        with pytest.raises(NonFiniteGradientError, match=r"step 6: .* 3 updates in a row, 3 in all"):
+            self.run(tmp_path, {4, 5, 6})
+
+
+class Poisoned(Failing):
+    """The same batches, some of them negative."""
+
+    def __init__(self, steps: set[int]) -> None:
+        super().__init__(1000)
+        self._steps = steps
+
+    def __next__(self):
+        count = 1000 - self._left
+        batch = super().__next__()
+        return -batch - 1 if count in self._steps else batch
+
+    def get_state(self):
+        return {"left": self._left, "batches": super().get_state()}
+
+    def set_state(self, state):
+        self._left = state["left"]
+        super().set_state(state["batches"])
+
+
+def test_a_request_to_stop_saves_where_it_is(whole, tmp_path):
+    """At a step at which no checkpoint is due; going on gives the same end."""
+    lines = []
+    log = lambda t, m: lines.append((t, m))
+    with Checkpoints(tmp_path) as checkpoints:
+        stopping = lambda: len(lines) >= 4
+        stopped = fit(step, start(), feed(), CONFIG, checkpoints=checkpoints, log=log, stopping=stopping)
+        assert checkpoints.latest() == int(stopped.step) == 5
+    state, more = run(tmp_path, feed())
+    assert lines + more == whole[1]
+    for a, b in zip(arrays(state), arrays(whole[0]), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_best_held_out_state_is_kept(tmp_path):
+    """Scores are taken where a checkpoint is due: after steps 3, 6, 9 and 10."""
+    scores = iter([1.0, 4.0, 2.0, 3.0])
+    with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
+        held_out = lambda state: next(scores)
+        fit(step, start(), feed(), CONFIG, checkpoints=checkpoints, log=lambda t, m: None, held_out=held_out)
+        assert int(checkpoints.best(start()).state.step) == 6
+        assert int(checkpoints.restore(start()).state.step) == STEPS
+
+
+class Slow(Failing):
+    """Each batch takes a twentieth of a second, in which any step here is long done."""
+
+    def __next__(self):
+        time.sleep(0.05)
+        return super().__next__()
+
+
+def test_time_without_a_batch_counts_as_waiting(tmp_path):
+    slow, quick = LoopTime(), LoopTime()
+    for name, batches, times in (("slow", Slow(1000), slow), ("quick", feed(), quick)):
+        with Checkpoints(tmp_path / name) as checkpoints:
+            fit(step, start(), batches, CONFIG, checkpoints=checkpoints, log=lambda t, m: None, times=times)
+    assert slow.steps == quick.steps == STEPS - 1  # all but the first, which compiles
+    assert slow.input_s >= 0.05 * slow.steps
+    assert slow.input_s <= slow.total_s
+    assert quick.input_s < slow.input_s
+    assert LoopTime().input_share == 0
+
+
+@pytest.mark.parametrize("field", ["steps", "save_every", "most_skipped"])
+def test_a_loop_of_nothing_is_refused(field):
+    with pytest.raises(ValueError, match=f"{field} is -1: must be at least"):
+        LoopConfig(**{"steps": 3, field: -1})

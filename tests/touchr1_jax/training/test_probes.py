@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import BOUNDS, collapse_alarms, contact_features, probe_right, rank_me
+from touchr1_jax.training.probes import BOUNDS, collapse_alarms, contact_features, probe_right, rank_me, told_apart
 
 
 def test_features_are_means_over_the_steps_that_exist():
@@ -38,12 +38,26 @@ def test_rank_of_known_shapes():
     assert rank_me(jnp.ones((5, 3))) == 1.0  # one point: the least that there is
 
 
-@pytest.mark.parametrize(
-    ("name", "sick"), [("flat_share", 0.6), ("rank_share", 0.05), ("skill", -0.1), ("probe_lead", 0.0)]
-)
+def test_contacts_are_told_apart_by_their_share_of_the_latents_whatever_the_scale():
+    """Two contacts at 3 and 5: they differ by 1 from their mean 4, so √(2 / 34)."""
+    latent = np.array([3.0, 5.0], np.float32).reshape(2, 1, 1, 1, 1)
+    exists = np.ones((2, 1, 1), bool)
+    np.testing.assert_allclose(told_apart(latent, exists), np.sqrt(2 / 34), rtol=1e-6)
+    np.testing.assert_allclose(told_apart(1e-3 * latent, exists), np.sqrt(2 / 34), rtol=1e-6)
+    absent = np.concatenate([latent, np.full_like(latent, 99.0)], 2)
+    np.testing.assert_allclose(told_apart(absent, np.array([[[True, False]]] * 2)), np.sqrt(2 / 34), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "sick"), [("kept", 0.4), ("rank_share", 0.05), ("skill", -0.1), ("probe_lead", 0.0)])
 def test_each_sign_of_collapse_raises_its_alarm_alone(name, sick):
-    well = {"flat_share": 0.2, "rank_share": 0.5, "skill": 0.3, "probe_lead": 9.0, "loss": 1.0}
-    assert collapse_alarms(well) == []
-    (alarm,) = collapse_alarms({**well, name: sick})
+    well = {"kept": 0.8, "rank_share": 0.5, "skill": 0.3, "probe_lead": 9.0, "loss": 1.0}
+    assert collapse_alarms(well, well) == []
+    (alarm,) = collapse_alarms({**well, name: sick}, {**well, name: sick})
     assert (alarm.code, alarm.value, alarm.bound) == ("F11", sick, BOUNDS[name][0])
-    assert collapse_alarms({}) == []
+    assert collapse_alarms({}, {}) == []
+
+
+def test_what_comes_once_or_recovers_raises_no_alarm():
+    assert collapse_alarms({"kept": 0.9}, {"kept": 0.3}) == []
+    assert collapse_alarms({"kept": 0.3}, {"kept": 0.4}) == []
+    assert len(collapse_alarms({"kept": 0.4}, {"kept": 0.3})) == 1

@@ -1,0 +1,54 @@
+"""How long training waits for data, at the sizes of the studies."""
+
+import dataclasses
+from collections.abc import Mapping
+
+from experiments.encoder.pretrain import PretrainConfig, pretrain
+from experiments.policies.assembly import assemble
+from experiments.policies.scores import PUBLISHED
+from experiments.policies.stages import (
+    encode_contacts,
+    gather_evidence,
+    noise_bank,
+    probe_features,
+    run_grpo,
+    run_sft,
+)
+from experiments.policies.study import StudyConfig, open_study_data
+from experiments.running.context import Context
+from experiments.running.loops import STEPPING, WAITING
+from sensors_io.scenes import SceneConfig
+from touchr1_jax.training.loop import LoopConfig
+
+STAGES = ("sft/0", "grpo/published/0", "dynamics/0")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WaitingConfig:
+    """Steps of each stage, of which the first is not timed, and the objects that they are about."""
+
+    steps: int = 16
+    study: StudyConfig = StudyConfig(scenes=SceneConfig(objects=60, sites=1))
+    dynamics: PretrainConfig = PretrainConfig()
+
+
+Waits = Mapping[str, tuple[float, float]]
+"""Stage → seconds in steps, and those of them that waited for data."""
+
+
+def waits(config: WaitingConfig, context: Context) -> Waits:
+    """Train each stage for some steps from where it is; a stage that is done is not timed again."""
+    study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
+    data = open_study_data(study, context)
+    assembly = assemble(study.model, data.clip.sensors)
+    evidence = gather_evidence(data, probe_features(data, context), study.probe)
+    sft = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
+    params = run_sft(assembly, data, evidence, sft, context, seed=0, stage=STAGES[0])
+    features = encode_contacts(assembly, params, data, data.parts["grpo"], context)
+    noise = noise_bank(assembly.agent, params, data, seed=0)
+    label, score = data.label[data.parts["grpo"]], assembly.score(PUBLISHED, data.prior())
+    run_grpo(assembly, params, features, label, noise, score, study.grpo, loop, context, seed=0, stage=STAGES[1])
+    dynamics = dataclasses.replace(config.dynamics, steps=config.steps, probe_every=config.steps)
+    pretrain(dynamics, data.store, data.parts["sft"], data.clip, context, stage=STAGES[2], seed=0)
+    times = context.timing()
+    return {stage: (times[f"{STEPPING}/{stage}"], times[f"{WAITING}/{stage}"]) for stage in STAGES}

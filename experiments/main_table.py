@@ -1,0 +1,200 @@
+"""What do the full model, SFT and every baseline score on the four tiers of the bench, beside the paper's main table?
+
+    make experiment EXP=main_table [ARGS="--scale smoke"]
+
+The bench's questions (see `dataset_card`) about the test objects of a study: properties of a touch, several at once,
+comparisons and orders, single sensors, and objects that look like what they are not.  Answered by the full model
+(published rewards and grounding), by SFT alone, and by baselines: constants, the measured force, the picture alone by a
+probe and by a policy that was trained without touch, the nearest training contacts by their fields, a linear probe on
+the encoder of SFT, and the same probe when every contact has another object's touch.  Policies and baselines answer
+about one touch at a time; comparisons follow from these answers (see `experiments.ladder.questions`).
+
+Cost: some 15 minutes on two cores with five seeds, of which SFT is shared with other experiments; `--scale smoke` under
+two.
+
+Expected: touch is worth twenty points over every baseline without it, and none over a linear probe on its own encoder.
+Baselines without touch stay at chance in comparisons.  A constant already has an average of about 29.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from experiments.bench import paper_numbers as paper
+from experiments.bench.draw import Quota, draw
+from experiments.bench.facts import gather
+from experiments.ladder.baselines import Known, Levels, nearest, probed
+from experiments.ladder.beside import beside_table, tier_table
+from experiments.ladder.features import Seen, field_features, picture_features
+from experiments.ladder.outcome import CURVES
+from experiments.ladder.questions import Answerer, answer_all, touch_rows
+from experiments.ladder.rows import bench_row
+from experiments.ladder.rungs import FULL
+from experiments.ladder.tables import DIFFERS, differences_table
+from experiments.ladder.ways import by_encoder
+from experiments.policies.answers import Evaluated
+from experiments.policies.baselines import baselines, level_answers
+from experiments.policies.estimates import compare_over_seeds
+from experiments.policies.examples import rollout_examples
+from experiments.policies.scores import PUBLISHED, study_settings
+from experiments.policies.study import BLIND, SFT, SMOKE, Study, StudyConfig, Way, run_study
+from experiments.reporting.findings import Requirement
+from experiments.reporting.results import Comparison, Estimate, Results
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from touchr1_jax.bench.items import Ask
+from touchr1_jax.rl.config import Paper
+
+ENCODER_PROBE, STRANGE = "encoder_probe", "shuffled_touch"
+PICTURE, NEAREST = "vision_only", "nearest_fields"
+
+TOUCHLESS = ("constant", "constant_joint", "constant_middle", "force_only", PICTURE, BLIND, STRANGE)
+"""Baselines that feel nothing of the object, or of another one."""
+
+COMPARED = ("h_acc", "r_acc", "p_acc", "mat_acc", "omae", "l2_em", "sfd", "soi_rho", "csc", "avg")
+
+Row = Mapping[str, Estimate]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MainConfig:
+    """The study, and how many questions of each kind are asked about its test objects."""
+
+    study: StudyConfig = StudyConfig()
+    quota: Quota = Quota()
+
+
+def run(config: MainConfig, context: Context) -> Results:
+    """Train, answer, score."""
+    ways = {
+        ENCODER_PROBE: Way(of=SFT, ask=functools.partial(by_encoder, False)),
+        STRANGE: Way(of=SFT, ask=functools.partial(by_encoder, True)),
+    }
+    study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, ways)
+    with context.timed("baselines"):
+        said = {**study.answers, **study.further, **{n: [x] for n, x in without_training(study, context).items()}}
+    with context.timed("score"):
+        asks = questions(study, config.quota)
+        rows = {
+            name: bench_row(asks, answered(study, asks, seeds), sight(study, asks, seeds))
+            for name, seeds in said.items()
+        }
+    trained = {name: rows[name] for name in (SFT, FULL)}
+    comparisons = against_sft(trained, config.study.seeds)
+    return Results(
+        arms=trained,
+        baselines={name: row for name, row in rows.items() if name not in trained},
+        settings=study_settings(config.study),
+        comparisons=tuple(comparisons),
+        verdict=verdict(rows, comparisons),
+        requirements=(seconds(context),),
+        tables=(beside_table(rows), tier_table(asks), differences_table((*DIFFERS[:4], *ASKED))),
+        data=study.data.summary() | {"questions": len(asks)},
+        curves=CURVES,
+        examples=rollout_examples(study, FULL, PUBLISHED),
+    )
+
+
+ASKED = (
+    ("several touches", "shown in one prompt", "answered one by one, compared by the levels"),
+    ("several properties", "asked in one prompt", "asked one by one"),
+    ("Avg", "of a formula that is not given", "mean of the nine columns, OMAE and ρ as shares"),
+)
+"""What differs in how the bench's questions are put."""
+
+
+def without_training(study: Study, context: Context) -> dict[str, Evaluated]:
+    """Answers of the baselines that need no policy, to the questions that policies were asked."""
+    data, levels = study.data, study.assembly.levels
+    train, test = np.concatenate([data.parts["sft"], data.parts["grpo"]]), data.parts["test"]
+    with context.progress("reading fields", len(train) + len(test)) as advance:
+        fields = [field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
+    pictures = [picture_features(data.store, rows) for rows in (train, test)]
+    known = lambda seen: Known(seen=seen, label=data.label[train])
+    found = baselines(study)
+    if pictures[0].present.any():
+        by_picture = probed(known(pictures[0]), pictures[1], levels, study.config.probe)
+        found[PICTURE] = _answers(study, Levels(together=by_picture.together, alone=_repeated(by_picture, fields[1])))
+    if fields[0].present.any():
+        found[NEAREST] = _answers(study, nearest(known(fields[0]), fields[1], levels))
+    return found
+
+
+def _answers(study: Study, levels: Levels) -> Evaluated:
+    return level_answers(study.assembly, study.answers[SFT][0], levels.together, levels.alone)
+
+
+def _repeated(levels: Levels, streams: Seen) -> np.ndarray:
+    """Who does not feel says the same whichever sensor is shown."""
+    return np.repeat(levels.together[:, None], streams.x.shape[1], 1)
+
+
+def questions(study: Study, quota: Quota) -> tuple[Ask, ...]:
+    """The bench's questions about the test contacts."""
+    return draw(gather(study.data.store, "test").contacts, study.data.clip.sensors, quota, seed=0)
+
+
+def answered(study: Study, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
+    """What the answers about single touches answer to the bench's questions, for every seed."""
+    data = study.data
+    rows, contacts = touch_rows(data), len(data.parts["test"])
+    return [answer_all(asks, Answerer.of(said, contacts), rows, data.clip.sensors) for said in seeds]
+
+
+def sight(study: Study, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
+    """What the policy without touch answers, seed by seed; its first seed for a baseline without seeds."""
+    return answered(study, asks, study.answers[BLIND][: len(seeds)])
+
+
+def against_sft(rows: Mapping[str, Row], seeds: int) -> list[Comparison]:
+    """The full model against SFT, paired by seed; needs two seeds at least."""
+    if seeds < 2:
+        return []
+    a, b = rows[FULL], rows[SFT]
+    return [compare_over_seeds(m, FULL, SFT, a[m], b[m]) for m in COMPARED if m in a and m in b]
+
+
+def seconds(context: Context) -> Requirement:
+    """Minutes so far against what the whole table may take on two cores."""
+    timing = context.timing()
+    minutes = sum(s for stage, s in timing.items() if stage != "total") / 60
+    return Requirement(
+        name="minutes of all stages", measured=minutes, bound=45.0, better="lower", unit="min", note="two cores"
+    )
+
+
+def verdict(rows: Mapping[str, Row], comparisons: Sequence[Comparison]) -> tuple[str, ...]:
+    """Touch against the best baseline without it, reinforcement against SFT, and the policy against its own encoder."""
+    single = [m for m in ("h_acc", "r_acc", "p_acc") if m in rows[FULL]]
+    mean = lambda name: float(np.mean([rows[name][m].mean for m in single])) if single else float("nan")
+    best = max((name for name in TOUCHLESS if name in rows), key=mean)
+    said = [
+        f"The full model answers {mean(FULL):.1f} % of hardness, roughness and protrusion right, SFT {mean(SFT):.1f}, "
+        f"a linear probe on the encoder of SFT {mean(ENCODER_PROBE):.1f}; the best without touch, {best}, "
+        f"{mean(best):.1f}."
+    ]
+    for c in comparisons:
+        if c.metric in ("avg", "omae", "csc"):
+            beyond = "0 lies outside" if c.ci95[0] > 0 or c.ci95[1] < 0 else "which may be chance"
+            said.append(f"GRPO moves {c.metric} by {c.difference:+.3g} [{c.ci95[0]:.3g}, {c.ci95[1]:.3g}] ({beyond}).")
+    if "avg" in rows[FULL]:
+        ours, theirs = rows[FULL]["avg"].mean, paper.MAIN["Touch-R1-7B"][1]
+        said.append(
+            f"Its average is {ours:.1f}; a constant has {rows['constant']['avg'].mean:.1f}. The paper's {theirs} is of "
+            "another formula."
+        )
+    return tuple(said)
+
+
+DEFAULT = MainConfig()
+SMALL = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
+
+EXPERIMENT = Experiment(
+    name="main_table",
+    config=DEFAULT,
+    scales={"smoke": MainConfig(study=SMOKE, quota=SMALL)},
+    run=run,
+    curves=CURVES,
+)

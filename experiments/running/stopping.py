@@ -1,0 +1,58 @@
+"""How a run hears that it should stop: at once, or, inside a training loop, once the step is done and saved."""
+
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Control-C, and what a scheduler sends before it takes the machine away."""
+
+
+class Stopped(BaseException):
+    """A signal asked the run to stop; no `except Exception` may swallow it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+class Stopping:
+    """The first of `SIGNALS` raises `Stopped`, at once or when a patient block ends; a second one ends the process."""
+
+    def __init__(self) -> None:
+        self._number: int | None = None
+        self._patient = False
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Hear the signals inside the block; only a process's main thread can."""
+        before = {n: signal.signal(n, self._hear) for n in SIGNALS}
+        try:
+            yield
+        finally:
+            for n, handler in before.items():
+                signal.signal(n, handler)
+
+    @contextlib.contextmanager
+    def patient(self) -> Iterator[Callable[[], bool]]:
+        """A block that ends by itself soon after the function that it gets says that a signal came.
+
+        Raises:
+          Stopped: when the block ends, if one came.
+        """
+        self._patient = True
+        try:
+            yield lambda: self._number is not None
+        finally:
+            self._patient = False
+        if self._number is not None:
+            raise Stopped(self._number)
+
+    def _hear(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        for n in SIGNALS:
+            signal.signal(n, signal.SIG_DFL)
+        self._number = number
+        if not self._patient:
+            raise Stopped(number)

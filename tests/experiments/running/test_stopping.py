@@ -1,0 +1,59 @@
+"""Signals: at once where nothing is lost by it, after the step inside a loop, for good the second time."""
+
+import signal
+
+import pytest
+
+from experiments.running.stopping import SIGNALS, Stopped, Stopping
+
+
+@pytest.fixture(autouse=True)
+def restored():
+    """The handlers that the test began with, whatever happens."""
+    before = {n: signal.getsignal(n) for n in SIGNALS}
+    yield
+    for n, handler in before.items():
+        signal.signal(n, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_raises_at_once(number):
+    with pytest.raises(Stopped, match=number.name) as stop, Stopping().listening():
+        signal.raise_signal(number)
+    assert stop.value.number == number
+
+
+def patiently(inside) -> None:
+    """Run a function in a patient block, in which a SIGTERM comes first."""
+    stopping = Stopping()
+    with stopping.listening(), stopping.patient() as asked:
+        assert not asked()
+        signal.raise_signal(signal.SIGTERM)
+        assert asked()
+        inside()
+
+
+def test_a_patient_block_is_told_and_ends_before_it_raises():
+    done = []
+    with pytest.raises(Stopped, match="SIGTERM"):
+        patiently(lambda: done.append("the step"))
+    assert done == ["the step"]
+
+
+def test_a_second_signal_acts_as_if_nobody_listened():
+    handlers = []
+    with pytest.raises(Stopped):
+        patiently(lambda: handlers.extend(signal.getsignal(n) for n in SIGNALS))
+    assert handlers == [signal.SIG_DFL] * 2
+
+
+def test_an_error_inside_is_what_comes_out():
+    with pytest.raises(ZeroDivisionError):
+        patiently(lambda: 1 / 0)
+
+
+def test_handlers_come_back():
+    before = [signal.getsignal(n) for n in SIGNALS]
+    with Stopping().listening():
+        assert [signal.getsignal(n) for n in SIGNALS] != before
+    assert [signal.getsignal(n) for n in SIGNALS] == before
