@@ -16,6 +16,7 @@ reads 5 to 12 times slower; WebP and FFV1 are at best a third smaller and read 2
 
 import dataclasses
 import fcntl
+import hashlib
 import os
 import pathlib
 from collections.abc import Mapping
@@ -239,6 +240,11 @@ class RecordStore:
     def complete(self) -> bool:
         """Whether the writing has ended."""
         return self._index.complete
+
+    @property
+    def digest(self) -> str:
+        """First 16 hex digits of the SHA-256 of the index: the configuration, all contacts, the size of every shard."""
+        return hashlib.sha256((self.path / INDEX).read_bytes()).hexdigest()[:16]
 
     @property
     def frames(self) -> dict[str, int]:

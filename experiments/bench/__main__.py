@@ -4,13 +4,13 @@ import sys
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from experiments.bench.card import CardError
 from experiments.bench.commands import Accept, Annotate, AnnotateSheets, Audit, AuditSheet, Generate, Propose, Score
 from experiments.bench.draw import QuotaError
 from experiments.bench.facts import FactsError
 from experiments.bench.sheets import SheetError
+from sensors_io.commands.console import complain
 from sensors_io.records import RecordsError
 from sensors_io.schema import SchemaError
 from touchr1_jax.bench.items import ItemError
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         return command.run()
     except KNOWN_ERRORS as error:
-        Console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, highlight=False, soft_wrap=True)
+        complain(error)
         return 1
 
 

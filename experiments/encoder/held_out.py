@@ -62,10 +62,6 @@ class Watched:
         columns = [ATTRIBUTES.index(name) for name in ORDINAL]
         return self.label[np.concatenate([self.fit_rows, self.read_rows])][:, columns]
 
-    def read_objects(self) -> np.ndarray:
-        """Object of each read row."""
-        return self.objects[self.read_rows]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Assessment:

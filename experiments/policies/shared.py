@@ -58,10 +58,17 @@ def shared_sft(
     Args:
       assembly, data, evidence, config, context, seed, stage, blind, tactile: as in `run_sft`.
     """
-    values = {"config": config, "model": assembly.model, "clip": data.clip, "seed": seed, "blind": blind}
-    values["mesh"] = context.devices.shape
+    values = {
+        "records": data.store.digest,
+        "config": config,
+        "model": assembly.model,
+        "clip": data.clip,
+        "seed": seed,
+        "blind": blind,
+        "mesh": context.devices.shape,
+    }
     felt = {} if tactile is None else {f"tactile/{name}": x for name, x in flat(tactile).items()}
-    arrays = {"evidence": evidence, "rows": data.parts["sft"], "label": data.label, **felt}
+    arrays = {"evidence": evidence, "rows": data.parts["sft"], **felt}
     path = context.cache_dir / "sft" / f"{fingerprint(values, arrays)}.npz"
     if path.exists():
         context.say(f"{stage}: made before, {path}")

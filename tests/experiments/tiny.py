@@ -5,50 +5,19 @@ import dataclasses
 import jax
 import numpy as np
 
-from experiments.policies.assembly import Assembly, ModelConfig
+from experiments.faults.victim import MODEL, SCENES
+from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import touch_batch
 from experiments.policies.stages import SFTConfig
 from experiments.policies.study import StudyConfig
 from sensors_io.pipeline import clip_batches
-from sensors_io.scenes import SceneConfig
 from tests.touchr1_jax.drawn import draw_params
-from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.types import Params, TouchBatch
 
-SCENES = SceneConfig(
-    objects=16,
-    sites=1,
-    frames=4,
-    image_px=28,
-    contact_grid=24,
-    view_px=16,
-    split_shares=(0.6, 0.1, 0.3),
-    solver_tolerance=1e-2,
-    solver_max_iterations=20,
-)
-MODEL = ModelConfig(
-    tactile=TactileViTConfig(sensors=0, width=16, num_layers=0, num_heads=2, stem_width=4),
-    vision=VisionConfig(image_px=16, patch_px=8, width=8, num_layers=0),
-    decoder=DecoderConfig(
-        vocab_size=0,
-        hidden_size=24,
-        num_layers=1,
-        num_heads=2,
-        num_kv_heads=1,
-        head_dim=8,
-        intermediate_size=32,
-        mrope_section=(1, 1, 2),
-    ),
-    frames=4,
-    image_px=28,
-    completion_tokens=20,
-)
 STUDY = StudyConfig(
     seeds=2,
     scenes=SCENES,

@@ -2,6 +2,8 @@
 
 import ast
 import dataclasses
+import json
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,6 +16,7 @@ from experiments.policies.shared import LATER, USED, fingerprint, shared_sft, so
 from experiments.policies.stages import SFTConfig
 from experiments.running.context import Context
 from experiments.running.runs import ROOT
+from sensors_io.records import RecordStore
 
 CONFIG = SFTConfig(steps=2, batch_size=4)
 
@@ -68,6 +71,17 @@ def test_another_setting_is_another_checkpoint(make, first, monkeypatch):
     for config, seed in ((dataclasses.replace(CONFIG, steps=3), 0), (CONFIG, 1)):
         with pytest.raises(TypeError):
             make("other", config, seed=seed)
+
+
+def test_other_records_are_another_checkpoint(data, tmp_path):
+    """The same touch may come with other pictures: the index knows, by its configuration and its shards' sizes."""
+    shutil.copytree(data.store.path, tmp_path / "other")
+    index = tmp_path / "other" / "index.json"
+    assert RecordStore(tmp_path / "other").digest == data.store.digest
+    tree = json.loads(index.read_text())
+    tree["meta"]["config_hash"] += "0"
+    index.write_text(json.dumps(tree))
+    assert RecordStore(tmp_path / "other").digest != data.store.digest
 
 
 def test_every_value_and_number_counts():
