@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -98,7 +97,7 @@ class Agent:
         states at a time.  `known` and `start` as in `prefill`.
         """
         first, prefix = self._apply(params, Policy.prefill_state, features, ids, mask, self.slots, known, start)
-        return jax.vmap(lambda o: self._apply(params, Policy.completion_states, o, first, prefix))(tokens), prefix
+        return self._apply(params, Policy.completion_states, tokens, first, prefix), prefix
 
     def logits(self, params: Params, states: Float[Array, "*n D"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts, banned ids out of reach."""

@@ -8,7 +8,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax.models.linear import Dense
 
 MASKED = -1e9
 """Score of a forbidden key or token: finite, so that 0 · MASKED is 0 and no NaN arises from differences."""
@@ -35,9 +38,9 @@ class GatedMLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
-        gate = nn.Dense(self.hidden, use_bias=self.use_bias, name="gate")(x)
-        up = nn.Dense(self.hidden, use_bias=self.use_bias, name="up")(x)
-        return nn.Dense(x.shape[-1], use_bias=self.use_bias, name="down")(nn.silu(gate) * up)
+        gate = Dense(self.hidden, use_bias=self.use_bias, name="gate")(x)
+        up = Dense(self.hidden, use_bias=self.use_bias, name="up")(x)
+        return Dense(x.shape[-1], use_bias=self.use_bias, name="down")(nn.silu(gate) * up)
 
 
 class Rotation(NamedTuple):
@@ -67,33 +70,40 @@ def mrope(positions: Int[Array, "3 T"], head_dim: int, sections: Sequence[int], 
     return Rotation(jnp.cos(angle), jnp.sin(angle))
 
 
-def rotate(x: Float[Array, "T *heads d"], rotation: Rotation) -> Float[Array, "T *heads d"]:
+def rotate(x: Float[Array, "*g T H d"], rotation: Rotation) -> Float[Array, "*g T H d"]:
     """Turn each (first half, second half) pair of a head by its token's angles."""
-    shape = (x.shape[0],) + (1,) * (x.ndim - 2) + (x.shape[-1] // 2,)
-    cos, sin = rotation.cos.reshape(shape).astype(x.dtype), rotation.sin.reshape(shape).astype(x.dtype)
-    first, second = jnp.split(x, 2, -1)
-    return jnp.concatenate([first * cos - second * sin, second * cos + first * sin], -1)
+    half = x.shape[-1] // 2
+    whole = lambda first, second: jnp.concatenate([first, second], -1)[:, None].astype(x.dtype)
+    cos, sin = whole(rotation.cos, rotation.cos), whole(-rotation.sin, rotation.sin)
+    exchange = jnp.asarray(np.roll(np.eye(2 * half), half, 0), x.dtype)
+    # A product, since XLA on CPU writes a concatenation number by number; exact, for each sum has one term.
+    return x * cos + jnp.matmul(x, exchange, precision=jax.lax.Precision.HIGHEST) * sin
 
 
 class KeySource(NamedTuple):
-    """One block of keys that queries may look at; `mask` says which, [Tq, n] or [n]."""
+    """One block of keys that queries may look at, shared by a group of sequences or one for each (*g).
 
-    k: Float[Array, "KV n d"]
-    v: Float[Array, "KV n d"]
+    `mask` says which queries may look at which keys, [Tq, n] or, for all queries, [n].
+    """
+
+    k: Float[Array, "KV *g n d"]
+    v: Float[Array, "KV *g n d"]
     mask: Bool[Array, "..."]
 
 
-def attend(q: Float[Array, "T KV R d"], sources: Sequence[KeySource]) -> Float[Array, "T KV*R*d"]:
-    """Grouped-query attention of one sequence over the union of several key blocks, softmax(q kᵀ/√d) v.
+def attend(q: Float[Array, "*g T KV R d"], sources: Sequence[KeySource]) -> Float[Array, "*g T KV*R*d"]:
+    """Grouped-query attention over the union of several key blocks, softmax(q kᵀ/√d) v, of one sequence or of a group.
 
-    The blocks stay apart, so that keys shared by a group of rollouts are stored and multiplied once under `vmap`.
-    The softmax runs in float32.
+    The blocks stay apart, so that keys that a group shares are stored and multiplied once.  The softmax runs in
+    float32.
     """
-    t, kv, r, d = q.shape
-    rows = (q * d**-0.5).transpose(1, 2, 0, 3).reshape(kv, r * t, d)  # all queries of a key head as one matrix
+    *lead, t, kv, r, d = q.shape
+    by_head = (q * d**-0.5).reshape(-1, t, kv, r, d).transpose(2, 0, 3, 1, 4)
+    rows = by_head.reshape(kv, -1, r * t, d)  # all queries of a key head and a sequence as one matrix
     masks = tuple(jnp.tile(s.mask, (r, 1)) if s.mask.ndim == 2 else s.mask for s in sources)
-    mixed = _mix(rows, tuple(s.k for s in sources), tuple(s.v for s in sources), masks)
-    return mixed.reshape(kv, r, t, d).transpose(2, 0, 1, 3).reshape(t, -1)
+    whose = lambda x: x.reshape(kv, -1, *x.shape[-2:])
+    mixed = _mix(rows, tuple(whose(s.k) for s in sources), tuple(whose(s.v) for s in sources), masks)
+    return mixed.reshape(kv, -1, r, t, d).transpose(1, 3, 0, 2, 4).reshape(*lead, t, -1)
 
 
 _Blocks = tuple[Array, ...]
@@ -101,7 +111,7 @@ _Blocks = tuple[Array, ...]
 
 @jax.custom_vjp
 def _mix(rows: Array, keys: _Blocks, values: _Blocks, masks: _Blocks) -> Array:
-    """softmax(rows · keysᵀ) · values of each key head; rows [KV, n, d], keys and values [KV, m, d] block by block.
+    """softmax(rows · keysᵀ) · values; rows [KV, G, n, d], keys and values [KV, G or 1, m, d] block by block.
 
     The gradient computes the weights again from the saved normaliser (FlashAttention, arXiv 2205.14135, appendix B.2):
     a third of the memory and half of the time of differentiating through them.
@@ -125,28 +135,45 @@ def _mix_backward(saved: tuple[Any, ...], g: Array) -> tuple[Array, _Blocks, _Bl
     d_rows, d_keys, d_values = jnp.zeros(rows.shape), [], []
     for k, v, m in zip(keys, values, masks, strict=True):
         weight = jnp.exp(_scores(rows, k, m) - normaliser)
-        d_score = weight * (jnp.einsum("knd,kmd->knm", g, v) - along)
+        d_score = weight * (_inner(g, v) - along)
         d_rows += _product(d_score, k)
-        d_keys.append(jnp.einsum("knm,knd->kmd", d_score, rows).astype(k.dtype))
-        d_values.append(jnp.einsum("knm,knd->kmd", weight, g).astype(v.dtype))
+        d_keys.append(_outer(d_score, rows, k))
+        d_values.append(_outer(weight, g, v))
     return d_rows.astype(rows.dtype), tuple(d_keys), tuple(d_values), None
 
 
 _mix.defvjp(_mix_forward, _mix_backward)
 
 
+def _among(x: Array, block: Array) -> Array:
+    """x [KV, G, n, …] as the rows that look at one block of keys: those of all sequences where they share it."""
+    return x.reshape(x.shape[0], block.shape[1], -1, x.shape[-1])
+
+
 def _scores(rows: Array, keys: Array, mask: Array) -> Array:
-    return jnp.where(mask, jnp.einsum("knd,kmd->knm", rows, keys, preferred_element_type=jnp.float32), MASKED)
+    return jnp.where(mask, _inner(rows, keys, jnp.float32), MASKED)
+
+
+def _inner(rows: Array, keys: Array, kind: DTypeLike | None = None) -> Array:
+    found = jnp.einsum("kgnd,kgmd->kgnm", _among(rows, keys), keys, preferred_element_type=kind)
+    return found.reshape(*rows.shape[:-1], -1)
 
 
 def _product(weights: Array, values: Array) -> Array:
-    return jnp.einsum("knm,kmd->knd", weights.astype(values.dtype), values, preferred_element_type=jnp.float32)
+    weights, shape = weights.astype(values.dtype), (*weights.shape[:-1], values.shape[-1])
+    mixed = jnp.einsum("kgnm,kgmd->kgnd", _among(weights, values), values, preferred_element_type=jnp.float32)
+    return mixed.reshape(shape)
+
+
+def _outer(weights: Array, rows: Array, block: Array) -> Array:
+    """Σ over the rows that look at a block, weightsᵀ rows."""
+    return jnp.einsum("kgnm,kgnd->kgmd", _among(weights, block), _among(rows, block)).astype(block.dtype)
 
 
 _LANES = 16  # float32 numbers of one AVX-512 register
 
 
-def _by_lanes(reduce: Callable[..., Array], x: Float[Array, "KV n m"]) -> Float[Array, "KV n 1"]:
+def _by_lanes(reduce: Callable[..., Array], x: Float[Array, "*n m"]) -> Float[Array, "*n 1"]:
     """Reduction of each row, first across registers, then within one: XLA's CPU reductions of rows do not vectorise."""
     *lead, m = x.shape
     whole = m // _LANES * _LANES

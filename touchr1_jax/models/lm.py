@@ -1,7 +1,8 @@
 """Decoder language model of the Qwen2.5 shape: grouped-query attention, RMSNorm, SwiGLU, multimodal rotary positions.
 
-Every method works on one sequence; the callers batch by `vmap`.  A group of G rollouts shares one prompt, so the keys
-of the prompt (`PrefixCache`) are an argument of their own that `vmap` over the group leaves unbatched.
+Every method works on one sequence, the learner's `extend` also on a group; the callers batch by `vmap`.  A group of G
+rollouts shares one prompt, so the keys of the prompt (`PrefixCache`) are an argument of their own, which a group, or
+`vmap` over it, leaves as it is.
 """
 
 import dataclasses
@@ -14,6 +15,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
+from touchr1_jax.models.linear import Dense, linear
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,8 +42,8 @@ class DecoderConfig:
 class LayerCache(NamedTuple):
     """Keys and values of one layer, head-major: a time-major layout is several times slower to attend to."""
 
-    k: Float[Array, "KV T d"]
-    v: Float[Array, "KV T d"]
+    k: Float[Array, "KV *g T d"]
+    v: Float[Array, "KV *g T d"]
 
 
 class PrefixCache(NamedTuple):
@@ -60,22 +62,22 @@ class DecoderLayer(nn.Module):
     def setup(self) -> None:
         c = self.config
         self.norm_attention, self.norm_mlp = RMSNorm(c.norm_epsilon), RMSNorm(c.norm_epsilon)
-        self.q_proj = nn.Dense(c.num_heads * c.head_dim)
-        self.k_proj = nn.Dense(c.num_kv_heads * c.head_dim)
-        self.v_proj = nn.Dense(c.num_kv_heads * c.head_dim)
-        self.o_proj = nn.Dense(c.hidden_size, use_bias=False)
+        self.q_proj = Dense(c.num_heads * c.head_dim)
+        self.k_proj = Dense(c.num_kv_heads * c.head_dim)
+        self.v_proj = Dense(c.num_kv_heads * c.head_dim)
+        self.o_proj = Dense(c.hidden_size, use_bias=False)
         self.mlp = GatedMLP(c.intermediate_size)
 
-    def project(self, x: Float[Array, "T D"], rotation: Rotation) -> tuple[Float[Array, "T KV R d"], LayerCache]:
+    def project(self, x: Float[Array, "*g T D"], rotation: Rotation) -> tuple[Float[Array, "*g T KV R d"], LayerCache]:
         """Queries of each token, and its keys and values head-major."""
-        c, t = self.config, x.shape[0]
-        y = self.norm_attention(x)
-        q = self.q_proj(y).reshape(t, c.num_kv_heads, c.num_heads // c.num_kv_heads, c.head_dim)
-        k = self.k_proj(y).reshape(t, c.num_kv_heads, c.head_dim)
-        v = self.v_proj(y).reshape(t, c.num_kv_heads, c.head_dim)
-        return rotate(q, rotation), LayerCache(rotate(k, rotation).swapaxes(0, 1), v.swapaxes(0, 1))
+        c, y = self.config, self.norm_attention(x)
+        heads = lambda z: z.reshape(*z.shape[:-1], -1, c.head_dim)
+        q = rotate(heads(self.q_proj(y)), rotation)
+        k, v = rotate(heads(self.k_proj(y)), rotation), heads(self.v_proj(y))
+        major = lambda z: jnp.moveaxis(z, -2, 0)
+        return q.reshape(*x.shape[:-1], c.num_kv_heads, -1, c.head_dim), LayerCache(major(k), major(v))
 
-    def finish(self, x: Float[Array, "T D"], attended: Float[Array, "T hd"]) -> Float[Array, "T D"]:
+    def finish(self, x: Float[Array, "*g T D"], attended: Float[Array, "*g T hd"]) -> Float[Array, "*g T D"]:
         """Residual sums after attention and after the MLP."""
         x = x + self.o_proj(attended)
         return x + self.mlp(self.norm_mlp(x))
@@ -97,11 +99,11 @@ class DecoderLayer(nn.Module):
         return self.finish(x[-1:], attend(q[-1:], [KeySource(cache.k, cache.v, mask)])), cache
 
     def over_completion(
-        self, x: Float[Array, "T D"], rotation: Rotation, past: LayerCache, mask: Bool[Array, "L"]
-    ) -> Float[Array, "T D"]:
-        """All tokens of a completion under the prompt whose keys are `past`."""
+        self, x: Float[Array, "*g T D"], rotation: Rotation, past: LayerCache, mask: Bool[Array, "L"]
+    ) -> Float[Array, "*g T D"]:
+        """All tokens of a completion, or of a group of them, under the prompt whose keys are `past`."""
         q, own = self.project(x, rotation)
-        causal = jnp.tril(jnp.ones((len(x), len(x)), bool))
+        causal = jnp.tri(x.shape[-2], dtype=bool)
         return self.finish(x, attend(q, [KeySource(past.k, past.v, mask), KeySource(own.k, own.v, causal)]))
 
 
@@ -130,16 +132,16 @@ class Decoder(nn.Module):
         self.layers = [layer(c) for _ in range(c.num_layers)]
         self.norm = RMSNorm(c.norm_epsilon)
         if not c.tie_embedding:
-            self.head = nn.Dense(c.vocab_size, use_bias=False)
+            self.head = Dense(c.vocab_size, use_bias=False)
 
-    def embed(self, tokens: Int[Array, "T"]) -> Float[Array, "T D"]:
+    def embed(self, tokens: Int[Array, "*n"]) -> Float[Array, "*n D"]:
         """Rows of the embedding table."""
         return self.embedding(tokens)
 
     def logits(self, x: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the next token in float32, with banned ids (placeholders, padding) out of reach for good."""
         y = self.norm(x)
-        scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)
+        scores = linear(y, self.embedding.embedding.T) if self.config.tie_embedding else self.head(y)
         return jnp.where(banned, MASKED, scores.astype(jnp.float32))
 
     def prefill(
@@ -181,9 +183,9 @@ class Decoder(nn.Module):
             caches.append(cache)
         return x, PrefixCache(tuple(caches), mask, _after(positions, mask))
 
-    def extend(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T D"]:
-        """Hidden states of a completion under its prompt, all tokens at once (the learner's forward pass)."""
-        t = tokens.shape[0]
+    def extend(self, tokens: Int[Array, "*g T"], prefix: PrefixCache) -> Float[Array, "*g T D"]:
+        """Hidden states of a completion, or of a group, under the prompt, all at once (the learner's forward pass)."""
+        t = tokens.shape[-1]
         x = self.embed(tokens)
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + jnp.arange(t), (3, t)))
         for layer, past in zip(self.layers, prefix.layers, strict=True):

@@ -5,7 +5,8 @@
     states = completion_states(tokens, prefix)        per rollout, the learner; `logits` scores them
     logits, cache = decode(token, t, prefix, cache)   per rollout and token, the sampler
 
-Every function but `encode` works on a single prompt or rollout and is batched by `vmap`.
+Every function works on a single prompt or rollout and is batched by `vmap`, but for `encode`, which takes a batch, and
+`completion_states`, which also takes a group of rollouts.
 """
 
 import dataclasses
@@ -149,10 +150,14 @@ class Policy(nn.Module):
         return self.decoder.prefill(x, positions, mask, known, start)
 
     def completion_states(
-        self, tokens: Int[Array, "T"], first: Float[Array, "D"], prefix: PrefixCache
-    ) -> Float[Array, "T D"]:
-        """Hidden states that predict each completion token: the first from the prefix, others from what precedes."""
-        return jnp.concatenate([first[None], self.decoder.extend(tokens[:-1], prefix)])
+        self, tokens: Int[Array, "*g T"], first: Float[Array, "D"], prefix: PrefixCache
+    ) -> Float[Array, "*g T D"]:
+        """Hidden states that predict each token of a completion, or of a group of completions of one prompt.
+
+        The first is predicted from the prefix, others from what precedes.
+        """
+        first = jnp.broadcast_to(first, (*tokens.shape[:-1], 1, *first.shape))
+        return jnp.concatenate([first, self.decoder.extend(tokens[..., :-1], prefix)], -2)
 
     def logits(self, states: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts."""

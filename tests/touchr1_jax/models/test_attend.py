@@ -59,6 +59,34 @@ def test_keys_that_a_group_shares_get_the_sum_of_its_gradients():
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
+def test_a_group_at_once_is_each_of_its_sequences_by_itself():
+    """Value and every gradient: one block of keys for all, one for each sequence."""
+    group, t = 3, 5
+    args = (
+        normal(0, group, t, KV, R, D),
+        normal(1, KV, 6, D),
+        normal(2, KV, 6, D),
+        normal(3, KV, group, t, D),
+        normal(4, KV, group, t, D),
+    )
+    seen, causal = jnp.arange(6) != 2, jnp.tri(t, dtype=bool)
+    weight = normal(5, group, t, KV * R * D)
+
+    def at_once(q, k, v, own_k, own_v):
+        return jnp.sum(weight * attend(q, [KeySource(k, v, seen), KeySource(own_k, own_v, causal)]))
+
+    def one_by_one(q, k, v, own_k, own_v):
+        each = jax.vmap(lambda q, a, b: naive(q, [KeySource(k, v, seen), KeySource(a, b, causal)]), in_axes=(0, 1, 1))
+        return jnp.sum(weight * each(q, own_k, own_v))
+
+    (ours, gradient), (theirs, expected) = (
+        jax.jit(jax.value_and_grad(f, argnums=range(5)))(*args) for f in (at_once, one_by_one)
+    )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+    for a, b in zip(gradient, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("rows", [3, PREFILL_ROWS + 9])
 def test_blocks_of_queries_see_what_the_whole_sees(rows):
     """Also where the queries are only the last of the keys' tokens."""

@@ -57,7 +57,7 @@ def test_mrope_sections_must_be_three_and_fill_half_a_head(sections):
 def test_rotation_of_a_unit_vector_by_hand():
     rotation = mrope(jnp.full((3, 1), 1), 4, (1, 1, 0), 100.0)
     np.testing.assert_allclose(
-        rotate(jnp.array([[1.0, 0, 0, 1.0]]), rotation)[0],
+        rotate(jnp.array([[[1.0, 0, 0, 1.0]]]), rotation)[0, 0],
         [np.cos(1), -np.sin(0.1), np.sin(1), np.cos(0.1)],
         atol=1e-6,
     )
@@ -67,7 +67,7 @@ def test_rotation_of_a_unit_vector_by_hand():
 @settings(max_examples=20, deadline=None)
 def test_scores_depend_on_the_difference_of_positions_alone(shift, gap):
     q, k = np.random.default_rng(1).normal(size=(2, 1, 8)).astype(np.float32)
-    at = lambda x, p: rotate(jnp.asarray(x), mrope(jnp.asarray(p)[:, None], 8, (1, 1, 2), 1e4))
+    at = lambda x, p: rotate(jnp.asarray(x)[None], mrope(jnp.asarray(p)[:, None], 8, (1, 1, 2), 1e4))[0]
     score = lambda base: at(q, np.full(3, base)) @ at(k, base + np.array(gap)).T
     np.testing.assert_allclose(score(30), score(30 + shift), atol=2e-4)
 

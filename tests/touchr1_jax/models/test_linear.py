@@ -1,0 +1,81 @@
+"""The product with a weight matrix: what `dot_general` gives, under every transformation, and what becomes of it."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import linen as nn
+
+from touchr1_jax.models.linear import Dense, linear
+
+RNG = np.random.default_rng(0)
+X, W = (jnp.asarray(RNG.normal(size=shape), jnp.float32) for shape in ((2, 3, 5, 4), (4, 6)))
+
+
+def value(product, w, x):
+    """A function of the product that is not linear, of all sequences at once or of each by itself."""
+    return jnp.sum(jnp.sin(product(x, w)))
+
+
+def batched(product, w, x):
+    return jnp.sum(jax.vmap(jax.vmap(lambda one: jnp.sin(product(one, w))))(x))
+
+
+@pytest.mark.parametrize("of", [value, batched])
+def test_value_and_gradients_are_those_of_the_plain_product(of):
+    ours, theirs = (jax.value_and_grad(lambda w, x, p=p: of(p, w, x), (0, 1))(W, X) for p in (linear, jnp.matmul))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_gradients_by_example_stay_apart():
+    """`vmap` of `grad`, where a sum over the batch would go unnoticed by shape alone."""
+    ours, theirs = (
+        jax.vmap(jax.grad(lambda w, x, p=p: value(p, w, x)), in_axes=(None, 0))(W, X) for p in (linear, jnp.matmul)
+    )
+    assert ours.shape == (2, 4, 6)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_weights_may_be_batched_too():
+    many = jnp.stack([W, 2 * W, -W])
+    np.testing.assert_allclose(
+        jax.vmap(linear, in_axes=(None, 0))(X, many), jax.vmap(jnp.matmul, in_axes=(None, 0))(X, many), rtol=1e-6
+    )
+    pairs = jax.vmap(linear, in_axes=(1, 0))(X, many)
+    np.testing.assert_allclose(pairs, jax.vmap(jnp.matmul, in_axes=(1, 0))(X, many), rtol=1e-6)
+
+
+def test_tangents_and_second_derivatives():
+    ours, theirs = (jax.hessian(lambda w, p=p: value(p, w, X[0, 0]))(W) for p in (linear, jnp.matmul))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_the_weight_gradient_is_one_contraction_over_all_rows():
+    """What the primitive is for: not one over the batch axes of every `vmap`."""
+    jaxpr = str(jax.make_jaxpr(jax.grad(lambda w: batched(linear, w, X)))(W))
+    (found,) = re.findall(r"dot_general\[\s*dimension_numbers=\(\(\[(.*?)\], \[(.*?)\]\)", jaxpr)
+    assert found == ("0", "0")
+    plain = str(jax.make_jaxpr(jax.grad(lambda w: batched(jnp.matmul, w, X)))(W))
+    assert "[0, 1, 2], [0, 1, 2]" in plain
+
+
+def test_types_are_joined_and_kept():
+    assert linear(X.astype(jnp.bfloat16), W.astype(jnp.bfloat16)).dtype == jnp.bfloat16
+    assert linear(X.astype(jnp.bfloat16), W).dtype == jnp.float32
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (4,), (4, 6, 1)])
+def test_shapes_that_do_not_fit_are_refused(shape):
+    with pytest.raises(ValueError, match=r"must be \[\*n, i\] and \[i, o\]"):
+        linear.__wrapped__(X, jnp.zeros(shape))
+
+
+def test_the_dense_layer_is_flax_s():
+    key = jax.random.key(0)
+    ours, theirs = Dense(6), nn.Dense(6)
+    params = theirs.init(key, X)
+    assert jax.tree.map(jnp.shape, ours.init(key, X)) == jax.tree.map(jnp.shape, params)
+    np.testing.assert_allclose(ours.apply(params, X), theirs.apply(params, X), rtol=1e-6)
