@@ -25,9 +25,9 @@ from typing import get_args
 
 import jax
 
-from experiments.grpo.harness import PeerJob
+from experiments.grpo.harness import PeerJob, PeerTimes
 from experiments.grpo.job import config_of
-from experiments.grpo.peers import installed_peers
+from experiments.grpo.peers import PeerFailed, installed_peers
 from experiments.grpo.size import BETA, Size
 from experiments.grpo.speed import (
     Alone,
@@ -127,9 +127,9 @@ def run(config: SpeedConfig, context: Context) -> Findings:
         context.say(f"prefix {prefix}: {said(twice[prefix])}")
     short = min(config.prefixes)
     course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps)
-    peers = measure_peers(config, context)
+    peers, failed = measure_peers(config, context)
     return Findings(
-        verdict=verdict(alone, twice, peers),
+        verdict=(*verdict(alone, twice, peers), *failed),
         requirements=requirements(alone, first, lean, peers, course, parser_seconds(config.size)),
         pictures=pictures(config.size, alone, first, peers, course),
         tables=(
@@ -180,19 +180,31 @@ def bucket_lengths(config: SpeedConfig) -> tuple[int, ...]:
     return tuple(n for n in (quarter, 2 * quarter, 3 * quarter) if n > 1)
 
 
-def measure_peers(config: SpeedConfig, context: Context) -> Peers:
-    """Every engine that is there at every prefix, one after the other."""
+def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[str, ...]]:
+    """Every engine that is there at every prefix, one after the other, and in words which failed at a longer one.
+
+    Raises:
+      PeerFailed: an engine that fails at the first prefix, for it cannot be measured at all.
+    """
     peers = installed_peers(config.trl_python, config.tunix_python)
     absent = {"TRL", "Tunix"} - {peer.name for peer in peers}
     if absent:
         context.say(f"not measured, for want of an interpreter that has them: {', '.join(sorted(absent))}")
-    found = {}
+    found: dict[tuple[str, int], PeerTimes] = {}
+    failed: list[str] = []
     for prefix in config.prefixes:
         for peer in peers:
             job = PeerJob(prefix=prefix, rounds=max(1, config.peer_tokens // prefix), size=config.size)
-            times = found[peer.name, prefix] = peer.measure(job)
-            context.say(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
-    return found
+            try:
+                times = found[peer.name, prefix] = peer.measure(job)
+            except PeerFailed as failure:
+                if prefix == config.prefixes[0]:
+                    raise
+                failed.append(f"{peer.name} has no figure at {prefix}: its process ended with {failure.code}.")
+                context.say(str(failure))
+            else:
+                context.say(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
+    return found, tuple(failed)
 
 
 def pictures(

@@ -23,7 +23,11 @@ LAST_LINES = 15  # of a failed peer's complaints
 
 
 class PeerFailed(RuntimeError):
-    """A peer's process ended without an answer."""
+    """A peer's process ended without an answer, with an exit code; −9: the system killed it, as for want of memory."""
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,7 +52,8 @@ class Peer:
             said = "\n".join(done.stderr.splitlines()[-LAST_LINES:])
             raise PeerFailed(
                 f"{self.name} ended with {done.returncode} at prefix {job.prefix}: {self.python} must be able to run "
-                f"{self.harness}; its recipe stands there.  It said:\n{said}"
+                f"{self.harness}; its recipe stands there.  It said:\n{said}",
+                done.returncode,
             )
         return read_answer(done.stdout)
 

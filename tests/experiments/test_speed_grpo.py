@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from experiments import speed_grpo
+from experiments.grpo.harness import PeerTimes
 from experiments.grpo.job import Job, config_of, init_decoder, make_agent, make_batch
+from experiments.grpo.peers import PeerFailed
 from experiments.grpo.size import Size
 from experiments.grpo.speed import Course, Option, in_own_process, many_steps, options, time_alone
 from experiments.grpo.speed_tables import steadiness
@@ -136,3 +138,27 @@ def test_the_experiment_reports_every_prefix(tmp_path):
     assert {p.name for p in (directory / "plots").iterdir()} == {"prefixes.svg", "steps.svg"}
     measured = {r["name"]: r["measured"] for r in results["requirements"]}
     assert measured["programs for one shape"] == measured["programs for all lengths"] == 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Limited:
+    """An engine that fails past a prefix."""
+
+    name: str
+    most: int
+
+    def measure(self, job):
+        if job.prefix > self.most:
+            raise PeerFailed(f"{self.name} ended with -9", -9)
+        return PeerTimes(seconds=(1.0,), first_s=2.0, peak_gb=0.5, versions={})
+
+
+def test_an_engine_that_fails_at_a_long_prefix_costs_no_other_figure(context, monkeypatch):
+    config = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16, 32))
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("Short", 16), Limited("Long", 32)))
+    found, failed = speed_grpo.measure_peers(config, context)
+    assert list(found) == [("Short", 16), ("Long", 16), ("Long", 32)]
+    assert failed == ("Short has no figure at 32: its process ended with -9.",)
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("None", 0),))
+    with pytest.raises(PeerFailed, match="None ended with -9"):
+        speed_grpo.measure_peers(config, context)
