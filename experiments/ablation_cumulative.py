@@ -1,6 +1,6 @@
 """Does each rung of the paper's ladder lift what it lifts there: ordinal credit OMAE, consistency CSC, SFT most of all?
 
-    make experiment EXP=ablation_cumulative [ARGS="--scale smoke"]
+    make experiment EXP=ablation_cumulative [ARGS="--scale smoke|gpu|paper"]
 
 The rungs of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)): the commonest levels, SFT, GRPO with
 0/1 credit, ordinal credit, the consistency reward, the format reward, tactile grounding; and above them the credit for
@@ -18,6 +18,7 @@ import itertools
 
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
+from experiments.ladder import presets
 from experiments.ladder.deltas import FOUR, MEASURES, Delta, Step
 from experiments.ladder.outcome import CURVES, Outcome, delta_picture, find, outcome, phrase, shown
 from experiments.ladder.rungs import LADDER, arms
@@ -25,7 +26,7 @@ from experiments.ladder.tables import attribute_table, delta_table, differences_
 from experiments.ladder.ways import untrained
 from experiments.policies.examples import rollout_examples
 from experiments.policies.scores import PUBLISHED, study_settings
-from experiments.policies.study import SFT, SMOKE, StudyConfig, Way, run_study
+from experiments.policies.study import SFT, StudyConfig, Way, run_study
 from experiments.reporting.findings import Requirement
 from experiments.reporting.results import Results
 from experiments.running.context import Context
@@ -137,5 +138,11 @@ def verdict(result: Outcome) -> tuple[str, ...]:
 
 
 EXPERIMENT = Experiment(
-    name="ablation_cumulative", config=StudyConfig(), scales={"smoke": SMOKE}, run=run, curves=CURVES
+    name="ablation_cumulative",
+    config=StudyConfig(),
+    scales=presets.SCALES,
+    run=run,
+    curves=CURVES,
+    needs=presets.NEEDS,
+    spreads=True,
 )

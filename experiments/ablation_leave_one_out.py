@@ -1,6 +1,6 @@
 """Which component is missed when it is left out of the full objective?
 
-    make experiment EXP=ablation_leave_one_out [ARGS="--scale smoke"]
+    make experiment EXP=ablation_leave_one_out [ARGS="--scale smoke|gpu|paper"]
 
 The full objective has every component that Touch-R1 names (arXiv 2605.27154): SFT, ordinal accuracy, consistency and
 format rewards, tactile grounding, and the credit for the use of touch of its abstract.  Each is left out in turn:
@@ -19,6 +19,7 @@ import functools
 
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
+from experiments.ladder import presets
 from experiments.ladder.deltas import FOUR, Step
 from experiments.ladder.outcome import CURVES, Outcome, delta_picture, outcome, phrase, shown
 from experiments.ladder.rungs import FULL, NO_SFT, OMISSIONS, WHOLE, omitted
@@ -26,7 +27,7 @@ from experiments.ladder.tables import delta_table, differences_table
 from experiments.ladder.ways import without_sft
 from experiments.policies.examples import rollout_examples
 from experiments.policies.scores import PUBLISHED, study_settings
-from experiments.policies.study import SFT, SMOKE, StudyConfig, Way, run_study
+from experiments.policies.study import SFT, StudyConfig, Way, run_study
 from experiments.reporting.results import Results
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
@@ -90,5 +91,11 @@ def verdict(result: Outcome) -> tuple[str, ...]:
 
 
 EXPERIMENT = Experiment(
-    name="ablation_leave_one_out", config=StudyConfig(), scales={"smoke": SMOKE}, run=run, curves=CURVES
+    name="ablation_leave_one_out",
+    config=StudyConfig(),
+    scales=presets.SCALES,
+    run=run,
+    curves=CURVES,
+    needs=presets.NEEDS,
+    spreads=True,
 )

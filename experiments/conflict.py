@@ -1,6 +1,6 @@
 """When the picture of an object lies about its touch, what is believed, and what do answers lose without touch?
 
-    make experiment EXP=conflict [ARGS="--scale smoke"]
+    make experiment EXP=conflict [ARGS="--scale smoke|gpu|paper"]
 
 Three of ten generated objects look like a material that differs from theirs in at least two of the levels that are
 typical of it; nothing else in their pictures depends on the object.  A question about one of them is deceptive where
@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from experiments.ladder import presets
 from experiments.ladder.charts import believed_chart
 from experiments.ladder.outcome import CURVES
 from experiments.ladder.rungs import FULL
@@ -40,7 +41,7 @@ from experiments.ladder.tables import DIFFERS, differences_table
 from experiments.ladder.ways import control_name, under_controls
 from experiments.policies.examples import rollout_examples
 from experiments.policies.scores import PUBLISHED, score_study, study_settings
-from experiments.policies.study import BLIND, SFT, SMOKE, Study, StudyConfig, run_study
+from experiments.policies.study import BLIND, SFT, Study, StudyConfig, run_study
 from experiments.reporting.findings import Picture, Requirement
 from experiments.reporting.results import Results
 from experiments.running.context import Context
@@ -199,4 +200,12 @@ def verdict(
     return tuple(said) or ("Too few objects look like others to say anything; use more.",)
 
 
-EXPERIMENT = Experiment(name="conflict", config=StudyConfig(), scales={"smoke": SMOKE}, run=run, curves=CURVES)
+EXPERIMENT = Experiment(
+    name="conflict",
+    config=StudyConfig(),
+    scales=presets.SCALES,
+    run=run,
+    curves=CURVES,
+    needs=presets.NEEDS,
+    spreads=True,
+)

@@ -1,6 +1,6 @@
 """What do the full model, SFT and every baseline score on the four tiers of the bench, beside the paper's main table?
 
-    make experiment EXP=main_table [ARGS="--scale smoke"]
+    make experiment EXP=main_table [ARGS="--scale smoke|gpu|paper"]
 
 The bench's questions (see `dataset_card`) about the test objects of a study: properties of a touch, several at once,
 comparisons and orders, single sensors, and objects that look like what they are not.  Answered by the full model
@@ -23,13 +23,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.bench import paper_numbers as paper
-from experiments.bench.draw import Quota, draw
-from experiments.bench.facts import gather
+from experiments.bench.draw import Quota
+from experiments.ladder import presets
 from experiments.ladder.baselines import Known, Levels, nearest, probed
 from experiments.ladder.beside import beside_table, tier_table
 from experiments.ladder.features import Seen, field_features, picture_features
 from experiments.ladder.outcome import CURVES
-from experiments.ladder.questions import Answerer, answer_all, touch_rows
+from experiments.ladder.questions import answered, questions
 from experiments.ladder.rows import bench_row
 from experiments.ladder.rungs import FULL
 from experiments.ladder.tables import DIFFERS, differences_table
@@ -76,9 +76,9 @@ def run(config: MainConfig, context: Context) -> Results:
     with context.timed("baselines"):
         said = {**study.answers, **study.further, **{n: [x] for n, x in without_training(study, context).items()}}
     with context.timed("score"):
-        asks = questions(study, config.quota)
+        asks = questions(study.data, config.quota)
         rows = {
-            name: bench_row(asks, answered(study, asks, seeds), sight(study, asks, seeds))
+            name: bench_row(asks, answered(study.data, asks, seeds), sight(study, asks, seeds))
             for name, seeds in said.items()
         }
     trained = {name: rows[name] for name in (SFT, FULL)}
@@ -131,21 +131,9 @@ def _repeated(levels: Levels, streams: Seen) -> np.ndarray:
     return np.repeat(levels.together[:, None], streams.x.shape[1], 1)
 
 
-def questions(study: Study, quota: Quota) -> tuple[Ask, ...]:
-    """The bench's questions about the test contacts."""
-    return draw(gather(study.data.store, "test").contacts, study.data.clip.sensors, quota, seed=0)
-
-
-def answered(study: Study, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
-    """What the answers about single touches answer to the bench's questions, for every seed."""
-    data = study.data
-    rows, contacts = touch_rows(data), len(data.parts["test"])
-    return [answer_all(asks, Answerer.of(said, contacts), rows, data.clip.sensors) for said in seeds]
-
-
 def sight(study: Study, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
     """What the policy without touch answers, seed by seed; its first seed for a baseline without seeds."""
-    return answered(study, asks, study.answers[BLIND][: len(seeds)])
+    return answered(study.data, asks, study.answers[BLIND][: len(seeds)])
 
 
 def against_sft(rows: Mapping[str, Row], seeds: int) -> list[Comparison]:
@@ -188,13 +176,14 @@ def verdict(rows: Mapping[str, Row], comparisons: Sequence[Comparison]) -> tuple
     return tuple(said)
 
 
-DEFAULT = MainConfig()
-SMALL = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
+SCALES = {name: MainConfig(study=study) for name, study in presets.SCALES.items()}
 
 EXPERIMENT = Experiment(
     name="main_table",
-    config=DEFAULT,
-    scales={"smoke": MainConfig(study=SMOKE, quota=SMALL)},
+    config=MainConfig(),
+    scales=SCALES | {"smoke": MainConfig(study=SMOKE, quota=presets.SMALL_QUOTA)},
     run=run,
     curves=CURVES,
+    needs=presets.NEEDS,
+    spreads=True,
 )

@@ -106,6 +106,7 @@ DEFAULTS: tuple[Judged, ...] = (
 ALSO = (
     "pareto_chooser",
     "speed_grpo",
+    "scaling",
     "throughput_scenes",
     "stability_contact",
     "stability_fields",

@@ -4,8 +4,9 @@
 
 Each folder of ball presses in DIR is calibrated by itself, with no labels and one setting, and the fields of some of
 its pictures are drawn: change of colour, depth, contact, deformation where the gel has markers.  A folder that cannot
-be calibrated says why.  Five minutes on one core (`smoke` takes the first folder only, half a minute).  Expected: the
-marker-less Minis calibrate to ten micrometres or so; DIGIT and marker gels are refused depth or flagged, not guessed.
+be calibrated says why.  Eight minutes on a core that others share (`smoke` takes the first folder only, half a minute).
+Expected: the marker-less Minis calibrate to ten micrometres or so, marker gels to some tens; what has too few presses,
+no ball or no zero level is refused depth or flagged, not guessed.
 """
 
 import dataclasses
@@ -47,11 +48,14 @@ def run(config: RealConfig, context: Context) -> Findings:
     """Calibrate each folder, extract, draw."""
     if config.data_dir is None:
         raise ValueError("data_dir is None: must be the folder of recordings; give --data-dir")
-    rows, pictures = [], []
+    rows: list[tuple[Cell, ...]] = []
+    notes: list[tuple[Cell, ...]] = []
+    pictures = []
     for folder in [f for f in FOLDERS if (config.data_dir / f.path).is_dir()][: config.folders]:
         context.say(folder.name)
-        row, picture = study(folder, config.data_dir, config)
+        row, note, picture = study(folder, config.data_dir, config)
         rows.append(row)
+        notes.append((folder.name, note))
         pictures.append(picture)
     if not rows:
         known = ", ".join(f.path for f in FOLDERS)
@@ -59,13 +63,13 @@ def run(config: RealConfig, context: Context) -> Findings:
     made = sum(row[3] is not None for row in rows)
     return Findings(
         verdict=(f"{made} of {len(rows)} folders calibrate with one setting; the others say why they do not.",),
-        tables=(_table(rows),),
+        tables=(_table(rows), _notes(notes)),
         pictures=tuple(pictures),
     )
 
 
-def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple[Cell, ...], Picture]:
-    """One folder: a row of figures and a picture of fields."""
+def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple[Cell, ...], str, Picture]:
+    """One folder: a row of figures, what there is to say, and a picture of fields."""
     frames, names, background = read_folder(folder, root)
     made, figures, note = _calibrated(folder, frames, names, background, config.folds)
     extractor = Extractor(background, folder.mm_per_px, made)
@@ -73,17 +77,20 @@ def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple
     began = time.perf_counter()
     fields = extractor.extract(frames)
     hz = len(frames) / (time.perf_counter() - began)
-    rejected = int(np.count_nonzero(fields.flags & np.uint32(Flag.NO_CONTACT)))
-    row = (folder.name, extractor.evidence.pattern.value, len(frames), *figures, rejected, hz, note)
+    rejected, floating = (
+        int(np.count_nonzero(fields.flags & np.uint32(f))) for f in (Flag.NO_CONTACT, Flag.NO_ZERO_LEVEL)
+    )
+    row = (folder.name, extractor.evidence.pattern.value, len(frames), *figures, rejected, floating, hz)
     drawn = [_row(fields, frames, background, int(i), names[i]) for i in chosen]
     picture = Picture(
         name=folder.name.replace(",", "").replace(" ", "-"),
         title=folder.name,
-        caption="; ".join(extractor.refused) or "Change of colour, depth, contact, deformation.",
+        caption=". ".join(s for s in (folder.remark, *extractor.refused) if s)
+        or "Change of colour, depth, contact, deformation.",
         content=field_rows(drawn, folder.mm_per_px),
         kind="png",
     )
-    return row, picture
+    return row, note, picture
 
 
 def _calibrated(
@@ -113,7 +120,17 @@ def _row(fields: Fields, frames: np.ndarray, background: np.ndarray, i: int, nam
         depth_mm=arrays["depth_mm"],
         contact=fields.contact[i],
         deformation_mm=arrays["deformation_mm"],
-        flags=", ".join(str(f.name).lower() for f in Flag if f & Flag(int(fields.flags[i]))) or "none",
+        flags=", ".join(_words(Flag(int(fields.flags[i])) & ~Flag.REFUSED)) or "no flag",
+    )
+
+
+def _words(flags: Flag) -> list[str]:
+    return [str(f.name).lower().replace("_", " ") for f in Flag if f & flags]
+
+
+def _notes(rows: list[tuple[Cell, ...]]) -> Table:
+    return Table(
+        title="What the calibration says", columns=(Column(name="folder"), Column(name="note")), rows=tuple(rows)
     )
 
 
@@ -127,9 +144,13 @@ def _table(rows: list[tuple[Cell, ...]]) -> Table:
             Column(name="depth rmse", unit="µm", format=".1f", meaning="held out, median over presses"),
             Column(name="radius error", unit="%", format=".1f"),
             Column(name="tip depth", unit="mm", format=".2f"),
-            Column(name="flagged as no contact", format="d"),
+            Column(name="no contact", format="d", meaning="pictures flagged so"),
+            Column(
+                name="no zero level",
+                format="d",
+                meaning="pictures whose absolute depth, the tip's too, hangs on nothing",
+            ),
             Column(name="all fields", unit="Hz", format=".0f"),
-            Column(name="note"),
         ),
         rows=tuple(rows),
     )

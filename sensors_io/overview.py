@@ -18,18 +18,32 @@ SKIPS_BY_NAME = 5
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FlagCounts:
-    """Frames that carry each quality flag, and all frames, by sensor."""
+    """Frames that carry each quality flag, those that were judged for it, and all frames, by sensor."""
 
     flags: collections.Counter[tuple[str, Flag]] = dataclasses.field(default_factory=collections.Counter)
+    judged: collections.Counter[tuple[str, Flag]] = dataclasses.field(default_factory=collections.Counter)
     frames: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
 
-    def add(self, sequences: Iterable[Sequence]) -> None:
-        """Count the frames of some sequences; a frame without a flag counts under `Flag.NONE`."""
-        for sequence in sequences:
-            self.frames[sequence.sensor] += len(sequence)
-            self.flags[sequence.sensor, Flag.NONE] += int(np.count_nonzero(sequence.flags == 0))
-            for flag in Flag:
-                self.flags[sequence.sensor, flag] += int(np.count_nonzero(sequence.flags & np.uint32(flag)))
+    def add(self, sequence: Sequence, judged: Iterable[Flag] = tuple(Flag)) -> None:
+        """Count the frames of a sequence; a frame without a flag counts under `Flag.NONE`.
+
+        Args:
+          sequence: with its flags.
+          judged: the flags that it could have been given.
+        """
+        self.frames[sequence.sensor] += len(sequence)
+        for flag in (Flag.NONE, *judged):
+            self.judged[sequence.sensor, flag] += len(sequence)
+        self.flags[sequence.sensor, Flag.NONE] += int(np.count_nonzero(sequence.flags == 0))
+        for flag in Flag:
+            self.flags[sequence.sensor, flag] += int(np.count_nonzero(sequence.flags & np.uint32(flag)))
+
+    def cell(self, sensor: str, flag: Flag) -> str:
+        """How many frames carry a flag, of how many judged where those are not all, a dot where none was."""
+        count, judged = self.flags[sensor, flag], self.judged[sensor, flag]
+        if judged == self.frames[sensor]:
+            return str(count)
+        return f"{count} of {judged}" if judged else "·"
 
 
 def summary_table(store: RecordStore) -> Table:
@@ -64,12 +78,12 @@ def object_table(store: RecordStore) -> Table:
 
 
 def flag_table(counts: FlagCounts, title: str = "flags") -> Table:
-    """Frames by quality flag and sensor; a frame may carry several."""
+    """Frames by quality flag and sensor; a frame may carry several, and a dot says that nothing could tell."""
     sensors = list(counts.frames)
     table = Table("frames", *sensors, title=title)
     table.add_row("all", *(str(counts.frames[sensor]) for sensor in sensors), end_section=True)
     for flag in (Flag.NONE, *Flag):
-        table.add_row(str(flag.name).lower(), *(str(counts.flags[sensor, flag]) for sensor in sensors))
+        table.add_row(str(flag.name).lower(), *(counts.cell(sensor, flag) for sensor in sensors))
     return table
 
 

@@ -57,7 +57,7 @@ class ClipMemory:
     def __init__(self, config: ClipConfig, most_bytes: int) -> None:
         self.config = config
         self._most, self._held = most_bytes, 0
-        self._clips: dict[int, dict[str, np.ndarray]] = {}
+        self._clips: dict[tuple[int, bool], dict[str, np.ndarray]] = {}
         self._lock = threading.Lock()
 
     @property
@@ -65,16 +65,16 @@ class ClipMemory:
         """Bytes of the clips that stay."""
         return self._held
 
-    def get(self, i: int, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-        """The arrays of contact i, from memory or made now; they must not be written to."""
-        kept = self._clips.get(i)
+    def get(self, i: int, make: Callable[[], dict[str, np.ndarray]], *, felt: bool = True) -> dict[str, np.ndarray]:
+        """The arrays of contact i, felt or not, from memory or made now; they must not be written to."""
+        kept = self._clips.get((i, felt))
         if kept is not None:
             return kept
         arrays = make()
         size = sum(array.nbytes for array in arrays.values())
         with self._lock:
-            if i not in self._clips and self._held + size <= self._most:
-                self._clips[i] = arrays
+            if (i, felt) not in self._clips and self._held + size <= self._most:
+                self._clips[i, felt] = arrays
                 self._held += size
         return arrays
 
@@ -177,7 +177,7 @@ def clip_batches(
       own: rows of each batch that are read, where machines share it; None for all.  States are those of the whole.
       felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
       augment: random changes of what is felt, for training; a function of `seed` and of the clip's place in the order.
-      memory: where clips stay that are felt and not changed at random; None for nowhere.
+      memory: where clips stay that are not changed at random; None for nowhere.
       workers: reading processes; 0 reads in threads of this one.  States carry over between equal numbers of workers.
       threads: reading threads of each process.
 
@@ -198,8 +198,8 @@ def clip_batches(
     reader = _Reader(store, config, felt, augment or AugmentConfig())
     if felt and reader.augment.active:
         clips = dataset.random_map(reader.change)
-    elif felt and memory is not None:
-        clips = dataset.map(lambda i: memory.get(i, lambda: reader(i)))
+    elif memory is not None:
+        clips = dataset.map(lambda i: memory.get(i, lambda: reader(i), felt=felt))
     else:
         clips = dataset.map(reader)
     return _read_ahead(_batched(clips, batch_size, own, whole), workers, threads)

@@ -125,7 +125,7 @@ def judge(sequence: Sequence, config: QualityConfig | None = None) -> Mapping[Fl
         found[Flag.SATURATED] = saturated(sequence.frames, None, config)
     if sequence.depth_mm is not None:
         found[Flag.NO_CONTACT] = untouched(sequence.depth_mm, sequence.valid, config)
-    if sequence.force_n is not None:
+    if sequence.force_n is not None and (sequence.phase == HOLD).any():
         found[Flag.UNSTABLE_FORCE] = unstable(sequence.force_n, sequence.phase, config)
     measured = [sequence.force_n, sequence.moment_nmm, sequence.target_force_n]
     if any(column is not None for column in measured):
@@ -133,10 +133,9 @@ def judge(sequence: Sequence, config: QualityConfig | None = None) -> Mapping[Fl
     return found
 
 
-def judged(sequence: Sequence, config: QualityConfig | None = None) -> Sequence:
-    """The sequence with the flags of the filters alone, in place of those it was recorded with."""
-    blank = np.zeros(len(sequence), np.uint32)
-    return dataclasses.replace(sequence, flags=marked(blank, judge(sequence, config)))
+def judged(sequence: Sequence, found: Mapping[Flag, np.ndarray]) -> Sequence:
+    """The sequence with the flags of filters alone, what `judge` found, in place of those it was recorded with."""
+    return dataclasses.replace(sequence, flags=marked(np.zeros(len(sequence), np.uint32), found))
 
 
 def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:

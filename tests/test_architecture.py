@@ -61,6 +61,7 @@ EXPERIMENTS_LAYERS = (
     {"fields"},
     {"loading"},
     {"scale"},
+    {"gpu"},
     {"encoder"},
     {"recordings"},
     {"bench"},

@@ -262,7 +262,7 @@ def look(directory: Path) -> Seen:
 
 
 def evidence(directory: Path) -> dict[str, str]:
-    """SHA-256 of all that a run came to: every log line, every answer, the final state of every stage, its results."""
+    """SHA-256 of all that a run came to: log lines, answers, what every stage kept at its end, results."""
     found = {"metrics.jsonl": _hash((directory / "metrics.jsonl").read_bytes())}
     for path in sorted((directory / "answers").glob("*.npz")):
         found[f"answers/{path.name}"] = _hash(path.read_bytes())
@@ -270,7 +270,8 @@ def evidence(directory: Path) -> dict[str, str]:
     found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
     checkpoints = directory / "checkpoints"
     for stage in sorted(path.parent for path in checkpoints.rglob("*") if path.name.isdigit() and _holds_state(path)):
-        found[f"state of {stage.relative_to(checkpoints)}"] = _state_hash(stage)
+        kept = sorted((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+        found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
     return found
 
 
@@ -283,12 +284,13 @@ def _holds_state(path: Path) -> bool:
     return (path / "state").is_dir()
 
 
-def _state_hash(stage: Path) -> str:
-    """Of step, data iterator and every array of a stage's newest checkpoint."""
-    newest = max((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+def _state_hash(checkpoint: Path) -> str:
+    """Of step, data iterator, score and every array of a checkpoint."""
     with ocp.StandardCheckpointer() as checkpointer:
-        state = checkpointer.restore(newest / "state")
-    digest = hashlib.sha256(newest.name.encode() + (newest / "data" / "metadata").read_bytes())
+        state = checkpointer.restore(checkpoint / "state")
+    digest = hashlib.sha256(checkpoint.name.encode() + (checkpoint / "data" / "metadata").read_bytes())
+    for score in sorted(checkpoint.glob("metrics/*")):
+        digest.update(score.read_bytes())
     for path, array in jax.tree.leaves_with_path(state):
         bits = jax.random.key_data(array) if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else array
         digest.update(jax.tree_util.keystr(path).encode() + np.asarray(bits).tobytes())

@@ -23,7 +23,7 @@ PROGRAMS_BYTES = 2**30
 """Never reached; but without a bound JAX takes no lock on what it writes."""
 
 _SERVER = multiprocessing.get_context("forkserver")
-_SERVER.set_forkserver_preload([f"{PACKAGE}.victim", f"{PACKAGE}.counting"])
+_SERVER.set_forkserver_preload([f"{PACKAGE}.{name}" for name in ("victim", "reinforcing", "counting")])
 
 
 def start(arguments: list[str], log: Path, programs: Path) -> BaseProcess:

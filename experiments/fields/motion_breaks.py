@@ -34,7 +34,7 @@ class Stress:
 
 STRESSES = (
     Stress(name="displacement, px", levels=(2, 8, 16, 24, 32, 48)),
-    Stress(name="gap: 24 px in 1/n frames", levels=(1 / 6, 1 / 4, 1 / 3, 1 / 2, 1)),
+    Stress(name="gap: share of 24 px at once", levels=(1 / 6, 1 / 4, 1 / 3, 1 / 2, 1)),
     Stress(name="dots lost, share", levels=(0.02, 0.1, 0.25, 0.5, 0.75, 0.9)),
     Stress(name="noise, grey levels", levels=(2, 5, 10, 20, 40, 80)),
     Stress(name="exposure, down", levels=(0.8, 0.5, 0.25, 0.12, 0.06, 0.03)),

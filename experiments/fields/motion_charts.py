@@ -59,7 +59,7 @@ def break_curves(
                 _draw(axes, curves[method][i], colours[method], tolerance, 2.4 if z == len(curves) - 1 else 1.1, 3 + z)
             axes.axhline(tolerance, color="black", lw=0.8, ls=":")
             axes.set_title(name, fontsize=9, loc="left")
-            axes.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels], fontsize=7.5)
+            axes.set_xticks(range(len(levels)), [f"{level:.3g}" for level in levels], fontsize=7.5)
             axes.set(yscale="log", ylim=(_DECADES[0] * tolerance, 1.3 * _DECADES[1] * tolerance))
         for axes in panels[:, 0]:
             axes.set_ylabel(f"error, {unit}")

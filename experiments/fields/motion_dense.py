@@ -127,5 +127,5 @@ def _picture(measured: Mapping[str, Mapping[str, tuple[float, float, float]]], g
         name="fields_dense",
         title=f"Dense field: speed against error, {gel}",
         caption="Mean distance from the truth; bars reach to the 95th percentile.",
-        content=speed_against_error(groups, "error, px", None),
+        content=speed_against_error(groups, "error, px", None, legend=False),
     )

@@ -211,5 +211,5 @@ def _picture(
         title=f"Markers: speed against error, {gel}",
         caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile.  "
         "Without smoothing this package's point stays where it is.",
-        content=speed_against_error(groups, "error, px", None),
+        content=speed_against_error(groups, "error, px", None, legend=False),
     )

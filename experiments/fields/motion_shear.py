@@ -291,5 +291,5 @@ def _picture(errors: Mapping[str, Mapping[str, float]], milliseconds: Mapping[st
         name="fields_shear",
         title="Shear: speed against error, Tac3D's gel",
         caption="Mean over the motions; bars reach to the worst motion.",
-        content=speed_against_error(points, "error, µm", None),
+        content=speed_against_error(points, "error, µm", None, legend=False),
     )

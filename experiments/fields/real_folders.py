@@ -20,6 +20,7 @@ class Folder:
       background: its picture of the gel at rest.
       mm_per_px: pitch.
       ball_diameter_mm: of the ball that pressed it, `None` where other things did.
+      remark: what its pictures show and what is not the gel's doing.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Folder:
     background: str
     mm_per_px: float
     ball_diameter_mm: float | None = None
+    remark: str = ""
 
 
 FOLDERS = (
@@ -42,10 +44,13 @@ FOLDERS = (
     Folder(
         name="FOTS Mini", path="FOTS/mlp_calib", pattern="gelsight/*.png", background="0000.png",
         mm_per_px=1 / 19.58, ball_diameter_mm=4.70,
+        remark="The gel slopes over the whole window: no zero level, depth is good up to a tilt and a constant",
     ),
     Folder(
         name="ShapeMap3D Mini", path="gsmini_shapemap/calib_ball", pattern="frame_*.jpg", background="frame_0.png",
         mm_per_px=0.08, ball_diameter_mm=4.0,
+        remark="Lens and light differ from the gel at rest all along the border: no zero level, absolute depth and the "
+        "outlines in the corners mean nothing",
     ),
     Folder(
         name="FOTS DIGIT", path="FOTS", pattern="mlp_calib/digit/*.png", background="assets/gel/digit_bg.png",
@@ -54,6 +59,8 @@ FOLDERS = (
     Folder(
         name="GelSlim", path="gelslim/test_data", pattern="sample_*.jpg", background="ref.jpg",
         mm_per_px=0.10577, ball_diameter_mm=7.6,
+        remark="The outlines at the upper and lower border are no contacts: the lamps there have drifted since the "
+        "gel at rest was recorded, and no threshold that keeps a light second touch removes them",
     ),
     Folder(
         name="GelSlim heightmap", path="gelsight_heightmap/test_data", pattern="sample_*.jpg", background="ref.jpg",

@@ -2,16 +2,19 @@
 
 import dataclasses
 import io
+import textwrap
 from collections.abc import Sequence
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy import ndimage
 
 from experiments.reporting.charts import LOOK
 
 _DPI = 110
+_FLAGS = 42  # letters of a line of flags
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,7 +45,7 @@ def field_rows(rows: Sequence[Row], mm_per_px: float) -> bytes:
 
 def _picture(axes: Axes, row: Row) -> None:
     axes.imshow(row.change)
-    axes.set_title(f"{row.name}\n{row.flags}", fontsize=7, loc="left")
+    axes.set_title("\n".join((row.name, *textwrap.wrap(row.flags, _FLAGS))), fontsize=7, loc="left")
     axes.set_axis_off()
 
 
@@ -64,15 +67,24 @@ def _depth(figure: Figure, axes: Axes, row: Row, mm_per_px: float) -> None:
 
 
 def _profile(axes: Axes, row: Row, mm_per_px: float) -> None:
-    """Depth along the row and the column of the deepest pixel."""
+    """Depth along the row and the column of the deepest pixel, where possible of a contact inside the picture."""
     if row.depth_mm is None:
         axes.set_axis_off()
         return
-    y, x = np.unravel_index(int(row.depth_mm.argmax()), row.depth_mm.shape)
+    inner = _off_border(row.contact)
+    y, x = np.unravel_index(int(np.where(inner, row.depth_mm, -np.inf).argmax()), row.depth_mm.shape)
     for values, label in ((row.depth_mm[y], "along x"), (row.depth_mm[:, x], "along y")):
         axes.plot(np.arange(len(values)) * mm_per_px, values, lw=1, label=label)
     axes.set(xlabel="mm", ylabel="depth, mm")
     axes.legend(fontsize=7)
+
+
+def _off_border(contact: np.ndarray) -> np.ndarray:
+    """Contacts that do not meet the border, [H, W]; all pixels if there are none."""
+    labels, _ = ndimage.label(contact)
+    at_border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    inner: np.ndarray = contact & ~np.isin(labels, at_border)
+    return inner if inner.any() else np.ones_like(contact)
 
 
 def _deformation(axes: Axes, row: Row, mm_per_px: float) -> None:
@@ -84,5 +96,5 @@ def _deformation(axes: Axes, row: Row, mm_per_px: float) -> None:
     height, width = row.contact.shape
     x, y = ((np.arange(n) + 0.5) / n * side * mm_per_px for n, side in ((w, width), (h, height)))
     axes.quiver(x, y, row.deformation_mm[..., 0], row.deformation_mm[..., 1], angles="xy", color="#0072b2")
-    axes.invert_yaxis()
+    axes.set(aspect="equal", xlim=(0, width * mm_per_px), ylim=(height * mm_per_px, 0))
     axes.set_title(f"greatest {np.hypot(*np.moveaxis(row.deformation_mm, -1, 0)).max():.2f} mm", fontsize=7)

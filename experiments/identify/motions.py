@@ -41,17 +41,20 @@ class Moved:
     objects: np.ndarray
 
 
-def feel(config: SceneConfig, motion: str, moments: int, advance: Callable[[], object]) -> Moved:
-    """Make and summarise all contacts of one motion.
+def feel(
+    config: SceneConfig, motion: str, moments: int, advance: Callable[[], object], rows: list[int] | None = None
+) -> Moved:
+    """Make and summarise contacts of one motion.
 
     Args:
       config: the protocol.
       motion: one of `MOTIONS`.
       moments: frames of a sequence that are looked at.
       advance: called after each contact.
+      rows: which contacts; all of the motion by default.
     """
     scenes = LiveScenes(config)
-    rows = rows_of(scenes, motion)
+    rows = rows_of(scenes, motion) if rows is None else rows
     felt = in_threads(lambda row: _contact(scenes, row, moments), rows, advance)
     slots = [slot(config, row) for row in rows]
     sites = [site_of(config, s.object_index, s.site, one.trial) for s, one in zip(slots, felt, strict=True)]

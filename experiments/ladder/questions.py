@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Int
 
+from experiments.bench.draw import Quota, draw
+from experiments.bench.facts import gather
 from experiments.policies.answers import Evaluated
 from experiments.policies.dataset import Dataset
 from sensors_io.schema import ATTRIBUTES
@@ -57,6 +59,17 @@ class Answerer:
             return None
         read = alone[alone != BOTTOM]
         return float(level) + (float(read.mean()) / SCALE if len(read) else 0.0)
+
+
+def questions(data: Dataset, quota: Quota) -> tuple[Ask, ...]:
+    """The bench's questions about the test contacts."""
+    return draw(gather(data.store, "test").contacts, data.clip.sensors, quota, seed=0)
+
+
+def answered(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
+    """What the answers about single touches answer to the bench's questions, for every seed."""
+    rows, contacts = touch_rows(data), len(data.parts["test"])
+    return [answer_all(asks, Answerer.of(said, contacts), rows, data.clip.sensors) for said in seeds]
 
 
 def touch_rows(data: Dataset, part: str = "test") -> dict[Touch, int]:

@@ -1,7 +1,7 @@
 """A few answers for the report, with the touch that they are about."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import cv2
 import numpy as np
@@ -43,15 +43,40 @@ def rollout_examples(
     for a in range(len(study.assembly.language.attributes)):
         for outcome in (True, False):
             rows += np.flatnonzero((said.attribute == a) & (right == outcome))[:1].tolist()
+    return rollouts_of(study, arm, weights, rows, instead)
+
+
+def rollouts_of(
+    study: Study,
+    arm: str,
+    weights: Weights,
+    rows: Iterable[int],
+    instead: Mapping[str, Evaluated] | None = None,
+    group: str = "",
+) -> tuple[RolloutExample, ...]:
+    """Chosen answers of the arm's first seed.
+
+    Args:
+      study, arm, weights, instead: as in `rollout_examples`.
+      rows: numbers of the answers.
+      group: heading under which they stand.
+    """
+    said = study.answers[arm][0]
     terms = reward_terms(study.assembly, said, weights, study.prior)
     return tuple(
-        _example(study, arm, said, row, {name: float(v[row]) for name, v in terms.items()}, instead or {})
+        _example(study, arm, said, row, {name: float(v[row]) for name, v in terms.items()}, instead or {}, group)
         for row in rows
     )
 
 
 def _example(
-    study: Study, arm: str, said: Evaluated, row: int, terms: dict[str, float], instead: Mapping[str, Evaluated]
+    study: Study,
+    arm: str,
+    said: Evaluated,
+    row: int,
+    terms: dict[str, float],
+    instead: Mapping[str, Evaluated],
+    group: str,
 ) -> RolloutExample:
     data, assembly = study.data, study.assembly
     contact = int(data.parts["test"][said.contact[row]])
@@ -75,6 +100,7 @@ def _example(
         view=card.view,
         fields={name: drawn for _, name in felt if (drawn := field_picture(recorded[name])) is not None},
         instead={name: traced(assembly.tokenizer.decode(other.tokens[row])) for name, other in instead.items()},
+        group=group,
     )
 
 

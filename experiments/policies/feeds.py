@@ -58,8 +58,8 @@ class Feed:
 
 
 def touch_batch(clip: dict[str, np.ndarray]) -> TouchBatch:
-    """The arrays of a clip batch as the JAX batch type."""
-    return TouchBatch(**{name: jnp.asarray(clip[name]) for name in CLIP_ARRAYS})
+    """The arrays of a clip batch as the JAX batch type; they must not be written to any more."""
+    return TouchBatch(**jax.device_put({name: clip[name] for name in CLIP_ARRAYS}))
 
 
 def random_streams(present: np.ndarray, full_share: float, rng: np.random.Generator) -> np.ndarray:
@@ -131,14 +131,14 @@ class AnswerFeed(Feed):
             for j in range(q)
         ]
         tokens, masks = (np.stack(x).reshape(p, q, -1) for x in zip(*pairs, strict=True))
-        return SFTBatch(
-            touch=touch_batch(element),
-            ids=jnp.asarray(layout.ids[chosen]),
-            mask=jnp.asarray(layout.mask[chosen]),
-            streams=jnp.asarray(streams),
-            tokens=jnp.asarray(tokens),
-            token_mask=jnp.asarray(masks),
-        )
+        written = {
+            "ids": layout.ids[chosen],
+            "mask": layout.mask[chosen],
+            "streams": streams,
+            "tokens": tokens,
+            "token_mask": masks,
+        }  # put on the device at once, for `jnp.asarray` runs a program for each array
+        return SFTBatch(touch=touch_batch(element), **jax.device_put(written))
 
     def _answer(
         self, contact: int, question: int, label: np.ndarray, streams: np.ndarray

@@ -4,22 +4,28 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
 
+_NAME_PX = (90.0, 13.0)  # width and height of a name at 100 dots an inch
+
 Point = tuple[str, float, float, float]
 """Name, ms a frame, median error, 95th percentile of the error."""
 
 
-def speed_against_error(groups: Mapping[str, Sequence[Point]], error: str, goal: tuple[float, float] | None) -> bytes:
+def speed_against_error(
+    groups: Mapping[str, Sequence[Point]], error: str, goal: tuple[float, float] | None, *, legend: bool = True
+) -> bytes:
     """Error over time a frame, logarithmic; each point's bar reaches from the median to the 95th percentile.
 
     Args:
       groups: points by kind; those of a kind are joined in the order given.
       error: label of the error axis.
       goal: time and error that must be kept, drawn as a corner; `None` for none.
+      legend: of the kinds; without one the names of the points must say it.
     """
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(7.4, 4.6), layout="constrained")
@@ -30,14 +36,29 @@ def speed_against_error(groups: Mapping[str, Sequence[Point]], error: str, goal:
             _, ms, median, high = zip(*points, strict=True)
             axes.plot(ms, median, marker=marker, color=colour, lw=1.2, ms=6, label=kind)
             axes.vlines(ms, median, high, color=colour, lw=1, alpha=0.5)
-            for name, x, y, _ in points:
-                axes.annotate(name, (x, y), (5, 4), textcoords="offset points", fontsize=7.5, color=colour)
         if goal is not None:
             limit, bound = goal
             axes.plot([limit, limit, axes.get_xlim()[0]], [axes.get_ylim()[0], bound, bound], "k:", lw=1)
         axes.set(xscale="log", yscale="log", xlabel="time a frame, ms", ylabel=error)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # less than two decades leave few powers of ten
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.legend(loc="best", fontsize=8)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # two decades leave few powers of ten
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
+        axes.margins(x=0.12)
+        coloured = zip(groups.values(), itertools.cycle(PALETTE), strict=False)
+        _name(axes, [(point, colour) for points, colour in coloured for point in points])
+        if legend:
+            axes.legend(loc="best", fontsize=8)
         return svg(figure)
+
+
+def _name(axes: Axes, points: Sequence[tuple[Point, str]]) -> None:
+    """Write each point's name beside it, lower where another name stands there already."""
+    taken: list[tuple[float, float]] = []
+    for (name, x, y, _), colour in sorted(points, key=lambda point: -point[0][2]):
+        right, up = axes.transData.transform((x, y))
+        while any(abs(right - r) < _NAME_PX[0] and abs(up - u) < _NAME_PX[1] for r, u in taken):
+            up -= _NAME_PX[1]
+        taken.append((right, up))
+        lowered = up - axes.transData.transform((x, y))[1]
+        axes.annotate(name, (x, y), (6, 3 + 0.72 * lowered), textcoords="offset points", fontsize=7.5, color=colour)

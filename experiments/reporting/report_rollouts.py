@@ -1,22 +1,35 @@
 """The part of a report that shows single answers: the touch, the trace with its parsed slots, the reward."""
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
 
-from experiments.reporting.page import Html, image, row, table, tag
+from experiments.reporting.page import Html, image, join, row, table, tag
 from experiments.reporting.results import RolloutExample, Slot
 
 
 def rollouts(examples: Sequence[RolloutExample], colour: Mapping[str, str]) -> Html:
-    """A section with one card per example, empty where there are none."""
+    """A section with one card per example, empty where there are none; those of a group fold away under its heading."""
     if not examples:
         return Html("")
     kinds = [tag("mark", kind, class_=kind) for kind in ("perceive", "compare", "conclude")]
     marks = [part for kind in kinds for part in (kind, " ")]
     note = tag("p", "Under each frame its normal force. Parsed slots of the trace: ", *marks, class_="note")
-    return tag("section", tag("h2", "A few rollouts"), note, *[_card(example, colour) for example in examples])
+    parts = [
+        _group(group, [_card(example, colour) for example in members], opened=not number)
+        for number, (group, members) in enumerate(itertools.groupby(examples, lambda example: example.group))
+    ]
+    return tag("section", tag("h2", "A few rollouts"), note, *parts)
+
+
+def _group(heading: str, cards: Iterable[Html], *, opened: bool) -> Html:
+    """Cards under a heading that folds them away; as they are where there is none."""
+    if not heading:
+        return join([*cards])
+    unfolded: dict[str, str | int] = {"open": "open"} if opened else {}
+    return tag("details", tag("summary", tag("b", heading)), *cards, **unfolded)
 
 
 def strip_png(frames: np.ndarray) -> bytes:

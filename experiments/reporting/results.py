@@ -81,6 +81,7 @@ class RolloutExample:
       view: uint8 [H, W, 3] RGB picture of the object, or `None`.
       fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
       instead: what stood in the place of the touch → what was then said.
+      group: heading under which it stands with its neighbours of the same one; none by default.
     """
 
     arm: str
@@ -96,6 +97,7 @@ class RolloutExample:
     view: np.ndarray | None = None
     fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
+    group: str = ""
 
     def __post_init__(self) -> None:
         Trace(text=self.trace, slots=self.slots)

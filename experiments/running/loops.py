@@ -26,6 +26,7 @@ def run_loop(
     stage: str,
     *,
     make_log: Callable[[Context, str, int], Log] = plain_log,
+    held_out: Callable[[Any], float] | None = None,
 ) -> Any:
     """`fit` from the newest checkpoint of the stage; a stopped one goes on there and ends in the same state.
 
@@ -37,12 +38,15 @@ def run_loop(
       context: the run.
       stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
       make_log: from context, stage and first step to what receives (step, metrics).
+      held_out: score of a state, the higher the better, taken at every checkpoint; the best one is kept.
     """
     times = LoopTime()
     with (
-        Checkpoints(context.checkpoint_dir(stage), say=context.say) as checkpoints,
+        Checkpoints(
+            context.checkpoint_dir(stage), better=None if held_out is None else "higher", say=context.say
+        ) as checkpoints,
         context.timed(stage),
-        context.stopping.patient() as stopping,
+        context.stopping.patient(context.team.any) as stopping,
     ):
         start, state = resume(state, batches, checkpoints)
         context.rewind(stage, start)
@@ -55,7 +59,7 @@ def run_loop(
 
             state = fit(
                 step, state, batches, loop,
-                checkpoints=checkpoints, log=log, start=start, stopping=stopping, times=times,
+                checkpoints=checkpoints, log=log, start=start, stopping=stopping, held_out=held_out, times=times,
             )  # fmt: skip
         if times.steps:
             context.add_time(f"{STEPPING}/{stage}", times.total_s)

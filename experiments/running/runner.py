@@ -32,6 +32,7 @@ from experiments.running.commands import COMMANDS, PROG, complain, run_command, 
 from experiments.running.context import Context
 from experiments.running.distributed import Launch, NoTeam, Team, devices_of, joined
 from experiments.running.history import seconds_of_last
+from experiments.running.machine import Machine, MachineError, require_machine
 from experiments.running.stopping import Stopped, Stopping
 from experiments.running.watcher import Watcher
 from sensors_io.importers.keep import ImportSourceError
@@ -41,7 +42,7 @@ from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.loop import NonFiniteGradientError
 
-USAGE = f"""usage: {PROG} NAME [--scale smoke|default] [--fresh] [--tensorboard] [--distributed] [overrides]
+USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorboard] [--distributed] [overrides]
        {PROG} list [NAME]            what ran, its cost, its result
        {PROG} new NAME [--reward]    a template that runs
        {PROG} compare RUN_A RUN_B    two runs, figure by figure
@@ -64,6 +65,7 @@ KNOWN_ERRORS = (
     NonFiniteGradientError,
     DamagedFileError,
     NoTeam,
+    MachineError,
     OSError,
 )
 """Whose message says all that a user needs; others come with their traceback."""
@@ -82,6 +84,7 @@ class Experiment(Generic[C]):
         and continue from checkpoints.
       scales: further configurations by name, `smoke` for one that takes under two minutes.
       curves: of each phase the scalars to draw while it runs; of a phase that is not named, the first few.
+      needs: of each scale what it asks of the machine; one that is not named runs on any.
       spreads: whether its training runs on the devices of all processes; others know one device.
     """
 
@@ -90,6 +93,7 @@ class Experiment(Generic[C]):
     run: Callable[[C, Context], Results | Findings]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    needs: Mapping[str, Machine] = dataclasses.field(default_factory=dict)
     spreads: bool = False
 
     def __post_init__(self) -> None:
@@ -101,6 +105,10 @@ class Experiment(Generic[C]):
                     f"scale {scale!r} of {self.name} is {config!r}: every scale must be an instance of one dataclass; "
                     "make it with dataclasses.replace from the default"
                 )
+
+        unknown = sorted(set(self.needs) - set(self.configs()))
+        if unknown:
+            raise ValueError(f"needs of {self.name} names {unknown}: must be scales; rename or drop them")
 
     def configs(self) -> dict[str, C]:
         """Every scale's configuration."""
@@ -187,6 +195,7 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
     directory = None
     try:
         team = joined(command.launch)
+        require_machine(command.scale, experiment.needs.get(command.scale))
         chosen, resumed = team.agreed(lambda: _directory(experiment, command, typed))
         directory = Path(chosen)
         with stopping.listening(), _held(directory, team), compilations_kept(command.cache_dir / COMPILED):

@@ -35,19 +35,31 @@ class Stopping:
                 signal.signal(n, handler)
 
     @contextlib.contextmanager
-    def patient(self) -> Iterator[Callable[[], bool]]:
+    def patient(self, agreed: Callable[[bool], bool] = bool) -> Iterator[Callable[[], bool]]:
         """A block that ends by itself soon after the function that it gets says that a signal came.
 
+        Args:
+          agreed: from whether one came to this process, whether one came to any process of the run; all ask it equally
+            often, so that all leave after the same step.
+
         Raises:
-          Stopped: when the block ends, if one came.
+          Stopped: when the block ends, if one came, to whichever process.
         """
+        stop = False
+
+        def asked() -> bool:
+            nonlocal stop
+            stop = stop or agreed(self._number is not None)
+            return stop
+
         self._patient = True
         try:
-            yield lambda: self._number is not None
+            yield asked
+            asked()  # one that came after the last step
         finally:
             self._patient = False
-        if self._number is not None:
-            raise Stopped(self._number)
+        if stop or self._number is not None:
+            raise Stopped(self._number or signal.SIGTERM)
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         del frame

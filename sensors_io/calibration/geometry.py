@@ -1,4 +1,4 @@
-"""Lens distortion and scale of a sensor's camera, from a board of pins or from presses of a known ball.
+"""Lens distortion and scale of a sensor's camera, from a board of pins.
 
 A pin at pixel p lies at millimetre m on the gel,
 
@@ -31,7 +31,7 @@ _BEST_SHARE = 0.25  # of the strongest spots' contrast: what a pin shows at leas
 
 
 class GeometryError(ValueError):
-    """A board or presses from which no geometry can be told; the message says what to do about it."""
+    """A board, or presses of a ball, from which no geometry can be told; the message says what to do about it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -219,41 +219,6 @@ def fit_geometry(pins_px: np.ndarray, *, pitch_mm: float, size_px: tuple[int, in
         errors.append(_fit(seen[~left_out], true[~left_out], size_px).to_mm(seen[left_out]) - true[left_out])
     held_out = float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, -1))))
     return dataclasses.replace(whole, held_out_mm=held_out)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Scale:
-    """Millimetres per pixel, with its standard error."""
-
-    mm_per_px: float
-    error: float
-
-
-def scale_from_presses(radius_px: np.ndarray, depth_mm: np.ndarray, *, ball_diameter_mm: float) -> Scale:
-    """Scale from presses of a ball to known depths, where no board is at hand:  s = √(2 R h − h²) / a.
-
-    The gel is taken to follow the ball up to the edge of contact; where it sinks in around the ball, the scale comes
-    out too large.
-
-    Args:
-      radius_px: of the contact circles, [P].
-      depth_mm: of the presses, [P].
-      ball_diameter_mm: 2 R.
-
-    Raises:
-      GeometryError: fewer than two presses, or a depth that the ball does not have.
-    """
-    if len(radius_px) < 2 or np.any(radius_px <= 0) or np.any((depth_mm <= 0) | (depth_mm > ball_diameter_mm / 2)):
-        raise GeometryError(
-            f"{len(radius_px)} presses to {np.round(depth_mm, 3).tolist()} mm: must be ≥ 2 of radius > 0, deeper "
-            f"than 0 and at most {ball_diameter_mm / 2} mm; measure again"
-        )
-    radius_mm = np.sqrt(ball_diameter_mm * depth_mm - depth_mm**2)
-    weight = radius_px**2  # a circle is found to about the same part of a pixel whatever its size
-    ratio = radius_mm / radius_px
-    mean = float(np.sum(weight * ratio) / weight.sum())
-    spread = np.sum(weight * (ratio - mean) ** 2) / weight.sum() / (len(ratio) - 1)
-    return Scale(mm_per_px=mean, error=float(np.sqrt(spread)))
 
 
 def _fit(seen: np.ndarray, true: np.ndarray, size_px: tuple[int, int]) -> Geometry:

@@ -10,10 +10,14 @@ from rich.table import Table
 
 from sensors_io.calibration.calibrate import CalibrateConfig, CalibrationReport, calibrate
 from sensors_io.calibration.presses import BallPresses
+from sensors_io.calibration.scale import measure_scale
 from sensors_io.commands.console import OUT
 from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.sources import Pictures, read_picture, read_pictures
-from sensors_io.fields.types import Calibration
+from sensors_io.fields.types import Calibration, CalibrationError
+from sensors_io.scenes.layer import Layer
+
+_POISSON = 0.48  # of silicone, nearly incompressible
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +36,12 @@ class Calibrate:
     out: pathlib.Path
     """File of the calibration."""
     mm_per_px: float | None = None
-    """Pitch of the pixels; the geometry's where there is one."""
+    """Pitch of the pixels; the geometry's where there is one, and measured where the press depths are known."""
+    press_depths_mm: tuple[float, ...] = ()
+    """How far each picture's ball has gone down since it first touched, in the order of the pictures, or one depth for
+    all: the pitch is then measured from the size of the contacts."""
+    gel_thickness_mm: float = 4.5
+    """Of the soft layer on its window, which decides how large a contact is at a depth."""
     geometry: pathlib.Path | None = None
     """File that `geometry` wrote: the pictures are straightened first, and `extract` must then be given it too."""
     sensor: str = "gelsight_mini"
@@ -42,7 +51,8 @@ class Calibrate:
     def run(self) -> int:
         background = read_picture(self.background)
         pictures = _without(read_pictures(self.balls, self.sensor), background)
-        straight = Straightening.of(self.geometry, self.mm_per_px, (background.shape[0], background.shape[1]))
+        pitch = self._measured_mm_per_px(pictures, background) if self.press_depths_mm else self.mm_per_px
+        straight = Straightening.of(self.geometry, pitch, (background.shape[0], background.shape[1]))
         presses = BallPresses(
             pictures=np.stack([straight(frame) for frame in pictures.frames]),
             background=straight(background),
@@ -56,6 +66,30 @@ class Calibrate:
         OUT.print(report_table(made, report))
         OUT.print(f"wrote {self.out}, hash {made.hash}", highlight=False)
         return 0
+
+    def _measured_mm_per_px(self, pictures: Pictures, background: np.ndarray) -> float:
+        """The pitch by which the contacts are as large as the ball makes them at the known depths."""
+        if self.mm_per_px is not None or self.geometry is not None:
+            raise CalibrationError(
+                "press_depths_mm is given beside mm_per_px or geometry: must be alone, since it measures the pitch; "
+                "leave one of them out"
+            )
+        depths = self.press_depths_mm * (len(pictures) if len(self.press_depths_mm) == 1 else 1)
+        if len(depths) != len(pictures):
+            raise CalibrationError(
+                f"press_depths_mm has {len(depths)} depths: must have one, or one for each of {len(pictures)} pictures "
+                f"({pictures.names[0]} … {pictures.names[-1]}); complete it"
+            )
+        if not self.gel_thickness_mm > 0:
+            raise CalibrationError(f"gel_thickness_mm is {self.gel_thickness_mm}: must be > 0; measure it")
+        gel = Layer(modulus_mpa=1.0, poisson=_POISSON, thickness_mm=self.gel_thickness_mm)
+        scale, _ = measure_scale(
+            pictures.frames, background, np.array(depths), ball_diameter_mm=self.ball_diameter_mm, gel=gel
+        )
+        OUT.print(
+            f"{scale.mm_per_px:.5f} ± {scale.error:.5f} mm/px by {len(depths)} presses to known depth", highlight=False
+        )
+        return scale.mm_per_px
 
 
 def report_table(made: Calibration, report: CalibrationReport) -> Table:

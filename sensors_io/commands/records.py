@@ -11,10 +11,10 @@ from rich.table import Table
 from sensors_io import overview, quality
 from sensors_io.commands.console import OUT, complain, progress_bar
 from sensors_io.fields.extract import Extractor
-from sensors_io.fields.types import Calibration
+from sensors_io.fields.types import Calibration, CalibrationError
 from sensors_io.importers.pictures import read_picture
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
-from sensors_io.schema import Sequence
+from sensors_io.schema import Flag, SchemaError, Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,8 @@ class Check:
 
     Tables count what an import left out, and frames by quality flag: as recorded, and as the quality filters judge them
     today.  Another, by `--pictures`, looks at the pictures themselves: contact, its border and number, saturation, lost
-    markers.  Nothing is changed or deleted.
+    markers.  A dot stands where the records hold nothing to tell a flag by.  Nothing is changed or deleted: a flag is a
+    bit beside its frame, and whoever reads the records chooses which flags to leave out.
     """
 
     records: tyro.conf.Positional[pathlib.Path]
@@ -48,12 +49,16 @@ class Check:
                 except CorruptRecordsError as damage:
                     problems.append(damage)
                     continue
-                recorded.add(contact)
-                judged.add(quality.judged(sequence) for sequence in contact)
+                for sequence in contact:
+                    recorded.add(sequence)
+                    found = quality.judge(sequence)
+                    judged.add(quality.judged(sequence, found), found)
                 for sequence in contact if self.pictures else ():
                     reason = eye.cannot_see(sequence)
-                    unseen.update([reason] if reason else [])
-                    looked.add([] if reason else [eye.look(sequence)])
+                    if reason:
+                        unseen.update([reason])
+                    else:
+                        looked.add(*eye.look(sequence))
                 progress(i + 1, len(store))
         OUT.print(overview.summary_table(store))
         left_out = _left_out(store)
@@ -98,6 +103,7 @@ class _Eye:
         self._records = records
         self._given = None if background is None else read_picture(background)
         self._calibration = None if calibration is None else Calibration.load(calibration)
+        self._extractors: dict[tuple[str, float], Extractor] = {}
 
     def cannot_see(self, sequence: Sequence) -> str:
         """Why a sequence cannot be judged; empty if it can."""
@@ -112,20 +118,38 @@ class _Eye:
             )
         if sequence.mm_per_px is None:
             return "nothing tells their mm per px: record them with it"
+        try:
+            self._extractor(sequence)
+        except (SchemaError, CalibrationError) as error:
+            return str(error)
         return ""
 
-    def look(self, sequence: Sequence) -> Sequence:
-        """The sequence with the flags that its pictures show, in place of its own."""
-        rest = self._at_rest(sequence)
+    def look(self, sequence: Sequence) -> tuple[Sequence, tuple[Flag, ...]]:
+        """The sequence with the flags that its pictures show, in place of its own, and those that they could show."""
         assert sequence.frames is not None
+        extractor = self._extractor(sequence)
+        fields = extractor.extract(sequence.frames)
+        return dataclasses.replace(sequence, flags=fields.flags), extractor.judged
+
+    def _extractor(self, sequence: Sequence) -> Extractor:
+        """Made once for each gel at rest."""
+        rest = self._at_rest(sequence)
         assert sequence.mm_per_px is not None
         assert rest is not None
-        fields = Extractor(rest, sequence.mm_per_px, self._calibration).extract(sequence.frames)
-        return dataclasses.replace(sequence, flags=fields.flags)
+        gel = _background(sequence), sequence.mm_per_px
+        if gel not in self._extractors:
+            self._extractors[gel] = Extractor(rest, sequence.mm_per_px, self._calibration)
+        return self._extractors[gel]
 
     def _at_rest(self, sequence: Sequence) -> np.ndarray | None:
-        name = sequence.camera.get("recording", {}).get("background")
-        return self._given if name is None else read_picture(self._records / name)
+        name = _background(sequence)
+        return read_picture(self._records / name) if name else self._given
+
+
+def _background(sequence: Sequence) -> str:
+    """File of the gel at rest that was recorded with a sequence, empty where none was."""
+    name: str = sequence.camera.get("recording", {}).get("background") or ""
+    return name
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

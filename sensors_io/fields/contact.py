@@ -5,6 +5,8 @@ import dataclasses
 import cv2
 import numpy as np
 
+from sensors_io.schema import SchemaError
+
 EDGE_SHARE = 0.5
 """Of a contact's greatest depth: that at the edge of a ball's contact on a half-space (Hertz), whatever its size."""
 
@@ -135,6 +137,9 @@ def steepest_change(picture: np.ndarray, background: np.ndarray, mm_per_px: floa
       picture, background: uint8 [H, W, 3].
       mm_per_px: pitch.
       smoothing_mm: standard deviation of the Gaussian, which averages the camera's noise away.
+
+    Raises:
+      SchemaError: a picture narrower than the smoothing.
     """
     return float(_steepness(picture, background, mm_per_px, smoothing_mm).max())
 
@@ -144,6 +149,11 @@ def _steepness(picture: np.ndarray, background: np.ndarray, mm_per_px: float, sm
     scale = max(1, round(smoothing_mm / mm_per_px / 2))  # the smoothed change needs no finer pixels
     difference = cv2.subtract(picture, background, dtype=cv2.CV_32F)
     height, width = difference.shape[0] // scale, difference.shape[1] // scale
+    if min(height, width) < 2:
+        raise SchemaError(
+            f"the picture is {picture.shape[0]} × {picture.shape[1]} px of {mm_per_px:g} mm: must be ≥ {2 * scale} px "
+            f"along either side, to be smoothed over {smoothing_mm:g} mm; correct mm_per_px or take a larger picture"
+        )
     small = cv2.resize(difference, (width, height), interpolation=cv2.INTER_AREA)
     smooth = cv2.GaussianBlur(small, (0, 0), smoothing_mm / (mm_per_px * scale))
     down, across = (np.diff(smooth, axis=axis) / (mm_per_px * scale) for axis in (0, 1))

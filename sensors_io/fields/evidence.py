@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sensors_io.fields.markers import Markers, find_markers
+from sensors_io.schema import SchemaError
 
 LEAST_CONTRAST = 20.0
 """Grey levels.  Bare gels under a load reach 15 (their shading), at rest 3; the faintest dots have 34."""
@@ -61,7 +62,15 @@ def examine(grey: np.ndarray) -> Evidence:
 
     Args:
       grey: uint8 or float32 [H, W].
+
+    Raises:
+      SchemaError: a picture too small to hold one window of texture.
     """
+    if min(grey.shape) < _TEXTURE_WINDOW_PX:
+        raise SchemaError(
+            f"the gel at rest is {grey.shape[0]} × {grey.shape[1]} px: must be ≥ {_TEXTURE_WINDOW_PX} px along either "
+            "side, to tell whether it carries a pattern; take a larger picture"
+        )
     texture, markers = texture_of(grey), find_markers(grey)
     missing = _missing(markers)
     if not missing:

@@ -16,7 +16,7 @@ from sensors_io.fields.shear import ShearReader
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.quality import QualityConfig, saturated, time_gap
 from sensors_io.scenes.layer import Layer
-from sensors_io.schema import Flag
+from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,6 +61,7 @@ class Extractor:
 
     Raises:
       CalibrationError: a calibration of another picture size or pitch.
+      SchemaError: a background that is no RGB picture or too small, a pitch that is none.
     """
 
     def __init__(
@@ -70,6 +71,9 @@ class Extractor:
         calibration: Calibration | None = None,
         config: ExtractConfig | None = None,
     ):
+        check_arrays({"background": Spec(np.uint8, ("H", "W", "3"))}, {"background": background}, "extraction")
+        if not 0 < mm_per_px < 1:
+            raise SchemaError(f"mm_per_px is {mm_per_px}: must lie in (0, 1); give millimetres per pixel")
         self.background, self.mm_per_px = background, mm_per_px
         self.config = config or ExtractConfig()
         self.evidence = examine(cv2.cvtColor(background, cv2.COLOR_RGB2GRAY))
@@ -92,6 +96,13 @@ class Extractor:
             reasons.append("shear_mm: needs depth_mm, from which the pressure is told")
         return tuple(reasons)
 
+    @property
+    def judged(self) -> tuple[Flag, ...]:
+        """The flags that a picture may be given: without depth none is for want of a zero level, and so on."""
+        always = (Flag.NO_CONTACT, Flag.BORDER_CONTACT, Flag.SEVERAL_CONTACTS, Flag.SATURATED, Flag.REFUSED)
+        of_depth = () if self._depth is None else (Flag.NO_ZERO_LEVEL,)
+        return (*always, *of_depth, *(() if self._deformation is None else (Flag.MARKER_LOSS,)))
+
     def read(self, picture: np.ndarray, *, gap: bool = False, apart: bool = False) -> Fields:
         """Fields of one picture, uint8 [H, W, 3] RGB, as `Fields` of one frame.
 
@@ -100,7 +111,13 @@ class Extractor:
           gap: whether frames are missing before it: flagged `TIME_GAP`, and markers are looked for anywhere.
           apart: whether nothing says that it follows the picture before, as with stills: markers are looked for
             anywhere, with no flag.
+
+        Raises:
+          SchemaError: a picture of another shape than the background.
         """
+        if picture.shape != self.background.shape:
+            shapes = f"{list(picture.shape)}: must be {list(self.background.shape)}"
+            raise SchemaError(f"the picture has shape {shapes}, as the gel at rest; crop both alike")
         surface = None if self._depth is None else self._depth.read(picture)
         depth = None if surface is None else surface.depth_mm
         contacts = self._contacts(picture) if surface is None else surface.contacts

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments import ablation_cumulative, ablation_leave_one_out, conflict, main_table
+from experiments import ablation_cumulative, ablation_leave_one_out, conflict, main_table, qualitative, scaling
 from experiments.bench.draw import Quota
 from experiments.ladder.rungs import LADDER, OMISSIONS
 from experiments.running.artifacts import read_json
+from experiments.running.context import read_metrics
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 
@@ -69,3 +70,36 @@ def test_conflict_asks_with_and_without_touch(tmp_path, cache_dir):
     assert uses["rows"][0][0] == "full, all"
     assert results["requirements"][-1]["name"] == "least gain from touch, all questions"
     assert len(list((directory / "answers").glob("*-under-*.npz"))) == 2 * 2 * 4
+
+
+@pytest.mark.slow
+def test_three_sizes_stand_beside_the_papers(tmp_path, cache_dir):
+    wide = dataclasses.replace(tiny.MODEL, tactile=dataclasses.replace(tiny.MODEL.tactile, width=32))
+    study = dataclasses.replace(STUDY, grpo_steps=2)  # the first step of a stage is not timed
+    config = scaling.ScalingConfig(study=study, small=tiny.MODEL, large=wide, quota=FEW, rounds=1)
+    directory = run(scaling, config, tmp_path, cache_dir)
+    results = read_json(directory / "results.json")
+    assert list(results["arms"]) == ["small", "default", "large"]
+    sizes, growth, beside, *_ = results["tables"]
+    counts = [row[1] for row in sizes["rows"]]
+    assert counts[0] == counts[1] < counts[2]
+    assert all(value > 0 for row in sizes["rows"] for value in row[3:])
+    assert "full model: OMAE" in [row[0] for row in growth["rows"]]
+    assert [row[0] for row in beside["rows"]][3:] == [f"Touch-R1-{n}B (paper)" for n in (3, 7, 14)]
+    assert beside["rows"][4][1] == 76.8
+    assert beside["rows"][5][1] is None
+    stages = {line["stage"] for line in read_metrics(directory)}
+    assert {"sft/small/0", "grpo/large/1", "blind/default/1"} <= stages
+
+
+@pytest.mark.slow
+def test_the_browser_shows_cases_and_items(tmp_path, cache_dir):
+    study = dataclasses.replace(STUDY, seeds=1)
+    directory = run(qualitative, qualitative.QualitativeConfig(study=study, quota=FEW), tmp_path, cache_dir)
+    common = read_json(directory / "results.json")["tables"][0]["rows"]
+    assert len(common) == 10
+    assert all(row[1] <= row[2] for row in common)
+    page = (directory / "report.html").read_text(encoding="utf-8")
+    assert "<summary><b>" in page
+    assert "another object&#x27;s touch" in page
+    assert "Tier 3, compare: " in page

@@ -21,7 +21,8 @@ AT_START = dataclasses.replace(STRUCK, phase=START, torn=False)
 
 def findings(differs=(), damage=(), inputs=()):
     """Figures of the report from 150 kills in steps and 50 at start-up."""
-    killed = {"study": stability_faults.Killed(kills=(STRUCK,) * 150 + (AT_START,) * 50, runs=2, differs=differs)}
+    struck = (STRUCK,) * 150 + (AT_START,) * 50
+    killed = {stability_faults.GRPO: stability_faults.Killed(kills=struck, runs=1, differs=differs)}
     waited = {"sft/0": (10.0, 0.1)}
     parts = (killed, damage, inputs, waited)
     met = {r.name: r.met for r in stability_faults._requirements(*parts)}
@@ -34,7 +35,7 @@ GOOD = [("run", f"input {i}", 1, "Error: as it must be", "") for i in range(25)]
 def test_all_is_met_where_nothing_differs():
     met, verdict, table = findings(damage=[("config.json", "removed", SAME, "")], inputs=GOOD)
     assert all(met.values())
-    assert "the study was killed 200 times in 2 runs and ended in the same bits" in verdict[0]
+    assert "the GRPO run was killed 200 times in 1 run and ended in the same bits" in verdict[0]
     assert "1.00% of a training step waits" in verdict[3]
     assert dict(zip((c.name for c in table.columns), table.rows[0], strict=True))["torn lines"] == 150
 

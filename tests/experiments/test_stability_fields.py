@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import stability_fields
-from experiments.fields import motion_breaks, motion_shear_breaks
+from experiments.fields import depth_breaks, motion_breaks, motion_shear_breaks
 from experiments.fields.motion_breaks import Outcome, Stress
 from experiments.fields.motion_truth import Film, pressed
 from experiments.running.artifacts import read_json
@@ -27,6 +27,9 @@ def directory(tmp_path_factory):
         layers = tuple(Stress(name=s.name, levels=s.levels[2:3]) for s in motion_shear_breaks.SHEAR_STRESSES)
         patch.setattr(motion_shear_breaks, "SHEAR_STRESSES", layers)
         patch.setattr(stability_fields, "SHEAR_STRESSES", layers)
+        balls = tuple(Stress(name=s.name, levels=s.levels[::4]) for s in depth_breaks.DEPTH_STRESSES)
+        patch.setattr(depth_breaks, "DEPTH_STRESSES", balls)
+        patch.setattr(stability_fields, "DEPTH_STRESSES", balls)
         assert main(["stability_fields", "--runs-dir", str(home)]) == 0
     (directory,) = (p for p in (home / "stability_fields").iterdir() if not p.is_symlink())
     return directory
@@ -36,12 +39,28 @@ def directory(tmp_path_factory):
 def test_nothing_of_ours_breaks_in_silence(directory):
     results = read_json(directory / "results.json")
     assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"]} == {}
-    assert set(results["data"]["silent"]) == set(TINY.methods)
+    assert set(results["data"]) == {f"silent, {method}" for method in TINY.methods}
 
 
 @pytest.mark.slow
 def test_the_curves_are_drawn(directory):
-    assert {p.name for p in (directory / "plots").iterdir()} >= {"stability_tracking.svg", "stability_shear.svg"}
+    assert {p.name for p in (directory / "plots").iterdir()} >= {
+        f"stability_{field}.svg" for field in ("tracking", "shear", "depth")
+    }
+
+
+def test_a_stressed_press_is_where_its_level_says():
+    """A contact whose centre lies on the border: half of it is seen, deepest at the outermost column."""
+    press = depth_breaks._stressed("contact from the border, mm", 0.0, seed=3)
+    assert press.touch[0] == depth_breaks.WINDOW_MM / 2
+    assert depth_breaks._stressed("exposure, up", 1.3, seed=3).gain == 1.3
+    assert depth_breaks._stressed("contact, radii of a ball of 6.31 mm", 0.5, seed=3).touch[2] == 6.31 / 4
+
+
+def test_depth_is_wrong_from_a_fifth_of_the_press():
+    truth, inside = np.array([[0.0, 1.0]]), np.array([[False, True]])
+    near, far = (depth_breaks._outcome(truth - off, Flag.NONE, truth, inside) for off in (0.19, 0.21))
+    assert (near.broken, far.broken) == (False, True)
 
 
 def test_known_motion_is_exact():

@@ -24,7 +24,7 @@ def run(monkeypatch):
     def call(*args):
         out, err = io.StringIO(), io.StringIO()
         for console, file in ((OUT, out), (ERR, err)):
-            monkeypatch.setattr(console, "file", file)
+            monkeypatch.setattr(console, "_file", file)  # `file` would come back as the stream of this test
             monkeypatch.setattr(console, "width", 200)
         return cli.main([str(arg) for arg in args]), out.getvalue(), err.getvalue()
 
@@ -53,6 +53,9 @@ def test_check_counts_flags_and_verifies(run, tmp_path):
     assert (status, err.strip()) == (0, "")
     assert "4 sequences, 48 frames" in out
     assert "strain_limit" in out
+    by_filters = out[out.index("flags by the filters") :]
+    assert re.search(r"incomplete\W+0 ", by_filters)
+    assert re.search(r"border_contact\W+· ", by_filters)  # no filter of recorded numbers can tell
     shard = tmp_path / "contacts-00001.arrayrecord"
     data = bytearray(shard.read_bytes())
     data[len(data) // 4] ^= 255

@@ -68,8 +68,13 @@ class TestClipMemory:
     def test_random_changes_are_not_kept(self, store):
         memory = ClipMemory(SMALL, 10**9)
         self.feed(store, memory, augment=LIVELY)
-        self.feed(store, memory, felt=False)
         assert memory.held_bytes == 0
+
+    def test_a_contact_felt_and_the_same_unfelt_are_two_clips(self, store):
+        memory = ClipMemory(SMALL, 10**9)
+        for felt in (True, False, True, False):
+            for a, b in zip(self.feed(store, memory, felt=felt), self.feed(store, None, felt=felt), strict=True):
+                same(a, b)
 
     def test_it_belongs_to_its_clips_and_its_process(self, store):
         other = ClipMemory(ClipConfig(frames=2, image_px=8, view_px=6), 10**9)

@@ -1,5 +1,7 @@
 """Each filter by hand values; flags that can be taken back."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -67,10 +69,12 @@ def test_a_sequence_is_judged_by_what_it_holds() -> None:
         flags=np.zeros(3, np.uint32),
     )
     found = quality.judge(sequence)
-    assert set(found) == {Flag.TIME_GAP, Flag.NO_CONTACT, Flag.UNSTABLE_FORCE, Flag.INCOMPLETE}
+    assert set(found) == {Flag.TIME_GAP, Flag.NO_CONTACT, Flag.INCOMPLETE}
+    held = dataclasses.replace(sequence, phase=np.full(3, quality.HOLD, np.uint8))
+    assert set(quality.judge(held)) == {*found, Flag.UNSTABLE_FORCE}  # which is judged in holds alone
     assert found[Flag.NO_CONTACT].all()
     assert found[Flag.INCOMPLETE].tolist() == [False, True, False]
-    again = quality.judged(sequence)
+    again = quality.judged(sequence, found)
     assert again.flags[1] == int(Flag.NO_CONTACT | Flag.INCOMPLETE)
     assert not sequence.flags.any()
 

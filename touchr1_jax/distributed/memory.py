@@ -49,7 +49,16 @@ def compiled_bytes(step: jax.stages.Wrapped, *arguments: Any) -> Compiled:
     Raises:
       RuntimeError: a backend that does not tell.
     """
-    found: Any = step.lower(*arguments).compile().memory_analysis()
+    return reserved_bytes(step.lower(*arguments).compile())
+
+
+def reserved_bytes(compiled: jax.stages.Compiled) -> Compiled:
+    """What the compiler of a program says.
+
+    Raises:
+      RuntimeError: a backend that does not tell.
+    """
+    found: Any = compiled.memory_analysis()
     if found is None:
         raise RuntimeError(f"backend {jax.default_backend()} has no memory analysis; compile for CPU or GPU")
     return Compiled(

@@ -46,6 +46,14 @@ class Dense(nn.Dense):
     dot_general: Callable[..., Array] | None = _as_dot_general
 
 
+class Embed(nn.Embed):
+    """Flax's table of embeddings, which computes logits by `linear`."""
+
+    def attend(self, query: Float[Array, "*n D"]) -> Float[Array, "*n V"]:
+        """Inner products with every row."""
+        return linear(query, self.embedding.T)
+
+
 def _dot(x: Array, w: Array) -> Array:
     return jax.lax.dot_general(x, w, (((x.ndim - 1,), (0,)), ((), ())))
 

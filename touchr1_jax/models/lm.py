@@ -15,7 +15,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
-from touchr1_jax.models.linear import Dense, linear
+from touchr1_jax.models.linear import Dense, Embed
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ class Decoder(nn.Module):
     def setup(self) -> None:
         c = self.config
         layer = Rematerialised if self.remat else DecoderLayer
-        self.embedding = nn.Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
+        self.embedding = Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
         self.layers = [layer(c) for _ in range(c.num_layers)]
         self.norm = RMSNorm(c.norm_epsilon)
         if not c.tie_embedding:
@@ -141,7 +141,7 @@ class Decoder(nn.Module):
     def logits(self, x: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the next token in float32, with banned ids (placeholders, padding) out of reach for good."""
         y = self.norm(x)
-        scores = linear(y, self.embedding.embedding.T) if self.config.tie_embedding else self.head(y)
+        scores = self.embedding.attend(y) if self.config.tie_embedding else self.head(y)
         return jnp.where(banned, MASKED, scores.astype(jnp.float32))
 
     def prefill(

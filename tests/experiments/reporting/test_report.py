@@ -12,7 +12,7 @@ import pytest
 from experiments.reporting import charts
 from experiments.reporting.page import Html, tag
 from experiments.reporting.report import is_best, write_report
-from experiments.reporting.report_rollouts import highlighted, strip_png
+from experiments.reporting.report_rollouts import highlighted, rollouts, strip_png
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.artifacts import write_text
 from tests.experiments.fakes import coin
@@ -199,3 +199,15 @@ def test_another_arm_does_not_recolour_the_others():
     colour = charts.colours(["a", "b", "c"])
     assert colour.items() <= charts.colours(["a", "b", "c", "d"]).items()
     assert len(set(colour.values())) == 3
+
+
+def test_rollouts_of_a_group_fold_away_under_its_heading():
+    example = coin.example()
+    grouped = [dataclasses.replace(example, group=name) for name in (HOSTILE, HOSTILE, "far off")]
+    section = rollouts([*grouped, example], {})
+    assert read(section).text.count("Question ") == 4
+    assert section.count("<details") == 2
+    assert section.count('<details open="open">') == 1
+    assert section.index("far off") > section.rindex("alert(")
+    assert "<script>" not in section
+    assert "<details" not in rollouts([example], {})

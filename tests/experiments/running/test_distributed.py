@@ -111,55 +111,75 @@ def test_a_step_on_a_mesh_is_the_step():
     assert len(devices._compiled) == 1
 
 
-def start(folder: Path, *launch: str) -> subprocess.Popen:
-    """`ablation_ordinal` in a process that compiles quickly, as the tests do; all share the generated data."""
+def start(folder: Path, *arguments: str) -> subprocess.Popen:
+    """A tiny study in a process that compiles quickly, as the tests do; all share the generated data."""
     environment = {
         "XLA_FLAGS": conftest.QUICKLY,
         "JAX_PLATFORMS": "cpu",
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
     where = ["--runs-dir", str(folder), "--cache-dir", str(folder.parent / "data")]
-    command = [sys.executable, "-m", "tests.experiments.running.tiny_study", *where, *launch]
+    command = [sys.executable, "-m", "tests.experiments.running.tiny_study", *arguments, *where]
     return subprocess.Popen(
         command, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 
-def finish(process: subprocess.Popen) -> str:
+def finish(process: subprocess.Popen, code: int = 0) -> str:
     try:
         output, _ = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
-    assert process.returncode == 0, output[-4000:]
+    assert process.returncode == code, output[-4000:]
     return output
 
 
-def free_address() -> str:
+def two(folder: Path, name: str, *, code: int = 0, struck: tuple[str, ...] = ()) -> list[str]:
+    """What two processes over loopback print; the second may be sent a signal."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    launch = ["--distributed", "--mesh.fsdp", "2", "--coordinator", address, "--processes", "2", "--process"]
+    workers = [start(folder, *(struck if i else ()), name, *launch, str(i)) for i in range(2)]
+    return [finish(worker, code) for worker in workers]
 
 
 def lines_of(folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (folder / "ablation_ordinal/latest/metrics.jsonl").read_text().splitlines()]
+    return [json.loads(line) for line in (folder / "latest/metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.slow
 def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path):
-    """Parameters and batches split between two processes over loopback; every logged figure to 1e-5, every answer."""
-    finish(start(tmp_path / "one"))
-    address = free_address()
-    launch = ["--distributed", "--mesh.fsdp", "2", "--coordinator", address, "--processes", "2", "--process"]
-    workers = [start(tmp_path / "two", *launch, str(i)) for i in range(2)]
-    leader, follower = (finish(worker) for worker in workers)
+    """Parameters and batches split between two processes over loopback; every logged figure to 1e-5, every answer.
+
+    A SIGTERM to the second of them in its third batch, the first of which told shapes alone, ends both after
+    that step, saved; they then go on.
+    """
+    name = "ablation_ordinal"
+    finish(start(tmp_path / "one", name))
+    stopped = two(tmp_path / "two", name, code=143, struck=("--strike", "3"))
+    assert all("Stopped by SIGTERM" in said for said in stopped)
+    folders = [tmp_path / run / name for run in ("one", "two")]
+    assert [(line["stage"], line["step"]) for line in lines_of(folders[1])] == [("sft/0", 0), ("sft/0", 1)]
+    leader, follower = two(tmp_path / "two", name)
     assert "report: " in leader
     assert "report: " not in follower
-    one, two = lines_of(tmp_path / "one"), lines_of(tmp_path / "two")
-    assert [(a["stage"], a["step"], *a) for a in two] == [(a["stage"], a["step"], *a) for a in one]
-    for a, b in zip(one, two, strict=True):
-        for name in a.keys() - {"stage"}:
-            assert b[name] == pytest.approx(a[name], rel=1e-5, abs=1e-5), (a["stage"], a["step"], name)
-    runs = [tmp_path / name / "ablation_ordinal/latest" for name in ("one", "two")]
-    arms = [json.loads((run / "results.json").read_text())["arms"] for run in runs]
+    one, both = (lines_of(folder) for folder in folders)
+    assert [(a["stage"], a["step"], *a) for a in both] == [(a["stage"], a["step"], *a) for a in one]
+    for a, b in zip(one, both, strict=True):
+        for field in a.keys() - {"stage"}:
+            assert b[field] == pytest.approx(a[field], rel=1e-5, abs=1e-5), (a["stage"], a["step"], field)
+    arms = [json.loads((folder / "latest/results.json").read_text())["arms"] for folder in folders]
     assert arms[0] == arms[1]
-    assert len(list((tmp_path / "two/ablation_ordinal").iterdir())) == 2  # one run, and `latest`
+    assert len(list(folders[1].iterdir())) == 2  # one run, and `latest`
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["main_table", "ablation_leave_one_out"])
+def test_further_ways_to_ask_and_to_train_in_two_processes(tmp_path, name):
+    """Probes on the encoder, and GRPO inside the asking: the same results as in one process."""
+    finish(start(tmp_path / "one", name))
+    two(tmp_path / "two", name)
+    found = [json.loads((tmp_path / run / name / "latest/results.json").read_text()) for run in ("one", "two")]
+    assert found[0]["arms"] == found[1]["arms"]
+    assert found[0]["baselines"] == found[1]["baselines"]

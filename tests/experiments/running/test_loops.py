@@ -3,12 +3,14 @@
 import json
 import signal
 
+import jax.numpy as jnp
 import pytest
 
 from experiments.faults import counting
 from experiments.faults.inputs import counting_paths, run_directory
 from experiments.faults.kills import differences, evidence
 from experiments.running.artifacts import read_json
+from experiments.running.loops import run_loop
 from experiments.running.runner import main
 
 
@@ -76,6 +78,23 @@ def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_pat
     logged = lines(tmp_path)
     assert [line.get("skipped") for line in logged] == [None] * 3 + [1, 2] + [None] * 7
     assert "loss" not in logged[3]
+
+
+def test_the_best_checkpoint_is_kept_beside_the_newest(context):
+    """Held-out scores fall from step 4 on, so that its checkpoint outlives two newer ones."""
+    config = counting.CountingConfig()
+    seen = []
+    run_loop(
+        lambda state, target: (state | {"step": state["step"] + 1}, {"loss": jnp.mean(target)}),
+        {"step": jnp.int32(0)},
+        counting.targets(config),
+        config.loop(),
+        context,
+        "count/0",
+        held_out=lambda state: seen.append(int(state["step"])) or -float(state["step"]),
+    )
+    kept = sorted(int(path.name) for path in (context.directory / "checkpoints/count/0").iterdir())
+    assert seen == kept == [4, 8, 12]
 
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed

@@ -40,6 +40,37 @@ def test_a_patient_block_is_told_and_ends_before_it_raises():
     assert done == ["the step"]
 
 
+def test_all_processes_leave_where_one_was_asked():
+    """Another process was asked before the second look; this one never was."""
+    others, seen = iter([False, True]), []
+
+    def agreed(here: bool) -> bool:
+        seen.append(here)
+        return next(others)
+
+    def train(stopping: Stopping) -> None:
+        with stopping.patient(agreed) as asked:
+            assert not asked()
+            assert asked()
+            assert asked()  # known by now: nobody is asked again
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train(Stopping())
+    assert seen == [False, False]
+
+
+def test_a_signal_after_the_last_step_is_agreed_on_as_well():
+    seen = []
+
+    def train(stopping: Stopping) -> None:
+        with stopping.listening(), stopping.patient(lambda here: bool(seen.append(here)) or here):
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train(Stopping())
+    assert seen == [True]
+
+
 def test_a_second_signal_acts_as_if_nobody_listened():
     handlers = []
     with pytest.raises(Stopped):

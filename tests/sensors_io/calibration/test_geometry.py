@@ -11,7 +11,6 @@ from sensors_io.calibration.geometry import (
     GeometryError,
     find_pins,
     fit_geometry,
-    scale_from_presses,
 )
 
 BOARD = pathlib.Path(__file__).parents[2] / "data" / "9DTact"
@@ -104,16 +103,3 @@ def test_bad_boards_are_refused():
         fit_geometry(points[:3], pitch_mm=1.6, size_px=SIZE)
     with pytest.raises(GeometryError, match="measure the geometry in this mode"):
         lens().view(mm_per_px=0.1, size_px=(10, 10))(empty[:-1])
-
-
-def test_presses_of_a_ball_to_known_depths_give_the_scale():
-    """A ball of 6 mm at .05 mm/px."""
-    depth = np.array([0.25, 0.5, 0.75, 1.0])
-    radius = np.sqrt(6 * depth - depth**2) / 0.05
-    exact = scale_from_presses(radius, depth, ball_diameter_mm=6.0)
-    assert exact.mm_per_px == pytest.approx(0.05)
-    assert exact.error < 1e-12
-    noisy = scale_from_presses(radius + np.array([0.5, -0.5, 0.5, -0.5]), depth, ball_diameter_mm=6.0)
-    assert noisy.mm_per_px == pytest.approx(0.05, abs=3 * noisy.error)
-    with pytest.raises(GeometryError, match=r"at most 3\.0 mm"):
-        scale_from_presses(radius, depth + 3, ball_diameter_mm=6.0)

@@ -196,3 +196,23 @@ def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-200])
     with pytest.raises(SourceError, match="is cut off"):
         read_pictures([tmp_path], "x")
+
+
+@pytest.mark.parametrize(
+    ("shape", "mm_per_px", "said"),
+    [
+        ((16, 32, 3), 0.1, "16 × 32 px: must be ≥ 21 px"),
+        ((32, 32), 0.1, r"background is 'uint8\[32, 32\]': must be uint8\[H, W, 3\]"),
+        ((32, 32, 3), 0.0, r"mm_per_px is 0.0: must lie in \(0, 1\)"),
+        ((32, 32, 3), 0.006, "32 × 32 px of 0.006 mm: must be ≥ 50 px"),
+    ],
+)
+def test_a_gel_that_is_too_small_or_no_picture_is_named(shape: tuple[int, ...], mm_per_px: float, said: str) -> None:
+    rest = np.full(shape, 128, np.uint8)
+    with pytest.raises(SchemaError, match=said):
+        Extractor(rest, mm_per_px).read(rest)
+
+
+def test_a_picture_of_another_size_than_the_gel_is_named() -> None:
+    with pytest.raises(SchemaError, match=r"shape \[80, 214, 3\]: must be \[160, 214, 3\]"):
+        Extractor(bare(), 0.1).read(bare()[:80])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from flax import linen as nn
 
-from touchr1_jax.models.linear import Dense, linear
+from touchr1_jax.models.linear import Dense, Embed, linear
 
 RNG = np.random.default_rng(0)
 X, W = (jnp.asarray(RNG.normal(size=shape), jnp.float32) for shape in ((2, 3, 5, 4), (4, 6)))
@@ -79,3 +79,12 @@ def test_the_dense_layer_is_flax_s():
     params = theirs.init(key, X)
     assert jax.tree.map(jnp.shape, ours.init(key, X)) == jax.tree.map(jnp.shape, params)
     np.testing.assert_allclose(ours.apply(params, X), theirs.apply(params, X), rtol=1e-6)
+
+
+def test_logits_of_the_table_are_flax_s():
+    key, query = jax.random.key(0), X
+    ours, theirs = Embed(9, 4), nn.Embed(9, 4)
+    params = theirs.init(key, jnp.zeros(2, jnp.int32))
+    np.testing.assert_allclose(
+        ours.apply(params, query, method="attend"), theirs.apply(params, query, method="attend"), rtol=1e-6
+    )

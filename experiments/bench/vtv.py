@@ -1,0 +1,243 @@
+"""The nine tasks of the VTV protocol over recordings with levels of four attributes, for whoever gives probabilities.
+
+VTV-LLM (Xie et al., arXiv 2505.22566) asks for hardness, protrusion, elasticity and friction of a recording, for all
+four at once (`combined`), which of two has more of an attribute (`sfd`), which of three has the most or the least
+(`soi`), which of three recordings is which of three named objects (`osc`), and which of two suits a scenario (`tsa`).
+Its questions are not published with levels; these are drawn over other recordings by the same rules.
+
+An answerer is log p [n, A, K].  A level is the likeliest; recordings are compared by the expected level, equal ones by
+their place; recordings are matched to names by the likeliest assignment, a name standing for the levels that it is
+known for.  Every pair is asked in both orders, every three in all three rotations or with each assignment right equally
+often, so that who tells nothing apart gets exactly the chance.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from touchr1_jax.bench.averages import VTV, vtv_average
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.bench.statistics import Interval, draw_clusters, drawn_means
+
+ATTRIBUTES = ("hardness", "protrusion", "elasticity", "friction")
+LEVELS = 3
+
+CHANCE: Mapping[str, float] = {
+    **dict.fromkeys(ATTRIBUTES, 100 / LEVELS),
+    "combined": 100 / LEVELS ** len(ATTRIBUTES),
+    "sfd": 100 / 2,
+    "soi": 100 / 3,
+    "osc": 100 / 6,
+    "tsa": 100 / 2,
+}
+"""Percent that guessing gets."""
+
+ASSIGNMENTS = tuple(itertools.permutations(range(3)))
+"""Assignment k gives name j to recording `ASSIGNMENTS[k][j]`."""
+
+RESAMPLES = 2_000
+"""Of each interval: its ends are then good to a tenth of its width."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A use, and what it asks of an object: attribute → +1 for more of it, −1 for less."""
+
+    text: str
+    wants: Mapping[str, int]
+
+    @property
+    def weights(self) -> Float[np.ndarray, "A"]:
+        """The same in the order of `ATTRIBUTES`."""
+        return np.array([self.wants.get(name, 0) for name in ATTRIBUTES], float)
+
+
+SCENARIOS: tuple[Scenario, ...] = (
+    Scenario(text="to be held with wet hands", wants={"friction": 1}),
+    Scenario(text="to slide under a cupboard", wants={"friction": -1, "protrusion": -1}),
+    Scenario(text="to drive a tent peg into the ground", wants={"hardness": 1, "friction": 1}),
+    Scenario(text="to sit on for an hour", wants={"hardness": -1, "elasticity": 1}),
+    Scenario(text="to give back the push of a spring", wants={"elasticity": 1}),
+    Scenario(text="to be found by its relief in the dark", wants={"protrusion": 1}),
+)
+"""Ours: those of the benchmark are not published."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Tasks:
+    """Questions over n recordings of different objects; every row of `pairs` and the like names recordings.
+
+    Attributes:
+      label: right levels, int [n, A].
+      pairs: int [P, 2], two levels of the attribute `pair_of` [P]: which has more?
+      threes: int [T, 3], three levels of the attribute `three_of` [T]: which has the most, where `most` [T], or least?
+      names: int [M, 3], recordings whose names are to be matched, in the order of the names; they are shown in the
+        order of `ASSIGNMENTS[shown]`, [M].
+      fits: int [F, 2], one of which suits the scenario `scenario` [F] better.
+    """
+
+    label: Int[np.ndarray, "n A"]
+    pairs: Int[np.ndarray, "P 2"]
+    pair_of: Int[np.ndarray, "P"]
+    threes: Int[np.ndarray, "T 3"]
+    three_of: Int[np.ndarray, "T"]
+    most: np.ndarray
+    names: Int[np.ndarray, "M 3"]
+    shown: Int[np.ndarray, "M"]
+    fits: Int[np.ndarray, "F 2"]
+    scenario: Int[np.ndarray, "F"]
+
+
+def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> Tasks:
+    """`count` questions of each comparing task; attributes, levels, assignments and scenarios come in turn.
+
+    Args:
+      label: levels of the recordings.
+      count: a multiple of 24, so that orders, rotations, assignments and attributes come equally often.
+      seed: of the draw.
+
+    Raises:
+      ValueError: another count; a level that no recording has; recordings that are all alike.
+    """
+    if count < 1 or count % 24:
+        raise ValueError(f"count is {count}: must be a positive multiple of 24, all orders of four attributes; change")
+    for a, name in enumerate(ATTRIBUTES):
+        missing = sorted(set(range(LEVELS)) - set(label[:, a].tolist()))
+        if missing:
+            raise ValueError(f"label lacks levels {missing} of {name}: comparisons need all; use more objects")
+    rng = np.random.default_rng(seed)
+    pairs = [turned for i in range(count // 2) for turned in _both_orders(_differing(label, i, 2, rng))]
+    threes = [turned for i in range(count // 3) for turned in _rotations(_differing(label, i, 3, rng))]
+    scenario = np.arange(count) // 2 % len(SCENARIOS)
+    fits = [turned for which in scenario[::2] for turned in _both_orders(_unequal(label, int(which), rng))]
+    return Tasks(
+        label=label,
+        pairs=np.array(pairs),
+        pair_of=np.arange(count) // 2 % len(ATTRIBUTES),
+        threes=np.array(threes),
+        three_of=np.arange(count) // 3 % len(ATTRIBUTES),
+        most=np.arange(count) // (3 * len(ATTRIBUTES)) % 2 == 0,
+        names=np.array([_unlike(label, 3, rng) for _ in range(count)]),
+        shown=np.arange(count) % len(ASSIGNMENTS),
+        fits=np.array(fits),
+        scenario=scenario,
+    )
+
+
+def _both_orders(pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return pair, pair[::-1]
+
+
+def _rotations(three: np.ndarray) -> list[np.ndarray]:
+    return [np.roll(three, turn) for turn in range(3)]
+
+
+def _differing(label: np.ndarray, turn: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "count"]:
+    """Recordings of different levels of the attribute whose turn it is."""
+    column = label[:, turn % len(ATTRIBUTES)]
+    levels = rng.permutation(LEVELS)[:count]
+    return np.array([rng.choice(np.flatnonzero(column == level)) for level in levels])
+
+
+def _unlike(label: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Recordings no two of which have the same levels."""
+    _, kind = np.unique(label, axis=0, return_inverse=True)
+    kinds = np.unique(kind)
+    if len(kinds) < count:
+        raise ValueError(f"label has {len(kinds)} different rows: must have {count}; use more objects")
+    chosen = rng.choice(kinds, count, replace=False)
+    return np.array([rng.choice(np.flatnonzero(kind.ravel() == k)) for k in chosen])
+
+
+def _unequal(label: np.ndarray, scenario: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
+    """Two recordings of which one suits a scenario better."""
+    worth = _worth(label)[:, scenario]
+    one = int(rng.integers(len(label)))
+    others = np.flatnonzero(worth != worth[one])
+    if not len(others):
+        raise ValueError(f"label suits {SCENARIOS[scenario].text!r} alike throughout: it must not; use more objects")
+    return np.array([one, rng.choice(others)])
+
+
+def score(tasks: Tasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, Scores]:
+    """Percent right in every task, keyed as `averages.VTV`; `Scores.items` names a recording of each question,
+    the same one in all orders.
+
+    Args:
+      tasks: the questions.
+      log_probs: of each level of each recording.
+    """
+    label = tasks.label
+    right = log_probs.argmax(-1) == label
+    probs = np.exp(log_probs - log_probs.max(-1, keepdims=True))
+    expected = (probs / probs.sum(-1, keepdims=True) * np.arange(log_probs.shape[-1])).sum(-1)
+    own = np.arange(len(label))
+    sign = np.where(tasks.most, 1, -1)
+    found = {name: (right[:, a], own) for a, name in enumerate(ATTRIBUTES)}
+    found["combined"] = right.all(1), own
+    same_more = lambda said, known, rows, column: _second(said, rows, column) == _second(known, rows, column)
+    found["sfd"] = same_more(expected, label, tasks.pairs, tasks.pair_of), tasks.pairs.min(1)
+    found["soi"] = _extreme(expected, tasks, sign) == _extreme(label, tasks, sign), tasks.threes.min(1)
+    found["osc"] = _matched(log_probs, tasks) == tasks.shown, tasks.names.min(1)
+    found["tsa"] = same_more(_worth(expected), _worth(label), tasks.fits, tasks.scenario), tasks.fits.min(1)
+    return {
+        name: Scores(values=100.0 * values, items=items, strata=np.zeros(len(values), int))
+        for name, (values, items) in ((name, found[name]) for name in VTV)
+    }
+
+
+def _worth(levels: np.ndarray) -> Float[np.ndarray, "n scenario"]:
+    """How well recordings suit each scenario; equal rows give equal numbers, unlike by a matrix product."""
+    return np.stack([(levels * s.weights).sum(-1) for s in SCENARIOS], 1)
+
+
+def _second(value: np.ndarray, pairs: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Whether the second of each pair has more, bool; of equal ones the first is taken to have less."""
+    return value[pairs[:, 1], column] >= value[pairs[:, 0], column]
+
+
+def _extreme(value: np.ndarray, tasks: Tasks, sign: np.ndarray) -> np.ndarray:
+    """The place of the most or the least of three."""
+    return (sign[:, None] * value[tasks.threes, tasks.three_of[:, None]]).argmax(1)
+
+
+def _matched(log_probs: np.ndarray, tasks: Tasks) -> np.ndarray:
+    """The likeliest assignment of three names to three recordings, as a position in `ASSIGNMENTS`."""
+    order = np.argsort(np.array(ASSIGNMENTS), axis=1)[tasks.shown]
+    recordings = np.take_along_axis(tasks.names, order, 1)  # place p holds the recording of the name it was given
+    levels = tasks.label[tasks.names]  # [M, name, A]
+    attributes = np.arange(len(ATTRIBUTES))
+    fit = log_probs[recordings[:, None, :, None], attributes, levels[:, :, None, :]].sum(-1)  # [M, name, place]
+    total = [sum(fit[:, name, place] for name, place in enumerate(given)) for given in ASSIGNMENTS]
+    return np.argmax(total, axis=0)
+
+
+def averaged(scores: Mapping[str, Scores], objects: np.ndarray) -> dict[str, Interval]:
+    """Every task and "average", with 95 % intervals from the same resamples of whole objects.
+
+    Args:
+      scores: as `score` gives them.
+      objects: [n], the object of each recording.
+    """
+    cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
+    drawn = {name: drawn_means(s.values, cluster[s.items], s.strata, weights) for name, s in scores.items()}
+    means = {name: s.mean() for name, s in scores.items()}
+    drawn["average"] = np.mean([drawn[name] for name in VTV], axis=0)
+    means["average"] = vtv_average(means)
+    spans = {name: np.nanquantile(values, (0.025, 0.975)) for name, values in drawn.items()}
+    return {name: Interval(mean=means[name], low=float(low), high=float(high)) for name, (low, high) in spans.items()}
+
+
+def prior_log_probs(label: Int[np.ndarray, "n A"]) -> Float[np.ndarray, "n A K"]:
+    """Who knows how common each level is and feels nothing: the same for every recording."""
+    shares = np.stack([np.bincount(label[:, a], minlength=LEVELS) / len(label) for a in range(label.shape[1])])
+    floor = np.finfo(float).tiny  # of a level that nobody has
+    return np.tile(np.log(np.maximum(shares, floor)), (len(label), 1, 1))
+
+
+def joint(parts: Sequence[Float[np.ndarray, "n K"]]) -> Float[np.ndarray, "n A K"]:
+    """Attributes side by side."""
+    return np.stack(parts, 1)
