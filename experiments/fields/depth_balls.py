@@ -158,8 +158,8 @@ def map_picture(errors: dict[str, BallErrors], ms: dict[str, float], name: str) 
     points = {}
     for kind, error in errors.items():
         figures = error.figures()
-        name = f"this: {kind}" if kind == PACKAGE else kind
-        points[kind] = [(name, ms[kind], figures["depth rmse median, um"], figures["depth rmse p90, um"])]
+        label = f"this: {kind}" if kind == PACKAGE else kind
+        points[kind] = [(label, ms[kind], figures["depth rmse median, um"], figures["depth rmse p90, um"])]
     return Picture(
         name=f"depth-{name}",
         title=f"Picture to depth on real presses ({name})",

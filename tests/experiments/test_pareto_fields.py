@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import pareto_fields
-from experiments.fields import depth_known, motion_drift, motion_frames, motion_markers
+from experiments.fields import depth_balls, depth_known, motion_drift, motion_frames, motion_markers
 from experiments.fields.depth_methods import MAPS
 from experiments.fields.depth_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
 from experiments.fields.motion_frames import Rest
@@ -126,3 +126,14 @@ def test_what_is_anchored_does_not_drift(monkeypatch):
     assert peer[2] - peer[1] > 3 * abs(ours[2] - ours[1])
     with pytest.raises(ValueError, match="must hold 1 and 10"):
         motion_drift.DriftConfig(cycles=(1, 2))
+
+
+def test_the_chart_of_maps_is_titled_by_its_sensor_and_names_the_package_s_map():
+    error = depth_balls.BallErrors(
+        depth_um=np.array([4.0, 6.0]), radius_share=np.array([0.01, 0.03]), tip_mm=np.array([0.5, 0.7])
+    )
+    kinds = ("colour table", depth_balls.PACKAGE, "perceptron")
+    picture = depth_balls.map_picture(dict.fromkeys(kinds, error), dict.fromkeys(kinds, 1.0), "bench")
+    assert picture.title == "Picture to depth on real presses (bench)"
+    assert picture.name == "depth-bench"
+    assert f"this: {depth_balls.PACKAGE}" in picture.content.decode()
