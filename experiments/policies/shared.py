@@ -1,39 +1,42 @@
-"""SFT checkpoints that experiments share: made once for a configuration, its data and the code behind it.
+"""Policies that experiments share: made once for a configuration, its data and the code behind it.
 
-A checkpoint lies in `CACHE/sft/HASH.npz` with the metrics that were logged while it was made, so that the report of an
-experiment that finds it shows the same curves.  The hash covers every value that SFT depends on and the source that it
-runs through.  The source of rewards and of reinforcement learning is not part of it, so that who works on those finds
-the checkpoints again.
+A policy lies in `CACHE/sft/HASH.npz` or `CACHE/grpo/HASH.npz` with the metrics that were logged while it was made, so
+that the report of an experiment that finds it shows the same curves.  The hash covers every value that training depends
+on and the source that it runs through.  For SFT the source of rewards and of reinforcement learning is not part of it,
+so that who works on those finds the checkpoints again.
 """
 
+import dataclasses
 import functools
 import hashlib
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from experiments.policies.arrays import flat, nested
-from experiments.policies.assembly import Assembly
+from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.dataset import Dataset
-from experiments.policies.stages import SFTConfig, run_sft
+from experiments.policies.stages import SFTConfig, run_grpo, run_sft
 from experiments.running.artifacts import jsonable, write_bytes
 from experiments.running.context import Context, read_metrics
 from experiments.running.runs import ROOT, versions
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 
-LATER = (
-    "touchr1_jax/rl",
-    "touchr1_jax/rewards",
-    "touchr1_jax/bench",
-    "touchr1_jax/distributed",
-    "sensors_io/commands",
-    "sensors_io/viewer",
-)
-"""Source that is at work only after SFT, or never in training."""
+NEVER = ("touchr1_jax/bench", "touchr1_jax/distributed", "sensors_io/commands", "sensors_io/viewer")
+"""Source that is never at work in training."""
+
+LATER = ("touchr1_jax/rl", "touchr1_jax/rewards", *NEVER)
+"""Source that is at work only after SFT, or never."""
 
 USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
@@ -69,20 +72,73 @@ def shared_sft(
     }
     felt = {} if tactile is None else {f"tactile/{name}": x for name, x in flat(tactile).items()}
     arrays = {"evidence": evidence, "rows": data.parts["sft"], **felt}
-    path = context.cache_dir / "sft" / f"{fingerprint(values, arrays)}.npz"
+    return _shared(
+        context.cache_dir / "sft" / f"{fingerprint(values, arrays, source_digest())}.npz",
+        lambda: run_sft(
+            assembly, data, evidence, config, context, seed=seed, stage=stage, blind=blind, tactile=tactile
+        ),
+        context,
+        stage,
+    )
+
+
+def shared_grpo(
+    assembly: Assembly,
+    params: Params,
+    features: Features,
+    label: np.ndarray,
+    noise: Float[Array, "K S N D"],
+    score: ScoreFn,
+    config: GRPOConfig,
+    loop: LoopConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+    weights: Weights,
+    prior: np.ndarray,
+) -> Params:
+    """What `run_grpo` gives for these arguments, from the cache where some experiment already made it.
+
+    Args:
+      assembly, params, features, label, noise, score, config, loop, context, seed, stage: as in `run_grpo`.
+      weights, prior: what `score` is made of, as in `Assembly.score`; a function itself has no hash.
+    """
+    values = {
+        "weights": list(weights.items()),
+        "config": config,
+        "steps": loop.steps,
+        "model": assembly.model,
+        "seed": seed,
+        "mesh": context.devices.shape,
+    }
+    named = dataclasses.asdict(features) | {"label": label, "noise": noise, "prior": prior}
+    arrays = flat(params) | {f"input/{name}": np.asarray(x) for name, x in named.items()}
+    return _shared(
+        context.cache_dir / "grpo" / f"{fingerprint(values, arrays, source_digest(NEVER))}.npz",
+        lambda: run_grpo(
+            assembly, params, features, label, noise, score, config, loop, context, seed=seed, stage=stage
+        ),
+        context,
+        stage,
+    )
+
+
+def _shared(path: Path, make: Callable[[], Params], context: Context, stage: str) -> Params:
+    """What lies at `path`; where nothing does, what `make` gives, published there."""
     if path.exists():
         context.say(f"{stage}: made before, {path}")
         with context.timed(stage):
             return _found(path, context, stage)
-    params = run_sft(assembly, data, evidence, config, context, seed=seed, stage=stage, blind=blind, tactile=tactile)
+    params = make()
     context.team.once(lambda: _publish(path, params, _logged(context, stage)))
     return params
 
 
-def fingerprint(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+def fingerprint(values: dict[str, Any], arrays: dict[str, np.ndarray], source: str) -> str:
     """Sixteen digits of the hash of configurations, arrays, package versions, the kind of device, and source."""
     sum_ = hashlib.sha256()
-    about = {**jsonable(values), "versions": versions(), "device": jax.default_backend(), "source": source_digest()}
+    about = {**jsonable(values), "versions": versions(), "device": jax.default_backend(), "source": source}
     sum_.update(json.dumps(about, sort_keys=True).encode())
     for name, x in sorted(arrays.items()):
         sum_.update(f"{name} {x.dtype.str} {x.shape}".encode())
@@ -91,13 +147,13 @@ def fingerprint(values: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
 
 
 @functools.cache
-def source_digest(root: Path = ROOT) -> str:
-    """Hash of the source that decides what SFT computes: the packages and `experiments/policies` without `LATER`."""
+def source_digest(without: tuple[str, ...] = LATER, root: Path = ROOT) -> str:
+    """Hash of the source that decides what is computed: the packages and `experiments/policies` but some folders."""
     sum_ = hashlib.sha256()
     for folder in ("touchr1_jax", "sensors_io", "experiments/policies"):
         for path in sorted((root / folder).rglob("*.py")):
             name = path.relative_to(root).as_posix()
-            if not name.startswith(tuple(f"{later}/" for later in LATER)) or name in USED:
+            if not name.startswith(tuple(f"{folder}/" for folder in without)) or name in USED:
                 sum_.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return sum_.hexdigest()
 

@@ -17,7 +17,7 @@ from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
-from experiments.policies.shared import shared_sft
+from experiments.policies.shared import shared_grpo, shared_sft
 from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
     Probed,
@@ -68,8 +68,8 @@ class StudyConfig:
     sft: SFTConfig = SFTConfig()
     blind: SFTConfig = SFTConfig(micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
-    share_sft: bool = True
-    """Take SFT checkpoints from the cache where an experiment with the same data, settings and code made them."""
+    share: bool = True
+    """Take policies from the cache where an experiment with the same data, settings and code trained them."""
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
     """What GRPO asks about; the arms may differ in how they pay for it."""
@@ -189,7 +189,7 @@ def run_study(
     scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
     for seed in range(config.seeds):
-        one = _Seed(config, data, assembly, tactile, evidence, scores, configs, ways, context, seed)
+        one = _Seed(config, data, assembly, tactile, evidence, prior, arms, scores, configs, ways, context, seed)
         for name, said in one.answers().items():
             answers[name].append(said)
     further = {name: answers.pop(name) for name in ways}
@@ -248,6 +248,8 @@ class _Seed:
     assembly: Assembly
     tactile: Params | None
     evidence: np.ndarray
+    prior: np.ndarray
+    arms: Mapping[str, Weights]
     scores: Mapping[str, ScoreFn]
     configs: Mapping[str, GRPOConfig]
     ways: Mapping[str, Way]
@@ -256,7 +258,7 @@ class _Seed:
 
     def answers(self) -> dict[str, Evaluated]:
         """Answers of all policies of this seed, from disk where they are there."""
-        names = (SFT, *self.scores, BLIND, *self.ways)
+        names = (SFT, *self.arms, BLIND, *self.ways)
         if not all(self._path(name).exists() for name in names):
             self._train()
         return {name: load_answers(self._path(name)) for name in names}
@@ -269,20 +271,8 @@ class _Seed:
         noise = noise_bank(assembly.agent, params, data, seed=seed)
         self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
         self._ask_further(SFT, params, test, noise)
-        for arm, score in self.scores.items():
-            tuned = run_grpo(
-                assembly,
-                params,
-                train,
-                self._grpo_label(),
-                noise,
-                score,
-                self.configs[arm],
-                LoopConfig(steps=config.grpo_steps, save_every=config.grpo_save_every),
-                context,
-                seed=seed,
-                stage=f"grpo/{arm}/{seed}",
-            )
+        for arm in self.arms:
+            tuned = self._grpo(arm, params, train, noise)
             self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
             self._ask_further(arm, tuned, test, noise)
         self._ask(BLIND, self._blind)
@@ -293,7 +283,7 @@ class _Seed:
         return evaluate_policy(self.assembly, params, features, self._label("test"))
 
     def _sft(self, sft: SFTConfig, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
-        make = shared_sft if self.config.share_sft else run_sft
+        make = shared_sft if self.config.share else run_sft
         return make(
             self.assembly,
             self.data,
@@ -304,6 +294,24 @@ class _Seed:
             stage=stage,
             blind=blind,
             tactile=tactile,
+        )
+
+    def _grpo(self, arm: str, params: Params, features: Features, noise: Array) -> Params:
+        make: Callable[..., Params] = run_grpo
+        if self.config.share:
+            make = functools.partial(shared_grpo, weights=self.arms[arm], prior=self.prior)
+        return make(
+            self.assembly,
+            params,
+            features,
+            self._grpo_label(),
+            noise,
+            self.scores[arm],
+            self.configs[arm],
+            LoopConfig(steps=self.config.grpo_steps, save_every=self.config.grpo_save_every),
+            self.context,
+            seed=self.seed,
+            stage=f"grpo/{arm}/{self.seed}",
         )
 
     def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:

@@ -13,7 +13,7 @@ from experiments.running.context import read_metrics
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 
-STUDY = dataclasses.replace(tiny.STUDY, grpo_steps=1, share_sft=False)
+STUDY = dataclasses.replace(tiny.STUDY, grpo_steps=1, share=False)
 FEW = Quota(identify=8, scale=0, compose=3, compare=2, order=0, one_sensor=8, conflict=0)
 
 

@@ -1,4 +1,4 @@
-"""A checkpoint that one experiment made is found by the next, and by none that differs in anything that matters."""
+"""A policy that one experiment made is found by the next, and by none that differs in anything that matters."""
 
 import ast
 import dataclasses
@@ -12,11 +12,13 @@ import pytest
 from rich.console import Console
 
 from experiments.policies import shared
-from experiments.policies.shared import LATER, USED, fingerprint, shared_sft, source_digest
+from experiments.policies.shared import LATER, NEVER, USED, fingerprint, shared_grpo, shared_sft, source_digest
 from experiments.policies.stages import SFTConfig
 from experiments.running.context import Context
 from experiments.running.runs import ROOT
 from sensors_io.records import RecordStore
+from tests.experiments import tiny
+from touchr1_jax.training.loop import LoopConfig
 
 CONFIG = SFTConfig(steps=2, batch_size=4)
 
@@ -73,6 +75,60 @@ def test_another_setting_is_another_checkpoint(make, first, monkeypatch):
             make("other", config, seed=seed)
 
 
+@pytest.fixture
+def reinforce(assembly, params, data, tmp_path, monkeypatch):
+    """An arm in a run of its own, and the stages that were trained; training adds one to the decoder and logs it."""
+    trained = []
+
+    def add_one(assembly, params, features, label, noise, score, config, loop, context, *, seed, stage):
+        trained.append(stage)
+        context.log(stage, step=0, reward=0.5)
+        return {**params, "decoder": jax.tree.map(lambda x: x + 1, params["decoder"])}
+
+    monkeypatch.setattr(shared, "run_grpo", add_one)
+
+    def run(name: str, *, weights=(("accuracy", 1.0),), moved: float = 0.0, steps: int = 1, seed: int = 0):
+        (tmp_path / name).mkdir()
+        context = Context(tmp_path / name, tmp_path / "cache", Console(quiet=True))
+        prior, felt = data.prior(), tiny.features(2)
+        felt = dataclasses.replace(felt, touch=felt.touch + moved)
+        label, noise, loop = np.zeros((2, 4), int), np.zeros((1, 4, 2, 8)), LoopConfig(steps=steps, save_every=1)
+        told = {"seed": seed, "stage": "grpo/a/0", "weights": dict(weights), "prior": prior}
+        made = shared_grpo(assembly, params, felt, label, noise, None, tiny.STUDY.grpo, loop, context, **told)
+        context.close()
+        return made, (tmp_path / name / "metrics.jsonl").read_bytes()
+
+    return run, trained
+
+
+def test_another_experiment_finds_the_same_arm_with_its_log(reinforce, params):
+    run, trained = reinforce
+    (first, log), (again, told) = run("first"), run("again")
+    assert trained == ["grpo/a/0"]
+    assert told == log
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b), first, again))
+    moved = jax.tree.map(lambda a, b: np.allclose(a - b, 1, atol=1e-5), again["decoder"], params["decoder"])
+    assert jax.tree.all(moved)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"weights": (("accuracy", 0.5),)},
+        {"weights": (("exact", 1.0),)},
+        {"moved": 1e-6},
+        {"steps": 2},
+        {"seed": 1},
+    ],
+    ids=str,
+)
+def test_an_arm_that_differs_in_anything_is_trained(reinforce, other):
+    run, trained = reinforce
+    run("first")
+    run("other", **other)
+    assert len(trained) == 2
+
+
 def test_other_records_are_another_checkpoint(data, tmp_path):
     """The same touch may come with other pictures: the index knows, by its configuration and its shards' sizes."""
     shutil.copytree(data.store.path, tmp_path / "other")
@@ -86,25 +142,27 @@ def test_other_records_are_another_checkpoint(data, tmp_path):
 
 def test_every_value_and_number_counts():
     x = {"x": np.arange(3.0)}
-    same = fingerprint({"config": CONFIG}, x)
-    assert same == fingerprint({"config": CONFIG}, {"x": np.arange(3.0)})
+    same = fingerprint({"config": CONFIG}, x, "s")
+    assert same == fingerprint({"config": CONFIG}, {"x": np.arange(3.0)}, "s")
     others = (
-        fingerprint({"config": CONFIG, "seed": 1}, x),
-        fingerprint({"config": CONFIG}, {"x": np.array([0, 1, 2 + 1e-9])}),
-        fingerprint({"config": CONFIG}, {"x": np.arange(3)}),
-        fingerprint({"config": CONFIG}, {"y": np.arange(3.0)}),
+        fingerprint({"config": CONFIG, "seed": 1}, x, "s"),
+        fingerprint({"config": CONFIG}, {"x": np.array([0, 1, 2 + 1e-9])}, "s"),
+        fingerprint({"config": CONFIG}, {"x": np.arange(3)}, "s"),
+        fingerprint({"config": CONFIG}, {"y": np.arange(3.0)}, "s"),
+        fingerprint({"config": CONFIG}, x, "other"),
     )
-    assert len({same, *others}) == 5
+    assert len({same, *others}) == 6
 
 
-def test_the_source_of_rewards_does_not_count_and_that_of_models_does(tmp_path):
+def test_the_source_of_rewards_counts_for_grpo_alone_and_that_of_models_for_both(tmp_path):
     for name in ("touchr1_jax/models/lm.py", "touchr1_jax/rewards/mine.py", "touchr1_jax/rl/losses.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("one")
-    digest = lambda: source_digest.__wrapped__(tmp_path)
-    start = digest()
+    digest = lambda without=LATER: source_digest.__wrapped__(without, tmp_path)
+    start, reinforced = digest(), digest(NEVER)
     (tmp_path / "touchr1_jax/rewards/mine.py").write_text("two")
     assert digest() == start
+    assert digest(NEVER) != reinforced
     for name in ("touchr1_jax/models/lm.py", "touchr1_jax/rl/losses.py"):
         before = digest()
         (tmp_path / name).write_text("two")
