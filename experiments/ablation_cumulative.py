@@ -19,6 +19,7 @@ import itertools
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
 from experiments.ladder import presets
+from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.deltas import FOUR, MEASURES, Delta, Step
 from experiments.ladder.outcome import CURVES, Outcome, delta_picture, find, outcome, phrase, shown
 from experiments.ladder.rungs import LADDER, arms
@@ -66,6 +67,7 @@ def run(config: StudyConfig, context: Context) -> Results:
             rung_table(result.estimates),
             delta_table(result.found, result.why, "What each rung changes", NOTE),
             attribute_table(result.estimates),
+            *aggregate_table(result.scored.arms, SFT),
             differences_table(),
         ),
         pictures=delta_picture(result.found, "What each rung changes"),

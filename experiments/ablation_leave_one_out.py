@@ -20,6 +20,7 @@ import functools
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
 from experiments.ladder import presets
+from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.deltas import FOUR, Step
 from experiments.ladder.outcome import CURVES, Outcome, delta_picture, outcome, phrase, shown
 from experiments.ladder.rungs import FULL, NO_SFT, OMISSIONS, WHOLE, omitted
@@ -68,6 +69,7 @@ def run(config: StudyConfig, context: Context) -> Results:
         verdict=verdict(result),
         tables=(
             delta_table(result.found, result.why, "What each component is worth", NOTE),
+            *aggregate_table(result.scored.arms, FULL),
             differences_table(),
         ),
         pictures=delta_picture(result.found, "What each component is worth"),

@@ -25,6 +25,7 @@ import numpy as np
 from experiments.bench import paper_numbers as paper
 from experiments.bench.draw import Quota
 from experiments.ladder import presets
+from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.baselines import Known, Levels, nearest, probed
 from experiments.ladder.beside import beside_table, tier_table
 from experiments.ladder.features import Seen, field_features, picture_features
@@ -90,7 +91,12 @@ def run(config: MainConfig, context: Context) -> Results:
         comparisons=tuple(comparisons),
         verdict=verdict(rows, comparisons),
         requirements=(seconds(context),),
-        tables=(beside_table(rows), tier_table(asks), differences_table((*DIFFERS[:4], *ASKED))),
+        tables=(
+            beside_table(rows),
+            *aggregate_table(rows, SFT),
+            tier_table(asks),
+            differences_table((*DIFFERS[:4], *ASKED)),
+        ),
         data=study.data.summary() | {"questions": len(asks)},
         curves=CURVES,
         examples=rollout_examples(study, FULL, PUBLISHED),
