@@ -18,6 +18,7 @@ import itertools
 
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
+from experiments.grpo.levels import level_report
 from experiments.ladder import presets
 from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.deltas import FOUR, MEASURES, Delta, Step
@@ -56,6 +57,7 @@ def run(config: StudyConfig, context: Context) -> Results:
     study = run_study(config, weights, context, algorithms, ways)
     with context.timed("compare"):
         result = outcome(study, STEPS, context)
+    pictures, reliability = level_report(study)
     return Results(
         arms=result.scored.arms,
         baselines={**result.scored.baselines, UNTRAINED: shown(result.estimates[UNTRAINED])},
@@ -68,9 +70,10 @@ def run(config: StudyConfig, context: Context) -> Results:
             delta_table(result.found, result.why, "What each rung changes", NOTE),
             attribute_table(result.estimates),
             *aggregate_table(result.scored.arms, SFT),
+            *reliability,
             differences_table(),
         ),
-        pictures=delta_picture(result.found, "What each rung changes"),
+        pictures=(*delta_picture(result.found, "What each rung changes"), *pictures),
         data=study.data.summary(),
         curves=CURVES,
         examples=rollout_examples(study, "grounding", PUBLISHED),

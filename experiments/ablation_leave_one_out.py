@@ -19,6 +19,7 @@ import functools
 
 from experiments.bench import paper_numbers as paper
 from experiments.grpo.ablation import compared_pairs
+from experiments.grpo.levels import level_report
 from experiments.ladder import presets
 from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.deltas import FOUR, Step
@@ -60,6 +61,7 @@ def run(config: StudyConfig, context: Context) -> Results:
     study = run_study(config, weights, context, algorithms, ways)
     with context.timed("compare"):
         result = outcome(study, STEPS, context)
+    pictures, reliability = level_report(study)
     kept = [s for s in STEPS if s.against != NO_SFT]
     return Results(
         arms={**result.scored.arms, NO_SFT: shown(result.estimates[NO_SFT])},
@@ -70,9 +72,10 @@ def run(config: StudyConfig, context: Context) -> Results:
         tables=(
             delta_table(result.found, result.why, "What each component is worth", NOTE),
             *aggregate_table(result.scored.arms, FULL),
+            *reliability,
             differences_table(),
         ),
-        pictures=delta_picture(result.found, "What each component is worth"),
+        pictures=(*delta_picture(result.found, "What each component is worth"), *pictures),
         data=study.data.summary(),
         curves=CURVES,
         examples=rollout_examples(study, FULL, PUBLISHED),

@@ -20,6 +20,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from experiments.grpo.levels import level_report
 from experiments.policies.answers import Evaluated, reward_of
 from experiments.policies.estimates import compare_over_objects, compare_over_seeds
 from experiments.policies.examples import rollout_examples
@@ -53,12 +54,15 @@ def run(config: StudyConfig, context: Context) -> Results:
         *over_seeds(estimates, trained, config.seeds),
         *over_objects(scored.rows, scored.objects, config.seeds),
     ]
+    pictures, tables = level_report(study)
     return Results(
         arms=scored.arms,
         baselines=scored.baselines,
         settings=study_settings(config),
         comparisons=tuple(comparisons),
         verdict=verdict(comparisons, estimates),
+        tables=tables,
+        pictures=pictures,
         data=study.data.summary(),
         curves=CURVES,
         examples=rollout_examples(study, "ordinal", ARMS["ordinal"]),

@@ -24,6 +24,7 @@ import numpy as np
 
 from experiments.bench import paper_numbers as paper
 from experiments.bench.draw import Quota
+from experiments.grpo.levels import level_report
 from experiments.ladder import presets
 from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.baselines import Known, Levels, nearest, probed
@@ -83,6 +84,7 @@ def run(config: MainConfig, context: Context) -> Results:
             for name, seeds in said.items()
         }
     trained = {name: rows[name] for name in (SFT, FULL)}
+    pictures, reliability = level_report(study)
     comparisons = against_sft(trained, config.study.seeds)
     return Results(
         arms=trained,
@@ -94,9 +96,11 @@ def run(config: MainConfig, context: Context) -> Results:
         tables=(
             beside_table(rows),
             *aggregate_table(rows, SFT),
+            *reliability,
             tier_table(asks),
             differences_table((*DIFFERS[:4], *ASKED)),
         ),
+        pictures=pictures,
         data=study.data.summary() | {"questions": len(asks)},
         curves=CURVES,
         examples=rollout_examples(study, FULL, PUBLISHED),

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 
+from experiments.grpo.levels import level_report
 from experiments.policies.assembly import Weights
 from experiments.policies.estimates import compare_over_seeds
 from experiments.policies.examples import rollout_examples
@@ -55,12 +56,15 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> R
     scored = score_study(study)
     comparisons = compared(ablation, scored.estimates, config.seeds)
     shown = ablation.example or list(ablation.arms)[-1]
+    pictures, tables = level_report(study)
     return Results(
         arms=scored.arms,
         baselines=scored.baselines,
         settings=settings(ablation, config),
         comparisons=tuple(comparisons),
         verdict=verdict(ablation, comparisons, scored.estimates),
+        tables=tables,
+        pictures=pictures,
         data=study.data.summary(),
         curves=ablation.drawn,
         examples=rollout_examples(study, shown, ablation.arms[shown]),

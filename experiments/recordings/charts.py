@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.recordings.policy import LANGUAGE, LEVELS
+from experiments.recordings.policy import LANGUAGE
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
+from experiments.reporting.levels import draw_confusion
 from touchr1_jax.bench.statistics import Interval
 
 
@@ -23,7 +23,8 @@ def confusions(answer: np.ndarray, label: np.ndarray, titles: tuple[str, ...]) -
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(9.0, 3.2), layout="constrained")
         for a, axes in enumerate(figure.subplots(1, len(titles))):
-            _draw_confusion(axes, answer[:, a], label[:, a], titles[a], [words[0] for words in _words(a)])
+            draw_confusion(axes, answer[:, a], label[:, a], [words[0] for words in _words(a)])
+            axes.set_title(titles[a], fontsize=9.5, loc="left")
         return svg(figure)
 
 
@@ -46,21 +47,6 @@ def against_objects(curves: Mapping[str, Mapping[int, Interval]], goals: Mapping
         axes.set(xlabel="objects learned from", ylabel="%", ylim=(0, 100), xlim=(0, None))
         figure.legend(loc="outside right upper")
         return svg(figure)
-
-
-def _draw_confusion(axes: Axes, answer: np.ndarray, label: np.ndarray, title: str, words: list[str]) -> None:
-    count = np.zeros((LEVELS, LEVELS), int)
-    np.add.at(count, (label, answer), 1)
-    share = count / np.maximum(count.sum(1, keepdims=True), 1)
-    axes.imshow(share, cmap="Blues", vmin=0, vmax=1)
-    for i, j in np.ndindex(*count.shape):
-        axes.text(j, i, f"{share[i, j]:.0%}\n{count[i, j]}", ha="center", va="center", fontsize=8.5,
-                  color="white" if share[i, j] > 0.55 else "black")  # fmt: skip
-    axes.set_title(title, fontsize=9.5, loc="left")
-    axes.set_xticks(range(LEVELS), words)
-    axes.set_yticks(range(LEVELS), words)
-    axes.set(xlabel="answered", ylabel="label")
-    axes.grid(visible=False)
 
 
 def _words(attribute: int) -> tuple[tuple[str, ...], ...]:
