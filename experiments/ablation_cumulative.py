@@ -144,7 +144,7 @@ def verdict(result: Outcome) -> tuple[str, ...]:
 
 EXPERIMENT = Experiment(
     name="ablation_cumulative",
-    config=StudyConfig(),
+    config=presets.BENCH,
     scales=presets.SCALES,
     run=run,
     curves=CURVES,

@@ -97,7 +97,7 @@ def verdict(result: Outcome) -> tuple[str, ...]:
 
 EXPERIMENT = Experiment(
     name="ablation_leave_one_out",
-    config=StudyConfig(),
+    config=presets.BENCH,
     scales=presets.SCALES,
     run=run,
     curves=CURVES,

@@ -202,7 +202,7 @@ def verdict(
 
 EXPERIMENT = Experiment(
     name="conflict",
-    config=StudyConfig(),
+    config=presets.BENCH,
     scales=presets.SCALES,
     run=run,
     curves=CURVES,

@@ -64,7 +64,7 @@ Row = Mapping[str, Estimate]
 class MainConfig:
     """The study, and how many questions of each kind are asked about its test objects."""
 
-    study: StudyConfig = StudyConfig()
+    study: StudyConfig = presets.BENCH
     quota: Quota = Quota()
 
 

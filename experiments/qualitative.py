@@ -56,7 +56,7 @@ ALSO = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained
 class QualitativeConfig:
     """The study, the bench's items that are drawn, and how many answers of each case are shown."""
 
-    study: StudyConfig = StudyConfig(seeds=1)
+    study: StudyConfig = dataclasses.replace(presets.BENCH, seeds=1)
     quota: Quota = Quota()
     shown: int = 2
 

@@ -1,4 +1,4 @@
-"""The scales of the bench's studies, in one place: `smoke`, one accelerator, the paper's sizes.
+"""The scales of the bench's studies, in one place: two cores, `smoke`, one accelerator, the paper's sizes.
 
     SCALES = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}, refused on a machine that lacks what `NEEDS` says
 
@@ -27,6 +27,10 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
+
+BENCH = StudyConfig(sft=SFTConfig(steps=1350), blind=SFTConfig(steps=1350, micro_contacts=16))
+"""The default: three times the SFT of `ablation_ordinal`, which was still gaining on validation objects when it stopped;
+what several studies share may cost more than a main job."""
 
 SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
 """Questions of the bench at `smoke`; every other scale asks all 4,800."""

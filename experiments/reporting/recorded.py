@@ -22,8 +22,9 @@ from experiments.running.runs import ROOT
 RECORDED = Path("experiments/recorded")
 """Relative to the checkout; one file for each experiment, the run that the documents speak of."""
 
-DOCUMENTS = (Path("README.md"), Path("experiments/README.md"))
+DOCUMENTS = tuple(Path(x) / "README.md" for x in (".", "touchr1_jax", "sensors_io", "experiments"))
 
+_ABSOLUTE = re.compile(r"(?:/[\w.+ -]+){2,}/?|[A-Za-z]:\\\S+")
 _MARK = re.compile(r"<!--= (?P<path>[^>]*?) -->(?P<shown>[^<]*)<!--/-->")
 
 
@@ -46,8 +47,17 @@ def record(run: Path, root: Path = ROOT) -> Path:
     results = read_json(run / "results.json")
     path = root / RECORDED / f"{results['experiment']}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, results)
+    write_json(path, _placeless(results))
     return path
+
+
+def _placeless(value: Any) -> Any:
+    """The same with the last part alone of every absolute path: where a folder lay is of no use to others."""
+    if isinstance(value, Mapping):
+        return {key: _placeless(x) for key, x in value.items()}
+    if isinstance(value, list):
+        return [_placeless(x) for x in value]
+    return Path(value).name if isinstance(value, str) and _ABSOLUTE.fullmatch(value) else value
 
 
 def filled(text: str, root: Path = ROOT) -> str:
