@@ -8,7 +8,7 @@ without SFT, GRPO starts from fresh parameters; without the accuracy reward only
 without ordinal credit 0/1 credit takes its place.  All else is the same: seeds, questions, their order.  The paper has
 a cumulative ladder alone, so the step of its ladder stands beside ours.
 
-Cost: some 45 minutes on two cores with five seeds, half of it shared with `ablation_cumulative` where that ran before;
+Cost: some 30 minutes of one core with five seeds after `ablation_cumulative`, whose policies it shares, 70 without;
 `--scale smoke` under two.
 
 Expected: without SFT every group earns nothing and nothing is learned (F7).  Without the accuracy reward slots agree
@@ -23,6 +23,7 @@ from experiments.grpo.levels import level_report
 from experiments.ladder import presets
 from experiments.ladder.aggregate import aggregate_table
 from experiments.ladder.deltas import FOUR, Step
+from experiments.ladder.experiment import bench_experiment
 from experiments.ladder.outcome import CURVES, Outcome, delta_picture, outcome, phrase, shown
 from experiments.ladder.rungs import FULL, NO_SFT, OMISSIONS, WHOLE, omitted
 from experiments.ladder.tables import delta_table, differences_table
@@ -32,7 +33,6 @@ from experiments.policies.scores import PUBLISHED, study_settings
 from experiments.policies.study import SFT, StudyConfig, Way, run_study
 from experiments.reporting.results import Results
 from experiments.running.context import Context
-from experiments.running.runner import Experiment
 
 STEPS = tuple(
     Step(
@@ -95,12 +95,4 @@ def verdict(result: Outcome) -> tuple[str, ...]:
     return (*said, *([f"No difference in accuracy beyond seeds: {', '.join(rest)}."] if rest else []))
 
 
-EXPERIMENT = Experiment(
-    name="ablation_leave_one_out",
-    config=presets.BENCH,
-    scales=presets.SCALES,
-    run=run,
-    curves=CURVES,
-    needs=presets.NEEDS,
-    spreads=True,
-)
+EXPERIMENT = bench_experiment("ablation_leave_one_out", presets.BENCH, presets.SCALES, run)

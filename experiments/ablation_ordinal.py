@@ -152,5 +152,11 @@ def _plain(values: Sequence[float]) -> Estimate:
 DEFAULT = StudyConfig()
 
 EXPERIMENT = Experiment(
-    name="ablation_ordinal", config=DEFAULT, scales={"smoke": SMOKE}, run=run, curves=CURVES, spreads=True
+    name="ablation_ordinal",
+    config=DEFAULT,
+    scales={"smoke": SMOKE},
+    run=run,
+    curves=CURVES,
+    quick=("smoke",),
+    spreads=True,
 )

@@ -8,8 +8,7 @@ what pictures suggest, by the vote of policies without touch of other seeds, is 
 (published rewards and grounding) and SFT are held against the policy without touch, and asked again with each control
 of touch in place: no touch, noise of the sensors' statistics, another object's touch, the same touch in another order.
 
-Cost: some 14 minutes on two cores with five seeds, of which SFT is shared with other experiments; `--scale smoke` under
-two.
+Cost: two minutes of one core after `main_table`, whose policies it asks, some 36 without; `--scale smoke` under two.
 
 Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
 its fellows; the full model is right about as often as elsewhere.  Touch is worth about 20 points over every control
@@ -22,6 +21,7 @@ import numpy as np
 
 from experiments.ladder import presets
 from experiments.ladder.charts import believed_chart
+from experiments.ladder.experiment import bench_experiment
 from experiments.ladder.outcome import CURVES
 from experiments.ladder.rungs import FULL
 from experiments.ladder.sight import (
@@ -45,7 +45,6 @@ from experiments.policies.study import BLIND, SFT, Study, StudyConfig, run_study
 from experiments.reporting.findings import Picture, Requirement
 from experiments.reporting.results import Results
 from experiments.running.context import Context
-from experiments.running.runner import Experiment
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE
 from touchr1_jax.rl.config import Paper
@@ -200,12 +199,4 @@ def verdict(
     return tuple(said) or ("Too few objects look like others to say anything; use more.",)
 
 
-EXPERIMENT = Experiment(
-    name="conflict",
-    config=presets.BENCH,
-    scales=presets.SCALES,
-    run=run,
-    curves=CURVES,
-    needs=presets.NEEDS,
-    spreads=True,
-)
+EXPERIMENT = bench_experiment("conflict", presets.BENCH, presets.SCALES, run)

@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from experiments.encoder.variants import REFERENCE
+from experiments.encoder.variants import STUDIED
 from experiments.fields import motion_dense, motion_markers
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.reporting.fronts import Axis, Point, dominators, front, points_of
@@ -90,7 +90,7 @@ DEFAULTS: tuple[Judged, ...] = (
         what="encoder",
         experiment="pareto_encoder",
         table="Variants",
-        default=REFERENCE,
+        default=STUDIED,
         axes=(Axis(column="a prompt", better="lower"), Axis(column="mean", better="higher")),
     ),
     Judged(

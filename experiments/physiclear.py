@@ -48,6 +48,9 @@ GOALS: Mapping[str, float] = {"all right": 45.0, "mean": 75.0, "OMAE": 0.28}
 MINUTES = 60.0
 """Bound of the training time, all folds together."""
 
+MADE = {"descriptions": "descriptions of videos", "data": "scenes", "scenes": "descriptions of scenes"}
+"""Stages that cost time only where the cache lacks what they make, and what that is."""
+
 _ABLATION = "On the partition that settings were chosen on, not that of the first table."
 _LIMITS = "Probes alone, on another partition.  To vote, and to have touched the object before, is not allowed above."
 
@@ -126,8 +129,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findi
     background = background_of(config, everything, context)
     fold = deal_folds(videos.objects, videos.label, config.folds, config.seed)
     answer = cross_validate(config.learn, videos, background, fold, config.seed, context, "fold")
-    counted = ("descriptions", "data", "scenes", "fold/")  # what a cache holds costs nothing again
-    trained_s = sum(seconds for stage, seconds in context.timing().items() if stage.startswith(counted))
+    spent = {stage: seconds for stage, seconds in context.timing().items() if stage.startswith((*MADE, "fold/"))}
     keep(config, videos, background, context)
     baselines = [Row(name=name, answer=said) for name, said in constants(videos.label, videos.objects, fold).items()]
     probes = Row(name="probes alone", answer=cross_answers(config.learn, videos, background, fold))
@@ -142,7 +144,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findi
     score = lambda title, rows, note="": score_table(title, rows, videos.label, videos.objects, note)
     return Findings(
         verdict=verdict(main, curve, videos, answer),
-        requirements=requirements(main, trained_s / 60),
+        requirements=requirements(main, spent),
         tables=(
             score("Unseen objects", [policy, probes, *baselines], "One answer to each video; no object in two folds."),
             fold_table(answer, videos.label, videos.objects, fold),
@@ -200,8 +202,8 @@ def background_of(config: PhysiclearStudy, everything: Described, context: Conte
     return Background(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled)
 
 
-def requirements(main: Mapping[str, Interval], minutes: float) -> tuple[Requirement, ...]:
-    """What is asked for, against what was measured."""
+def requirements(main: Mapping[str, Interval], spent: Mapping[str, float]) -> tuple[Requirement, ...]:
+    """What is asked for, against what was measured; `spent` are the seconds of the stages that are counted."""
     side: Mapping[str, Literal["lower", "higher"]] = {"all right": "higher", "mean": "higher", "OMAE": "lower"}
     kept = [
         Requirement(
@@ -214,7 +216,15 @@ def requirements(main: Mapping[str, Interval], minutes: float) -> tuple[Requirem
         )
         for name, bound in GOALS.items()
     ]
-    time = Requirement(name="data and training, all folds", measured=minutes, bound=MINUTES, better="lower", unit="min")
+    found = [made for stage, made in MADE.items() if stage not in spent]
+    time = Requirement(
+        name="data and training, all folds",
+        measured=sum(spent.values()) / 60,
+        bound=MINUTES,
+        better="lower",
+        unit="min",
+        note=f"found in the cache and not counted: {', '.join(found)}" if found else "nothing was found in the cache",
+    )
     return (*kept, time)
 
 

@@ -10,10 +10,11 @@ encoder as it was before training.  The averaged encoder lies in the run as `enc
 
 Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
 
-Expected: a skill well above .2, since most of what the next level of force changes can be foreseen.  The skill over
-each step's mean latent, which knows the force but not the object, says more.  A random encoder is hard to beat: it
-computes the energies of its filters by design, and probes read two thirds of the labels in them, close to what fixed
-statistics of the pictures tell; prediction moves hardness up, which is dynamics, and texture down, which is not.
+Expected: a skill near .5, since most of what the next level of force changes can be foreseen.  The skill over each
+step's mean latent, which knows the force but not the object, says more: .4.  A random encoder is hard to beat: it
+computes the energies of its filters by design, and probes read seven labels in ten in them, as in fixed statistics of
+the pictures; the same network taught with the labels of 1,200 contacts gains two points.  Prediction moves hardness
+up at first, which is dynamics, and texture and shape down throughout, which are not: by the end three points are lost.
 """
 
 import dataclasses

@@ -7,7 +7,7 @@ the reward term by term, and beside it what the same policy says without its tou
 touch, with the frames in another order, and what SFT and a policy without touch say.  Cases and items are chosen by
 rule, the first that fit in the order of the data; a table says how common each case is, which examples cannot.
 
-Cost: some four minutes of one core, SFT shared with other experiments; `--scale smoke` under one.
+Cost: a minute of one core after `main_table`, whose policy it asks, seven without; `--scale smoke` under one.
 
 Expected: answers that are right become wrong with another object's touch; where a picture leads a policy without touch
 astray, touch overrules it in about half of the questions (`conflict`), about the material least often.
@@ -20,6 +20,7 @@ import numpy as np
 from experiments.bench.draw import Quota
 from experiments.ladder import presets
 from experiments.ladder.cases import Case, Said, Shown, case_table, cases, first_of, items_shown
+from experiments.ladder.experiment import bench_experiment
 from experiments.ladder.outcome import CURVES
 from experiments.ladder.questions import answered, questions, touch_rows
 from experiments.ladder.rungs import FULL
@@ -32,7 +33,6 @@ from experiments.policies.scores import PUBLISHED, score_study, study_settings
 from experiments.policies.study import BLIND, SFT, Study, StudyConfig, run_study
 from experiments.reporting.results import Results, RolloutExample
 from experiments.running.context import Context
-from experiments.running.runner import Experiment
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.rl.config import Paper
@@ -130,15 +130,10 @@ def verdict(found: tuple[Case, ...]) -> tuple[str, ...]:
     )
 
 
-EXPERIMENT = Experiment(
-    name="qualitative",
-    config=QualitativeConfig(),
-    scales={
-        name: QualitativeConfig(study=dataclasses.replace(study, seeds=1)) for name, study in presets.SCALES.items()
-    }
+EXPERIMENT = bench_experiment(
+    "qualitative",
+    QualitativeConfig(),
+    {name: QualitativeConfig(study=dataclasses.replace(study, seeds=1)) for name, study in presets.SCALES.items()}
     | {"smoke": QualitativeConfig(study=dataclasses.replace(presets.SMOKE, seeds=1), quota=presets.SMALL_QUOTA)},
-    run=run,
-    curves=CURVES,
-    needs=presets.NEEDS,
-    spreads=True,
+    run,
 )

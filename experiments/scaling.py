@@ -23,6 +23,7 @@ import numpy as np
 from experiments.bench.draw import Quota
 from experiments.ladder import presets
 from experiments.ladder.beside import tier_table
+from experiments.ladder.experiment import bench_experiment
 from experiments.ladder.growth import (
     CLAIMED,
     Growth,
@@ -46,7 +47,6 @@ from experiments.policies.study import BLIND, SFT, SMOKE, StudyConfig
 from experiments.reporting.findings import Picture
 from experiments.reporting.results import Estimate, Results, RolloutExample
 from experiments.running.context import Context
-from experiments.running.runner import Experiment
 from experiments.running.timing import interleaved
 from touchr1_jax.bench.items import Ask
 from touchr1_jax.models.lm import DecoderConfig
@@ -217,10 +217,10 @@ def _narrow(width: int) -> ModelConfig:
     )
 
 
-EXPERIMENT = Experiment(
-    name="scaling",
-    config=ScalingConfig(),
-    scales={
+EXPERIMENT = bench_experiment(
+    "scaling",
+    ScalingConfig(),
+    {
         "smoke": ScalingConfig(
             study=dataclasses.replace(SMOKE, model=_narrow(24)),
             small=_narrow(16),
@@ -230,7 +230,6 @@ EXPERIMENT = Experiment(
         ),
         "gpu": ScalingConfig(study=presets.GPU, small=presets.GPU_SMALL, large=presets.GPU_LARGE),
     },
-    run=run,
-    curves=CURVES,
-    needs={"gpu": presets.NEEDS["gpu"]},
+    run,
+    spreads=False,
 )

@@ -119,8 +119,14 @@ class Outcome:
 
 
 def run(config: Config, context: Context) -> Findings:
-    """Every arm, all seeds at once."""
+    """Every arm, all seeds at once.
+
+    Raises:
+      ValueError: a single contact to watch.
+    """
     data = open_touch(config.touch, config.frames, config.touch.scenes.image_px, context)
+    if len(data.parts["val"]) < 2:
+        raise ValueError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
     contacts, label, train = load(data, config)
     watched = batch_of(data, config, data.parts["val"])
     encoder = dataclasses.replace(config.encoder, sensors=config.sensors)
@@ -183,7 +189,7 @@ def findings(config: Config, outcomes: list[Outcome]) -> Findings:
     by = {o.arm.name: o for o in outcomes}
     noticed = float(alarmed[failed].mean()) if failed.any() else 1.0
     false = float(alarmed[~failed].mean()) if (~failed).any() else 0.0
-    cures = [o for o in outcomes if o.arm.cures]
+    cures = [o for o in outcomes if o.arm.cures and by[o.arm.cures].failed.any()]
     return Findings(
         verdict=(
             f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training noticed "
@@ -196,13 +202,28 @@ def findings(config: Config, outcomes: list[Outcome]) -> Findings:
             ),
         ),
         requirements=(
-            Requirement(name="failed runs that were noticed", measured=noticed, bound=0.9, better="higher"),
-            Requirement(name="sound runs with an alarm", measured=false, bound=0.1, better="lower"),
+            Requirement(
+                name="failed runs that were noticed",
+                measured=100 * noticed,
+                bound=90.0,
+                better="higher",
+                unit="%",
+                note=f"{(alarmed & failed).sum()} of {failed.sum()}",
+            ),
+            Requirement(
+                name="sound runs with an alarm",
+                measured=100 * false,
+                bound=10.0,
+                better="lower",
+                unit="%",
+                note=f"{(alarmed & ~failed).sum()} of {(~failed).sum()}",
+            ),
             Requirement(
                 name="failures with all guards",
-                measured=float(by["all guards"].failed.mean()),
-                bound=0.1,
+                measured=100 * float(by["all guards"].failed.mean()),
+                bound=10.0,
                 better="lower",
+                unit="%",
                 note=f"{config.seeds} seeds",
             ),
         ),

@@ -2,9 +2,9 @@
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
-Four parts. Kills: training is ended by `kill -9` at random moments, a quarter of them uniform over its start-up and the
-others uniform over a time after its first work, and goes on until it is done; logs, answers and the final state of
-every stage are held bit by bit to those of a run that nobody killed. Two victims, with networks so small that the loop
+Four parts. Kills: training is ended by `kill -9` at random moments, a quarter of them while it starts and the others
+spread over the whole run, and goes on until it is done; logs, answers and the final state of every stage are held bit
+by bit to those of a run that nobody killed. Two victims, with networks so small that the loop
 around a step is most of it: one run of a study's GRPO, whose session starts in seconds, killed 200 times, and a whole
 study, supervised fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of a run that is about
 to go on, in four ways. Bad input: some forty kinds through the public command lines. Waiting: the share of a step that
@@ -21,29 +21,20 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from experiments.faults.bad_inputs import cases
 from experiments.faults.cases import provoke
 from experiments.faults.charts import where_kills_struck
 from experiments.faults.damage import OUTCOMES, WRONG, strike
+from experiments.faults.evidence import differences, evidence
 from experiments.faults.inputs import unfinished_run
-from experiments.faults.kills import (
-    ALONE,
-    PHASES,
-    START,
-    Campaign,
-    Kill,
-    KillConfig,
-    Victim,
-    differences,
-    evidence,
-)
+from experiments.faults.kills import ALONE, Alone, Campaign, KillConfig
 from experiments.faults.reinforcing import EXPERIMENT as REINFORCING
 from experiments.faults.victim import EXPERIMENT as STUDY
 from experiments.faults.waiting import WaitingConfig, Waits, waits
+from experiments.faults.watched import PHASES, START, Kill, Victim
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
+from experiments.running.progress import Advance
 from experiments.running.runner import Experiment
 
 MOST_WAITING = 0.02
@@ -63,10 +54,9 @@ CELL = 110
 class FaultsConfig:
     """Kills of both victims and their moments, steps of the GRPO run, files to damage, steps to time."""
 
-    grpo: KillConfig = KillConfig(kills=KILLS, life_s=0.5)
-    grpo_steps: int = 3000
-    """So many that one run outlives its kills."""
-    study: KillConfig = KillConfig(kills=10, life_s=1.5, startup_share=0.2)
+    grpo: KillConfig = KillConfig(kills=KILLS)
+    grpo_steps: int = 2000
+    study: KillConfig = KillConfig(kills=10, startup_share=0.2)
     study_scale: str = "default"
     damaged_files: int | None = None
     """Most files to damage; all by default."""
@@ -119,29 +109,42 @@ def _study(scale: str) -> Victim:
 
 
 def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> Killed:
-    """Runs of a victim until all kills have struck; a stopped session of this experiment goes on with the next run."""
+    """Runs of a victim until all kills have struck; a stopped session of this experiment goes on behind the last."""
     stage = f"kill/{victim.name}"
     campaign = Campaign(context.directory / "victims" / victim.name, context.cache_dir / "programs", victim, config)
     if not context.done(f"{stage}/{ALONE}"):
-        context.save_stage(f"{stage}/{ALONE}", evidence(campaign.left_alone()))
-    whole = context.load_stage(f"{stage}/{ALONE}")
+        context.save_stage(f"{stage}/{ALONE}", campaign.left_alone()._asdict())
+    alone = Alone(**context.load_stage(f"{stage}/{ALONE}"))
     kills: list[Kill] = []
     differs: list[str] = []
-    runs = 0
+    number = 0
     with context.progress(f"killing the {name}", config.kills) as advance:
         while len(kills) < config.kills:
-            here = f"{stage}/{runs}"
+            here = f"{stage}/{number}"
             if not context.done(here):
-                rng = np.random.default_rng((config.seed, runs))
-                struck = campaign.killed(str(runs), config.kills - len(kills), rng)
-                found = differences(whole, evidence(campaign.directory(str(runs))))
+                struck = _one_run(campaign, here, number, config.kills - len(kills), alone, context, advance)
+                found = differences(alone.evidence, evidence(campaign.directory(str(number))))
                 context.save_stage(here, {"kills": struck, "differs": found})
             kept = context.load_stage(here)
             kills += [Kill(**kill) for kill in kept["kills"]]
-            differs += [f"run {runs}: {what}" for what in kept["differs"]]
-            runs += 1
-            advance(len(kept["kills"]))
-    return Killed(kills=tuple(kills), runs=runs, differs=tuple(differs))
+            differs += [f"run {number}: {what}" for what in kept["differs"]]
+            number += 1
+    return Killed(kills=tuple(kills), runs=number, differs=tuple(differs))
+
+
+def _one_run(
+    campaign: Campaign, here: str, number: int, kills: int, alone: Alone, context: Context, advance: Advance
+) -> tuple[Kill, ...]:
+    """Kills of one run, each of which is kept at once."""
+    stage = f"{here}-struck"
+    before = [Kill(**kill) for kill in context.load_stage(stage)] if context.done(stage) else []
+    advance(len(before))
+
+    def keep(struck: tuple[Kill, ...]) -> None:
+        context.save_stage(stage, struck)
+        advance()
+
+    return campaign.killed(number, kills, alone, before=before, keep=keep)
 
 
 def _damage(config: FaultsConfig, context: Context, scratch: Path) -> list[tuple[str, str, str, str]]:
@@ -294,9 +297,9 @@ def _waiting_table(waited: Waits) -> Table:
 
 DEFAULT = FaultsConfig()
 SMOKE = FaultsConfig(
-    grpo=KillConfig(kills=3, life_s=0.4),
+    grpo=KillConfig(kills=3),
     grpo_steps=20,
-    study=KillConfig(kills=1, life_s=0.5),
+    study=KillConfig(kills=1),
     study_scale="short",
     damaged_files=2,
     bad_inputs=30,

@@ -103,22 +103,15 @@ def run(config: StabilityConfig, context: Context) -> Findings:
 
 
 def _tracking(outcomes: Outcomes) -> Panel:
-    silent = {name: _silent(by) for name, by in outcomes.items()}
-    total = sum(len(o) for o in outcomes[OURS].values())
+    said, none_silent = _silence(outcomes, "frames", "frames broken")
     mild = [o for s in STRESSES for o in outcomes[OURS][s.name, s.levels[0]] if not o.broken]
     alarms = sum(o.flagged for o in mild)
     return Panel(
         verdict=(
-            f"Of {total} frames under stress, broken without a word: "
-            + ", ".join(f"{name} {count}" for name, count in silent.items())
-            + ".",
+            said,
             f"{OURS}: {alarms} of {len(mild)} frames under the mildest level of each stress are flagged.",
         ),
-        requirements=(
-            Requirement(
-                name=f"{OURS}: frames broken and not flagged", measured=float(silent[OURS]), bound=0, better="lower"
-            ),
-        ),
+        requirements=(none_silent,),
         tables=(_break_table("Where tracking breaks first", outcomes, STRESSES),),
         pictures=(
             _curves(
@@ -154,19 +147,10 @@ def _shear(outcomes: Outcomes) -> Panel:
 
 
 def _depth(outcomes: Outcomes) -> Panel:
-    total = sum(len(o) for o in outcomes[OURS].values())
-    silent = {name: _silent(by) for name, by in outcomes.items()}
+    said, none_silent = _silence(outcomes, "presses", "depth wrong")
     return Panel(
-        verdict=(
-            f"Of {total} presses under stress, depth wrong without a word: "
-            + ", ".join(f"{name} {count}" for name, count in silent.items())
-            + ".",
-        ),
-        requirements=(
-            Requirement(
-                name=f"{OURS}: depth wrong and not flagged", measured=float(silent[OURS]), bound=0, better="lower"
-            ),
-        ),
+        verdict=(said,),
+        requirements=(none_silent,),
         tables=(_break_table("Where depth breaks first", outcomes, DEPTH_STRESSES),),
         pictures=(
             _curves(
@@ -181,6 +165,17 @@ def _depth(outcomes: Outcomes) -> Panel:
                 "share of the depth",
             ),
         ),
+    )
+
+
+def _silence(outcomes: Outcomes, things: str, fault: str) -> tuple[str, Requirement]:
+    """How often each method was at fault without a flag, in words, and that ours must never be."""
+    silent = {name: _silent(by) for name, by in outcomes.items()}
+    total = sum(len(o) for o in outcomes[OURS].values())
+    counts = ", ".join(f"{name} {count}" for name, count in silent.items())
+    return (
+        f"Of {total} {things} under stress, {fault} and not flagged: {counts}.",
+        Requirement(name=f"{OURS}: {fault} and not flagged", measured=float(silent[OURS]), bound=0, better="lower"),
     )
 
 

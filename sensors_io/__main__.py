@@ -15,6 +15,7 @@ from sensors_io.commands.force_zero import ForceZeroing
 from sensors_io.commands.generate import Generate
 from sensors_io.commands.geometry import Geometry
 from sensors_io.commands.imports import Import
+from sensors_io.commands.label import Label, LabelsError
 from sensors_io.commands.record import Record
 from sensors_io.commands.records import Check, List
 from sensors_io.commands.sync import Sync
@@ -34,6 +35,7 @@ Command = (
     | Annotated[Generate, tyro.conf.subcommand("generate")]
     | Annotated[Check, tyro.conf.subcommand("check")]
     | Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Label, tyro.conf.subcommand("label")]
     | Annotated[Geometry, tyro.conf.subcommand("geometry")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Record, tyro.conf.subcommand("record")]
@@ -48,6 +50,7 @@ KNOWN_ERRORS = (
     RecordsError,
     SchemaError,
     ImportSourceError,
+    LabelsError,
     DeviceError,
     ForceError,
     OffsetsError,

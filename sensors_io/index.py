@@ -57,6 +57,12 @@ class Index:
     contacts: list[tuple[ContactKey, dict[str, int]]] = dataclasses.field(default_factory=list)
     frames: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
 
+    @property
+    def next_objects(self) -> str:
+        """Name of the next shard of cards; no number comes twice, though shards of replaced cards are gone."""
+        used = [int(shard.file.removeprefix("objects-").partition(".")[0]) for shard in self.object_shards]
+        return f"objects-{max(used, default=-1) + 1:05d}"
+
     @classmethod
     def read(cls, root: pathlib.Path) -> Self:
         """The index of the data set in `root`.

@@ -89,7 +89,7 @@ class RecordWriter:
                 f"{self._root} leads to a file: must be a directory; choose another path"
             ) from error
         self._per_shard = contacts_per_shard
-        self._lock = _lock(self._root)
+        self._lock = write_lock(self._root)
         try:
             self._index = _start(self._root, meta, resume)
         except BaseException:
@@ -157,7 +157,7 @@ class RecordWriter:
         """Make everything written so far visible, in a shard of its own."""
         index = self._index
         if self._cards:
-            cards = ShardWriter(self._root, f"objects-{len(index.object_shards):05d}")
+            cards = ShardWriter(self._root, index.next_objects)
             for card in self._cards.values():
                 cards.write(card)
             index.object_shards.append(cards.publish())
@@ -285,8 +285,12 @@ class RecordStore:
         return contacts_of_split(self.contacts, self.objects, split)
 
 
-def _lock(root: pathlib.Path) -> IO[str]:
-    """An advisory lock on the directory, which dies with the process."""
+def write_lock(root: pathlib.Path) -> IO[str]:
+    """An advisory lock on the directory, until it is closed or the process dies.
+
+    Raises:
+      RecordsExistError: another process holds it.
+    """
     file = (root / ".lock").open("w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,5 +1,6 @@
 """What all tests share: shape checking, patience with a busy machine, quick compilation and its programs."""
 
+import contextlib
 import gc
 import os
 import tempfile
@@ -10,6 +11,7 @@ import jax
 import jaxtyping
 import pytest
 
+from experiments.running.quick import compiled_quickly
 from tests.typecheck import functions
 
 jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions.__name__}")
@@ -17,9 +19,6 @@ jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions
 # both judge by the clock, which a shared machine falsifies
 hypothesis.settings.register_profile("shared", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("shared")
-
-QUICKLY = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
-"""Flag of XLA: of its two ways to write a fused loop the older one, as long as there is one, compiles twice as fast."""
 
 PROGRAMS = "TOUCHR1_TEST_PROGRAMS"
 """Environment variable that tells the workers of a session where the session keeps its compiled programs."""
@@ -36,9 +35,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Most of XLA's optimisations are left out: they take longer here than all the arithmetic.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if QUICKLY not in flags:  # XLA reads them when it compiles its first program
-        os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
+    quick = contextlib.ExitStack()
+    quick.enter_context(compiled_quickly())
+    config.add_cleanup(quick.close)
     if PROGRAMS not in os.environ:  # else this is a worker of a session that has its folder
         folder = tempfile.TemporaryDirectory(prefix="touchr1-programs-")
         config.add_cleanup(folder.cleanup)
@@ -47,7 +46,6 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", os.environ[PROGRAMS])
     jax.config.update("jax_compilation_cache_max_size", MOST_BYTES)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH_KEEPING_S)
-    jax.config.update("jax_disable_most_optimizations", True)
 
 
 def pytest_collection_finish() -> None:

@@ -40,6 +40,7 @@ SENSORS_LAYERS = (
     {"shards", "selection"},
     {"index"},
     {"records"},
+    {"cards"},
     {"pipeline", "importers", "scenes"},
     {"fields"},
     {"calibration"},
@@ -75,6 +76,7 @@ REWARDS_MAY_IMPORT = {
     "touchr1_jax.masked",
     "touchr1_jax.rewards",
     "jax.numpy",
+    "jax.errors",
     "numpy",
     "jaxtyping",
 }

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
+from experiments.reporting.names import Named, name_points
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.probes import BOUNDS
 
@@ -103,13 +104,14 @@ def accuracy_against_time(
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(8.4, 5.0), layout="constrained")
         axes = figure.subplots()
+        names: list[Named] = []
         for kind, colour, marker in zip(kinds, cycle(COLOURS), cycle(MARKERS), strict=False):
             for name, own, ms, accuracy, lost in points:
                 if own != kind:
                     continue
                 axes.vlines(ms, reference - lost.high, reference - lost.low, color=colour, lw=1, alpha=0.45)
                 axes.scatter(ms, accuracy, s=46, color=colour, marker=marker, edgecolors="white", zorder=3)
-                axes.annotate(name, (ms, accuracy), (6, 5), textcoords="offset points", fontsize=7.5, color=colour)
+                names.append(Named(name=name, x=ms, y=accuracy, colour=colour))
             axes.scatter([], [], color=colour, marker=marker, label=kind)
         axes.set(xscale="log", xlabel="forward, ms a prompt of 8 frames × 4 sensors", ylabel="probes right, %")
         limit, bound = goal
@@ -118,4 +120,5 @@ def accuracy_against_time(
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         figure.legend(loc="outside right upper", fontsize=8, title="saving in")
+        name_points(axes, names)
         return svg(figure)

@@ -10,7 +10,7 @@ import numpy as np
 import optax
 
 from experiments.encoder.held_out import Watched, assess
-from experiments.policies.feeds import Feed, touch_batch
+from experiments.policies.feeds import Feed, host_touch, touch_batch
 from experiments.policies.pretrained import PretrainedEncoder
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
@@ -84,7 +84,7 @@ class ClipFeed(Feed):
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch:
         """The clips as they are."""
         del rng
-        return touch_batch(element)
+        return host_touch(element)
 
 
 def clip_of(config: PretrainConfig, clip: ClipConfig) -> ClipConfig:

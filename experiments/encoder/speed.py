@@ -19,7 +19,7 @@ MATRIX = 1024  # side of the matrices whose product is the yardstick of the mach
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Program:
-    """A compiled call and the arithmetic that XLA counts in it, in Gflop."""
+    """A compiled call and its arithmetic, in Gflop."""
 
     call: Callable[[], Any]
     gflop: float
@@ -27,7 +27,7 @@ class Program:
 
 def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> Program:
     """The encoder from the bytes of a batch to its tokens."""
-    return compiled(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
+    return by_contact(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
 
 
 def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Program]:
@@ -44,11 +44,11 @@ def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[s
 
     cut = lambda x, kept: cut_patches(x, e, kept).astype(jnp.float32) / 127.5
     return {
-        "cut the bytes": compiled(lambda b: each(cut, b), batch),
-        "stem, energies, embedding": compiled(
+        "cut the bytes": by_contact(lambda b: each(cut, b), batch),
+        "stem, energies, embedding": by_contact(
             lambda p, b: each(lambda x, kept: _Stem(e).apply({"params": p}, x, kept), b), stem, batch
         ),
-        "time, force, pooling": compiled(lambda p, b: encode_each(shallow, p, read_frames(networks, b)), few, batch),
+        "time, force, pooling": by_contact(lambda p, b: encode_each(shallow, p, read_frames(networks, b)), few, batch),
         "transformer": forward(networks, params, batch),
     }
 
@@ -66,15 +66,31 @@ class _Stem(nn.Module):
 def matrix_product() -> Program:
     """One product of square matrices."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
-    return compiled(lambda a: a @ a, x)
+    product = lambda a: a @ a
+    return Program(call=held(product, x), gflop=arithmetic(product, x))
 
 
-def compiled(function: Callable[..., Any], *arguments: Any) -> Program:
-    """Compile for some arguments; they are held, so that a call takes none."""
+def by_contact(function: Callable[..., Any], *arguments: Any) -> Program:
+    """A program that reads the contacts of a batch, its last argument, one after the other.
+
+    XLA counts one turn of a loop, however many it takes: the arithmetic is that of one contact, times their number.
+    """
+    *others, batch = arguments
+    one = jax.tree.map(lambda x: x[:1], batch)
+    return Program(call=held(function, *arguments), gflop=len(batch.frames) * arithmetic(function, *others, one))
+
+
+def held(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Compiled for some arguments, which are held on the device, so that a call takes none."""
     placed = jax.device_put(arguments)
     program = jax.jit(function).lower(*placed).compile()
-    cost: Any = program.cost_analysis()
-    return Program(call=lambda: program(*placed), gflop=float(cost["flops"]) / 1e9)
+    return lambda: program(*placed)
+
+
+def arithmetic(function: Callable[..., Any], *arguments: Any) -> float:
+    """Gflop of a call as XLA counts them before it optimises, a loop's body once."""
+    cost: Any = jax.jit(function).lower(*arguments).cost_analysis()
+    return float(cost["flops"]) / 1e9
 
 
 def medians(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:

@@ -13,6 +13,9 @@ FRAMES, IMAGE_PX = 8, 112
 REFERENCE = "256 tokens"
 """The variant that the others are held against: 4 steps of two frames, 64 patches of 14 px."""
 
+STUDIED = "4 frames by salience"
+"""The variant with the encoder of the studies: four frames, each a step of 16 patches of 28 px."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Variant:
@@ -50,7 +53,7 @@ def variants(base: PretrainConfig) -> tuple[Variant, ...]:
         variant("128 tokens", "tokens", base.encoder),
         variant("64 tokens", "tokens", two),
         variant("32 tokens", "tokens", dataclasses.replace(base.encoder, frames_per_step=4)),
-        variant("4 frames by salience", "frames", base.encoder, frames_kept=4),
+        variant(STUDIED, "frames", base.encoder, frames_kept=4),
         variant("8 patches", "patches", kept(8, "drop")),
         variant("4 patches", "patches", kept(4, "drop")),
         variant("4 patches and the rest", "merged", kept(4, "merge")),

@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.faults.kills import PHASES, Kill
+from experiments.faults.watched import PHASES, Kill
 from experiments.reporting.charts import LOOK, PALETTE, svg
 
 BINS = 20

@@ -7,8 +7,8 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from experiments.faults.evidence import differences, evidence
 from experiments.faults.inputs import counting_paths, cut, emptied, flipped, newest_checkpoints, run_directory
-from experiments.faults.kills import differences, evidence
 from experiments.running.runner import main
 
 WAYS: Mapping[str, Callable[[Path], None]] = {

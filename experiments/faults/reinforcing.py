@@ -9,6 +9,8 @@ the hundred.
 """
 
 import dataclasses
+import io
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,12 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.faults.victim import ARM, MODEL
+from experiments.policies.arrays import flat, nested
 from experiments.policies.assembly import Assembly, assemble
 from experiments.policies.feeds import QuestionFeed
 from experiments.policies.scores import PUBLISHED
 from experiments.policies.stages import grpo_program
 from experiments.policies.watching import watched_log
 from experiments.reporting.findings import Findings
+from experiments.running.artifacts import write_bytes
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
 from experiments.running.runner import Experiment
@@ -65,13 +69,14 @@ def run(config: ReinforcingConfig, context: Context) -> Findings:
     prior = uniform_prior(list(assembly.levels))
     score, agent = assembly.score(PUBLISHED, prior), assembly.agent
     optimizer, step = grpo_program(agent, score, config.grpo, config.steps, None)
-    decoder = {"decoder": _params(assembly)["decoder"]}
+    decoder = {"decoder": _decoder(assembly, context.directory / "start.npz")}
     rng = np.random.default_rng(1)
     noise = _features(rng, NOISE).touch
     fixed = Fixed(reference=decoder, noise=jnp.asarray(noise))
     feed = _questions(assembly, rng, CONTACTS, config.grpo.drawn)
     held = next(_questions(assembly, rng, HELD_OUT, HELD_OUT))
-    state = start_state(decoder, optimizer, jax.random.key(0), config.grpo)
+    begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
+    state = begin(decoder, jax.random.key(0))
     judge = jax.jit(lambda params: _certainty(assembly, params, held))
     run_loop(
         lambda s, batch: step(s, batch, fixed),
@@ -113,8 +118,19 @@ def _features(rng: np.random.Generator, contacts: int) -> Features:
     return Features(**on_host)
 
 
-def _params(assembly: Assembly) -> Params:
-    """Those of a fresh policy."""
+def _decoder(assembly: Assembly, path: Path) -> Params:
+    """A fresh policy's, drawn by the first session and found by the others, as GRPO finds what SFT left."""
+    if not path.exists():
+        arrays: dict[str, Any] = flat(_drawn(assembly)["decoder"])
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        write_bytes(path, buffer.getvalue())
+    with np.load(path) as file:
+        return nested(dict(file))
+
+
+def _drawn(assembly: Assembly) -> Params:
+    """Parameters of a fresh policy."""
     streams, px, view_px = (1, len(SENSORS), MODEL.frames), MODEL.image_px, MODEL.vision.image_px
     nothing = TouchBatch(
         frames=jnp.zeros((*streams, px, px, 3), jnp.uint8),

@@ -46,6 +46,7 @@ def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig
         scales={"smoke": SMOKE},
         run=functools.partial(run_ablation, ablation),
         curves=ablation.drawn,
+        quick=("smoke",),
         spreads=True,
     )
 

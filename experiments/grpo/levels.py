@@ -6,6 +6,7 @@ import numpy as np
 
 from experiments.policies.answers import Evaluated
 from experiments.policies.study import BLIND, SFT, Study
+from experiments.reporting.charts import PALETTE
 from experiments.reporting.findings import Picture, Table
 from experiments.reporting.levels import Levels, confusion_chart, reliability_table, trust_chart
 from sensors_io.schema import ATTRIBUTES
@@ -21,6 +22,8 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     language = study.assembly.language
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
     felt = {name: said for name, said in rows.items() if said.agree is not None}
+    if len(felt) > len(PALETTE):  # more lines than colours: where training begins, and where it ends
+        felt = {name: said for name, said in felt.items() if name in (SFT, list(study.arms)[-1])}
     pictures = [
         Picture(
             name="confusions",

@@ -29,7 +29,7 @@ from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 
 BENCH = StudyConfig(sft=SFTConfig(steps=1350), blind=SFTConfig(steps=1350, micro_contacts=16))
-"""The default: three times the SFT of `ablation_ordinal`, which was still gaining on validation objects when it stopped;
+"""The default: three times the SFT of `ablation_ordinal`, which still gained on validation objects when it stopped;
 what several studies share may cost more than a main job."""
 
 SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rewards import check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.rewards import RewardError, check_weights, make_rewards, total_reward, uniform_prior
 from touchr1_jax.rl.scoring import ScoreFn, check_finite, make_score
 from touchr1_jax.text.constraint import Constraint, compile_constraint
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
@@ -79,24 +80,24 @@ class Assembly:
         return make_score(self.parser, make_rewards(prior), weights)
 
     def target(self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray) -> Target:
-        """Targets of single-attribute questions; labels of the attributes that are not asked are hidden."""
+        """Targets of single-attribute questions, on the host; labels of attributes that are not asked are hidden."""
         asked = self.layout.asked[attribute]
-        ordinal = np.array([a.ordinal for a in self.language.attributes])
-        return Target(
-            asked=jnp.asarray(asked),
-            label=jnp.asarray(np.where(asked, label, -1), jnp.int32),
-            levels=jnp.broadcast_to(jnp.asarray(self.levels, jnp.int32), asked.shape),
-            ordinal=jnp.broadcast_to(jnp.asarray(ordinal), asked.shape),
-            streams=jnp.asarray(streams),
-        )
+        of: dict[str, Any] = {
+            "asked": asked,
+            "label": np.where(asked, label, -1).astype(np.int32),
+            "levels": np.tile(np.array(self.levels, np.int32), (len(asked), 1)),
+            "ordinal": np.tile([a.ordinal for a in self.language.attributes], (len(asked), 1)),
+            "streams": streams,
+        }
+        return Target(**of)
 
 
 def prove_rewards(arms: Mapping[str, Weights]) -> None:
     """Try every weighted reward of every arm on an empty answer, so that a misfit shows before anything is made.
 
     Raises:
-      ValueError: an unknown reward, a weight that is negative or not finite, a reward that can be NaN or infinite.
-      TypeError: a reward that is no floating scalar; a note names the arm.
+      RewardError: an unknown reward, a weight that is negative or not finite, a reward that is no floating scalar,
+        cannot be traced, or can be NaN or infinite; it names the arm.
     """
     attributes, sensors = len(TOUCH_LANGUAGE.attributes), len(TOUCH_LANGUAGE.sensors)
     rewards = make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
@@ -116,9 +117,8 @@ def prove_rewards(arms: Mapping[str, Weights]) -> None:
             jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
             for name in weights:
                 check_finite(name, rewards[name], sensors, attributes)
-        except (TypeError, ValueError) as error:
-            error.add_note(f"in the weights of arm {arm!r}, {dict(weights)}")
-            raise
+        except RewardError as error:
+            raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
 
 
 def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:

@@ -1,16 +1,17 @@
 """Batches for the stages: clips with answers for SFT, encoded contacts with questions for GRPO and evaluation.
 
 A feed wraps a Grain iterator and counts what it has drawn; its own randomness is a function of (seed, count), so that
-`set_state` resumes it exactly.
+`set_state` resumes it exactly.  Batches are NumPy arrays: the step that takes one puts it on its devices, and a mesh
+splits it without fetching it back.  Put there array by array, they would be held up two dozen times while the threads
+that write a checkpoint hold Python's lock.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
 import grain
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -57,9 +58,14 @@ class Feed:
         self._elements.set_state(state["elements"])
 
 
-def touch_batch(clip: dict[str, np.ndarray]) -> TouchBatch:
-    """The arrays of a clip batch as the JAX batch type; they must not be written to any more."""
-    return TouchBatch(**jax.device_put({name: clip[name] for name in CLIP_ARRAYS}))
+def host_touch(clip: Mapping[str, Any]) -> TouchBatch:
+    """The arrays of a clip batch as the JAX batch type, on the host; they must not be written to any more."""
+    return TouchBatch(**{name: clip[name] for name in CLIP_ARRAYS})
+
+
+def touch_batch(clip: Mapping[str, Any]) -> TouchBatch:
+    """The same on the device, for whoever computes with it outside of a compiled program."""
+    return jax.device_put(host_touch(clip))
 
 
 def random_streams(present: np.ndarray, full_share: float, rng: np.random.Generator) -> np.ndarray:
@@ -131,14 +137,14 @@ class AnswerFeed(Feed):
             for j in range(q)
         ]
         tokens, masks = (np.stack(x).reshape(p, q, -1) for x in zip(*pairs, strict=True))
-        written = {
+        written: dict[str, Any] = {
             "ids": layout.ids[chosen],
             "mask": layout.mask[chosen],
             "streams": streams,
             "tokens": tokens,
             "token_mask": masks,
-        }  # put on the device at once, for `jnp.asarray` runs a program for each array
-        return SFTBatch(touch=touch_batch(element), **jax.device_put(written))
+        }
+        return SFTBatch(touch=host_touch(element), **written)
 
     def _answer(
         self, contact: int, question: int, label: np.ndarray, streams: np.ndarray
@@ -214,18 +220,21 @@ def question_batch(
 ) -> GRPOBatch:
     """One question per row: row i asks attribute[i] about contact[i], felt by streams[i]."""
     chosen = take(features, contact)
+    asked: dict[str, Any] = {
+        "ids": assembly.layout.ids[attribute],
+        "mask": assembly.layout.mask[attribute],
+        "ordered": assembly.ordered[attribute],
+    }
     return GRPOBatch(
-        features=dataclasses.replace(chosen, stream_mask=chosen.stream_mask & jnp.asarray(streams)),
-        ids=jnp.asarray(assembly.layout.ids[attribute]),
-        mask=jnp.asarray(assembly.layout.mask[attribute]),
+        features=dataclasses.replace(chosen, stream_mask=chosen.stream_mask & streams),
         target=assembly.target(attribute, label[contact], streams),
-        ordered=jnp.asarray(assembly.ordered[attribute]),
+        **asked,
     )
 
 
 def take(features: Features, rows: np.ndarray) -> Features:
-    """Rows of encoded contacts kept on the host."""
-    return jax.tree.map(lambda x: jnp.asarray(x[rows]), features)
+    """Rows of encoded contacts, on the host as these are."""
+    return jax.tree.map(lambda x: x[rows], features)
 
 
 def each(total: int, size: int) -> Iterator[tuple[np.ndarray, int]]:

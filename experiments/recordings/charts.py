@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from experiments.recordings.policy import LANGUAGE
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
@@ -43,7 +42,7 @@ def against_objects(curves: Mapping[str, Mapping[int, Interval]], goals: Mapping
             axes.plot(x, [i.mean for i in found], color=colour, marker=marker, lw=1.6, label=name)
             axes.vlines(x, [i.low for i in found], [i.high for i in found], color=colour, lw=1, alpha=0.5)
             axes.axhline(goals[name], color=colour, ls=":", lw=1)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_xticks(sorted({x for curve in curves.values() for x in curve}))
         axes.set(xlabel="objects learned from", ylabel="%", ylim=(0, 100), xlim=(0, None))
         figure.legend(loc="outside right upper")
         return svg(figure)

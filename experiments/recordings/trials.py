@@ -101,6 +101,6 @@ def probes(config: LearnConfig, background: Background) -> dict[str, tuple[Learn
         "the same, no unlabelled videos": (config, bare),
         "the same, scenes' ridge as the others'": (harder, background),
         "probes of the description, no scenes": (reading(*own), background),
-        "both": (reading(*own, "scenes"), background),
+        "probes of the description and of what scenes teach": (reading(*own, "scenes"), background),
         **{f"probe of {name} alone, no scenes": (reading(name), background) for name in own},
     }

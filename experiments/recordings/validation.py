@@ -100,7 +100,7 @@ def score_table(title: str, rows: Sequence[Row], label: np.ndarray, objects: np.
         for name, interval in found.items():
             line.append(interval.mean)
             if name in _HEAD:
-                line.append(f"{interval.low:{_format(name)}} to {interval.high:{_format(name)}}")
+                line.append(f"{interval.low:{_format(name)}}–{interval.high:{_format(name)}}")
         cells.append(tuple(line))
     return Table(title=title, columns=tuple(columns), rows=tuple(cells), note=note)
 
@@ -121,7 +121,7 @@ _HEAD = ("all right", "mean", "OMAE")
 
 
 def _unit(name: str) -> str:
-    return "levels" if name == "OMAE" else "%"
+    return "" if name == "OMAE" else "%"
 
 
 def _format(name: str) -> str:

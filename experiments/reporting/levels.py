@@ -73,7 +73,7 @@ def draw_confusion(axes: Axes, answer: np.ndarray, label: np.ndarray, levels: Se
     for i, j in np.ndindex(*count.shape):
         axes.text(j, i, f"{share[i, j]:.0%}\n{count[i, j]}", ha="center", va="center", fontsize=7.5,
                   color="white" if share[i, j] > 0.55 else "black")  # fmt: skip
-    axes.set_xticks(range(len(columns)), columns, fontsize=8)
+    axes.set_xticks(range(len(columns)), columns, fontsize=8 if len(columns) == len(levels) else 6.5)
     axes.set_yticks(range(len(levels)), levels, fontsize=8)
     axes.set(xlabel="answered", ylabel="label")
     axes.grid(visible=False)

@@ -129,7 +129,7 @@ def _loops(loops: Sequence[Loop]) -> Html:
             f"{loop.completed:,} of {loop.total:,}",
             tag("td", tag("div", tag("i", style=f"left:0;width:{100 * _share(loop):.1f}%"), class_="bar")),
             f"{number(loop.rate, '.3g')}/s",
-            "–" if loop.left_s is None else duration(loop.left_s),
+            loop.left or "–",
             tag("td", loop.note, class_="text"),
             head=1,
         )

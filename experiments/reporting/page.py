@@ -34,6 +34,7 @@ tbody th:first-child { white-space: normal; }
 tr.baseline th, tr.baseline td { color: var(--quiet); }
 td.text, th.text { text-align: left; }
 td.text { white-space: normal; min-width: 11rem; }
+td.long { min-width: 34rem; }
 .ci { display: block; color: var(--quiet); font-size: .75rem; font-weight: 400; }
 .better { color: var(--quiet); font-weight: 400; }
 .swatch { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .45em; }

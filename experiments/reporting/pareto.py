@@ -4,13 +4,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
-
-_NAME_PX = (90.0, 13.0)  # width and height of a name at 100 dots an inch
+from experiments.reporting.names import Named, name_points
 
 Point = tuple[str, float, float, float]
 """Name, ms a frame, median error, 95th percentile of the error."""
@@ -45,20 +43,9 @@ def speed_against_error(
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
         axes.margins(x=0.12)
-        coloured = zip(groups.values(), itertools.cycle(PALETTE), strict=False)
-        _name(axes, [(point, colour) for points, colour in coloured for point in points])
         if legend:
             axes.legend(loc="best", fontsize=8)
+        coloured = zip(groups.values(), itertools.cycle(PALETTE), strict=False)
+        named = ((point, colour) for points, colour in coloured for point in points)
+        name_points(axes, [Named(name=name, x=ms, y=median, colour=c) for (name, ms, median, _), c in named])
         return svg(figure)
-
-
-def _name(axes: Axes, points: Sequence[tuple[Point, str]]) -> None:
-    """Write each point's name beside it, lower where another name stands there already."""
-    taken: list[tuple[float, float]] = []
-    for (name, x, y, _), colour in sorted(points, key=lambda point: -point[0][2]):
-        right, up = axes.transData.transform((x, y))
-        while any(abs(right - r) < _NAME_PX[0] and abs(up - u) < _NAME_PX[1] for r, u in taken):
-            up -= _NAME_PX[1]
-        taken.append((right, up))
-        lowered = up - axes.transData.transform((x, y))[1]
-        axes.annotate(name, (x, y), (6, 3 + 0.72 * lowered), textcoords="offset points", fontsize=7.5, color=colour)

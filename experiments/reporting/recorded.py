@@ -3,10 +3,10 @@
     python -m experiments.reporting.recorded record RUN        # keep a finished run's results in the repository
     python -m experiments.reporting.recorded fill              # write every marked figure anew
 
-A marked figure stands between two comments, `<!--= NAME | KEY | … | FORMAT -->63<!--/-->`: the path of a value in
-`experiments/recorded/NAME.json`, and the format of its number.  A key names an entry of an object; of a list, the entry
-with that `name` or `title`; of a table, the row that begins with it, then the column.  A test holds the documents to
-what `fill` would write.
+A marked figure stands between two comments, `<!--= NAME :: KEY :: … :: FORMAT -->63<!--/-->`: the path of a value in
+`experiments/recorded/NAME.json`, and the format of its number; a bar would end the cell of a table.  A key names an
+entry of an object; of a list, the entry with that `name` or `title`; of a table, the row that begins with it, then the
+column.  A test holds the documents to what `fill` would write.
 """
 
 import argparse
@@ -79,12 +79,12 @@ def filled(text: str, root: Path = ROOT) -> str:
 
 
 def shown(path: str, root: Path = ROOT) -> str:
-    """A figure as its mark asks for it: "conflict | requirements | least gain from touch | measured | .0f".
+    """A figure as its mark asks for it: "conflict :: requirements :: least gain from touch :: measured :: .0f".
 
     Raises:
       FigureError: an unknown run or key, or something that has no such format.
     """
-    name, *keys = [part.strip() for part in path.split("|")]
+    name, *keys = [part.strip() for part in path.split("::")]
     file = root / RECORDED / f"{name}.json"
     if len(keys) < 2:
         raise FigureError(f"mark {path!r} has {len(keys)} parts after the run: must have a key and a format; add them")

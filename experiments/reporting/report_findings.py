@@ -11,6 +11,9 @@ from experiments.running.artifacts import write_bytes, write_text
 
 MEDIA = {"svg": "svg+xml", "png": "png"}
 
+LONG = 80
+"""Characters of a cell beyond which it is given room: in a narrow column a paragraph is a tower."""
+
 
 def write_findings(directory: Path, findings: Findings, *, about: str, description: Mapping[str, Any]) -> Path:
     """Write `report.html` and `plots/*` of a run and return the path of the report.
@@ -92,5 +95,5 @@ def _cell(value: Cell, spec: str) -> Html | str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, str):
-        return tag("td", value, class_="text")
+        return tag("td", value, class_="text long" if len(value) > LONG else "text")
     return number(value, spec if isinstance(value, float) else ",")

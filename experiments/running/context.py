@@ -107,6 +107,7 @@ class Context:
         self.stopping = stopping or Stopping()
         self.team = team
         self.devices = devices or Devices()
+        self._opened = time.monotonic()
         self._watchers = watchers
         self._loops: list[Loop] = []
         self._log = MetricLog(directory / "metrics.jsonl", watchers) if team.leads else None
@@ -198,6 +199,11 @@ class Context:
     def timing(self) -> dict[str, float]:
         """Wall seconds of every timed stage so far."""
         return read_json(self._timing_file) if self._timing_file.exists() else {}
+
+    @property
+    def elapsed_s(self) -> float:
+        """Wall seconds of the run so far, those before interruptions too."""
+        return self.timing().get("total", 0.0) + time.monotonic() - self._opened
 
     def close(self) -> None:
         """Close the log; the runner calls this."""

@@ -18,6 +18,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from experiments.running.history import duration
+
 PLAIN_EVERY_S = 10.0
 """Seconds between two plain lines."""
 
@@ -55,14 +57,26 @@ class Loop:
     @property
     def rate(self) -> float:
         """Steps per second; what the first call took does not count once there are others, for it compiled."""
-        completed, since = self._first_call if self.completed > self._first_call[0] else self._began
+        completed, since = self._began if self.starting else self._first_call
         elapsed_s = time.monotonic() - since
         return (self.completed - completed) / elapsed_s if elapsed_s > 0 else 0.0
+
+    @property
+    def starting(self) -> bool:
+        """Whether there was no second call yet, so that all that is known of its speed is a first that compiled."""
+        return self.completed == self._first_call[0]
 
     @property
     def left_s(self) -> float | None:
         """Seconds to its end at this rate, `None` before the first step."""
         return (self.total - self.completed) / self.rate if self.rate > 0 else None
+
+    @property
+    def left(self) -> str:
+        """The same in words, empty before the first step and at the end; "at most" while all steps seem as slow."""
+        if not self.left_s:
+            return ""
+        return f"{'at most ' if self.starting else ''}{duration(self.left_s)}"
 
 
 class RateColumn(ProgressColumn):
@@ -90,7 +104,8 @@ def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: N
     else:
         plain = _Plain(console, loop)
         yield _advance(loop, plain.look, after)
-        plain.print()
+        if plain.said != loop.completed:
+            plain.print()
 
 
 def _advance(loop: Loop, *shows: Callable[[], None]) -> Advance:
@@ -122,6 +137,8 @@ class _Plain:
     def __init__(self, console: Console, loop: Loop) -> None:
         self._console, self._loop = console, loop
         self._printed = time.monotonic()
+        self.said: int | None = None
+        """Steps that the last line told of."""
 
     def look(self) -> None:
         """Print a line if the last one is old."""
@@ -130,8 +147,8 @@ class _Plain:
 
     def print(self) -> None:
         """Print a line."""
-        self._printed, loop = time.monotonic(), self._loop
-        left = "" if loop.left_s is None else f", {loop.left_s:.0f} s left"
+        self._printed, self.said, loop = time.monotonic(), self._loop.completed, self._loop
+        left = f", {loop.left} left" if loop.left else ""
         note = f"  {loop.note}" if loop.note else ""
-        line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {loop.elapsed_s:.0f} s{left}{note}"
+        line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {duration(loop.elapsed_s)}{left}{note}"
         self._console.print(line, markup=False, highlight=False, soft_wrap=True)

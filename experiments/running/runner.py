@@ -33,11 +33,13 @@ from experiments.running.context import Context
 from experiments.running.distributed import Launch, NoTeam, Team, devices_of, joined
 from experiments.running.history import seconds_of_last
 from experiments.running.machine import Machine, MachineError, require_machine
+from experiments.running.quick import compiled_quickly
 from experiments.running.stopping import Stopped, Stopping
 from experiments.running.watcher import Watcher
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.records import RecordsError
 from sensors_io.schema import SchemaError
+from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.loop import NonFiniteGradientError
@@ -66,6 +68,7 @@ KNOWN_ERRORS = (
     DamagedFileError,
     NoTeam,
     MachineError,
+    RewardError,
     OSError,
 )
 """Whose message says all that a user needs; others come with their traceback."""
@@ -85,6 +88,7 @@ class Experiment(Generic[C]):
       scales: further configurations by name, `smoke` for one that takes under two minutes.
       curves: of each phase the scalars to draw while it runs; of a phase that is not named, the first few.
       needs: of each scale what it asks of the machine; one that is not named runs on any.
+      quick: scales whose programs run so few times that they are compiled quickly (`running/quick.py`).
       spreads: whether its training runs on the devices of all processes; others know one device.
     """
 
@@ -94,6 +98,7 @@ class Experiment(Generic[C]):
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     needs: Mapping[str, Machine] = dataclasses.field(default_factory=dict)
+    quick: tuple[str, ...] = ()
     spreads: bool = False
 
     def __post_init__(self) -> None:
@@ -106,9 +111,10 @@ class Experiment(Generic[C]):
                     "make it with dataclasses.replace from the default"
                 )
 
-        unknown = sorted(set(self.needs) - set(self.configs()))
-        if unknown:
-            raise ValueError(f"needs of {self.name} names {unknown}: must be scales; rename or drop them")
+        for field, named in (("needs", self.needs), ("quick", self.quick)):
+            unknown = sorted(set(named) - set(self.configs()))
+            if unknown:
+                raise ValueError(f"{field} of {self.name} names {unknown}: must be scales; rename or drop them")
 
     def configs(self) -> dict[str, C]:
         """Every scale's configuration."""
@@ -143,7 +149,8 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
     except ValueError as error:  # a configuration refuses its own values
         complain(f"{type(error).__name__}: {error}")
         return 2
-    return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
+    with compiled_quickly() if command.scale in module.EXPERIMENT.quick else contextlib.nullcontext():
+        return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:

@@ -51,13 +51,13 @@ def memory_table(lines: Lines, reserved: Reserved, compiler: str, layers: int) -
 
 
 def time_table(training: Training, setups: tuple[Setup, ...], machine: Machine) -> Table:
-    """Predicted seconds of a step by phase; weights gathered at every token, as the program does, or kept."""
+    """Predicted seconds of a step by phase."""
     rows: list[tuple[Cell, ...]] = []
     for setup in setups:
         shape = training.shape(setup)
-        now, stay = (seconds(shape, machine, weights_stay=kept) for kept in (False, True))
-        share = model_flops(shape) / sum(now.values()) / machine.flops / setup.mesh.devices
-        rows.append((setup.name, *now.values(), sum(now.values()), stay["sampling"], 100 * share))
+        phases = seconds(shape, machine)
+        share = model_flops(shape) / sum(phases.values()) / machine.flops / setup.mesh.devices
+        rows.append((setup.name, *phases.values(), sum(phases.values()), 100 * share))
     return Table(
         title="Predicted seconds of a step",
         columns=(
@@ -66,7 +66,6 @@ def time_table(training: Training, setups: tuple[Setup, ...], machine: Machine) 
             Column(name="sampling", unit="s"),
             Column(name="learning", unit="s"),
             Column(name="step", unit="s"),
-            Column(name="sampling, weights kept", unit="s", meaning="gathered once a step instead of at every token"),
             Column(name="share of peak", unit="%", meaning="operations that no program can avoid, over the step"),
         ),
         rows=tuple(rows),

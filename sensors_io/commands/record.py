@@ -69,7 +69,7 @@ class Record(Bench):
     out: pathlib.Path
     """Directory of the records."""
     object_id: str
-    """Of the object; give its card with labels later."""
+    """Of the object; `label` gives it labels afterwards."""
     site: int = 0
     """Number of the place on the object."""
     free_s: float = 0.0

@@ -8,8 +8,8 @@ from experiments import stability_faults
 from experiments.faults.charts import where_kills_struck
 from experiments.faults.damage import OLDER, SAME, WRONG, strike
 from experiments.faults.inputs import unfinished_run
-from experiments.faults.kills import START, STEPPING, Kill
 from experiments.faults.waiting import WaitingConfig
+from experiments.faults.watched import START, STEPPING, Kill
 from experiments.running.artifacts import read_json
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk

@@ -128,9 +128,10 @@ def grpo_bytes(
 ) -> dict[str, int]:
     """Bytes of a GRPO step on each device, line by line; shapes in place of arrays will do.
 
-    Forward passes gather a layer's weights where they use them and drop them: two layers are there at a time, the next
-    one on its way, and the heads of all policies that are compared.  Of two gradients one is the sum over
-    micro-batches.  With `remat` the backward pass keeps matrix products alone; without it about twice that.
+    Sampling gathers all weights before its first token.  Other passes gather a layer's where they use them and drop
+    them: two layers are there at a time, the next one on its way, and the heads of all policies that are compared.  Of
+    two gradients one is the sum over micro-batches.  With `remat` the backward pass keeps products with weights alone;
+    without it about twice that.
 
     Args:
       shape: sizes of the step.
@@ -152,6 +153,7 @@ def grpo_bytes(
         "gradients": 2 * held(state.params),
         "parameters in bfloat16": 2 * held(half) if shape.grpo.bfloat16 else 0,
         "gathered weights": (2 * layer + _policies(shape) * head) * shape.number,
+        "weights while sampling": _sampler_bytes(shape, (base, half if shape.grpo.bfloat16 else state.params)),
         "caches while sampling": cache_bytes(shape),
         "logits while sampling": 3 * shape.rows * shape.grpo.group * shape.decoder.vocab_size * FLOAT,
         "saved for the gradient": saved_bytes(shape),
@@ -163,7 +165,7 @@ def grpo_bytes(
 ARGUMENTS = ("frozen base", "parameters", "optimizer", "reference", "noise bank", "batch")
 """Lines of `grpo_bytes` that are arguments of the step, and must be what the compiler says."""
 
-SAMPLING = ("caches while sampling", "logits while sampling")
+SAMPLING = ("weights while sampling", "caches while sampling", "logits while sampling")
 LEARNING = ("gradients", "saved for the gradient", "attention while learning", "logits while learning")
 """Lines that are there one after the other."""
 
@@ -216,6 +218,11 @@ def logit_bytes(shape: GRPOShape) -> int:
     v = shape.decoder.vocab_size
     tokens = min(shape.grpo.group * shape.grpo.length, max(1, shape.grpo.max_logits // v))
     return 3 * _policies(shape) * shape.micro_rows * tokens * v // shape.mesh.tensor * FLOAT
+
+
+def _sampler_bytes(shape: GRPOShape, params: Params) -> int:
+    """The parameters whole along fsdp, where that axis is there: sampling gathers them once."""
+    return held_bytes(dataclasses.replace(shape.mesh, fsdp=1), params) if shape.mesh.fsdp > 1 else 0
 
 
 def _policies(shape: GRPOShape) -> int:

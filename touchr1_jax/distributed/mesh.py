@@ -18,8 +18,9 @@ class MeshConfig:
     """How data · fsdp · tensor devices share the work; the defaults are one device.
 
     Prompts are split over data and fsdp.  Parameters and optimizer state are whole along data, so that it suits slow
-    links between machines; they are split along fsdp and gathered where they are used (ZeRO-3, arXiv 1910.02054) and
-    split along tensor for good, each device computing its heads and hidden channels (Megatron-LM, arXiv 1909.08053).
+    links between machines; they are split along fsdp and gathered where they are used (ZeRO-3, arXiv 1910.02054), to
+    sample once before the first token, and split along tensor for good, each device computing its heads and hidden
+    channels (Megatron-LM, arXiv 1909.08053).
 
     Raises:
       ValueError: an axis of less than one device.

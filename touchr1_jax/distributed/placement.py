@@ -4,6 +4,7 @@ The steps of all stages, (state, batch, …) → (state, metrics), stay as they 
 program that they trace to by the shardings of its arguments and results.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -15,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding
 
-from touchr1_jax.distributed.rules import activation_axes, batch_shardings, state_shardings, whole
+from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, state_shardings, whole
 from touchr1_jax.models.layers import RMSNorm
+from touchr1_jax.rl.holding import holding
 
 LAYERS = (nn.Dense, nn.Embed, RMSNorm)
 """Layers whose results are held in place; what lies between follows from them."""
@@ -107,12 +109,17 @@ def shard_step(
     plain = inspect.unwrap(step)  # a jitted step would bring along a trace from before, or of another mesh
 
     def on_mesh(*arguments: Any) -> tuple[Any, dict[str, jax.Array]]:
-        with split_activations(mesh):
+        with split_activations(mesh), holding(functools.partial(gathered, mesh)):
             return plain(*arguments)
 
     results = (placed, whole(mesh))
     options = None if compiler_options is None else dict(compiler_options)
     return jax.jit(on_mesh, in_shardings=given, out_shardings=results, donate_argnums=0, compiler_options=options)
+
+
+def gathered(mesh: Mesh, params: Any) -> Any:
+    """Parameters of a traced program, gathered along fsdp; what reads them after that exchanges none."""
+    return jax.tree.map(jax.lax.with_sharding_constraint, params, gathered_shardings(mesh, params))
 
 
 def split_activations(mesh: Mesh) -> AbstractContextManager[None]:

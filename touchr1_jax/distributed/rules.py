@@ -90,6 +90,13 @@ def state_shardings(mesh: AnyMesh, state: Any, *, large_bytes: int = LARGE_BYTES
     return jax.tree_util.tree_map_with_path(place, state)
 
 
+def gathered_shardings(mesh: AnyMesh, params: Any) -> Any:
+    """Sharding of parameters that are whole along fsdp, as a layer multiplies with them; in the same tree."""
+    whole_along = lambda axis: None if axis == FSDP else axis
+    gathered = lambda placed: NamedSharding(mesh, PartitionSpec(*map(whole_along, placed.spec)))
+    return jax.tree.map(gathered, state_shardings(mesh, params))
+
+
 def batch_shardings(mesh: AnyMesh, batch: Any) -> Any:
     """Sharding of every leaf of a batch, in the same tree: split along its first dimension.
 

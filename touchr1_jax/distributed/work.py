@@ -48,21 +48,19 @@ class Machine:
     link_share: float = 0.7
 
 
-def grpo_work(shape: GRPOShape, *, weights_stay: bool = False) -> dict[str, Work]:
+def grpo_work(shape: GRPOShape) -> dict[str, Work]:
     """Work of a step on each device; the optimizer's is too little to count.
 
-    Args:
-      shape: the step.
-      weights_stay: whether the sampler gathers its weights once, instead of at every token.
+    What prompts gather, sampling finds there.
     """
     return {
         "prompts": _prompts(shape),
-        "sampling": _sampling(shape, weights_stay=weights_stay),
+        "sampling": _sampling(shape),
         "learning": _learning(shape),
     }
 
 
-def seconds(shape: GRPOShape, machine: Machine, *, weights_stay: bool = False) -> dict[str, float]:
+def seconds(shape: GRPOShape, machine: Machine) -> dict[str, float]:
     """Time of each phase: the longest of computing, reading and gathering, which may overlap, and the sums beside it.
 
     Neighbours on the mesh are neighbours in a machine: an axis that fits into one, behind the axes after it, exchanges
@@ -78,7 +76,7 @@ def seconds(shape: GRPOShape, machine: Machine, *, weights_stay: bool = False) -
         gathering = work.gathered_bytes / (gather_rate * machine.link_share)
         return max(computing, reading, gathering) + work.summed_bytes / (sum_rate * machine.link_share)
 
-    return {name: of(work) for name, work in grpo_work(shape, weights_stay=weights_stay).items()}
+    return {name: of(work) for name, work in grpo_work(shape).items()}
 
 
 def model_flops(shape: GRPOShape) -> float:
@@ -95,7 +93,7 @@ def _prompts(shape: GRPOShape) -> Work:
     return Work(flops / shape.mesh.tensor, _local(shape), _gathered(shape, 1), _summed(shape, tokens))
 
 
-def _sampling(shape: GRPOShape, *, weights_stay: bool) -> Work:
+def _sampling(shape: GRPOShape) -> Work:
     """Token by token: all weights are read for each, and the keys of a prompt once for its whole group."""
     c, g = shape.decoder, shape.grpo
     rollouts = shape.rows * g.group
@@ -103,9 +101,7 @@ def _sampling(shape: GRPOShape, *, weights_stay: bool) -> Work:
     flops += rollouts * _attention(shape, 1, g.length, shape.prompt_tokens)
     keys = shape.rows * (shape.prompt_tokens + g.group * g.length / 2) * c.num_layers * 2 * c.num_kv_heads * c.head_dim
     read = g.length * (_local(shape) + keys * shape.number / shape.mesh.tensor)
-    gathers = 1 if weights_stay else g.length
-    tensor = shape.mesh.tensor
-    return Work(flops / tensor, read, _gathered(shape, gathers), _summed(shape, rollouts * g.length))
+    return Work(flops / shape.mesh.tensor, read, 0.0, _summed(shape, rollouts * g.length))
 
 
 def _learning(shape: GRPOShape) -> Work:

@@ -42,6 +42,11 @@ class Agent:
         """Encode any batch of single streams; arguments as in `TactileViT`."""
         return self._apply(params, Policy.encode_streams, *stream)
 
+    def with_context(self, change: Callable[[Params], Params]) -> "Agent":
+        """The agent with parameters that are no argument changed; this one has none."""
+        del change
+        return self
+
     @property
     def touch_start(self) -> int:
         """First prompt token that any touch can change: a tactile token or a sensor's name."""

@@ -40,6 +40,14 @@ def _as_dot_general(x: Array, w: Array, dimensions: Any, precision: Any = None) 
     return linear(x, w)
 
 
+def product_with_weights(primitive: Primitive, *_: Any, **__: Any) -> bool:
+    """Policy of rematerialisation: the backward pass keeps results of `linear` and computes all else again.
+
+    JAX's own policies know `dot_general` alone; what is no weight, such as the scores of attention, is not kept.
+    """
+    return primitive is linear_p
+
+
 class Dense(nn.Dense):
     """Flax's dense layer, x W + b, by `linear`."""
 

@@ -15,7 +15,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
-from touchr1_jax.models.linear import Dense, Embed
+from touchr1_jax.models.linear import Dense, Embed, product_with_weights
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class DecoderLayer(nn.Module):
 
 Rematerialised = nn.remat(
     DecoderLayer,
-    policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+    policy=product_with_weights,
     methods=("over_prompt", "over_end", "over_completion"),
 )
 """A layer of which the backward pass keeps matrix products with weights alone.  Layer by layer: the recomputation waits

@@ -138,6 +138,10 @@ class LoraAgent(Agent):
     base: Params
     lora: LoraConfig
 
+    def with_context(self, change: Callable[[Params], Params]) -> "LoraAgent":
+        """The agent on a changed base."""
+        return dataclasses.replace(self, base=change(self.base))
+
     def _apply(self, params: Trainable, method: Callable[..., Any], *args: Any) -> Any:
         with adapted(params.adapters, self.lora):
             return self.policy.apply({"params": {**self.base, **params.towers}}, *args, method=method)

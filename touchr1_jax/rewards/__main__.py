@@ -87,11 +87,12 @@ class Explain:
             reading = read(language, self.text)
             asked = self._asked(language, reading)
             streams = self._streams(language, reading)
-            labels = self._labels(language, asked)
+            targets = ((w, _target(language, asked, label, streams)) for w, label in self._labels(language, asked))
+            parsed = self._parsed(reading)
+            earned = terms_table(rewards, weights, parsed, targets)
         except ValueError as error:
             _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
             return 1
-        parsed = self._parsed(reading)
         there = [s.name for s, is_there in zip(language.sensors, streams, strict=True) if is_there]
         console.print(slots_table(language, reading))
         if max(map(max, (*reading.perceive, reading.compare, reading.conclude))) < 0:
@@ -99,8 +100,7 @@ class Explain:
         console.print(f"formatted: {format_fault(language, self.text, reading)}")
         console.print(f"length: {parsed.length}, truncated: {'yes' if self.truncated else 'no'}")
         console.print(f"sensors that touched: {', '.join(there) or 'none'}")
-        targets = ((words, _target(language, asked, label, streams)) for words, label in labels)
-        console.print(terms_table(rewards, weights, parsed, targets))
+        console.print(earned)
         return 0
 
     def _asked(self, language: Language, reading: Reading) -> tuple[str, ...]:

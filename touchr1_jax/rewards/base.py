@@ -1,13 +1,22 @@
 """What a reward is, and how rewards add up."""
 
 import math
+import traceback
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+from jax.errors import ConcretizationTypeError, TracerArrayConversionError
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax.types import Parsed, Target
+
+UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError)
+"""What JAX raises where Python or NumPy wants to know a number that the compiled program will compute."""
+
+
+class RewardError(ValueError):
+    """A reward or a weight that does not fit; the message names it, its value, the constraint and the fix."""
 
 
 def always(target: Target) -> Bool[Array, ""]:
@@ -46,12 +55,13 @@ def total_reward(
       R, and what each weighted reward adds to it: the parts sum to R.
 
     Raises:
-      ValueError: an unknown name, a weight that is negative or not finite, or none above 0.
-      TypeError: a reward that is no floating scalar, or whose `applies` is no boolean scalar.
+      RewardError: an unknown name, a weight that is negative or not finite, or none above 0; a reward that is no
+        floating scalar, whose `applies` is no boolean scalar, or that cannot be traced.
+      Exception: any other of a reward, with a note of its name.
     """
     check_weights(rewards, weights)
-    values = {name: _scalar(name, "value", rewards[name].value(parsed, target), jnp.floating) for name in weights}
-    applies = {name: _scalar(name, "applies", rewards[name].applies(target), jnp.bool_) for name in weights}
+    values = {name: _scalar(name, "value", jnp.floating, rewards[name].value, parsed, target) for name in weights}
+    applies = {name: _scalar(name, "applies", jnp.bool_, rewards[name].applies, target) for name in weights}
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
     in_force = sum(share.values())
     scale = jnp.where(in_force > 0, sum(weights.values()) / jnp.where(in_force > 0, in_force, 1.0), 0.0)
@@ -63,26 +73,39 @@ def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -
     """Hold the names and sizes of weights against the rewards that there are.
 
     Raises:
-      ValueError: an unknown name, a weight that is negative or not finite, or none above 0.
+      RewardError: an unknown name, a weight that is negative or not finite, or none above 0.
     """
     for name, weight in weights.items():
         if name not in rewards:
-            raise ValueError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
+            raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
         if not (math.isfinite(weight) and weight >= 0):
-            raise ValueError(
+            raise RewardError(
                 f"weights[{name}] is {weight}: must be finite and ≥ 0; let a penalty have a negative value"
             )
     if not any(weights.values()):
-        raise ValueError(f"weights is {dict(weights)}: at least one must be above 0; give a reward some weight")
+        raise RewardError(f"weights is {dict(weights)}: at least one must be above 0; give a reward some weight")
 
 
-def _scalar(name: str, part: str, value: Any, kind: type) -> Any:
-    """The value itself, if it is a scalar of that kind."""
-    shape, dtype = jnp.shape(value), jnp.result_type(value)
-    if shape != () or not jnp.issubdtype(dtype, kind):
+def _scalar(name: str, part: str, kind: type, function: Callable[..., Any], *of: Parsed | Target) -> Any:
+    """What a part of a reward gives, if it is a scalar of that kind."""
+    try:
+        value = function(*of)
+    except UNTRACEABLE as error:
+        line = traceback.extract_tb(error.__traceback__)[1]  # below this function stands the reward's
+        raise RewardError(
+            f"reward {name!r}: {part} cannot be traced, {line.filename}:{line.lineno} wants to know a number that is "
+            "computed later; choose with jnp.where instead of `if`, compute with jnp instead of numpy or float(), or "
+            "score on the host with rl.scoring.make_host_score"
+        ) from error
+    except Exception as error:
+        error.add_note(f"raised by reward {name!r}, its {part}")
+        raise
+    number = isinstance(value, (jnp.ndarray, jnp.generic, bool, int, float))
+    shape, dtype = (jnp.shape(value), jnp.result_type(value)) if number else ((), None)
+    if shape != () or dtype is None or not jnp.issubdtype(dtype, kind):
+        got = f"has type {dtype}{list(shape)}" if number else f"is {value!r}"
         wanted = "bool[]" if kind is jnp.bool_ else "float[]"
-        raise TypeError(
-            f"reward {name!r}: {part} has type {dtype}{list(shape)}, must be {wanted}; "
-            "reduce it to one number per rollout and cast it"
+        raise RewardError(
+            f"reward {name!r}: {part} {got}, must be {wanted}; return one number per rollout, of that type"
         )
     return value

@@ -26,6 +26,7 @@ from touchr1_jax.rl import tactile_use
 from touchr1_jax.rl.advantages import added_after, batch_advantage, degenerate, group_advantage, livelier_first
 from touchr1_jax.rl.config import Algorithm, GRPOConfig, TactileUse
 from touchr1_jax.rl.counterfactual import drop_touch, mask_one_stream, noise_touch, shuffle_touch, swap_touch
+from touchr1_jax.rl.holding import held
 from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metrics, touch_metrics
 from touchr1_jax.rl.objective import Experience, GRPOBatch, at_precision, objective_gradient
 from touchr1_jax.rl.rollout import SampleConfig, sample
@@ -148,7 +149,8 @@ class _Engine:
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
         control_key = jax.random.fold_in(key, 2)
-        group, control_metrics = self.explore(state.params, batch, fixed, sample_key, control_key)
+        sampler = dataclasses.replace(self, agent=self.agent.with_context(held))
+        group, control_metrics = sampler.explore(state.params, batch, fixed, sample_key, control_key)
         reference = fixed.reference if state.reference is None else state.reference
         learn = self.experience(group, fixed, mask_key)
         params, opt_state, parts = self.update(state, reference, learn)
@@ -160,7 +162,7 @@ class _Engine:
         self, params: Params, batch: GRPOBatch, fixed: Fixed, key: Array, control_key: Array
     ) -> tuple[Group, dict[str, Array]]:
         """Sample and score; with R_tu also under every control.  Of the candidates the lively groups are kept."""
-        params = at_precision(self.config, params)
+        params = held(at_precision(self.config, params))
         prompts = encode_prompts(self.agent, params, batch)
         rollout = sample_prompts(self.agent, params, prompts, key, self._draw(self.config.group))
         reward, terms, parsed = self._scored(rollout, batch.target)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from touchr1_jax.rewards.base import Reward, total_reward
+from touchr1_jax.rewards.base import Reward, RewardError, total_reward
 from touchr1_jax.types import Parsed, Target
 
 ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, Array], Parsed]]
@@ -28,7 +28,7 @@ def make_score(
     """Score by weighted rewards (see `rewards.base.total_reward`), each proved finite when the step is traced.
 
     Raises (when traced):
-      ValueError: a reward that gives NaN or infinity for some answer; it names the reward and the answer.
+      RewardError: a reward that gives NaN or infinity for some answer; it names the reward and the answer.
     """
 
     def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
@@ -86,7 +86,7 @@ def check_finite(name: str, reward: Reward, sensors: int, attributes: int) -> No
     """Try a reward on the corners of what answers and targets can be; once for each reward and size.
 
     Raises:
-      ValueError: NaN or infinity.
+      RewardError: NaN or infinity.
     """
     with jax.ensure_compile_time_eval():
         answers, targets = _corner_answers(sensors, attributes), _corner_targets(sensors, attributes)
@@ -96,7 +96,7 @@ def check_finite(name: str, reward: Reward, sensors: int, attributes: int) -> No
     if len(bad):
         a, t = bad[0]
         say = lambda tree, i: jax.tree.map(lambda x: np.asarray(x)[i].tolist(), tree)
-        raise ValueError(
+        raise RewardError(
             f"reward {name!r} is {values[a, t]} for {say(answers, a)} against {say(targets, t)}: must be finite "
             "everywhere; choose with jnp.where before you divide or take logarithms"
         )

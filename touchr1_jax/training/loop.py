@@ -64,6 +64,12 @@ class LoopTime:
     total_s: float = 0.0
     input_s: float = 0.0
 
+    def add(self, step_s: float, waited_s: float) -> None:
+        """One more step: what it took, and how much of that it waited."""
+        self.steps += 1
+        self.total_s += step_s
+        self.input_s += waited_s
+
     @property
     def input_share(self) -> float:
         """Share of the time that waited for data; 0 where no step was timed."""
@@ -85,8 +91,9 @@ def fit(
 ) -> Any:
     """Run `step` to `config.steps`, continuing from the newest checkpoint where there is one.
 
-    The metrics of step t are fetched after step t + 1 has been dispatched, so the device never waits for the host.
-    Resuming restores state and data iterator together: the result equals the uninterrupted run's bit for bit.
+    Step t is dispatched, then batch t + 1 is made, then the metrics of step t − 1 are fetched: all of it while the
+    device computes, so that it waits for none of it, and after a save the next batch is there.  Resuming restores state
+    and data iterator together: the result equals the uninterrupted run's bit for bit.
 
     Args:
       step: jitted (state, batch) → (state, metrics); it may donate its state.
@@ -107,11 +114,14 @@ def fit(
         start, state = resume(state, batches, checkpoints)
     times = LoopTime() if times is None else times
     lines = _LateLines(log, config.most_skipped, _skipped_before(state))
+    batch = next(batches) if start < config.steps else None
     for t in range(start, config.steps):
         began = time.perf_counter()
-        batch = next(batches)
-        waited_s = time.perf_counter() - began if lines.idle() else 0.0
         state, metrics = step(state, batch)
+        place, asked = batches.get_state(), time.perf_counter()
+        if t + 1 < config.steps:
+            batch = next(batches)
+        waited_s = time.perf_counter() - asked if _computed(metrics) else 0.0
         if t == start:
             return_memory()  # the step is compiled by now
         lines.put(_Line(t, metrics, count_skipped(state)))
@@ -120,11 +130,9 @@ def fit(
         if due or leaving:
             lines.flush()
             score = held_out(state) if due and held_out is not None else None
-            checkpoints.save(t + 1, state, batches.get_state(), score)
+            checkpoints.save(t + 1, state, place, score)
         if t > start:
-            times.steps += 1
-            times.total_s += time.perf_counter() - began
-            times.input_s += waited_s
+            times.add(time.perf_counter() - began, waited_s)
         if leaving:
             break
     return state
@@ -159,11 +167,6 @@ class _LateLines:
         self._log, self._most, self._skipped = log, most_skipped, skipped
         self._pending: _Line | None = None
 
-    def idle(self) -> bool:
-        """Whether the device is done with the last step."""
-        arrays: list[Any] = [] if self._pending is None else list(self._pending.metrics.values())
-        return all(array.is_ready() for array in arrays)
-
     def put(self, line: _Line) -> None:
         """Log the line before this one."""
         self.flush()
@@ -189,6 +192,11 @@ class _LateLines:
                 f"{self._most} in a row may be left out: lower the learning rate, or look at what the batches from "
                 f"step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
             )
+
+
+def _computed(metrics: dict[str, Any]) -> bool:
+    """Whether the device is done with the step of these metrics."""
+    return all(array.is_ready() for array in metrics.values())
 
 
 def _skipped_before(state: Any) -> int:

@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.encoder import pretrain as module
 from experiments.encoder.data import TouchConfig, watched
 from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain, starting_from, untrained
-from experiments.encoder.variants import FieldsOnly, variants
+from experiments.encoder.variants import STUDIED, FieldsOnly, variants
 from experiments.running.context import Context, read_metrics
 from sensors_io.pipeline import make_clip
 from tests.experiments import tiny
@@ -103,3 +103,8 @@ def test_variants_say_how_many_tokens_they_have():
     assert tokens["64 tokens"] == tokens["4 frames by salience"] == tokens["56²"] == tokens["fields"] == 64
     assert tokens["8 patches"] == tokens["32 tokens"] == tokens["4 frames, 8 patches"] == 32
     assert (tokens["4 patches"], tokens["4 patches and the rest"]) == (16, 20)
+
+
+def test_one_variant_is_the_encoder_of_the_studies():
+    studied = next(v.config for v in variants(PretrainConfig(frames=8)) if v.name == STUDIED)
+    assert (studied.encoder, studied.frames_kept) == (PretrainConfig().encoder, PretrainConfig().frames)

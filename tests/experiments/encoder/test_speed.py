@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.encoder.speed import matrix_product, medians, parts
+from experiments.encoder.speed import MATRIX, by_contact, matrix_product, medians, parts
 from tests.experiments import tiny
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
@@ -46,5 +46,17 @@ def test_the_last_part_is_the_whole_encoder(rest):
     np.testing.assert_allclose(programs["transformer"].call(), whole, rtol=1e-4, atol=1e-5)
 
 
-def test_times_are_positive():
-    assert medians({"product": matrix_product()}, 2)["product"] > 0
+def test_arithmetic_is_that_of_all_contacts():
+    """XLA counts a loop's body once: as many contacts must be so many times as much work, the products by hand."""
+    weights = jnp.ones((5, 7))
+    read = lambda w, b: jax.lax.map(lambda frames: frames.reshape(-1, 5) @ w, b.frames.astype(jnp.float32))
+    few, many = (by_contact(read, weights, touched(p=p, px=10)) for p in (1, 4))
+    rows = 2 * 3 * 10 * 10 * 3 // 5
+    np.testing.assert_allclose(few.gflop, 2e-9 * rows * 5 * 7, rtol=0.1)  # and some for the cast to float
+    np.testing.assert_allclose(many.gflop, 4 * few.gflop)
+
+
+def test_the_yardstick_is_one_product():
+    product = matrix_product()
+    np.testing.assert_allclose(product.gflop, 2e-9 * MATRIX**3)
+    assert medians({"product": product}, 2)["product"] > 0

@@ -2,10 +2,11 @@
 
 import json
 
-import numpy as np
 import pytest
 
-from experiments.faults.kills import ALONE, PHASES, Campaign, KillConfig, Victim, differences, evidence, look
+from experiments.faults.evidence import differences, evidence
+from experiments.faults.kills import ALONE, Campaign, KillConfig
+from experiments.faults.watched import PHASES, Victim, look
 
 LINE = json.dumps({"stage": "sft/0", "step": 3, "loss": 1.0}) + "\n"
 
@@ -21,8 +22,7 @@ LINE = json.dumps({"stage": "sft/0", "step": 3, "loss": 1.0}) + "\n"
 )
 def test_whole_lines_and_a_torn_one_are_told_apart(tmp_path, text, lines, last, torn):
     (tmp_path / "metrics.jsonl").write_text(text)
-    seen = look(tmp_path)
-    assert (seen.lines, seen.last, seen.torn, seen.answers) == (lines, last, torn, 0)
+    assert look(tmp_path) == (lines, last, torn)
 
 
 def test_a_run_that_has_not_begun_holds_nothing(tmp_path):
@@ -34,20 +34,36 @@ def test_what_differs_is_named():
     assert differences({"a": "1"}, {"a": "1"}) == ()
 
 
-@pytest.mark.parametrize("changed", [{"kills": 0}, {"startup_share": 1.0}, {"life_s": 0.0}])
+@pytest.mark.parametrize("changed", [{"kills": 0}, {"startup_share": 1.0}])
 def test_kills_that_cannot_be_are_refused(changed):
     with pytest.raises(ValueError, match="needs kills"):
         KillConfig(**changed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "phase", "steps"), [("counting", "count", 16), ("reinforcing", "grpo", 24)])
+@pytest.mark.parametrize(("name", "phase", "steps"), [("counting", "count", 60), ("reinforcing", "grpo", 40)])
 def test_killed_training_ends_in_the_same_bits(tmp_path, name, phase, steps):
+    """Though the kills are counted by two callers, of which the first is gone after one."""
     victim = Victim(name=name, options=("--steps", str(steps)), steps={phase: steps})
-    campaign = Campaign(tmp_path / "home", tmp_path / "cache", victim, KillConfig(kills=3, life_s=0.3))
+    campaign = Campaign(tmp_path / "home", tmp_path / "cache", victim, KillConfig(kills=3))
     alone = campaign.left_alone()
-    kills = campaign.killed("killed", 3, np.random.default_rng(0))
-    assert not differences(evidence(alone), evidence(campaign.directory("killed")))
-    assert 0 < len(kills) <= 3
+    assert alone.evidence == evidence(campaign.directory(ALONE))
+    assert alone.lines == steps
+
+    class Gone(Exception):
+        """The first caller is no more."""
+
+    kept = []
+
+    def keep(struck):
+        kept[:] = struck
+        raise Gone
+
+    with pytest.raises(Gone):
+        campaign.killed(0, 3, alone, keep=keep)
+    assert len(kept) == 1
+    kills = campaign.killed(0, 3, alone, before=kept)
+    assert kills == campaign.killed(0, 3, alone, before=kills)  # it has ended, and is not begun anew
+    assert not differences(alone.evidence, evidence(campaign.directory("0")))
+    assert 1 < len(kills) <= 3
     assert all(kill.phase in PHASES and 0 <= kill.done <= 1 for kill in kills)
-    assert campaign.directory(ALONE) == alone

@@ -5,7 +5,7 @@ import pytest
 from experiments.policies import assembly
 from experiments.policies.assembly import prove_rewards
 from experiments.policies.scores import PUBLISHED
-from touchr1_jax.rewards import Reward
+from touchr1_jax.rewards import Reward, RewardError
 
 
 def test_the_published_rewards_pass():
@@ -13,20 +13,18 @@ def test_the_published_rewards_pass():
 
 
 @pytest.mark.parametrize(
-    ("reward", "error", "message"),
+    ("reward", "message"),
     [
-        (Reward(lambda p, t: p.conclude * 1.0), TypeError, r"reward 'mine': value has type float32\[4\]"),
-        (Reward(lambda p, t: 1.0 / p.length), ValueError, r"reward 'mine' is inf .*must be finite everywhere"),
+        (Reward(lambda p, t: p.conclude * 1.0), r"reward 'mine': value has type float32\[4\]"),
+        (Reward(lambda p, t: 1.0 / p.length), r"reward 'mine' is inf .*must be finite everywhere"),
     ],
 )
-def test_a_reward_that_does_not_fit_is_named_with_its_arm(monkeypatch, reward, error, message):
+def test_a_reward_that_does_not_fit_is_named_with_its_arm(monkeypatch, reward, message):
     monkeypatch.setattr(assembly, "make_rewards", lambda prior: {"mine": reward})
-    with pytest.raises(error, match=message) as caught:
+    with pytest.raises(RewardError, match=rf"{message}.* \(in the weights of arm 'good', {{'mine': 0.5}}\)"):
         prove_rewards({"good": {"mine": 0.5}})
-    assert caught.value.__notes__[-1] == "in the weights of arm 'good', {'mine': 0.5}"
 
 
 def test_an_unknown_reward_is_answered_with_the_known_ones():
-    with pytest.raises(ValueError, match="no reward is called 'brevty'; choose from accuracy") as caught:
+    with pytest.raises(RewardError, match=r"no reward is called 'brevty'; choose from accuracy.* of arm 'mine'"):
         prove_rewards({"published": PUBLISHED, "mine": {"brevty": 1.0}})
-    assert "'mine'" in caught.value.__notes__[0]

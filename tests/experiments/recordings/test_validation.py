@@ -46,7 +46,7 @@ def test_constants_are_the_training_modes():
 
 def test_a_table_has_a_line_for_each_method():
     table = score_table("t", [Row(name="right", answer=LABEL)], LABEL, OBJECTS)
-    assert table.rows[0][:3] == ("right", 100.0, "100.0 to 100.0")
+    assert table.rows[0][:3] == ("right", 100.0, "100.0–100.0")
 
 
 def test_agreement_counts_pairs_of_one_object():

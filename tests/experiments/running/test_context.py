@@ -79,16 +79,39 @@ def test_timing_adds_up_and_survives_an_error(context):
     assert context.timing()["sft/0"] >= first
 
 
+def test_the_time_of_a_run_counts_what_came_before_an_interruption(context):
+    assert 0 < context.elapsed_s < 60
+    context.add_time("total", 1000.0)
+    assert 1000 < context.elapsed_s < 1060
+
+
 def test_progress_writes_plain_lines_where_there_is_no_terminal(context, monkeypatch):
     monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
     with context.progress("sft [0]", 4, completed=2) as advance:
         advance(1, "loss 0.5")
         advance()
-    lines = context.console.file.getvalue().splitlines()
-    assert lines[0].startswith("sft [0]: 3/4")
-    assert "s left" in lines[0]
-    assert lines[0].endswith("loss 0.5")
-    assert lines[-1].startswith("sft [0]: 4/4")
+    first, last = context.console.file.getvalue().splitlines()
+    assert first.startswith("sft [0]: 3/4")
+    assert " left" in first
+    assert first.endswith("loss 0.5")
+    assert last.startswith("sft [0]: 4/4")
+    assert " left" not in last
+
+
+def test_the_first_step_bounds_the_time_left_and_later_ones_tell_it(monkeypatch):
+    """The first compiled for 60 s; those after it take 2 s each."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    loop = progress.Loop("sft", 11)
+    assert (loop.left_s, loop.left) == (None, "")
+    now = 60.0
+    loop.advance(1)
+    assert (loop.left_s, loop.left) == (600.0, "at most 10 min 0 s")
+    now = 62.0
+    loop.advance(1)
+    assert (loop.rate, loop.left) == (0.5, "18 s")
+    loop.advance(9)
+    assert loop.left == ""
 
 
 def test_progress_draws_a_bar_on_a_terminal():

@@ -15,7 +15,7 @@ from rich.console import Console
 from experiments.running import distributed
 from experiments.running.context import Context
 from experiments.running.distributed import ALONE, Devices, Launch, NoTeam, Spread, Team, devices_of, joined
-from tests import conftest
+from experiments.running.quick import OLDER_LOOPS
 from tests.touchr1_jax.distributed.problems import ROWS, feed, words
 from touchr1_jax.distributed.mesh import MeshConfig
 
@@ -114,7 +114,7 @@ def test_a_step_on_a_mesh_is_the_step():
 def start(folder: Path, *arguments: str) -> subprocess.Popen:
     """A tiny study in a process that compiles quickly, as the tests do; all share the generated data."""
     environment = {
-        "XLA_FLAGS": conftest.QUICKLY,
+        "XLA_FLAGS": OLDER_LOOPS,
         "JAX_PLATFORMS": "cpu",
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     }
@@ -157,7 +157,7 @@ def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path):
     """
     name = "ablation_ordinal"
     finish(start(tmp_path / "one", name))
-    stopped = two(tmp_path / "two", name, code=143, struck=("--strike", "3"))
+    stopped = two(tmp_path / "two", name, code=143, struck=("--strike", "4"))
     assert all("Stopped by SIGTERM" in said for said in stopped)
     folders = [tmp_path / run / name for run in ("one", "two")]
     assert [(line["stage"], line["step"]) for line in lines_of(folders[1])] == [("sft/0", 0), ("sft/0", 1)]

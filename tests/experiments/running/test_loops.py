@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 from experiments.faults import counting
+from experiments.faults.evidence import differences, evidence
 from experiments.faults.inputs import counting_paths, run_directory
-from experiments.faults.kills import differences, evidence
 from experiments.running.artifacts import read_json
 from experiments.running.loops import run_loop
 from experiments.running.runner import main
@@ -38,12 +38,12 @@ def test_waiting_is_kept_with_the_wall_times(whole):
     ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
 def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_path, capsys, monkeypatch, number, code):
-    """Step 5 of 12, of which every fourth is saved: nothing that was computed is computed again."""
+    """Step 5 of 12, while the batch of step 6 is made; every fourth is saved: nothing computed is computed again."""
     made = counting.targets
 
     class Struck:
         def __init__(self, config):
-            self._targets, self._left = made(config), 6
+            self._targets, self._left = made(config), 7
 
         def __next__(self):
             self._left -= 1

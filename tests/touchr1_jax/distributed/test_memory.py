@@ -36,6 +36,16 @@ def test_arguments_by_hand():
     assert lines["parameters"] == lines["reference"] == 4 * numbers
     assert lines["optimizer"] == 2 * 4 * numbers + 4
     assert lines["noise bank"] == 64 * 2 * 4 * 64 * 4
+    assert lines["weights while sampling"] == 0
+
+
+def test_sampling_holds_all_weights_of_its_share_of_the_heads():
+    """Split in halves along tensor, whole along fsdp, but for what both leave whole: norms and outer biases."""
+    alone, step = tiny_step(1, MeshConfig())
+    lines = grpo_bytes(tiny_step(1, MeshConfig(fsdp=8, tensor=2))[0], step.state, step.batch, step.fixed)
+    whole = grpo_bytes(alone, step.state, step.batch, step.fixed)["parameters"]
+    norms = 3 * 64
+    assert lines["weights while sampling"] == whole / 2 + 4 * norms / 2
 
 
 def test_caches_and_saved_products_by_hand():
@@ -48,8 +58,9 @@ def test_caches_and_saved_products_by_hand():
 
 
 def test_phases_do_not_add_up():
-    """Of sampling, 3 + 4, and learning, 1 + 2 + 5 + 6, the larger counts."""
+    """Of sampling, 3 + 4 + 0, and learning, 1 + 2 + 5 + 6, the larger counts."""
     lines = {
+        "weights while sampling": 0,
         "caches while sampling": 3,
         "logits while sampling": 4,
         "gradients": 1,

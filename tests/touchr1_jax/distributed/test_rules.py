@@ -12,7 +12,13 @@ from jax.sharding import PartitionSpec as P
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.distributed.problems import PROBLEMS
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.rules import activation_axes, batch_shardings, rule, state_shardings
+from touchr1_jax.distributed.rules import (
+    activation_axes,
+    batch_shardings,
+    gathered_shardings,
+    rule,
+    state_shardings,
+)
 from touchr1_jax.models.frame_decoder import FrameDecoder, FrameDecoderConfig
 from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.qwen.config import released
@@ -71,6 +77,14 @@ def test_adapters_lie_as_the_layers_that_they_change(seven):
     assert found["decoder/layers_0/q_proj/a"] == P("fsdp", None)
     assert found["decoder/layers_0/q_proj/b"] == P(None, "tensor")
     assert found["decoder/layers_0/mlp/down/a"] == P("tensor", None)
+
+
+def test_gathered_parameters_keep_their_share_of_the_heads(seven):
+    layer = {"layers_0": seven["decoder"]["layers_0"]}
+    found = gathered_shardings(MESH, layer)["layers_0"]
+    assert found["q_proj"]["kernel"].spec == P(None, "tensor")
+    assert found["o_proj"]["kernel"].spec == P("tensor", None)
+    assert found["q_proj"]["bias"].spec == P("tensor")
 
 
 def test_the_frame_decoder_is_named():

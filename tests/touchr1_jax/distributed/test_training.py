@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests import conftest
+from experiments.running.quick import OLDER_LOOPS
 from tests.touchr1_jax.distributed.problems import PROBLEMS, STEPS, feed
 from tests.touchr1_jax.distributed.worker import SAVE_AT, plain_losses
 from touchr1_jax.training.checkpoint import Checkpoints
@@ -23,7 +23,7 @@ MESHES = {"data": "8,1,1", "fsdp": "1,8,1", "tensor": "1,1,4", "mixed": "2,2,2"}
 
 def start(problem: str, mesh: str, directory: Path, devices: int, *process: str) -> subprocess.Popen:
     """A worker on simulated devices, compiling quickly as the tests do."""
-    flags = f"{conftest.QUICKLY} --xla_force_host_platform_device_count={devices}"
+    flags = f"{OLDER_LOOPS} --xla_force_host_platform_device_count={devices}"
     environment = {
         "XLA_FLAGS": flags,
         "JAX_PLATFORMS": "cpu",
@@ -106,3 +106,17 @@ def test_two_processes_over_loopback(problem, tmp_path):
         assert found["rows_read"] == 4
     with Checkpoints(tmp_path / "checkpoints") as checkpoints:
         assert checkpoints.restore(PROBLEMS[problem]().state).step == STEPS
+
+
+@pytest.mark.slow
+def test_sampling_exchanges_nothing_token_by_token():
+    """Weights are gathered before the loop; all prompts are one micro-batch, so that no other loop exchanges any."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "tests.touchr1_jax.distributed.exchanges"]
+    environment = os.environ | flags
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 0, done.stderr[-4000:]
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["loops"]
+    assert not any(found["loops"].values())
+    assert found["all"] > 20

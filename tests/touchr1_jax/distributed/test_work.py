@@ -55,12 +55,10 @@ def test_devices_share_the_operations(mesh):
     assert model_flops(shape(mesh)) == pytest.approx(model_flops(shape()))
 
 
-def test_weights_that_stay_are_gathered_once():
-    split = shape(MeshConfig(fsdp=8, tensor=2))
-    every, once = (grpo_work(split, weights_stay=kept)["sampling"] for kept in (False, True))
-    assert every.gathered_bytes == 16 * once.gathered_bytes
-    assert once.gathered_bytes == 4 * (layer_weights(ONE) + head_weights(ONE)) / 2 * 7 / 8
-    assert every[:2] == once[:2]
+def test_what_prompts_gather_is_there_for_sampling():
+    work = grpo_work(shape(MeshConfig(fsdp=8, tensor=2)))
+    assert work["prompts"].gathered_bytes == 4 * (layer_weights(ONE) + head_weights(ONE)) / 2 * 7 / 8
+    assert work["sampling"].gathered_bytes == 0
 
 
 def test_a_phase_takes_what_is_longest_and_then_its_sums(monkeypatch):
@@ -68,7 +66,7 @@ def test_a_phase_takes_what_is_longest_and_then_its_sums(monkeypatch):
         flops=10.0, read_bytes=5.0, near_bytes=4.0, far_bytes=1.0, flops_share=1.0, read_share=1.0, link_share=1.0
     )
     work = {"learning": Work(flops=100.0, read_bytes=10.0, gathered_bytes=20.0, summed_bytes=8.0)}
-    monkeypatch.setattr("touchr1_jax.distributed.work.grpo_work", lambda shape, weights_stay: work)
+    monkeypatch.setattr("touchr1_jax.distributed.work.grpo_work", lambda shape: work)
     near, far = shape(MeshConfig(fsdp=4, tensor=2)), shape(MeshConfig(fsdp=8, tensor=2))
     assert seconds(near, machine)["learning"] == 100 / 10 + 8 / 4
     assert seconds(far, machine)["learning"] == 20 / 1 + 8 / 4  # beyond one machine the weights take longest

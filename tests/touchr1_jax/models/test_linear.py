@@ -7,9 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import linen as nn
+from jax.extend.core import jaxprs_in_params
 
-from touchr1_jax.models.linear import Dense, Embed, linear
+from touchr1_jax.models.layers import mrope
+from touchr1_jax.models.linear import Dense, Embed, linear, linear_p
+from touchr1_jax.models.lm import DecoderConfig, DecoderLayer, Rematerialised
 
+DECODER = DecoderConfig(vocab_size=16)
 RNG = np.random.default_rng(0)
 X, W = (jnp.asarray(RNG.normal(size=shape), jnp.float32) for shape in ((2, 3, 5, 4), (4, 6)))
 
@@ -60,6 +64,26 @@ def test_the_weight_gradient_is_one_contraction_over_all_rows():
     assert found == ("0", "0")
     plain = str(jax.make_jaxpr(jax.grad(lambda w: batched(jnp.matmul, w, X)))(W))
     assert "[0, 1, 2], [0, 1, 2]" in plain
+
+
+def products(jaxpr) -> int:
+    """How often a program multiplies with weights, in all that it calls."""
+    inner = [jaxpr for eqn in jaxpr.eqns for jaxpr in jaxprs_in_params(eqn.params)]
+    return sum(eqn.primitive is linear_p for eqn in jaxpr.eqns) + sum(map(products, inner))
+
+
+def test_rematerialised_layers_multiply_with_no_weight_twice():
+    """The backward pass keeps what they make of weights; of a policy that keeps nothing the count is larger."""
+    x, mask = jnp.ones((5, DECODER.hidden_size)), jnp.ones(5, bool)
+    rotation = mrope(jnp.zeros((3, 5), jnp.int32), DECODER.head_dim, DECODER.mrope_section, DECODER.rope_theta)
+    nothing = nn.remat(DecoderLayer, methods=("over_prompt",))
+    found = []
+    for kind in (DecoderLayer, Rematerialised, nothing):
+        layer = kind(DECODER)
+        params = layer.init(jax.random.key(0), x, rotation, mask, method="over_prompt")
+        cost = lambda p, layer=layer: jnp.sum(layer.apply(p, x, rotation, mask, method="over_prompt")[0] ** 2)
+        found.append(products(jax.make_jaxpr(jax.grad(cost))(params).jaxpr))
+    assert found[0] == found[1] < found[2]
 
 
 def test_types_are_joined_and_kept():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.rewards.examples import constant, make_parsed, make_target
-from touchr1_jax.rewards import Reward, make_rewards, total_reward
+from touchr1_jax.rewards import Reward, RewardError, make_rewards, total_reward
 from touchr1_jax.types import Parsed, Target
 
 PRIOR = np.array([[1 / 3] * 3 + [0] * 6, [1 / 3] * 3 + [0] * 6, [1 / 9] * 9])
@@ -101,7 +101,7 @@ def test_every_reward_is_a_scalar(name):
     ],
 )
 def test_bad_weights_are_named(weights, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(RewardError, match=message):
         total(weights, constant(0), make_target())
 
 
@@ -119,8 +119,24 @@ def test_bad_weights_are_named(weights, message):
             Reward(lambda p, t: jnp.ones(()), lambda t: 1.0),
             r"reward 'mine': applies has type float32\[\], must be bool",
         ),
+        (Reward(lambda p, t: None), r"reward 'mine': value is None, must be float\[\]; return one number"),
+        (
+            Reward(lambda p, t: 1.0 if p.length > 5 else 0.0),
+            r"reward 'mine': value cannot be traced, .*test_total\.py:\d+ wants .*jnp\.where .*make_host_score",
+        ),
+        (
+            Reward(lambda p, t: np.mean(np.asarray(p.conclude))),
+            r"reward 'mine': value cannot be traced, .*jnp instead",
+        ),
     ],
 )
 def test_bad_rewards_fail_when_traced(reward, message):
-    with pytest.raises(TypeError, match=message):
+    with pytest.raises(RewardError, match=message):
         jax.eval_shape(lambda p, t: total_reward({"mine": reward}, {"mine": 1.0}, p, t), constant(0), make_target())
+
+
+def test_an_error_inside_a_reward_says_whose_it_is():
+    slip = Reward(lambda p, t: p.lenght)
+    with pytest.raises(AttributeError, match=r"has no attribute 'lenght'") as caught:
+        total_reward({"mine": slip}, {"mine": 1.0}, constant(0), make_target())
+    assert caught.value.__notes__ == ["raised by reward 'mine', its value"]

@@ -1,0 +1,52 @@
+"""What a run came to, as hashes: two runs that ended in the same bits have the same."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from experiments.running.artifacts import read_json
+
+
+def evidence(directory: Path) -> dict[str, str]:
+    """SHA-256 of all that a run came to: log lines, answers, what every stage kept at its end, results."""
+    found = {"metrics.jsonl": _hash((directory / "metrics.jsonl").read_bytes())}
+    for path in sorted((directory / "answers").glob("*.npz")):
+        found[f"answers/{path.name}"] = _hash(path.read_bytes())
+    results = read_json(directory / "results.json")
+    found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
+    checkpoints = directory / "checkpoints"
+    for stage in sorted(path.parent for path in checkpoints.rglob("*") if path.name.isdigit() and _holds_state(path)):
+        kept = sorted((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+        found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
+    return found
+
+
+def differences(a: Mapping[str, str], b: Mapping[str, str]) -> tuple[str, ...]:
+    """What two runs came to differently."""
+    return tuple(sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name)))
+
+
+def _holds_state(path: Path) -> bool:
+    return (path / "state").is_dir()
+
+
+def _state_hash(checkpoint: Path) -> str:
+    """Of step, data iterator, score and every array of a checkpoint."""
+    with ocp.StandardCheckpointer() as checkpointer:
+        state = checkpointer.restore(checkpoint / "state")
+    digest = hashlib.sha256(checkpoint.name.encode() + (checkpoint / "data" / "metadata").read_bytes())
+    score = checkpoint / "metrics" / "metrics"  # beside it Orbax writes its own path
+    digest.update(score.read_bytes() if score.exists() else b"")
+    for path, array in jax.tree.leaves_with_path(state):
+        bits = jax.random.key_data(array) if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else array
+        digest.update(jax.tree_util.keystr(path).encode() + np.asarray(bits).tobytes())
+    return digest.hexdigest()
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,53 @@
+"""Cards of objects that are recorded already, given labels and splits afterwards: all of them or none."""
+
+import os
+import pathlib
+from collections.abc import Iterable
+
+from sensors_io.codec import decode_card, encode_card
+from sensors_io.index import Index
+from sensors_io.records import write_lock
+from sensors_io.schema import ObjectCard, SchemaError
+from sensors_io.shards import Entries, ShardWriter
+
+
+def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> None:
+    """Put cards in the place of those with the same ids; contacts stay as they are.
+
+    One new shard holds the cards of all objects; the index that names it replaces the old one in one step, and only
+    then the old shards go: a killed process leaves the old cards or the new ones.
+
+    Args:
+      path: directory of the records.
+      cards: the new ones.
+
+    Raises:
+      SchemaError: a card of an object that the records do not hold.
+      RecordsError: records that are missing, damaged, or being written.
+    """
+    root = pathlib.Path(path)
+    Index.read(root)  # before a lock file is made where there are no records
+    with write_lock(root):
+        index = Index.read(root)
+        stored = Entries(root, index.object_shards)
+        known = {name: stored.decode(i, decode_card) for i, name in enumerate(index.objects)}
+        new = {card.object_id: card for card in cards}
+        strange = sorted(set(new) - set(known))
+        if strange:
+            raise SchemaError(
+                f"object_id is {strange[0]!r}: {root} holds {_some(known)}; correct it or record it first"
+            )
+        shard = ShardWriter(root, index.next_objects)
+        for card in {**known, **new}.values():
+            shard.write(encode_card(card))
+        old = index.object_shards
+        index.object_shards = [shard.publish()]
+        index.write(root)
+        for one in old:
+            (root / one.file).unlink()
+
+
+def _some(names: Iterable[str], most: int = 8) -> str:
+    """The first few names."""
+    listed = list(names)
+    return ", ".join(listed[:most]) + (f" and {len(listed) - most} more" if len(listed) > most else "")
