@@ -2,8 +2,11 @@
 
 import hashlib
 import json
+import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -37,15 +40,23 @@ def _holds_state(path: Path) -> bool:
 
 def _state_hash(checkpoint: Path) -> str:
     """Of step, data iterator, score and every array of a checkpoint."""
-    with ocp.StandardCheckpointer() as checkpointer:
-        state = checkpointer.restore(checkpoint / "state")
     digest = hashlib.sha256(checkpoint.name.encode() + (checkpoint / "data" / "metadata").read_bytes())
     score = checkpoint / "metrics" / "metrics"  # beside it Orbax writes its own path
     digest.update(score.read_bytes() if score.exists() else b"")
-    for path, array in jax.tree.leaves_with_path(state):
-        bits = jax.random.key_data(array) if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key) else array
-        digest.update(jax.tree_util.keystr(path).encode() + np.asarray(bits).tobytes())
+    for path, array in jax.tree.leaves_with_path(_arrays(checkpoint / "state")):
+        digest.update(jax.tree_util.keystr(path).encode() + array.tobytes())
     return digest.hexdigest()
+
+
+def _arrays(state: Path) -> Any:
+    """The arrays of a saved state on the host, without the file that says which devices held them: it may be damaged,
+    and training that names its own devices goes on all the same.
+    """
+    with tempfile.TemporaryDirectory() as home, ocp.PyTreeCheckpointer() as checkpointer:
+        path = shutil.copytree(state, Path(home) / "state", ignore=shutil.ignore_patterns("_sharding"))
+        tree = checkpointer.metadata(path).item_metadata.tree
+        as_array = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
+        return checkpointer.restore(path, restore_args=as_array)
 
 
 def _hash(content: bytes) -> str:
