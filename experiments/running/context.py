@@ -230,7 +230,10 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
 def _whole_lines(path: Path) -> list[str]:
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    except UnicodeDecodeError as error:
+        raise _damaged(path, str(error)) from error
     return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
 
 
@@ -238,10 +241,12 @@ def _row(line: str, path: Path) -> dict[str, Any]:
     try:
         row: dict[str, Any] = json.loads(line)
     except ValueError as error:
-        raise DamagedFileError(
-            f"{path} is damaged ({error} in {line[:80]!r}): put a copy back, or start the run anew with --fresh"
-        ) from error
+        raise _damaged(path, f"{error} in {line[:80]!r}") from error
     return row
+
+
+def _damaged(path: Path, how: str) -> DamagedFileError:
+    return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start the run anew with --fresh")
 
 
 def _before(row: dict[str, Any], stage: str, step: int) -> bool:

@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from experiments.running import progress
+from experiments.running.artifacts import DamagedFileError
 from experiments.running.context import Context, MetricLog, read_metrics
 
 
@@ -120,3 +121,12 @@ def test_progress_draws_a_bar_on_a_terminal():
         advance(2, "reward 0.5")
     assert "2/2" in console.file.getvalue()
     assert "reward 0.5" in console.file.getvalue()
+
+
+@pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])
+def test_a_log_with_a_flipped_byte_is_named(context, flipped):
+    context.log("sft/0", 0, loss=1.0)
+    path = context.directory / "metrics.jsonl"
+    path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
+    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start the run anew with --fresh"):
+        read_metrics(context.directory)
