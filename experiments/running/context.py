@@ -148,6 +148,20 @@ class Context:
             self._loops.remove(loop)
         self._looping()
 
+    def require_logged(self, stage: str, steps: int) -> None:
+        """Hold the log to a checkpoint: every step before it is there, so that no run ends with a part of its log.
+
+        Raises:
+          DamagedFileError: a line is missing.
+        """
+        if steps == 0 or not self.team.leads:
+            return
+        seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
+        missing = sorted(set(range(steps)) - seen)
+        if missing:
+            how = f"of stage {stage} {len(missing)} of {steps} steps are missing, the first is {missing[0]}"
+            raise _damaged(self.directory / "metrics.jsonl", how)
+
     def _looping(self) -> None:
         for watcher in self._watchers:
             watcher.looping(self._loops)

@@ -49,6 +49,7 @@ def run_loop(
         context.stopping.patient(context.team.any) as stopping,
     ):
         start, state = resume(state, batches, checkpoints)
+        context.require_logged(stage, start)
         context.rewind(stage, start)
         write = make_log(context, stage, start)
         with context.progress(stage, loop.steps, min(start, loop.steps)) as advance:

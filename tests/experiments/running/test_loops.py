@@ -108,3 +108,17 @@ def test_damage_is_told_to_the_reader_and_costs_the_steps_since(whole, tmp_path,
     assert run(tmp_path) == 0
     assert "is kept as damaged-12" in capsys.readouterr().out
     assert not differences(evidence(run_directory(whole)), evidence(directory))
+
+
+@pytest.mark.parametrize("kept", [0, 5], ids=["emptied", "cut"])
+def test_no_run_ends_with_a_part_of_its_log(tmp_path, capsys, kept):
+    assert run(tmp_path) == 0
+    directory = run_directory(tmp_path)
+    (directory / "results.json").unlink()
+    log = directory / "metrics.jsonl"
+    log.write_text("".join(log.read_text().splitlines(keepends=True)[:kept]))
+    assert run(tmp_path) != 0
+    said = capsys.readouterr().err
+    assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in said
+    assert "put a copy back, or start the run anew with --fresh" in said
+    assert not (directory / "results.json").exists()
