@@ -31,7 +31,7 @@ def where_kills_struck(kills: Mapping[str, Sequence[Kill]]) -> bytes:
             phase.annotate(f"{total:.0f}", (total, y), (3, 0), textcoords="offset points", va="center", fontsize=8)
         phase.set(xlabel="kills", xlim=(0, 1.12 * max(left, default=1)))
         phase.grid(axis="y", visible=False)
-        phase.legend(fontsize=8, loc="lower right")
+        figure.legend(*phase.get_legend_handles_labels(), fontsize=8, loc="outside upper left", ncols=len(kills))
         share.set(xlabel="steps of the run done, %", ylabel="kills", xlim=(0, 100))
         share.grid(axis="x", visible=False)
         return svg(figure)
