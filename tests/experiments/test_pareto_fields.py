@@ -11,6 +11,7 @@ from experiments.fields.depth_methods import MAPS
 from experiments.fields.depth_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
 from experiments.fields.motion_frames import Rest
 from experiments.fields.motion_subjects import Subject, subject
+from experiments.reporting import pareto
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 from sensors_io.calibration.circles import find_circles
@@ -128,7 +129,9 @@ def test_what_is_anchored_does_not_drift(monkeypatch):
         motion_drift.DriftConfig(cycles=(1, 2))
 
 
-def test_the_chart_of_maps_is_titled_by_its_sensor_and_names_the_package_s_map():
+def test_the_chart_of_maps_is_titled_by_its_sensor_and_names_the_package_s_map(monkeypatch):
+    names: list[str] = []
+    monkeypatch.setattr(pareto, "name_points", lambda axes, points: names.extend(p.name for p in points))
     error = depth_balls.BallErrors(
         depth_um=np.array([4.0, 6.0]), radius_share=np.array([0.01, 0.03]), tip_mm=np.array([0.5, 0.7])
     )
@@ -136,4 +139,4 @@ def test_the_chart_of_maps_is_titled_by_its_sensor_and_names_the_package_s_map()
     picture = depth_balls.map_picture(dict.fromkeys(kinds, error), dict.fromkeys(kinds, 1.0), "bench")
     assert picture.title == "Picture to depth on real presses (bench)"
     assert picture.name == "depth-bench"
-    assert f"this: {depth_balls.PACKAGE}" in picture.content.decode()
+    assert sorted(names) == sorted(["colour table", "perceptron", f"this: {depth_balls.PACKAGE}"])
