@@ -118,7 +118,7 @@ def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> 
     kills: list[Kill] = []
     differs: list[str] = []
     number = 0
-    with context.progress(f"killing the {name}", config.kills) as advance:
+    with context.progress(f"killing the {name}", config.kills, _struck_before(stage, context)) as advance:
         while len(kills) < config.kills:
             here = f"{stage}/{number}"
             if not context.done(here):
@@ -132,13 +132,20 @@ def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> 
     return Killed(kills=tuple(kills), runs=number, differs=tuple(differs))
 
 
+def _struck_before(stage: str, context: Context) -> int:
+    """Kills that struck a victim's runs in earlier sessions of this experiment."""
+    number, before = 0, 0
+    while context.done(here := f"{stage}/{number}"):
+        before, number = before + len(context.load_stage(here)["kills"]), number + 1
+    return before + (len(context.load_stage(f"{here}-struck")) if context.done(f"{here}-struck") else 0)
+
+
 def _one_run(
     campaign: Campaign, here: str, number: int, kills: int, alone: Alone, context: Context, advance: Advance
 ) -> tuple[Kill, ...]:
     """Kills of one run, each of which is kept at once."""
     stage = f"{here}-struck"
     before = [Kill(**kill) for kill in context.load_stage(stage)] if context.done(stage) else []
-    advance(len(before))
 
     def keep(struck: tuple[Kill, ...]) -> None:
         context.save_stage(stage, struck)

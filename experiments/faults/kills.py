@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.faults.evidence import evidence
-from experiments.faults.watched import Kill, Session, Victim, look, only
+from experiments.faults.watched import START, Kill, Session, Victim, look, only
 from experiments.running import runs
 
 ALONE = "alone"
@@ -23,13 +23,8 @@ RECORDS = "scenes-*"
 class KillConfig:
     """How many kills strike, and when.
 
-    A share of them strikes uniformly within the time that the last start-up took.  The others strike uniformly within
-
-        2 W (1 − d) / (k + 1)
-
-    seconds after the first thing that a session adds to its run, of which a share d is done, while k kills are left and
-    the run that was left alone worked for W seconds: sessions get on by as much as lets the kills last for the whole
-    run, however slow the machine is meanwhile, and even the last kill comes before the end.
+    A share of them strikes uniformly within the time that the last start-up took, the others within
+    `Pace.most_life_s` of the first thing that a session adds to its run.
 
     Args:
       kills: how many.
@@ -47,6 +42,44 @@ class KillConfig:
                 f"{self}: needs kills ≥ 1 and 0 ≤ startup_share < 1, else no session gets anywhere; correct what is "
                 "outside"
             )
+
+
+class Pace:
+    """What the lives of sessions so far say about the next: shares of the run a second, and a share lost by each kill.
+
+    Args:
+      work_s: seconds that the run worked when it was left alone; lives soon weigh more.
+    """
+
+    def __init__(self, work_s: float) -> None:
+        self._gained, self._worked_s = _ALONE_WEIGHS, _ALONE_WEIGHS * work_s
+        self._lost: list[float] = []
+
+    def most_life_s(self, done: float, left: int) -> float:
+        """Longest time for which a session works before it is killed, 2 min((1 − d) / (k + 1) + l, .45 (1 − d)) / v.
+
+        A kill loses what was done since the last checkpoint, a share l of the run.  With lives uniform up to this
+        bound, sessions keep on average as much as lets the kills last for the whole run, and even the last kill comes
+        before the end.
+
+        Args:
+          done: d, share of the run that the session finds done.
+          left: k, kills that are left.
+        """
+        lost = float(np.mean(self._lost)) if self._lost else 0.0
+        share = min((1 - done) / (left + 1) + lost, 0.45 * (1 - done))
+        return 2 * share * self._worked_s / self._gained
+
+    def went_on(self, reached: float, done: float) -> None:
+        """A session found a share of the run done, of which the one before had reached more."""
+        self._lost.append(max(0.0, reached - done))
+
+    def lived(self, gained: float, worked_s: float) -> None:
+        """A session added a share of the run in so many seconds."""
+        self._gained, self._worked_s = self._gained + max(0.0, gained), self._worked_s + worked_s
+
+
+_ALONE_WEIGHS = 0.05  # share of a run that counts from the one that was left alone
 
 
 class Alone(NamedTuple):
@@ -101,11 +134,13 @@ class Campaign:
           before: those that have struck already, in an earlier session of the caller.
           keep: told after each kill of all that have struck.
         """
-        struck = tuple(before)
+        struck, pace = tuple(before), Pace(alone.work_s)
         while not self._ended(number):
             session = self._session(str(number))
             left = kills - len(struck)
-            kill = session.kill(alone.lines) if left > 0 and self._wait(session, alone, number, left) else None
+            reached = next((kill.done for kill in reversed(struck) if kill.phase != START), 0.0)
+            lives = left > 0 and self._wait(session, alone, number, left, pace, reached)
+            kill = session.kill(alone.lines) if lives else None
             if kill is None:
                 session.finish()
             else:
@@ -129,13 +164,18 @@ class Campaign:
                 shutil.copytree(records, own / records.name)
         return Session(self._victim, self._home / name, self._programs)
 
-    def _wait(self, session: Session, alone: Alone, number: int, left: int) -> bool:
-        """Sleep until a random moment of the session's life; whether it lives then."""
+    def _wait(self, session: Session, alone: Alone, number: int, left: int, pace: Pace, reached: float) -> bool:
+        """Sleep until a random moment of the session's life; whether it lives then.  Earlier ones reached a share."""
         rng = np.random.default_rng((self._config.seed, number, left))
         if rng.random() < self._config.startup_share:
             return session.sleep_until(rng.uniform(0, self._startup_s))
         if not session.wait_for_work():
             return False
-        self._startup_s = session.age_s
-        to_do = max(0.0, 1 - session.seen().lines / alone.lines)
-        return session.sleep_until(session.age_s + rng.uniform(0, 2 * alone.work_s * to_do / (left + 1)))
+        self._startup_s, done = session.age_s, self._done(session, alone)
+        pace.went_on(reached, done)
+        lives = session.sleep_until(self._startup_s + rng.uniform(0, pace.most_life_s(done, left)))
+        pace.lived(self._done(session, alone) - done, session.age_s - self._startup_s)
+        return lives
+
+    def _done(self, session: Session, alone: Alone) -> float:
+        return min(session.seen().lines / alone.lines, 1.0)

@@ -2,10 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from experiments.faults.evidence import differences, evidence
-from experiments.faults.kills import ALONE, Campaign, KillConfig
+from experiments.faults.kills import ALONE, Campaign, KillConfig, Pace
 from experiments.faults.watched import PHASES, Victim, look
 
 LINE = json.dumps({"stage": "sft/0", "step": 3, "loss": 1.0}) + "\n"
@@ -38,6 +39,43 @@ def test_what_differs_is_named():
 def test_kills_that_cannot_be_are_refused(changed):
     with pytest.raises(ValueError, match="needs kills"):
         KillConfig(**changed)
+
+
+def struck_at(kills, steps, save_every, speed, *, seed=0):
+    """Shares of a run at which kills strike that each lose what was done since the last checkpoint."""
+    rng, step, reached, struck = np.random.default_rng(seed), 0, 0, []
+    pace = Pace(work_s=10.0)
+    while len(struck) < kills:
+        pace.went_on(reached / steps, step / steps)
+        life_s = rng.uniform(0, pace.most_life_s(step / steps, kills - len(struck)))
+        reached = step + int(speed * life_s / 10 * steps)
+        if reached >= steps:
+            break
+        pace.lived((reached - step) / steps, life_s)
+        step = reached - reached % save_every
+        struck.append(reached / steps)
+    return np.asarray(struck)
+
+
+@pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])  # against the run that was left alone
+@pytest.mark.parametrize("save_every", [5, 20])
+def test_kills_strike_the_whole_run_though_each_loses_work(speed, save_every):
+    struck = struck_at(200, 2000, save_every, speed)
+    assert len(struck) == 200  # in one run
+    tenths = np.histogram(struck, 10, (0, 1))[0]
+    assert tenths.max() < 60
+    assert (tenths >= 4).sum() >= 8
+
+
+def test_a_last_life_ends_before_the_run_and_one_of_many_is_its_share():
+    pace = Pace(work_s=10.0)
+    assert pace.most_life_s(0.0, 1) == pytest.approx(9.0)
+    assert pace.most_life_s(0.5, 49) == pytest.approx(0.2)
+    pace.went_on(0.52, 0.5)
+    assert pace.most_life_s(0.5, 49) == pytest.approx(0.6)
+    assert pace.most_life_s(1.0, 3) == 0.0
+    pace.lived(0.05, 1.5)  # a third of the speed
+    assert pace.most_life_s(0.5, 49) == pytest.approx(1.2)
 
 
 @pytest.mark.slow
