@@ -11,7 +11,7 @@ of touch in place: no touch, noise of the sensors' statistics, another object's 
 Cost: two minutes of one core after `main_table`, whose policies it asks, some 36 without; `--scale smoke` under two.
 
 Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
-its fellows; the full model is right about as often as elsewhere.  Touch is worth about 20 points over every control
+its fellows; the full model is right in more than half of them.  Touch is worth about 35 points over every control
 but the order of the frames of a press, which says next to nothing.
 """
 

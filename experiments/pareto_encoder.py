@@ -122,15 +122,13 @@ def learn(config: Config, variant: Variant, data: Dataset, context: Context, nam
     store = FieldsOnly(data.store) if variant.fields else data.store
     rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
     state = pretrain(variant.config, store, rows, data.clip, context, stage=stage, seed=SEED)
-    answers = context.directory / "probes" / f"{name}.npy"
-    if not answers.exists():
+    if not context.done(answers := f"probes/{name}"):
         clip = clip_of(variant.config, data.clip)
         both = np.concatenate([data.parts["val"], data.parts["test"]])
         unseen = dataclasses.replace(watched(data, "test", config.touch), store=store, clip=clip, read_rows=both)
         found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen)
-        answers.parent.mkdir(exist_ok=True)
-        np.save(answers, found)
-    right = np.load(answers)
+        context.save_stage(answers, found)
+    right = np.array(context.load_stage(answers))
     context.say(f"{variant.name}: {100 * right.mean():.1f} %")
     return state.target, right
 

@@ -23,6 +23,9 @@ class TactileViTConfig:
     A frame of H × W pixels is read by `stem_px` cells first, then by patches of `patch_cells` cells; `frames_per_step`
     frames make one time step.  With the defaults 4 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
 
+    The `energy` stem sums the energy of its filters over each patch (see `patch_tokens`).  The `linear` one is a vision
+    transformer's plain patch embedding, of the pixels and of their change; `stem_width` is not used then.
+
     A `causal` encoder lets a step see itself and earlier ones alone, as the prediction of the next step needs.  With
     `patches_kept` the transformer gets only the patches of a stream that change most, the same ones in every step; the
     `rest` is dropped before its pixels are read, or kept as one mean token of each step.
@@ -33,6 +36,7 @@ class TactileViTConfig:
     num_layers: int = 2
     num_heads: int = 3
     mlp_ratio: int = 2
+    stem: Literal["energy", "linear"] = "energy"
     stem_px: int = 4
     stem_width: int = 16
     patch_cells: int = 7
@@ -176,7 +180,7 @@ def patch_tokens(
 ) -> Float[Array, "*n step patch D"]:
     """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
 
-    The stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
+    The energy stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
 
     Args:
       frames: pixel values 0..255.
@@ -189,6 +193,10 @@ def patch_tokens(
     *lead, f = frames.shape[:-3]
     x = cut_patches(frames, c, kept)
     patches = x.shape[-3]
+    embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
+    if c.stem == "linear":
+        x = x.reshape(*lead, f, patches, -1).astype(jnp.float32) / 127.5 - 1.0
+        return embed(jnp.concatenate([x, x - x[..., :1, :, :]], -1), "patch")
     # one long matrix: XLA's CPU gradient of a dense layer over many leading axes is seven times slower
     x = x.reshape(-1, 3 * c.stem_px**2).astype(jnp.float32) / 127.5 - 1.0
     x = nn.Dense(2 * c.stem_width, name="stem")(x)
@@ -198,7 +206,6 @@ def patch_tokens(
     moved = log_energy(change)
     energy = jnp.concatenate([texture, texture - texture[..., :1, :, :], moved, change.mean(-2)], -1)
     x = nn.relu(level + 4.0 * change).reshape(*lead, f, patches, -1)
-    embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
     return embed(x, "patch") + embed(energy, "energy")
 
 

@@ -32,10 +32,10 @@ class Patches(nn.Module):
         return patch_tokens(frames, self.config)
 
 
-@pytest.fixture(scope="module")
-def patches():
-    """Jitted frames [F, H, W, 3] → tokens [step, patch, D]."""
-    module = Patches()
+@pytest.fixture(scope="module", params=["energy", "linear"])
+def patches(request):
+    """Jitted frames [F, H, W, 3] → tokens [step, patch, D], of either stem."""
+    module = Patches(dataclasses.replace(CONFIG, stem=request.param))
     frames = jnp.zeros((F, H, W, 3))
     params = module.init(jax.random.key(0), frames)
     return jax.jit(lambda x: module.apply(params, x))
@@ -79,6 +79,19 @@ def test_the_first_frame_is_what_changes_are_measured_from(patches):
     touched[0, 1, 1] += 50
     changed = np.any(np.asarray(patches(touched) != patches(frames)), -1)
     np.testing.assert_array_equal(changed, [[True] + [False] * 5] * 2)  # its patch, in every step
+
+
+def test_the_plain_patch_embedding_by_hand():
+    """Pixels and their change since the first frame, on a scale of −1 to 1, times one matrix."""
+    module = Patches(dataclasses.replace(CONFIG, stem="linear"))
+    frames = np.random.default_rng(2).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
+    params = module.init(jax.random.key(0), jnp.asarray(frames))
+    kernel, bias = (np.asarray(params["params"]["patch"][name]) for name in ("kernel", "bias"))
+    cells = lambda f: [frames[f, y : y + 2, 8 + x : 10 + x].ravel() / 127.5 - 1 for y in (4, 6) for x in (0, 2)]
+    pixels, first = (np.concatenate(cells(f)) for f in (3, 0))
+    third = np.concatenate(cells(2))
+    row = np.concatenate([third, third - first, pixels, pixels - first])  # both frames of the second step
+    np.testing.assert_allclose(module.apply(params, jnp.asarray(frames))[1, 5], row @ kernel + bias, rtol=1e-4)
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 10, 3), (4, 6, 12, 3), (3, 8, 12, 3)])
