@@ -7,11 +7,11 @@ parameters, as 3 and 14 billion are of 7 in the paper's figure.  Every size is t
 published rewards and grounding, on the same scenes, questions and seeds, and answers the bench's questions about the
 test objects; beside it a policy of its size without touch.  Learning rates and steps are the default size's.
 
-Cost: some 15 minutes of one core with three seeds, GRPO shortened to a third; the default size's SFT is shared with
-other experiments; `--scale smoke` under one minute.
+Cost: some 45 minutes of one core with three seeds and their data, GRPO shortened to a third; the default size's SFT is
+shared with other experiments; `--scale smoke` under one minute.
 
-Expected: on 2,400 objects a few points from the smallest to the default, and little beyond: the encoder's probe stands
-above every policy here (`main_table`), so that data and decoding, not size, hold answers back.
+Expected: on 2,400 objects some five points from the smallest to the default, and nothing beyond: the encoder's probe
+stands above every policy here (`main_table`), so that data and decoding, not size, hold answers back.
 """
 
 import dataclasses
@@ -49,6 +49,7 @@ from experiments.reporting.results import Estimate, Results, RolloutExample
 from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from touchr1_jax.bench.items import Ask
+from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
@@ -196,14 +197,15 @@ def verdict(
     for metric in DRAWN:
         growth = by.get((POLICIES[FULL], metric))
         if growth is not None:
-            low, high = growth.slope.low, growth.slope.high
+            slope = growth.slope
             said.append(
-                f"A doubling changes its {metric} by {growth.slope.mean:+.3g} [{low:.3g}, {high:.3g}] ({growth.sign})."
+                f"A doubling of the parameters changes its {REPORTED[metric].title} by {slope.mean:+.2g} "
+                f"[{slope.low:.2g}, {slope.high:.2g}] ({growth.sign})."
             )
     claimed = [by[key] for m in CLAIMED if (key := (POLICIES[FULL], m)) in by]
     if claimed:
         count = sum(g.sign == "better" for g in claimed)
-        said.append(f"Of {len(claimed)} metrics that the paper says grow clearly, {count} do so here beyond chance.")
+        said.append(f"Of the {len(claimed)} metrics that grow clearly in the paper, {count} here beyond chance.")
     return tuple(said)
 
 
