@@ -2,11 +2,17 @@
 
 import contextlib
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Control-C, and what a scheduler sends before it takes the machine away."""
+
+
+AGAIN_S = 0.01
+"""Until `Stopped` is raised again where it was lost."""
 
 
 class Stopped(BaseException):
@@ -18,7 +24,11 @@ class Stopped(BaseException):
 
 
 class Stopping:
-    """The first of `SIGNALS` raises `Stopped`, at once or when a patient block ends; a second one ends the process."""
+    """The first of `SIGNALS` raises `Stopped`, at once or when a patient block ends; a second one ends the process.
+
+    A signal may strike within a callback of the garbage collector, of which JAX has one, or within a `__del__`.  Python
+    reports what is raised there and goes on; `Stopped` is then raised again a moment later.
+    """
 
     def __init__(self) -> None:
         self._number: int | None = None
@@ -28,9 +38,14 @@ class Stopping:
     def listening(self) -> Iterator[None]:
         """Hear the signals inside the block; only a process's main thread can."""
         before = {n: signal.signal(n, self._hear) for n in SIGNALS}
+        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._again)
+        report = sys.unraisablehook
+        sys.unraisablehook = lambda lost: self._lost(lost, report)
         try:
             yield
         finally:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            sys.unraisablehook = report
             for n, handler in before.items():
                 signal.signal(n, handler)
 
@@ -68,3 +83,14 @@ class Stopping:
         self._number = number
         if not self._patient:
             raise Stopped(number)
+
+    def _lost(self, lost: Any, report: Callable[[Any], Any]) -> None:
+        if isinstance(lost.exc_value, Stopped):
+            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+        else:
+            report(lost)
+
+    def _again(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self._number is not None and not self._patient:
+            raise Stopped(self._number)

@@ -1,6 +1,8 @@
 """Signals: at once where nothing is lost by it, after the step inside a loop, for good the second time."""
 
+import gc
 import signal
+import time
 
 import pytest
 
@@ -88,3 +90,44 @@ def test_handlers_come_back():
     with Stopping().listening():
         assert [signal.getsignal(n) for n in SIGNALS] != before
     assert [signal.getsignal(n) for n in SIGNALS] == before
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_stop_that_the_garbage_collector_swallows_is_raised_again(times):
+    """Its callbacks, and `__del__`, cannot raise: Python would report the stop, and the run would go on."""
+    asked = []
+
+    def strike(phase, info):
+        if phase == "stop" and len(asked) < times:
+            asked.append(info)
+            if len(asked) == 1:
+                signal.raise_signal(signal.SIGTERM)
+            else:
+                time.sleep(1.0)  # the stop comes again while it is within
+
+    def collect_for(seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            gc.collect()
+
+    gc.callbacks.append(strike)
+    try:
+        with pytest.raises(Stopped, match="SIGTERM"), Stopping().listening():
+            collect_for(5.0)
+    finally:
+        gc.callbacks.remove(strike)
+    assert len(asked) == times
+
+
+def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
+    said = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: said.append(lost.exc_value))
+
+    class Broken:
+        def __del__(self):
+            raise OSError("the disk is gone")
+
+    with Stopping().listening():
+        broken = Broken()
+        del broken
+    assert [str(x) for x in said] == ["the disk is gone"]
