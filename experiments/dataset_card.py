@@ -89,8 +89,8 @@ def _findings(
         verdict=(
             f"{len(items):,} questions about {len(shown)} objects that no training contact shows pass all "
             f"{len(checks)} checks; the rules removed {len(found.removed)}.",
-            f"Of {len(items[:: max(1, len(items) // config.faulty)])} items with a planted fault each rule names at least "
-            f"{100 * min(caught.values()):.1f} %.",
+            f"Of {len(items[:: max(1, len(items) // config.faulty)])} items with a planted fault each rule names at "
+            f"least {100 * min(caught.values()):.1f} %.",
             f"In {100 * odd:.0f} % of the questions the sensors' numbers, each read by one threshold, do not say the "
             "answer: these stay, or the bench would hold only what a threshold can answer.",
         ),
