@@ -20,6 +20,7 @@ from sensors_io.commands.record import Record
 from sensors_io.commands.records import Check, List
 from sensors_io.commands.sync import Sync
 from sensors_io.commands.view import View
+from sensors_io.commands.zero import Zero
 from sensors_io.devices.errors import DeviceError
 from sensors_io.fields.sources import SourceError
 from sensors_io.fields.types import CalibrationError
@@ -39,6 +40,7 @@ Command = (
     | Annotated[Geometry, tyro.conf.subcommand("geometry")]
     | Annotated[Devices, tyro.conf.subcommand("devices")]
     | Annotated[Record, tyro.conf.subcommand("record")]
+    | Annotated[Zero, tyro.conf.subcommand("zero")]
     | Annotated[ForceZeroing, tyro.conf.subcommand("force-zero")]
     | Annotated[Sync, tyro.conf.subcommand("sync")]
     | Annotated[View, tyro.conf.subcommand("view")]

@@ -22,6 +22,8 @@ class CalibrateConfig:
       most_misfit: share of a press's change that a ball may leave unexplained.
       most_saturated: share of the contact's pixels with a channel at 255.
       most_drift: grey levels that a picture may differ from the background by its median, which contact hardly moves.
+      window_mm: between which the longer side of the pictures must lie at their pitch; the four sensors show 15 to 31
+        mm, and of 14 to 30 mm a pitch that is wrong by a factor of 3 makes too little or too much.
       contact_radii: between which the median contact radius must lie, in ball radii.
       most_depth_um, most_radius: held-out errors beyond which nothing was learnt.
     """
@@ -31,6 +33,7 @@ class CalibrateConfig:
     most_misfit: float = 0.7
     most_saturated: float = 0.5
     most_drift: float = 40.0
+    window_mm: tuple[float, float] = (10.0, 40.0)
     contact_radii: tuple[float, float] = (0.15, 0.95)
     most_depth_um: float = 60.0
     most_radius: float = 0.25
@@ -72,6 +75,7 @@ def calibrate(
       CalibrationError: a set that nothing can be learnt from; it says why and what to do.
     """
     config = config or CalibrateConfig()
+    _check_window(presses, config)
     bad = {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
     good = _enough(presses, names, bad, config)
     circles = find_circles(presses.chosen(good))
@@ -140,6 +144,21 @@ def _enough(presses: BallPresses, names: tuple[str, ...], bad: dict[int, str], c
             f"{config.least_presses} times or more, all over the window{reasons}"
         )
     return good
+
+
+def _check_window(presses: BallPresses, config: CalibrateConfig) -> None:
+    """A window of the size of a coin or of a hand is a wrong pitch, such as that of pictures of another resolution.
+
+    Nothing in the pictures tells it: they look the same under half the ball in half the window.
+    """
+    low, high = config.window_mm
+    rows_mm, columns_mm = (side * presses.mm_per_px for side in presses.shape)
+    if not low <= max(rows_mm, columns_mm) <= high:
+        raise CalibrationError(
+            f"pictures of {presses.shape[1]} × {presses.shape[0]} px show {columns_mm:.1f} × {rows_mm:.1f} mm at "
+            f"--mm-per-px {presses.mm_per_px:g}: the longer side must lie in [{low:g}, {high:g}] mm; measure the "
+            "window and divide by the pixels of these pictures, or set --window-mm for a sensor of another size"
+        )
 
 
 def _check_size(presses: BallPresses, touches: Touches, config: CalibrateConfig) -> None:

@@ -96,6 +96,10 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
     """What was learnt, how well, and what was left out and why."""
     table = Table("what", "figure or reason", title=f"calibration of {made.sensor}")
     table.add_row("presses used", str(len(report.kept)))
+    rows_mm, columns_mm = (side * made.mm_per_px for side in made.background.shape[:2])
+    table.add_row("the picture shows, mm (hold a ruler to it)", f"{columns_mm:.1f} × {rows_mm:.1f}")
+    contact_mm = float(np.median(report.touches.radius_px)) * made.mm_per_px
+    table.add_row("radius of the contacts, mm (median)", f"{contact_mm:.2f}")
     table.add_row("degree in colour, in position", f"{report.choice.degree}, {report.choice.position_degree}")
     for name, value in report.errors.figures().items():
         table.add_row(f"held out: {name}", f"{value:.3g}")

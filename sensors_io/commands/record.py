@@ -108,14 +108,16 @@ class Record(Bench):
             show = stack.enter_context(board.shown())
             if self.port is not None:
                 stack.enter_context(self._live_view(tactile, force, board))
-            try:
-                report = record_session(
-                    self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
-                )
-            except StreamEndedError as end:
-                OUT.print(f"{end}: what was recorded is in {self.out}", markup=False)
-                return 0
+            report = record_session(
+                self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
+            )
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
+        if report.ended:
+            asked = f"{self.free_s:g} s of free motion" if self.free_s > 0 else f"all {len(config.stages)} contacts"
+            raise StreamEndedError(
+                f"{report.ended}, before {asked} were complete: what there was is in {self.out}; replay a longer "
+                "recording, or repeat it with --seconds"
+            )
         return 0
 
     def session(self) -> SessionConfig:

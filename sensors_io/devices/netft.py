@@ -181,8 +181,8 @@ class NetFt:
             },
         )
 
-    def take_bias(self) -> None:
-        """Make the sensor take its present load as zero; a bias fitted by `force` leaves a trace in the records."""
+    def take_zero(self) -> None:
+        """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
 
     def _receive(self, timeout_s: float) -> None:

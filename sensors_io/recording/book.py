@@ -35,11 +35,19 @@ class ObjectView:
 
 @dataclasses.dataclass(kw_only=True)
 class Report:
-    """What a session did: contacts written, those recovered from journals of a killed one, those asked for again."""
+    """What a session did.
+
+    Attributes:
+      contacts: written.
+      recovered: those of them that came from journals of a killed session.
+      incomplete: those of them that are asked for again.
+      ended: the replay that ended before the session was complete, in words; empty otherwise.
+    """
 
     contacts: int = 0
     recovered: int = 0
     incomplete: int = 0
+    ended: str = ""
 
 
 class Book:

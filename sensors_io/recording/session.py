@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.devices.base import Sample
-from sensors_io.devices.errors import DeviceError
+from sensors_io.devices.errors import DeviceError, StreamEndedError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.recording.book import Book, ObjectView, Report
@@ -89,7 +89,7 @@ def record_session(
     view: ObjectView | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Report:
-    """Record what is missing of a session; a second call goes on behind the first.
+    """Record what is missing of a session; a second call goes on behind the first, and a replay that ends ends it.
 
     Args:
       out: directory of the records.
@@ -119,6 +119,8 @@ def record_session(
             for stage in _stages(config):
                 while not stop() and (key := book.wanted(config.object_id, config.site, stage)) is not None:
                     session.contact(stage, key)
+        except StreamEndedError as end:
+            report.ended = str(end)
         finally:
             book.publish()
     return report

@@ -89,6 +89,13 @@ def test_a_ball_smaller_than_its_contact_is_refused(presses: BallPresses) -> Non
         calibrate(wrong, names(wrong), "x", QUICK)
 
 
+@pytest.mark.parametrize(("factor", "shown"), [(3, "47.7 × 36.0 mm at --mm-per-px 0.45"), (1 / 3, "5.3 × 4.0 mm")])
+def test_a_pitch_wrong_by_three_is_noticed_by_the_window(presses: BallPresses, factor: float, shown: str) -> None:
+    wrong = dataclasses.replace(presses, mm_per_px=presses.mm_per_px * factor)
+    with pytest.raises(CalibrationError, match=f"pictures of 106 × 80 px show {shown}.*longer side must lie in"):
+        calibrate(wrong, names(wrong), "x", QUICK)
+
+
 def test_saturated_presses_are_left_out(presses: BallPresses) -> None:
     bright = np.clip(presses.pictures.astype(int) * 8 - 770, 0, 255).astype(np.uint8)
     washed = dataclasses.replace(presses, pictures=bright)

@@ -53,12 +53,23 @@ def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, c
     """The protocol asks for 20 N, the recording ends at 3: kept as incomplete, with the force of the sensor itself."""
     out = tmp_path / "records"
     args = ["record", "--out", out, "--object-id", "cup", "replay", "--path", press]
-    assert cli.main([*map(str, args)]) == 0
+    assert cli.main([*map(str, args)]) == 1
+    said = capsys.readouterr()
+    assert "1 contacts written, 0 recovered, 1 incomplete" in said.out
+    assert "A1.npz has been replayed to its end, before all 19 contacts were complete" in said.err
     store = RecordStore(out, allow_incomplete=True)
     made = store.contact(0)["tac3d"]
     assert made.key.motion == "press"
     assert set(made.phase.tolist()) == {0, 1}
     assert -made.force_n[:, 2].min() == pytest.approx(3.0, abs=0.1)
+
+
+def test_a_replay_shorter_than_asked_says_so(tmp_path, press, capsys):
+    """1.2 s, of which 2 are asked: stored, and no success."""
+    args = ["record", "--out", tmp_path / "records", "--object-id", "cup", "--free-s", 2, "replay", "--path", press]
+    assert run(*args) == 1
+    assert "before 2 s of free motion were complete" in capsys.readouterr().err
+    assert len(RecordStore(tmp_path / "records", allow_incomplete=True).contact(0)["tac3d"]) > 100
 
 
 def test_ctrl_c_ends_a_recording_cleanly(tmp_path, press):
@@ -186,9 +197,9 @@ def test_benches_that_make_no_sense_are_one_line(args, message, capsys, monkeypa
 
 @pytest.fixture
 def poses(tmp_path):
-    """A recording of a force sensor held in eight directions, 60 ms each, at 1 kHz; 1.5 N hang on it."""
+    """A recording of a force sensor held in eight directions, 200 ms each, at 1 kHz; 1.5 N hang on it."""
     down = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
-    down = down[[0, 1, 3, 2, 6, 7, 5, 4]].repeat(60, 0)
+    down = down[[0, 1, 3, 2, 6, 7, 5, 4]].repeat(200, 0)
     force = [1.0, -2.0, 3.0] + 1.5 * down
     path = tmp_path / "HDL1.npz"
     np.savez(

@@ -55,7 +55,7 @@ def test_counts_become_newtons_and_newton_millimetres():
     loaded = record(5, 1_000_000, -2_000_000, -7_500_000, 1_000, 0, -2_000_000)
     with sensor([loaded]) as (config, commands), config.open() as device:
         sample = device.read(5.0)
-        device.take_bias()
+        device.take_zero()
         assert device.identity.settings["counts_per_nmm"] == 1000
         assert device.identity.counter_modulus == 2**32
     np.testing.assert_allclose(sample.arrays["force_n"], [1, -2, -7.5])

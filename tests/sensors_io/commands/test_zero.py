@@ -1,0 +1,43 @@
+"""`zero`: the sensor is told, its force before and after is shown, and one that cannot is named."""
+
+import contextlib
+import time
+
+import numpy as np
+
+from sensors_io import __main__ as cli
+from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.tac3d import Tac3dConfig
+
+
+class Drifted(contextlib.AbstractContextManager):
+    """A sensor that reads 0.4 N untouched until it has taken its zero, obeyed after 50 ms."""
+
+    identity = Identity(sensor="tac3d")
+
+    def __init__(self):
+        self.zeroed_s = float("inf")
+
+    def __exit__(self, *error):
+        return None
+
+    def take_zero(self):
+        self.zeroed_s = time.monotonic() + 0.05
+
+    def read(self, timeout_s):
+        time.sleep(0.001)
+        force = 0.0 if time.monotonic() > self.zeroed_s else -0.4
+        return Sample(host_time_ns=time.monotonic_ns(), arrays={"force_n": np.array([0, 0, force], np.float32)})
+
+
+def test_a_drifted_sensor_reads_zero_afterwards(monkeypatch, capsys):
+    monkeypatch.setattr(Tac3dConfig, "open", lambda self: Drifted())
+    assert cli.main(["zero", "--seconds", "0.05", "tac3d", "+", "tac3d"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "tac3d" in line]
+    assert len(rows) == 2
+    assert all("+0.000 +0.000 -0.400" in row and row.count("+0.000 +0.000 +0.000") == 1 for row in rows)
+
+
+def test_a_device_without_a_zero_is_named(tmp_path, capsys):
+    assert cli.main(["zero", "replay", "--path", str(tmp_path)]) == 1
+    assert "gelsight_mini has no zero to take: give tac3d or netft" in capsys.readouterr().err
