@@ -15,7 +15,8 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Seq
 from typing import Any
 
-from sensors_io.importers.keep import ImportSourceError, Skip, UnreadableError, at_height
+from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.keep import ImportSourceError, Shares, Skip, UnreadableError, at_height
 from sensors_io.importers.pictures import read_picture
 from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ATTRIBUTES, SPLITS, UNKNOWN, ContactKey, ObjectCard, Sequence
@@ -205,16 +206,44 @@ def require_files(root: pathlib.Path, found: Seq[Any], expected: str) -> None:
         raise ImportSourceError(f"{root} {state}: expected {expected}; give the directory that holds them")
 
 
-def bare_cards(splits: Mapping[str, str]) -> dict[str, ObjectCard]:
-    """Cards of objects that nobody annotated, by id; their name is the id in words.
+def bare_catalogue(
+    root: pathlib.Path,
+    contacts: Seq[Listed],
+    files: Seq[pathlib.Path],
+    config: Shares,
+    *,
+    source: str,
+    licence: str,
+    sensors: tuple[str, ...],
+    skipped: Seq[Skip] = (),
+    listings: Seq[pathlib.Path] = (),
+) -> Catalogue:
+    """The catalogue of objects that nobody annotated: split by their ids, named by them in words.
 
     Args:
-      splits: split of each id.
+      root: directory of the source.
+      contacts: in the order of import; the objects are those that they name.
+      files, listings: as `fingerprint` takes them.
+      config: a dataclass, whose shares are held out.
+      source, licence, sensors, skipped: as in `Catalogue`.
     """
-    return {
-        name: ObjectCard(object_id=name, split=split, labels={}, annotator="nobody", name=name.replace("_", " "))
-        for name, split in splits.items()
-    }
+    objects = (listed.key.object_id for listed in contacts)
+    splits = split_by_name(objects, val_share=config.val_share, test_share=config.test_share)
+    return Catalogue(
+        source=source,
+        licence=licence,
+        sensors=sensors,
+        annotated=(),
+        cards={name: _bare_card(name, split) for name, split in splits.items()},
+        contacts=tuple(contacts),
+        skipped=tuple(skipped),
+        config=dataclasses.asdict(config),
+        identity=fingerprint(root, files, config, listings),
+    )
+
+
+def _bare_card(name: str, split: str) -> ObjectCard:
+    return ObjectCard(object_id=name, split=split, labels={}, annotator="nobody", name=name.replace("_", " "))
 
 
 def _with_view(card: ObjectCard, path: pathlib.Path | None) -> tuple[ObjectCard, list[Skip]]:

@@ -11,15 +11,13 @@ annotated.
 """
 
 import collections
-import dataclasses
 import functools
 import pathlib
 import re
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip, UnreadableError
 from sensors_io.importers.pickles import read_pickle
 from sensors_io.importers.pictures import film, natural, nominal_ns
@@ -48,17 +46,15 @@ def list_estimate_modulus(source: pathlib.Path, config: ImportConfig) -> Catalog
         key = ContactKey(object_id=match[1], site=0, motion="press", trial=trials[match[1]])
         trials[match[1]] += 1
         contacts.append(Listed(key=key, name=name, read=functools.partial(_read, path, key, config)))
-    splits = split_by_name(trials, val_share=config.val_share, test_share=config.test_share)
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        videos,
+        config,
         source="EstimateModulus",
         licence="not stated by its authors; local use only",
         sensors=(SENSOR,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, videos, config),
+        skipped=skipped,
     )
 
 

@@ -25,8 +25,7 @@ from typing import Literal
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.pictures import film, read_pictures
 from sensors_io.importers.tables import read_table
@@ -76,7 +75,6 @@ def list_feelanyforce(source: pathlib.Path, config: FeelAnyForceConfig) -> Catal
     films = collections.defaultdict(list)
     for row in sorted(rows, key=lambda row: row.time_ms):
         films[row.indenter, row.table].append(row)
-    splits = split_by_name((row.indenter for row in rows), val_share=config.val_share, test_share=config.test_share)
     contacts, trials = [], collections.Counter[str]()
     for (indenter, table), film_rows in films.items():
         for piece in config.pieces(len(film_rows)):
@@ -85,16 +83,16 @@ def list_feelanyforce(source: pathlib.Path, config: FeelAnyForceConfig) -> Catal
             chosen = [film_rows[i] for i in piece]
             read = functools.partial(_read, key, chosen, sign[table], config)
             contacts.append(Listed(key=key, name=f"{table}: {chosen[0].path.name}", read=read))
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        [row.path for row in rows],
+        config,
         source="FeelAnyForce",
         licence="not stated by its authors; local use only",
         sensors=(SENSOR,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, [row.path for row in rows], config, tables),
+        skipped=skipped,
+        listings=tables,
     )
 
 

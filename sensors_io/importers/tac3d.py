@@ -14,15 +14,13 @@ record and is left out.  A frame before which the counter `index` skips some is 
 the client's receive time where it was stored, the sensor's send time elsewhere.
 """
 
-import dataclasses
 import functools
 import pathlib
 import zipfile
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import Shares, Skip, UnreadableError
 from sensors_io.importers.pictures import film
 from sensors_io.schema import ContactKey
@@ -53,21 +51,18 @@ def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
     """
     files = sorted(source.glob("*.npz"))
     require_files(source, files, "<name>_<serial>.npz with the arrays of a PyTac3D recording")
-    splits = split_by_name((path.stem for path in files), val_share=config.val_share, test_share=config.test_share)
     contacts = []
     for path in files:
         key = ContactKey(object_id=path.stem, site=0, motion="free", trial=0)
         contacts.append(Listed(key=key, name=path.name, read=functools.partial(_read, path, key)))
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        files,
+        config,
         source="Tac3D recordings",
         licence="not stated by the vendor; local use only",
         sensors=(SENSOR,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=(),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, files, config),
     )
 
 

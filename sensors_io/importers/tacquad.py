@@ -13,14 +13,12 @@ published: times are those of `RATE_HZ`.
 """
 
 import collections
-import dataclasses
 import functools
 import pathlib
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip
 from sensors_io.importers.pictures import PictureError, film, nominal_ns, numbered, read_pictures
 from sensors_io.importers.tables import read_rows
@@ -66,19 +64,18 @@ def list_tacquad(source: pathlib.Path, config: ImportConfig) -> Catalogue:
             folder = source / part / item
             read = functools.partial(_read, folder, key, spans, config)
             contacts.append(Listed(key=key, name=f"{part}/{item}", read=read, view=folder / "img_gelsight" / "0.png"))
-    splits = split_by_name(trials, val_share=config.val_share, test_share=config.test_share)
     places = sorted({place for table in tables for place in (source / TABLES[table.name]).glob("*/*")})
     pictures = [path for place in places for path in numbered(place)]
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        pictures,
+        config,
         source="TacQuad",
         licence="that of the download",
         sensors=tuple(FOLDERS),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, pictures, config, tables),
+        skipped=skipped,
+        listings=tables,
     )
 
 

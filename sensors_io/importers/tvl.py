@@ -17,8 +17,7 @@ import pathlib
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.pictures import PictureError, film, natural, nominal_ns, read_picture, read_pictures
 from sensors_io.importers.tables import read_table
@@ -53,7 +52,6 @@ def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
     )
     require_files(source, tables, "train.csv or test.csv, in it or in data1, data2, data3")
     trajectories, skipped = _trajectories(source, tables)
-    splits = split_by_name(trajectories, val_share=config.val_share, test_share=config.test_share)
     contacts = []
     for name, rows in trajectories.items():
         rows = sorted(rows, key=lambda row: natural(row.tactile))
@@ -61,16 +59,16 @@ def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
         read = functools.partial(_read, key, rows, config)
         contacts.append(Listed(key=key, name=name, read=read, view=_vision(rows[0])))
     pictures = [path for rows in trajectories.values() for row in rows for path in (row.tactile, row.vision)]
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        pictures,
+        config,
         source="TVL, HCT",
         licence="that of the download",
         sensors=(SENSOR,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, pictures, config, tables),
+        skipped=skipped,
+        listings=tables,
     )
 
 

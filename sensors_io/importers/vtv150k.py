@@ -13,8 +13,7 @@ import re
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip
 from sensors_io.importers.pictures import film, natural, nominal_ns
 from sensors_io.importers.video import read_video
@@ -40,21 +39,19 @@ def list_vtv150k(source: pathlib.Path, config: VTVConfig) -> Catalogue:
     require_files(source, videos, "<object>_<n>.mp4")
     named = [(path, match) for path in videos if (match := _NAME.fullmatch(path.stem))]
     skipped = [Skip(name=p.name, reason="is not named <object>_<n>") for p in videos if not _NAME.fullmatch(p.stem)]
-    splits = split_by_name((m[1] for _, m in named), val_share=config.val_share, test_share=config.test_share)
     contacts = []
     for path, match in named:
         key = ContactKey(object_id=match[1], site=0, motion="free", trial=int(match[2]))
         contacts.append(Listed(key=key, name=path.name, read=functools.partial(_read, path, key, config)))
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        videos,
+        config,
         source=f"VTV150K, {config.sensor}",
         licence="not stated by its authors; local use only",
         sensors=(config.sensor,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, videos, config),
+        skipped=skipped,
     )
 
 

@@ -8,15 +8,13 @@ DIR is the folder `real`, or the one above it.  A slide is cut into pieces of `m
 the trial counts its pieces.  The hand moves freely, no force was measured, and no level was annotated.
 """
 
-import dataclasses
 import functools
 import pathlib
 import re
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_cards, fingerprint, require_files
-from sensors_io.importers.holdout import split_by_name
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip, UnreadableError
 from sensors_io.importers.pickles import PickleError, read_pickle
 from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
@@ -53,18 +51,15 @@ def list_ycb_slide(source: pathlib.Path, config: ImportConfig) -> Catalogue:
             key = ContactKey(object_id=slide.parent.name, site=int(number[1]), motion="free", trial=trial)
             read = functools.partial(_read, slide, key, paths, piece, config)
             contacts.append(Listed(key=key, name=f"{slide.parent.name}/{slide.name} {trial}", read=read))
-    objects = {listed.key.object_id for listed in contacts}
-    splits = split_by_name(objects, val_share=config.val_share, test_share=config.test_share)
-    return Catalogue(
+    return bare_catalogue(
+        source,
+        contacts,
+        pictures,
+        config,
         source="YCB-Slide, real",
         licence="CC BY-SA 4.0",
         sensors=(SENSOR,),
-        annotated=(),
-        cards=bare_cards(splits),
-        contacts=tuple(contacts),
-        skipped=tuple(skipped),
-        config=dataclasses.asdict(config),
-        identity=fingerprint(source, pictures, config),
+        skipped=skipped,
     )
 
 
