@@ -57,15 +57,6 @@ class Adhesion:
             return force_n + 2 * unit
         return force_n + 3 * unit + float(np.sqrt(max(6 * unit * force_n + 9 * unit**2, 0.0)))
 
-    def relative_change(self, force_n: float) -> float:
-        """By how much adhesion widens the contact at a pressing force: (F₁/F)^{1/3} − 1.
-
-        Raises:
-          ValueError: a force not above 0.
-        """
-        require(force_n > 0, "force_n", force_n, "must be > 0")
-        return (self.hertz_force_n(force_n) / force_n) ** (1 / 3) - 1
-
     def least_force_n(self, tolerance: float) -> float:
         """Force from which on adhesion widens the contact by no more than `tolerance`: where the change equals it.
 

@@ -46,7 +46,6 @@ def shuffle_touch(features: Features, key: Array) -> Perturbed:
     Departure from R_tu's definition, which permutes frames: here encoded steps change places, because the encoder
     stands still in GRPO and contacts are encoded once.  The two are the same for an encoder that reads each step by
     itself; one whose steps see each other leaves traces of the order in them, so that this control is the milder one.
-    `permute_frames` is the permutation before the encoder.
     """
     keys = jax.random.split(key, features.stream_mask.shape)
     source, moved = jax.vmap(jax.vmap(_shuffled_tokens))(features.touch_time, keys)
@@ -83,18 +82,6 @@ def mask_one_stream(
     replaced = features.touch.at[jnp.arange(p), stream].set(noise[draw, stream])
     any_stream = jnp.any(features.stream_mask, -1)[:, None, None, None]
     return jnp.where(any_stream, replaced, features.touch), stream
-
-
-def permute_frames(frames: Array, frame_mask: Bool[Array, "F"], key: Array) -> tuple[Array, Bool[Array, ""]]:
-    """The existing frames of one stream in another order, for use before an encoder; false where there are not two.
-
-    Args:
-      frames: [F, …], anything recorded frame by frame, to be permuted alike.
-      frame_mask: which frames exist; the others stay.
-      key: randomness.
-    """
-    source, moved = _another_order(frame_mask, key)
-    return frames[source], moved
 
 
 def _shuffled_tokens(time: Int[Array, "N"], key: Array) -> tuple[Int[Array, "N"], Bool[Array, ""]]:

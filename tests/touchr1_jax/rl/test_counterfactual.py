@@ -10,7 +10,6 @@ from touchr1_jax.rl.counterfactual import (
     drop_touch,
     mask_one_stream,
     noise_touch,
-    permute_frames,
     shuffle_touch,
     swap_touch,
 )
@@ -105,14 +104,3 @@ def test_one_stream_of_each_prompt_is_masked():
     touch, stream = mask_one_stream(FEATURES, NOISE, jax.random.key(3))
     changed = np.asarray((touch != FEATURES.touch).any((-1, -2)))
     np.testing.assert_array_equal(changed, np.arange(tiny.S) == np.asarray(stream)[:, None])
-
-
-def test_frames_are_permuted_before_an_encoder():
-    frames, mask = jnp.arange(5), jnp.array([True, True, False, True, True])
-    for key in many()[:50]:
-        order, moved = permute_frames(frames, mask, key)
-        assert moved
-        assert order[2] == 2
-        assert (order != frames).any()
-        assert sorted(order.tolist()) == list(range(5))
-    assert not permute_frames(frames, jnp.arange(5) == 1, jax.random.key(0))[1]
