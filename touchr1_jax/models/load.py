@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Literal
 
+import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import tyro
@@ -80,6 +81,19 @@ def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:
             )
 
 
+def check_finite(params: Params) -> None:
+    """Refuse weights that are no numbers; a loader that reads every release need not look, the command does.
+
+    Raises:
+      ValueError: NaN or infinity.
+    """
+    whole = jax.jit(lambda x: jnp.isfinite(x).all())
+    broken = [name for name, x in flax.traverse_util.flatten_dict(params, sep="/").items() if not whole(x)]
+    if broken:
+        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        raise ValueError(f"{broken[0]}{more} holds NaN or infinity: must be finite; fetch the weights again")
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Load:
     """Read a checkpoint and say what it is."""
@@ -92,6 +106,7 @@ class Load:
         console, began = Console(soft_wrap=True, highlight=False), time.perf_counter()
         try:
             found = load_checkpoint(self.directory, jnp.dtype(self.dtype))
+            check_finite(found.params)
         except (OSError, ValueError) as error:
             Console(stderr=True, soft_wrap=True).print(
                 f"{type(error).__name__}: {error}", markup=False, highlight=False

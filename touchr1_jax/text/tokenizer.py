@@ -159,11 +159,15 @@ def from_file(path: str | Path, *, vocab_size: int | None = None) -> Tokenizer:
 
     Raises:
       FileNotFoundError: there is no such file.
-      ValueError: as `from_tokenizers`.
+      ValueError: no tokenizer in it, or as `from_tokenizers`.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} is no file: must be the tokenizer.json of a checkpoint; correct the path")
-    return from_tokenizers(tokenizers.Tokenizer.from_file(str(path)), vocab_size=vocab_size)
+    try:
+        library = tokenizers.Tokenizer.from_file(str(path))
+    except Exception as error:  # the library raises nothing more particular
+        raise ValueError(f"{path} is no tokenizer ({error}): must be that of a checkpoint; fetch it again") from error
+    return from_tokenizers(library, vocab_size=vocab_size)
 
 
 def _byte_alphabet() -> dict[str, int]:

@@ -1,42 +1,25 @@
 """The command that reads a checkpoint, and what it refuses."""
 
 import json
-import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.touchr1_jax.models.qwen import cases, chats, tiny, words
+from tests.touchr1_jax.models.checkpoint import PICTURES, write_checkpoint
+from tests.touchr1_jax.models.qwen import cases
 from touchr1_jax.models.load import Load, load_checkpoint
-from touchr1_jax.models.qwen.config import parse_config
 from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget
 from touchr1_jax.models.qwen.prompts import Film, prepare
+from touchr1_jax.models.qwen.safetensors import read_header
 from touchr1_jax.text.chat import Media, Message
-from touchr1_jax.text.language import TOUCH_LANGUAGE
-
-FIELDS = {
-    "vision_start_token_id": "<|vision_start|>",
-    "vision_end_token_id": "<|vision_end|>",
-    "image_token_id": "<|image_pad|>",
-    "video_token_id": "<|video_pad|>",
-}
-
-
-PICTURES = {"min_pixels": 64, "max_pixels": 4096, "patch_size": 4, "temporal_patch_size": 2, "merge_size": 2}
 
 
 @pytest.fixture
 def directory(tmp_path):
-    """A whole checkpoint, whose table has more rows than its tokenizer has words, as Qwen's."""
-    ids = words.write(tmp_path / "tokenizer.json", TOUCH_LANGUAGE)
-    config = cases.config_json() | {"vocab_size": 512} | {field: ids[mark] for field, mark in FIELDS.items()}
-    tiny.write_weights(tmp_path, parse_config(config))
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(PICTURES))
-    shutil.copy(chats.TEMPLATE, tmp_path)
+    write_checkpoint(tmp_path)
     return tmp_path
 
 
@@ -64,6 +47,23 @@ def test_command_names_the_misfit_and_fails(directory, capsys):
     (directory / "config.json").write_text(json.dumps(config))
     assert Load(directory=directory).run() == 1
     assert "extra: model.layers.1.mlp.down_proj.weight" in capsys.readouterr().err
+
+
+def test_weights_that_are_no_numbers_are_named(directory, capsys):
+    entry = read_header(directory / "model.safetensors")["visual.patch_embed.proj.weight"]
+    content = bytearray((directory / "model.safetensors").read_bytes())
+    content[entry.start : entry.start + 4] = np.float32("nan").tobytes()
+    (directory / "model.safetensors").write_bytes(content)
+    assert Load(directory=directory).run() == 1
+    assert "vision/patch/kernel holds NaN or infinity: must be finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("file", ["tokenizer.json", "preprocessor_config.json"])
+@pytest.mark.parametrize("content", ["{", "[]"])
+def test_a_file_that_was_damaged_is_named(directory, capsys, file, content):
+    (directory / file).write_text(content)
+    assert Load(directory=directory).run() == 1
+    assert f"{file} is no " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

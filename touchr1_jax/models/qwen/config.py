@@ -160,10 +160,10 @@ def parse_config(found: Mapping[str, Any]) -> QwenConfig:
     return QwenConfig(
         decoder=_decoder(text, tied=_is_tied(found)),
         vision=_vision(vision),
-        vision_start_id=root["vision_start_token_id"],
-        vision_end_id=root["vision_end_token_id"],
-        image_id=root["image_token_id"],
-        video_id=root["video_token_id"],
+        vision_start_id=root.count("vision_start_token_id"),
+        vision_end_id=root.count("vision_end_token_id"),
+        image_id=root.count("image_token_id"),
+        video_id=root.count("video_token_id"),
     )
 
 
@@ -178,23 +178,30 @@ class _Fields:
             raise ValueError(f"config.json lacks {self.prefix}{name}, without which the model has no shape; add it")
         return self.found[name]
 
+    def count(self, name: str) -> int:
+        """A field that must be a whole number above 0."""
+        value = self[name]
+        if type(value) is not int or value < 1:
+            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a whole number above 0; correct config.json")
+        return value
+
 
 def _decoder(text: _Fields, *, tied: bool) -> DecoderConfig:
     _require("hidden_act", text.found, "silu", text.prefix)
     if text.found.get("use_sliding_window"):
         raise ValueError(f"{text.prefix}use_sliding_window is true: only full attention is computed; set it to false")
     theta, sections = _rope(text)
-    hidden, heads = text["hidden_size"], text["num_attention_heads"]
+    hidden, heads = text.count("hidden_size"), text.count("num_attention_heads")
     if hidden % heads:
         raise ValueError(f"{text.prefix}hidden_size {hidden} must be a multiple of num_attention_heads {heads}")
     return DecoderConfig(
-        vocab_size=text["vocab_size"],
+        vocab_size=text.count("vocab_size"),
         hidden_size=hidden,
-        num_layers=text["num_hidden_layers"],
+        num_layers=text.count("num_hidden_layers"),
         num_heads=heads,
-        num_kv_heads=text["num_key_value_heads"],
+        num_kv_heads=text.count("num_key_value_heads"),
         head_dim=hidden // heads,
-        intermediate_size=text["intermediate_size"],
+        intermediate_size=text.count("intermediate_size"),
         mrope_section=sections,
         rope_theta=float(theta),
         norm_epsilon=text["rms_norm_eps"],
@@ -223,15 +230,15 @@ def _vision(vision: _Fields) -> QwenVisionConfig:
     channels = "in_channels" if "in_channels" in vision.found else "in_chans"
     _require(channels, vision.found, COLOURS, vision.prefix)
     return QwenVisionConfig(
-        out_size=vision["out_hidden_size"],
-        depth=vision["depth"],
-        hidden_size=vision["hidden_size"],
-        num_heads=vision["num_heads"],
-        intermediate_size=vision["intermediate_size"],
-        patch_px=vision["patch_size"],
-        patch_frames=vision["temporal_patch_size"],
-        merge=vision["spatial_merge_size"],
-        window_px=vision["window_size"],
+        out_size=vision.count("out_hidden_size"),
+        depth=vision.count("depth"),
+        hidden_size=vision.count("hidden_size"),
+        num_heads=vision.count("num_heads"),
+        intermediate_size=vision.count("intermediate_size"),
+        patch_px=vision.count("patch_size"),
+        patch_frames=vision.count("temporal_patch_size"),
+        merge=vision.count("spatial_merge_size"),
+        window_px=vision.count("window_size"),
         full_layers=tuple(vision["fullatt_block_indexes"]),
         tokens_per_second=vision["tokens_per_second"],
     )

@@ -44,12 +44,15 @@ def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
 
     Raises:
       FileNotFoundError: the checkpoint has none.
-      ValueError: sizes of patches that are not the config's, another normalisation, or no budget.
+      ValueError: no JSON, sizes of patches that are not the config's, another normalisation, or no budget.
     """
     path = directory / PREPROCESSOR_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file: must be the picture settings of a checkpoint; fetch it")
-    written = json.loads(path.read_text(encoding="utf-8"))
+    try:
+        written = dict(json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} is no JSON object: {error}; fetch it again") from error
     found = {field: value for field, value in written.items() if value is not None}  # newer files list what is unset
     expected = {
         "patch_size": config.patch_px,

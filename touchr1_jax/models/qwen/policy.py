@@ -9,10 +9,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.policy import Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.pictures import PICTURE_BUDGET, PixelBudget, fitting_size, patchify, resize
@@ -20,7 +20,7 @@ from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
-from touchr1_jax.types import Params
+from touchr1_jax.types import Params, TouchBatch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,14 +105,33 @@ def qwen_agent(
     )
 
 
-def with_pretrained(params: Params, pretrained: Params) -> Params:
-    """Fresh parameters of a policy with vision tower and decoder replaced by those of `QwenVL`.
+def init_on_pretrained(
+    policy: Policy,
+    key: Array,
+    batch: TouchBatch,
+    ids: Int[np.ndarray, "L"],
+    mask: Bool[np.ndarray, "L"],
+    slots: Slots,
+    pretrained: Params,
+) -> Params:
+    """Parameters of a policy on a pretrained model: its own vision tower and decoder, beside them fresh ones, float32.
+
+    Vision tower and decoder are never initialised: memory is what `pretrained` has already.
+
+    Args:
+      policy: built from the config that belongs to `pretrained`.
+      key: randomness of what is fresh.
+      batch, ids, mask, slots: as `init_policy` takes them.
+      pretrained: the tree of `QwenVL`, as `load_checkpoint` reads it.
 
     Raises:
       ValueError: towers of other shapes.
     """
-    replaced = {**params, "vision": {"tower": pretrained["vision"]}, "decoder": pretrained["decoder"]}
-    shapes = lambda tree: jax.tree.map(lambda x: np.shape(x), tree)
-    if shapes(replaced) != shapes(params):
+    taken = {"vision": {"tower": pretrained["vision"]}, "decoder": pretrained["decoder"]}
+    fresh = lambda k: init_policy(policy, k, batch, ids, mask, slots)
+    wanted = jax.eval_shape(fresh, key)
+    shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree)
+    if shapes(taken) != shapes({name: wanted[name] for name in taken}):
         raise ValueError("pretrained has other shapes than the policy's towers; build the policy from its config")
-    return replaced
+    others = jax.jit(lambda k: {name: tree for name, tree in fresh(k).items() if name not in taken})
+    return {**others(key), **taken}

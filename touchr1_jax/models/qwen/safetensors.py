@@ -23,6 +23,9 @@ DTYPES: Mapping[str, np.dtype] = {
 """Types of tensors that can be weights, by the format's names."""
 
 METADATA = "__metadata__"
+POINTER = b"version "
+"""Begins what stands in the place of a file that Git LFS has not fetched."""
+
 MAX_HEADER = 100_000_000
 """Longest header, bytes; the format forbids more, and a file of another format would seem to ask for exabytes."""
 
@@ -41,11 +44,13 @@ def read_header(path: Path) -> dict[str, Entry]:
     """What tensors a file holds.
 
     Raises:
-      ValueError: not this format, cut off, or an entry that contradicts itself.
+      ValueError: not this format, not fetched, cut off, or an entry that contradicts itself.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
         prefix = file.read(8)
+        if prefix == POINTER:
+            raise ValueError(f"{path} points to a file of Git LFS that was not fetched; fetch it by `git lfs pull`")
         length = struct.unpack("<Q", prefix)[0] if len(prefix) == 8 else MAX_HEADER + 1
         if length > min(MAX_HEADER, size - 8):
             raise ValueError(f"{path} is no safetensors file or was cut off: its header does not fit; fetch it again")

@@ -113,14 +113,19 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
     index = directory / INDEX
     if not index.is_file():
         single = directory / SINGLE
+        shards = sorted(path.name for path in directory.glob("*.safetensors"))
+        if not single.is_file() and shards:
+            raise FileNotFoundError(
+                f"{directory} holds {shards[0]} and not {INDEX}, which says what is where; fetch it"
+            )
         if not single.is_file():
             raise FileNotFoundError(
                 f"{directory} holds neither {SINGLE} nor {INDEX}: no weights; correct the directory"
             )
         return safetensors.read_header(single)
     try:
-        place = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
-    except (json.JSONDecodeError, KeyError) as error:
+        place = dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
     entries: dict[str, safetensors.Entry] = {}
     for shard in sorted(set(place.values())):

@@ -12,11 +12,11 @@ from tests.touchr1_jax import tiny
 from tests.touchr1_jax.models.qwen import small_policy
 from tests.touchr1_jax.models.qwen.small_policy import AGENT, CONFIG, LAYOUT, POLICY, SLOTS, TOKENIZER, VIEW_TOKENS
 from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, init_adapters, over_base
-from touchr1_jax.models.policy import prompt_mask, prompt_positions
+from touchr1_jax.models.policy import init_policy, prompt_mask, prompt_positions
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.model import Inputs, QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget, patchify, resize
-from touchr1_jax.models.qwen.policy import QwenViewConfig, qwen_agent, with_pretrained
+from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_agent
 from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
 from touchr1_jax.rl.config import Algorithm, GRPOConfig
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
@@ -195,15 +195,18 @@ def test_half_precision_decodes_as_the_learner_scores(batch):
     np.testing.assert_allclose(step[WRITABLE], scored[WRITABLE], atol=0.02 * float(jnp.abs(scored[WRITABLE]).max()))
 
 
-def test_pretrained_towers_replace_fresh_ones():
+def test_pretrained_towers_stand_beside_fresh_ones():
     params = small_policy.params()
     model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
-    doubled = jax.tree.map(lambda x: 2 * x, model)
-    joined = with_pretrained(params, doubled)
-    assert joined["tactile"] is params["tactile"]
-    np.testing.assert_array_equal(joined["decoder"]["norm"]["scale"], 2 * params["decoder"]["norm"]["scale"])
+    of = (POLICY, jax.random.key(0), tiny.touch_batch(), LAYOUT.ids[0], LAYOUT.mask[0], SLOTS)
+    joined = init_on_pretrained(*of, model)
+    assert jax.tree.map(jnp.shape, joined) == jax.tree.map(jnp.shape, params)
+    assert joined["decoder"] is model["decoder"]
+    assert joined["vision"]["tower"] is model["vision"]
+    fresh = init_policy(*of)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), joined["tactile"], fresh["tactile"])
     with pytest.raises(ValueError, match="pretrained has other shapes"):
-        with_pretrained(params, {**doubled, "decoder": {}})
+        init_on_pretrained(*of, {**model, "decoder": {}})
 
 
 def test_view_sizes_are_checked():

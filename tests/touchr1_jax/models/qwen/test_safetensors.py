@@ -53,6 +53,12 @@ def test_other_files_are_refused(tmp_path, content):
         read_header(tmp_path / "x")
 
 
+def test_a_pointer_is_named(tmp_path):
+    (tmp_path / "x").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 17\n")
+    with pytest.raises(ValueError, match="points to a file of Git LFS that was not fetched"):
+        read_header(tmp_path / "x")
+
+
 def test_header_must_be_json(tmp_path):
     raw_file(tmp_path / "x", b"not json", b"")
     with pytest.raises(ValueError, match="the header is no JSON"):

@@ -185,7 +185,14 @@ def test_shards_may_not_overlap(tmp_path, weights):
         load_params(tmp_path, CONFIG)
 
 
-@pytest.mark.parametrize("content", ["{", "{}"])
+def test_shards_without_an_index_ask_for_it(tmp_path, weights):
+    write_shards(tmp_path, weights)
+    (tmp_path / "model.safetensors.index.json").unlink()
+    with pytest.raises(FileNotFoundError, match=r"holds model-00001-of-00003\.safetensors and not .*index\.json"):
+        load_params(tmp_path, CONFIG)
+
+
+@pytest.mark.parametrize("content", ["{", "{}", "[]", '{"weight_map": 1}'])
 def test_index_must_be_one(tmp_path, content):
     (tmp_path / "model.safetensors.index.json").write_text(content)
     with pytest.raises(ValueError, match="is no index: must be JSON with a weight_map"):

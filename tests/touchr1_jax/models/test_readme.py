@@ -1,0 +1,74 @@
+"""What the README says of released models is run as it stands, on a tiny checkpoint."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from tests.touchr1_jax.models.checkpoint import write_checkpoint
+from touchr1_jax.models.load import load_checkpoint
+from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge, over_base
+from touchr1_jax.models.qwen.policy import init_on_pretrained, qwen_agent, qwen_policy
+from touchr1_jax.models.qwen.weights import load_params, save_params
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.text.chat_layout import build_chat_layout
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
+from touchr1_jax.types import TouchBatch
+
+BLOCK = re.compile(r"^```python\n(found = load_checkpoint.*?)^```$", re.MULTILINE | re.DOTALL)
+README = Path(__file__).resolve().parents[3] / "touchr1_jax" / "README.md"
+P, S, FRAMES, T = 1, 4, 2, 3
+
+NAMED = (
+    *(load_checkpoint, LoraConfig, Trainable, adapt, init_adapters, merge, over_base, init_on_pretrained, qwen_agent),
+    *(qwen_policy, save_params, TactileViTConfig, build_chat_layout, SFTState, make_sft_step),
+)
+"""What the lines use, under its own name; only these and those below are known to them."""
+
+
+def touch_batch() -> TouchBatch:
+    rng = np.random.default_rng(0)
+    return TouchBatch(
+        frames=jnp.asarray(rng.integers(0, 256, (P, S, FRAMES, 28, 28, 3)), jnp.uint8),
+        force_n=jnp.zeros((P, S, FRAMES, 3)),
+        frame_index=jnp.broadcast_to(jnp.arange(FRAMES), (P, S, FRAMES)),
+        frame_mask=jnp.ones((P, S, FRAMES), bool),
+        stream_mask=jnp.ones((P, S), bool),
+        view=jnp.zeros((P, 64, 64, 3), jnp.uint8),
+        view_mask=jnp.ones(P, bool),
+        label=jnp.zeros((P, len(TOUCH_LANGUAGE.attributes)), jnp.int32),
+    )
+
+
+def make_batch(layout) -> SFTBatch:
+    """One question about one contact, answered by three words."""
+    return SFTBatch(
+        touch=touch_batch(),
+        ids=jnp.asarray(layout.ids[:1, None]),
+        mask=jnp.asarray(layout.mask[:1, None]),
+        streams=jnp.ones((P, 1, S), bool),
+        tokens=jnp.full((P, 1, T), 7, jnp.int32),
+        token_mask=jnp.ones((P, 1, T), bool),
+    )
+
+
+def test_a_released_model_is_trained_and_written_back(tmp_path):
+    (block,) = re.findall(
+        r"^```python\n(found = load_checkpoint.*?)^```$", README.read_text(), re.MULTILINE | re.DOTALL
+    )
+    (tmp_path / "in").mkdir()
+    write_checkpoint(tmp_path / "in")
+    known = {thing.__name__: thing for thing in NAMED}
+    known |= {"jax": jax, "jnp": jnp, "TOUCH_LANGUAGE": TOUCH_LANGUAGE, "FRAMES": FRAMES, "make_batch": make_batch}
+    known |= {"DIR": tmp_path / "in", "OUT": tmp_path / "model.safetensors", "touch": touch_batch()}
+    known |= {"optimizer": optax.sgd(10.0)}
+    exec(block, known)
+    assert np.isfinite(known["metrics"]["loss"])
+    written, read = (load_params(folder, known["found"].config) for folder in (tmp_path, tmp_path / "in"))
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), written, read)
+    assert not any(jax.tree.leaves(changed["vision"]))
+    assert any(jax.tree.leaves(changed["decoder"]))
