@@ -6,11 +6,13 @@ python -m touchr1_jax.rewards explain --text "…" --label hardness firm --weigh
 """
 
 import dataclasses
+import functools
 import itertools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
@@ -179,9 +181,14 @@ def terms_table(
     parsed: Parsed,
     targets: Iterator[tuple[str, Target]],
 ) -> Table:
-    """Value, weight and share of every term, and the total, for each target."""
+    """Value, weight and share of every term, and the total, for each target.
+
+    Raises:
+      RewardError: as `total_reward` does where it is traced, as training will: what cannot be trained is not shown.
+    """
     table = Table("if it is", "reward", "value", "weight", "adds", title="What it earns")
     for words, target in targets:
+        jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
         total, parts = total_reward(rewards, weights, parsed, target)
         for name, weight in weights.items():
             applies = bool(rewards[name].applies(target))

@@ -73,11 +73,14 @@ def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -
     """Hold the names and sizes of weights against the rewards that there are.
 
     Raises:
-      RewardError: an unknown name, a weight that is negative or not finite, or none above 0.
+      RewardError: an unknown name, an entry that is no `Reward`, a weight that is negative or not finite, or none above
+        0.
     """
     for name, weight in weights.items():
         if name not in rewards:
             raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
+        if not isinstance(rewards[name], Reward):
+            raise RewardError(f"rewards[{name}] is {rewards[name]!r}: must be a Reward; write Reward(function)")
         if not (math.isfinite(weight) and weight >= 0):
             raise RewardError(
                 f"weights[{name}] is {weight}: must be finite and ≥ 0; let a penalty have a negative value"

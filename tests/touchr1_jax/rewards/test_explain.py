@@ -1,9 +1,11 @@
 """`python -m touchr1_jax.rewards`: an answer's slots, its terms and its total, and what it says to wrong arguments."""
 
+import jax.numpy as jnp
 import pytest
 
 from experiments.policies.scores import PUBLISHED as REPORTED
-from touchr1_jax.rewards import make_rewards, uniform_prior
+from touchr1_jax.rewards import Reward, make_rewards, uniform_prior
+from touchr1_jax.rewards import __main__ as explanation
 from touchr1_jax.rewards.__main__ import PUBLISHED, main
 
 ANSWER = "<perceive> gelsight_mini soft xense firm </perceive> <compare> soft </compare> <conclude> firm </conclude>"
@@ -93,6 +95,13 @@ def test_words_of_another_language_are_answered_with_those_that_count(capsys):
 def test_wrong_arguments_are_named(capsys, arguments, message):
     assert main(["explain", *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_what_cannot_be_trained_is_not_explained(capsys, monkeypatch):
+    branching = Reward(lambda parsed, target: jnp.float32(1 if parsed.length > 3 else 0))
+    monkeypatch.setattr(explanation, "make_rewards", lambda prior: {"mine": branching})
+    assert main(["explain", "--text", ANSWER, "--label", "hardness", "soft", "--weights", "mine", "1"]) == 1
+    assert "reward 'mine': value cannot be traced" in capsys.readouterr().err
 
 
 def test_the_published_weights_are_those_that_reports_use():

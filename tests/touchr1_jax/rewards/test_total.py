@@ -105,6 +105,11 @@ def test_bad_weights_are_named(weights, message):
         total(weights, constant(0), make_target())
 
 
+def test_a_bare_function_in_the_dictionary_is_named():
+    with pytest.raises(RewardError, match=r"rewards\[mine\] is <function .*: must be a Reward; write Reward\("):
+        total_reward({"mine": lambda p, t: jnp.ones(())}, {"mine": 1.0}, constant(0), make_target())
+
+
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
