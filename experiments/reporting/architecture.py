@@ -18,7 +18,7 @@ from rich.console import Console
 from experiments.reporting.charts import PALETTE
 from experiments.reporting.imports import condensed, part_graph, reduced, rows, within
 from experiments.running.artifacts import write_text
-from experiments.running.runs import ROOT
+from experiments.running.runs import NoCheckoutError, checkout
 
 PICTURE = Path("experiments/figures/architecture.svg")
 """Relative to the checkout."""
@@ -211,7 +211,12 @@ def _arrow(start: Point, end: float, colour: str) -> str:
 
 def main() -> int:
     """Draw the picture of this checkout; returns the exit status."""
-    write_text(ROOT / PICTURE, draw(ROOT))
+    try:
+        root = checkout()
+    except NoCheckoutError as error:
+        Console(stderr=True, soft_wrap=True).print(str(error), markup=False, highlight=False)
+        return 1
+    write_text(root / PICTURE, draw(root))
     Console().print(str(PICTURE), markup=False, highlight=False)
     return 0
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running.artifacts import read_json, write_json, write_text
-from experiments.running.runs import ROOT
+from experiments.running.runs import ROOT, NoCheckoutError, checkout
 
 RECORDED = Path("experiments/recorded")
 """Relative to the checkout; one file for each experiment, the run that the documents speak of."""
@@ -120,13 +120,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands.add_parser("fill", help="write every marked figure anew")
     chosen = parser.parse_args(arguments)
     try:
+        root = checkout()
         if chosen.command == "record":
-            record(chosen.run)
+            record(chosen.run, root)
         else:
             for document in DOCUMENTS:
-                text = (ROOT / document).read_text(encoding="utf-8")
-                write_text(ROOT / document, filled(text))
-    except FigureError as error:
+                text = (root / document).read_text(encoding="utf-8")
+                write_text(root / document, filled(text, root))
+    except (FigureError, NoCheckoutError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

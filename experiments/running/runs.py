@@ -32,6 +32,23 @@ class RunInUse(RuntimeError):
     """Another process is working in the run directory."""
 
 
+class NoCheckoutError(FileNotFoundError):
+    """The code is installed by itself: what belongs to a checkout alone is not there."""
+
+
+def checkout(root: Path = ROOT) -> Path:
+    """The top of the checkout that this code lies in.
+
+    Raises:
+      NoCheckoutError: it is installed without one.
+    """
+    if not (root / "pyproject.toml").exists():
+        raise NoCheckoutError(
+            f"{root} holds no pyproject.toml: must be a checkout of the project; clone it and work there"
+        )
+    return root
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Revision:
     """The commit of the code, `unknown` outside a checkout; `dirty`: unignored files differed from it."""

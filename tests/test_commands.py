@@ -1,0 +1,108 @@
+"""Every command that the documents and the experiments' docstrings show is one that the command line understands."""
+
+import ast
+import importlib
+import itertools
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import tyro
+
+from experiments.bench.__main__ import Command as Bench
+from experiments.running.catalogue import find
+from experiments.running.commands import COMMANDS, Command
+from experiments.running.runner import parse
+from sensors_io.__main__ import Command as Sensors
+from sensors_io.commands.choices import sections, with_devices
+from touchr1_jax.models.load import Load
+from touchr1_jax.rewards.__main__ import Command as Rewards
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
+DOCUMENTS = [ROOT / "README.md", *(ROOT / ".github").glob("*.md"), *(ROOT / p / "README.md" for p in PACKAGES)]
+DOCUMENTS.append(ROOT / "experiments" / "TUTORIAL.md")
+EXPERIMENTS = find("experiments")
+
+MODULE = re.compile(r"^(?:    )?(?:.*`)?python -m ((?:experiments|sensors_io|touchr1_jax)\S*) ?([^`\n]*)", re.MULTILINE)
+MAKE = re.compile(r"make experiment EXP=(\w+)(?: \[?ARGS=\"([^\"]*)\")?")
+STANDS_FOR = {"D": "6.3", "S": "0.06", "N": "2", "I": "1", "MASS_KG": "0.1"}
+"""Capital letters of the documents where the command line wants numbers."""
+
+WRITTEN_BY_TUTORIAL = {"brevity"}
+
+
+def shown(text: str) -> Iterator[tuple[str, str]]:
+    """Module and arguments of every command in a text; `a|b` counts as two commands."""
+    for module, rest in MODULE.findall(text):
+        yield from ((module, arguments) for arguments in choices(re.split(r"\s{2,}|\s#", rest)[0]))
+    for name, rest in MAKE.findall(text):
+        yield from (("experiments", f"{name} {arguments}") for arguments in choices(rest))
+
+
+def choices(arguments: str) -> list[str]:
+    """The command lines that brackets and bars stand for."""
+    words = [word.split("|") for word in shlex.split(arguments.replace("[", "").replace("]", "").replace("...", ""))]
+    return [shlex.join(words) for words in itertools.product(*words)]
+
+
+def status(module: str, arguments: str) -> object:
+    """Exit status of parsing a command line: 2 where it is not understood, 0 after help."""
+    try:
+        read(module, arguments)
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+def read(module: str, arguments: str) -> None:
+    """Parse a command line; `SystemExit` and every error of a configuration come out."""
+    words = [STANDS_FOR.get(word, word) for word in shlex.split(arguments)]
+    if module == "sensors_io":
+        first, *others = sections(words)
+        with_devices(tyro.cli(Sensors, args=first, config=(tyro.conf.OmitArgPrefixes,)), others)
+    elif module == "experiments" and words[0] in EXPERIMENTS:
+        parse(importlib.import_module(f"experiments.{words[0]}").EXPERIMENT, words[1:], "")
+    elif module == "experiments" and words[0] not in {"NAME", *WRITTEN_BY_TUTORIAL}:
+        assert words[0] in COMMANDS, f"there is no experiment {words[0]!r}"
+        tyro.cli(Command, args=words, config=(tyro.conf.OmitArgPrefixes,))
+    elif module == "touchr1_jax.models.load":
+        tyro.cli(Load, args=words)
+    elif module in ("experiments.bench", "touchr1_jax.rewards"):
+        kind = Bench if module == "experiments.bench" else Rewards
+        tyro.cli(kind, args=words, config=(tyro.conf.OmitArgPrefixes,))
+    else:
+        importlib.import_module(module)
+
+
+def test_commands_are_found():
+    text = (
+        "    python -m sensors_io list RECORDS   # what\nor `python -m experiments list x`, `make experiment EXP=a`\n"
+    )
+    text += '    make experiment EXP=b [ARGS="--scale smoke|gpu"]\n    python -m experiments c [--scale smoke]\n'
+    assert list(shown(text)) == [
+        ("sensors_io", "list RECORDS"),
+        ("experiments", "list x"),
+        ("experiments", "c --scale smoke"),
+        ("experiments", "a "),
+        ("experiments", "b --scale smoke"),
+        ("experiments", "b --scale gpu"),
+    ]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_of_the_documents_are_understood(document):
+    for module, arguments in shown(document.read_text(encoding="utf-8")):
+        assert status(module, arguments) == 0, f"python -m {module} {arguments}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_commands_of_an_experiment_are_understood(name):
+    about = ast.get_docstring(ast.parse((ROOT / "experiments" / f"{name}.py").read_text(encoding="utf-8"))) or ""
+    commands = list(shown(about))
+    assert any(arguments.split()[0] == name for _, arguments in commands), "its docstring shows no command"
+    for module, arguments in commands:
+        assert status(module, arguments) == 0, f"python -m {module} {arguments}"
