@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from experiments.running.artifacts import DamagedFileError
 from experiments.running.catalogue import find
 from experiments.running.compare import ComparisonError, compare_runs
 from experiments.running.history import listing_of_runs, listing_with_runs, locate, read_run
@@ -102,7 +103,7 @@ class Compare:
         try:
             a, b = (read_run(locate(name, self.runs_dir)) for name in (self.run_a, self.run_b))
             say(compare_runs(a, b, self.most))
-        except (ComparisonError, FileNotFoundError) as error:
+        except (ComparisonError, DamagedFileError, FileNotFoundError) as error:
             complain(f"{type(error).__name__}: {error}")
             return 1
         return 0

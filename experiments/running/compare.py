@@ -53,8 +53,10 @@ def compare_runs(a: Past, b: Past, most: int) -> str:
       most: figures to show, the gravest differences first; the others are counted.
 
     Raises:
-      ComparisonError: a run is unfinished, or the two have no figure in common.
+      ComparisonError: one run twice, a run that is unfinished, or two that have no figure in common.
     """
+    if a.directory == b.directory:
+        raise ComparisonError(f"RUN_A and RUN_B are both {a.directory}: must be two runs; name them by NAME/STAMP")
     for run in (a, b):
         if run.results is None:
             raise ComparisonError(

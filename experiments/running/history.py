@@ -6,10 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running import runs
-from experiments.running.artifacts import read_json
+from experiments.running.artifacts import DamagedFileError, read_json
 
 MINUTE, HOUR = 60, 3600
 """In seconds."""
+
+TOLD = frozenset({"experiment", "scale", "config", "git", "versions", "machine", "command"})
+"""What `config.json` of a run holds, and that of a model does not."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,8 +47,10 @@ class Past:
 
     @property
     def code(self) -> str:
-        """Short commit, with a plus where files differed from it."""
+        """Short commit, with a plus where files differed from it; the version of a package without a checkout."""
         git = self.description["git"]
+        if git["commit"] == runs.UNKNOWN:
+            return f"version {self.description['versions'].get(runs.PACKAGES[0], runs.UNKNOWN)}"
         return git["commit"][:7] + ("+" if git["dirty"] else "")
 
     @property
@@ -62,15 +67,21 @@ def read_run(directory: Path) -> Past:
     """What lies in the directory of one run.
 
     Raises:
-      FileNotFoundError: no `config.json` there.
+      FileNotFoundError: no `config.json` there, or not that of a run.
+      DamagedFileError: a file that is not what was written.
     """
     if not (directory / "config.json").exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
+    description = read_json(directory / "config.json")
+    if not isinstance(description, Mapping) or not description.keys() >= TOLD:
+        raise FileNotFoundError(
+            f"{directory / 'config.json'} is not that of a run: must be its directory; correct the path"
+        )
     times = directory / "timing.json"
     results = directory / "results.json"
     return Past(
         directory=directory,
-        description=read_json(directory / "config.json"),
+        description=description,
         seconds=read_json(times).get("total") if times.exists() else None,  # stages come before the total
         results=read_json(results) if results.exists() else None,
         held=runs.held(directory),
@@ -117,19 +128,21 @@ def listing_with_runs(questions: Mapping[str, str], runs_dir: Path) -> str:
     width = max(map(len, questions), default=0)
     for name, question in questions.items():
         lines.append(f"  {name:<{width}}  {question}")
-        past = runs_of(runs_dir / name)
+        past, damaged = _readable(runs_dir / name)
         for run in past[:1]:
             more = f" (and {len(past) - 1} more)" if len(past) > 1 else ""
             lines.append(f"  {'':<{width}}    {summary(run)}{more}  {' '.join(run.outcome[:1])}".rstrip())
+        lines += [f"  {'':<{width}}    {complaint}" for complaint in damaged]
     return "\n".join(lines)
 
 
 def listing_of_runs(name: str, question: str, runs_dir: Path) -> str:
     """Every run of one experiment, the newest first, with all that it says."""
-    past = runs_of(runs_dir / name)
-    if not past:
+    past, damaged = _readable(runs_dir / name)
+    if not past and not damaged:
         return f"{name}: {question}\n  has not run under {runs_dir}"
     blocks = [[f"  {summary(run)}", *(f"      {s}" for s in run.outcome), f"      {_report(run)}"] for run in past]
+    blocks.append([f"  {complaint}" for complaint in damaged])
     return "\n".join([f"{name}: {question}", *(line.rstrip() for block in blocks for line in block if line.strip())])
 
 
@@ -154,6 +167,17 @@ def aligned(rows: Sequence[Sequence[str]], gap: str = "  ") -> str:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = (gap.join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
     return "\n".join(line.rstrip() for line in lines)
+
+
+def _readable(home: Path) -> tuple[list[Past], list[str]]:
+    """Every run under `runs/NAME` that can be read, the newest first, and what is wrong with the others."""
+    past, damaged = [], []
+    for directory in sorted(runs.started(home), reverse=True):
+        try:
+            past.append(read_run(directory))
+        except (DamagedFileError, FileNotFoundError) as error:
+            damaged.append(str(error))
+    return past, damaged
 
 
 def _report(run: Past) -> str:

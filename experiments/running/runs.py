@@ -24,6 +24,9 @@ from experiments.running.artifacts import point_link, read_json, write_json
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
 """The packages whose versions are kept with a run."""
 
+UNKNOWN = "unknown"
+"""Commit of code that lies in no checkout."""
+
 ROOT = Path(__file__).resolve().parents[2]
 """The checkout that this code lies in, if it lies in one."""
 
@@ -65,7 +68,7 @@ def revision(root: Path = ROOT) -> Revision:
     top = _git(root, "rev-parse", "--show-toplevel")
     commit = _git(root, "rev-parse", "HEAD")
     if top is None or commit is None or Path(top).resolve() != root.resolve():
-        return Revision(commit="unknown", dirty=False)
+        return Revision(commit=UNKNOWN, dirty=False)
     return Revision(commit=commit, dirty=bool(_git(root, "status", "--porcelain")))
 
 

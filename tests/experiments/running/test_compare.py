@@ -106,6 +106,11 @@ def test_the_gravest_differences_come_first_and_the_others_are_counted(home, cap
 def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):
     assert main(["compare", "coin", "dice", "--runs-dir", str(home)], package=FAKES) == 1
     assert "'dice' is no run" in capsys.readouterr().err
+    assert main(["compare", "coin", "coin", "--runs-dir", str(home)], package=FAKES) == 1
+    assert "RUN_A and RUN_B are both" in capsys.readouterr().err
+    (tmp_path / "config.json").write_text("{")
+    assert main(["compare", "coin", str(tmp_path), "--runs-dir", str(home)], package=FAKES) == 1
+    assert "DamagedFileError" in capsys.readouterr().err
     unfinished = tmp_path / "coin" / "20260101-000000"
     unfinished.mkdir(parents=True)
     (unfinished / "config.json").write_bytes((home / "coin" / stamps(home)[0] / "config.json").read_bytes())

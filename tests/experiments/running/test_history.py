@@ -1,5 +1,7 @@
 """What ran, as `list` shows it, and how a run is named."""
 
+import dataclasses
+
 import pytest
 
 from experiments.running.artifacts import write_json
@@ -74,6 +76,24 @@ def test_an_experiment_without_runs_says_so(tmp_path, capsys):
     assert "has not run under" in capsys.readouterr().out
     assert main(["list", "coyn", "--runs-dir", str(tmp_path)], package=FAKES) == 2
     assert "Did you mean coin?" in capsys.readouterr().err
+
+
+def test_a_damaged_run_hides_no_other(tmp_path, capsys):
+    make_run(tmp_path, "20260101-000000", results=FINISHED, total=2)
+    (make_run(tmp_path, "20260102-000000") / "config.json").write_text("{")
+    (make_run(tmp_path, "20260103-000000") / "config.json").write_text('{"model_type": "qwen2_5_vl"}')
+    for arguments in (["list"], ["list", "coin"]):
+        assert main([*arguments, "--runs-dir", str(tmp_path)], package=FAKES) == 0
+        out = capsys.readouterr().out
+        assert "20260101-000000  smoke, code 0123456+: finished, 2 s" in out
+        assert "20260102-000000/config.json is damaged" in out
+        assert "20260103-000000/config.json is not that of a run" in out
+
+
+def test_a_run_of_an_installed_package_shows_its_version(tmp_path):
+    run = read_run(make_run(tmp_path, "20260101-000000"))
+    away = {**run.description, "git": {"commit": "unknown", "dirty": False}, "versions": {"touchr1-jax": "0.1.0"}}
+    assert dataclasses.replace(run, description=away).code == "version 0.1.0"
 
 
 def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
