@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 import rich.console
+import rich.live
 import rich.progress
 
 OUT = rich.console.Console()
@@ -13,6 +14,20 @@ ERR = rich.console.Console(stderr=True)
 def complain(error: Exception) -> None:
     """One line on stderr, as it stands."""
     ERR.print(f"{type(error).__name__}: {error}", markup=False, highlight=False, soft_wrap=True)
+
+
+@contextlib.contextmanager
+def live_display(
+    per_second: float, get_renderable: Callable[[], rich.console.RenderableType] | None = None
+) -> Iterator[rich.live.Live]:
+    """A part of the terminal that is drawn anew; where there is no terminal its last state, on lines of its own."""
+    with rich.live.Live(console=OUT, refresh_per_second=per_second, get_renderable=get_renderable) as live:
+        try:
+            yield live
+        finally:
+            live.stop()
+            if not OUT.is_terminal:
+                OUT.line()
 
 
 @contextlib.contextmanager

@@ -5,11 +5,10 @@ import pathlib
 import time
 
 import numpy as np
-import rich.live
 from rich.table import Table
 
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
-from sensors_io.commands.console import OUT
+from sensors_io.commands.console import OUT, live_display
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.devices.reader import Reader
 from sensors_io.force import ForceError
@@ -41,7 +40,7 @@ class ForceZeroing(Bench):
         with stop_on_interrupt() as stop, readers((self.device,), numbers=True) as (sensor,):
             finder = PoseFinder(self.still)
             end_s = time.monotonic() + self.wait_s
-            with rich.live.Live(console=OUT, refresh_per_second=10) as live:
+            with live_display(10) as live:
                 while len(finder.poses) < self.poses and not stop.is_set() and time.monotonic() < end_s:
                     try:
                         newest = _take(sensor, finder, self.poses)

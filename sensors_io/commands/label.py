@@ -19,6 +19,9 @@ ID, SPLIT, NAME = "object_id", "split", "name"
 COLUMNS = (ID, *ATTRIBUTES, SPLIT, NAME)
 """Of a table of labels; all but the first may be missing, and a cell may be empty."""
 
+LEAST = {"hardness": "soft", "roughness": "smooth", "protrusion": "flat"}
+"""What level 0 of an attribute means."""
+
 Row = Mapping[str, str]
 
 
@@ -108,7 +111,8 @@ def labelled(card: ObjectCard, row: Row, annotator: str) -> ObjectCard:
 def _level(object_id: str, attribute: str, cell: str) -> int:
     words = MATERIALS if attribute == "material" else tuple(map(str, range(LEVELS[attribute])))
     if cell not in words:
+        order = f" (from {LEAST[attribute]} upwards)" if attribute in LEAST else ""
         raise LabelsError(
-            f"{attribute} of {object_id!r} is {cell!r}: must be one of {', '.join(words)}, or empty; correct it"
+            f"{attribute} of {object_id!r} is {cell!r}: must be one of {', '.join(words)}{order}, or empty; correct it"
         )
     return words.index(cell)

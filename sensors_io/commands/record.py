@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import rich.console
-import rich.live
 import rich.panel
 import rich.progress_bar
 import rich.table
 
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
-from sensors_io.commands.console import OUT
+from sensors_io.commands.console import OUT, live_display
 from sensors_io.commands.extraction import Extraction
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.devices.reader import Reader
@@ -112,6 +111,11 @@ class Record(Bench):
                 self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
             )
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
+        if not report.contacts and not stop.is_set():
+            OUT.print(
+                f"nothing was missing: {self.object_id}, site {self.site} is complete; name another --site",
+                markup=False,
+            )
         if report.ended:
             asked = f"{self.free_s:g} s of free motion" if self.free_s > 0 else f"all {len(config.stages)} contacts"
             raise StreamEndedError(
@@ -173,7 +177,7 @@ class _Board:
     @contextlib.contextmanager
     def shown(self) -> Iterator[Callable[[Status], None]]:
         """A function that shows a status, while the block runs."""
-        with rich.live.Live(console=OUT, refresh_per_second=12, get_renderable=self._render) as live:
+        with live_display(12, self._render) as live:
             del live
 
             def show(status: Status) -> None:

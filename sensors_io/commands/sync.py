@@ -5,11 +5,10 @@ import dataclasses
 import pathlib
 import time
 
-import rich.live
 from rich.table import Table
 
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
-from sensors_io.commands.console import OUT
+from sensors_io.commands.console import OUT, live_display
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.offsets import Offsets, OffsetsError
 from sensors_io.recording.signals import By, Listener, measure_offsets
@@ -46,7 +45,7 @@ class Sync(Bench):
         with stop_on_interrupt() as stop, readers(configs) as devices:
             listeners = [Listener(device) for device in devices]
             end_s = time.monotonic() + self.seconds
-            with rich.live.Live(console=OUT, refresh_per_second=10) as live, contextlib.suppress(StreamEndedError):
+            with live_display(10) as live, contextlib.suppress(StreamEndedError):
                 while not stop.is_set() and time.monotonic() < end_s:
                     for listener in listeners:
                         listener.look()

@@ -87,7 +87,10 @@ def test_a_card_of_no_object_is_refused(root):
     ("table", "message"),
     [
         ("object_id,hardness\ncup,1\n", "object_id is 'cup': must be an object of"),
-        ("object_id,hardness\nobject_0,3\n", "hardness of 'object_0' is '3': must be one of 0, 1, 2, or empty"),
+        (
+            "object_id,hardness\nobject_0,3\n",
+            "hardness of 'object_0' is '3': must be one of 0, 1, 2 (from soft upwards), or empty",
+        ),
         ("object_id,material\nobject_0,stone\n", "material of 'object_0' is 'stone': must be one of plastic, metal"),
         ("object_id,split\nobject_0,dev\n", "split of 'object_0' is 'dev': must be one of train, val, test"),
         ("object_id,hardnes\nobject_0,1\n", "columns are ('object_id', 'hardnes'): must be object_id and any of"),

@@ -40,13 +40,16 @@ def press(tmp_path):
     return path
 
 
-def test_free_motion_is_recorded_from_a_replay(tmp_path, press):
+def test_free_motion_is_recorded_from_a_replay(tmp_path, press, capsys):
     out = tmp_path / "records"
     args = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.3", "replay", "--path", press]
     assert cli.main([*map(str, args)]) == 0
     made = RecordStore(out).contact(0)["tac3d"]
     assert 25 <= len(made) <= 40
     assert made.depth_mm.shape[1:] == (20, 20)
+    assert "\n1 contacts written, 0 recovered, 0 incomplete" in capsys.readouterr().out  # on a line of its own
+    assert cli.main([*map(str, args)]) == 0
+    assert "nothing was missing: cup, site 0 is complete; name another --site" in capsys.readouterr().out
 
 
 def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, capsys):
