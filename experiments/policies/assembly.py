@@ -27,6 +27,10 @@ from touchr1_jax.types import Params, Parsed, Target, TouchBatch
 Weights = Mapping[str, float]
 
 
+class ModelError(ValueError):
+    """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig:
     """Sizes of the towers, 0.64 million parameters by default; sensors and vocabulary come from the data."""
@@ -37,6 +41,11 @@ class ModelConfig:
     frames: int = 4
     image_px: int = 112
     completion_tokens: int = 20
+
+    def __post_init__(self) -> None:
+        for field, value in (("tactile.sensors", self.tactile.sensors), ("decoder.vocab_size", self.decoder.vocab_size)):
+            if value:
+                raise ModelError(f"{field} is {value}: comes from the data and the language; leave it out")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,6 +128,31 @@ def prove_rewards(arms: Mapping[str, Weights]) -> None:
                 check_finite(name, rewards[name], sensors, attributes)
         except RewardError as error:
             raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
+
+
+def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
+    """Build a model without computing anything, so that sizes which contradict each other show before data are made.
+
+    Raises:
+      ModelError: they do.
+    """
+    p, s, f, px, view = 1, len(sensors), model.frames, model.image_px, model.vision.image_px
+    shape = jax.ShapeDtypeStruct
+    batch = TouchBatch(
+        frames=shape((p, s, f, px, px, 3), jnp.uint8),
+        force_n=shape((p, s, f, 3), jnp.float32),
+        frame_index=shape((p, s, f), jnp.int32),
+        frame_mask=shape((p, s, f), bool),
+        stream_mask=shape((p, s), bool),
+        view=shape((p, view, view, 3), jnp.uint8),
+        view_mask=shape((p,), bool),
+        label=shape((p, len(TOUCH_LANGUAGE.attributes)), jnp.int32),
+    )
+    try:
+        made = assemble(model, sensors)
+        jax.eval_shape(functools.partial(made.init, 0), batch)
+    except (ValueError, TypeError, ZeroDivisionError) as error:
+        raise ModelError(f"no model can be built of these sizes: {error}; change them together") from error
 
 
 def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
