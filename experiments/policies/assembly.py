@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -27,10 +28,6 @@ from touchr1_jax.types import Params, Parsed, Target, TouchBatch
 Weights = Mapping[str, float]
 
 
-class ModelError(ValueError):
-    """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig:
     """Sizes of the towers, 0.64 million parameters by default; sensors and vocabulary come from the data."""
@@ -43,9 +40,7 @@ class ModelConfig:
     completion_tokens: int = 20
 
     def __post_init__(self) -> None:
-        for field, value in (("tactile.sensors", self.tactile.sensors), ("decoder.vocab_size", self.decoder.vocab_size)):
-            if value:
-                raise ModelError(f"{field} is {value}: comes from the data and the language; leave it out")
+        check_sizes(self, "frames", "image_px", "completion_tokens")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,25 +129,26 @@ def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
     """Build a model without computing anything, so that sizes which contradict each other show before data are made.
 
     Raises:
-      ModelError: they do.
+      SizeError: they do.
     """
     p, s, f, px, view = 1, len(sensors), model.frames, model.image_px, model.vision.image_px
-    shape = jax.ShapeDtypeStruct
-    batch = TouchBatch(
-        frames=shape((p, s, f, px, px, 3), jnp.uint8),
-        force_n=shape((p, s, f, 3), jnp.float32),
-        frame_index=shape((p, s, f), jnp.int32),
-        frame_mask=shape((p, s, f), bool),
-        stream_mask=shape((p, s), bool),
-        view=shape((p, view, view, 3), jnp.uint8),
-        view_mask=shape((p,), bool),
-        label=shape((p, len(TOUCH_LANGUAGE.attributes)), jnp.int32),
-    )
+    of: dict[str, Any] = {
+        "frames": ((p, s, f, px, px, 3), jnp.uint8),
+        "force_n": ((p, s, f, 3), jnp.float32),
+        "frame_index": ((p, s, f), jnp.int32),
+        "frame_mask": ((p, s, f), bool),
+        "stream_mask": ((p, s), bool),
+        "view": ((p, view, view, 3), jnp.uint8),
+        "view_mask": ((p,), bool),
+        "label": ((p, len(TOUCH_LANGUAGE.attributes)), jnp.int32),
+    }
+    shapes: dict[str, Any] = {name: jax.ShapeDtypeStruct(*shape) for name, shape in of.items()}
+    batch = TouchBatch(**shapes)
     try:
         made = assemble(model, sensors)
         jax.eval_shape(functools.partial(made.init, 0), batch)
-    except (ValueError, TypeError, ZeroDivisionError) as error:
-        raise ModelError(f"no model can be built of these sizes: {error}; change them together") from error
+    except (ValueError, TypeError) as error:
+        raise SizeError(f"no model can be built of these sizes: {error}") from error
 
 
 def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from experiments.policies.answers import Evaluated, evaluate_policy
-from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_rewards
+from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_model, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
 from experiments.policies.shared import shared_grpo, shared_sft
@@ -34,10 +34,11 @@ from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes import SceneConfig
-from sensors_io.schema import UNKNOWN, Flag
+from sensors_io.schema import SENSORS, UNKNOWN, Flag
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params, Parsed
@@ -77,6 +78,20 @@ class StudyConfig:
     grpo_save_every: int = 200
 
     def __post_init__(self) -> None:
+        if self.seeds < 1:
+            raise ValueError(f"seeds is {self.seeds}: must be at least 1; raise it")
+        known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
+        unknown = sorted(set(self.grpo_attributes) - set(known))
+        if unknown or not self.grpo_attributes:
+            raise ValueError(
+                f"grpo_attributes is {self.grpo_attributes}: must be some of {', '.join(known)}; correct it"
+            )
+        told = {"tactile.sensors": self.model.tactile.sensors, "decoder.vocab_size": self.model.decoder.vocab_size}
+        for field, value in told.items():
+            if value:
+                raise ValueError(
+                    f"model.{field} is {value}: must be 0, the data and the language tell it; leave it out"
+                )
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(
                 f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
@@ -171,9 +186,11 @@ def run_study(
       ways: other ways to ask SFT and the arms, by the names of their answers.
 
     Raises:
-      ValueError: a way that asks a policy that is not there, or has the name of one; what `prove_rewards` raises.
+      ValueError: a way that asks a policy that is not there, or has the name of one.
+      RewardError, SizeError: as `prove_rewards` and `prove_model`.
     """
     prove_rewards(arms)
+    prove_model(config.model, SENSORS)
     ways = ways or {}
     _check_ways(ways, arms)
     configs = {

@@ -39,6 +39,7 @@ from experiments.running.watcher import Watcher
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.records import RecordsError
 from sensors_io.schema import SchemaError
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
@@ -69,6 +70,7 @@ KNOWN_ERRORS = (
     NoTeam,
     MachineError,
     RewardError,
+    SizeError,
     OSError,
 )
 """Whose message says all that a user needs; others come with their traceback."""

@@ -17,6 +17,31 @@ MASKED = -1e9
 """Score of a forbidden key or token: finite, so that 0 · MASKED is 0 and no NaN arises from differences."""
 
 
+class SizeError(ValueError):
+    """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
+
+
+def check_sizes(config: Any, *fields: str) -> None:
+    """Refuse a config with a size below 1.
+
+    Raises:
+      SizeError: naming the field.
+    """
+    for field in fields:
+        if getattr(config, field) < 1:
+            raise SizeError(f"{field} is {getattr(config, field)}: must be at least 1; raise it")
+
+
+def check_heads(width: int, heads: int) -> None:
+    """Refuse a width that heads cannot share.
+
+    Raises:
+      SizeError: naming both.
+    """
+    if width % heads:
+        raise SizeError(f"width {width} must be a multiple of num_heads {heads}; change either")
+
+
 class RMSNorm(nn.Module):
     """Root-mean-square normalisation, x · g / √(mean x² + ε) (Zhang & Sennrich 2019), computed in float32."""
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
+from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, check_sizes, mrope, rotate
 from touchr1_jax.models.linear import Dense, Embed, product_with_weights
 
 
@@ -35,6 +35,7 @@ class DecoderConfig:
     tie_embedding: bool = True
 
     def __post_init__(self) -> None:
+        check_sizes(self, "hidden_size", "num_layers", "num_heads", "num_kv_heads", "head_dim", "intermediate_size")
         if self.num_heads % self.num_kv_heads:
             raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
 

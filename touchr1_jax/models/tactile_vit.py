@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from touchr1_jax.models.layers import MASKED, RMSNorm
+from touchr1_jax.models.layers import MASKED, RMSNorm, check_heads, check_sizes
 from touchr1_jax.models.salience import busiest_patches, patch_change, rest_mean
 
 
@@ -29,6 +29,9 @@ class TactileViTConfig:
     A `causal` encoder lets a step see itself and earlier ones alone, as the prediction of the next step needs.  With
     `patches_kept` the transformer gets only the patches of a stream that change most, the same ones in every step; the
     `rest` is dropped before its pixels are read, or kept as one mean token of each step.
+
+    Raises:
+      SizeError: a size below 1, or heads that do not share the width.
     """
 
     sensors: int
@@ -46,6 +49,11 @@ class TactileViTConfig:
     causal: bool = False
     patches_kept: int | None = None
     rest: Literal["drop", "merge"] = "drop"
+
+    def __post_init__(self) -> None:
+        check_sizes(self, "width", "num_heads", "mlp_ratio", "stem_px", "stem_width", "patch_cells")
+        check_sizes(self, "frames_per_step", "tokens_per_step")
+        check_heads(self.width, self.num_heads)
 
 
 class Encoded(NamedTuple):

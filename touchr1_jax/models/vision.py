@@ -6,13 +6,17 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
-from touchr1_jax.models.layers import RMSNorm
+from touchr1_jax.models.layers import RMSNorm, SizeError, check_heads, check_sizes
 from touchr1_jax.models.tactile_vit import EncoderLayer
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VisionConfig:
-    """Shape of the vision tower; a 64 px view in 16 px patches gives 16 patches, merged to 4 tokens."""
+    """Shape of the vision tower; a 64 px view in 16 px patches gives 16 patches, merged to 4 tokens.
+
+    Raises:
+      SizeError: a size below 1, heads that do not share the width, patches that do not fill the image in pairs.
+    """
 
     image_px: int = 64
     patch_px: int = 16
@@ -20,6 +24,14 @@ class VisionConfig:
     num_layers: int = 1
     num_heads: int = 2
     mlp_ratio: int = 2
+
+    def __post_init__(self) -> None:
+        check_sizes(self, "image_px", "patch_px", "width", "num_heads", "mlp_ratio")
+        check_heads(self.width, self.num_heads)
+        if self.image_px % (2 * self.patch_px):
+            raise SizeError(
+                f"image_px {self.image_px} must be a multiple of 2 · patch_px = {2 * self.patch_px}; change either"
+            )
 
     @property
     def grid(self) -> int:

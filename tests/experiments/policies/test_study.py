@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from experiments.policies.answers import Evaluated
+from experiments.policies.assembly import ModelConfig
 from experiments.policies.baselines import baselines, constant_answers, joint_mode, level_answers
 from experiments.policies.scores import score, score_study
 from experiments.policies.stages import Probed
-from experiments.policies.study import SFT, Study, Way, load_answers, run_study, save_answers
+from experiments.policies.study import SFT, Study, StudyConfig, Way, load_answers, run_study, save_answers
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
 from touchr1_jax.bench.metrics import evaluate
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.types import Parsed
 
@@ -174,3 +177,18 @@ def test_answers_by_single_sensors_are_their_own(study):
     assert np.array_equal(said.alone[:, 0].max(1), said.label.max(1))
     present = np.asarray(said.streams)
     assert (np.asarray(said.parsed.perceive)[~present] == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seeds": 0}, "seeds is 0: must be at least 1"),
+        ({"grpo_attributes": ("hardnes",)}, r"grpo_attributes is \('hardnes',\): must be some of hardness, roughness"),
+        ({"grpo_attributes": ()}, r"grpo_attributes is \(\): must be some of"),
+        ({"model": ModelConfig(decoder=DecoderConfig(vocab_size=50))}, r"model\.decoder\.vocab_size is 50: must be 0"),
+        ({"model": ModelConfig(tactile=TactileViTConfig(sensors=2))}, r"model\.tactile\.sensors is 2: must be 0"),
+    ],
+)
+def test_a_study_that_makes_no_sense_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(StudyConfig(), **change)

@@ -8,6 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, attend, mrope, rotate
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
 
 RNG = np.random.default_rng(0)
 
@@ -106,3 +109,18 @@ def test_masked_keys_have_weight_and_gradient_exactly_zero():
 def test_two_masked_scores_differ_by_zero():
     assert jnp.float32(MASKED) - jnp.float32(MASKED) == 0
     assert 0 * jnp.float32(MASKED) == 0
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: DecoderConfig(vocab_size=0, num_heads=0), "num_heads is 0: must be at least 1"),
+        (lambda: TactileViTConfig(sensors=1, width=97), "width 97 must be a multiple of num_heads 3"),
+        (lambda: TactileViTConfig(sensors=1, patch_cells=0), "patch_cells is 0: must be at least 1"),
+        (lambda: VisionConfig(width=63), "width 63 must be a multiple of num_heads 2"),
+        (lambda: VisionConfig(patch_px=13), "image_px 64 must be a multiple of 2 · patch_px = 26"),
+    ],
+)
+def test_sizes_that_no_tower_has_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+import pytest
 
 from tests.touchr1_jax.models.checkpoint import write_checkpoint
 from touchr1_jax.models.load import load_checkpoint
@@ -56,6 +57,7 @@ def make_batch(layout) -> SFTBatch:
     )
 
 
+@pytest.mark.slow
 def test_a_released_model_is_trained_and_written_back(tmp_path):
     (block,) = re.findall(
         r"^```python\n(found = load_checkpoint.*?)^```$", README.read_text(), re.MULTILINE | re.DOTALL
