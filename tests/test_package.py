@@ -1,6 +1,9 @@
 """What is shipped and what is said of it: type information, importable folders, the glossary, links."""
 
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -28,6 +31,19 @@ def test_every_folder_of_sources_is_a_package(package):
     """The wheel leaves out folders without `__init__.py`."""
     folders = {path.parent for path in (ROOT / package).rglob("*.py")}
     assert not [folder for folder in folders if not (folder / "__init__.py").exists()]
+
+
+def test_recording_needs_no_jax():
+    """As the README of sensors_io says: these import where there is none."""
+    needed = (
+        "sensors_io.recording.session",
+        "sensors_io.devices.uvc",
+        "sensors_io.pipeline",
+        "sensors_io.viewer.server",
+    )
+    blocked = f"import sys; sys.modules['jax'] = None; import {', '.join(needed)}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    subprocess.run([sys.executable, "-c", blocked], env=environment, check=True)
 
 
 def test_every_dimension_is_in_the_glossary():
