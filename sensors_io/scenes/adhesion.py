@@ -39,24 +39,6 @@ class Adhesion:
         stretch = self.radius_mm * self.work_n_per_mm**2 / self.plane_modulus_mpa**2
         return float((stretch / RANGE_MM**3) ** (1 / 3))
 
-    def hertz_force_n(self, force_n: float) -> float:
-        """Force F₁ at which the contact without adhesion is as wide: a³ = 3RF₁ / 4E*.
-
-            JKR  F₁ = F + 3πwR + √(6πwRF + (3πwR)²),   DMT  F₁ = F + 2πwR
-
-        The JKR one from a Tabor parameter of 1 on, the DMT one below.
-
-        Raises:
-          ValueError: a tension past the pull-off.
-        """
-        jkr = self.tabor >= 1
-        unit = np.pi * self.work_n_per_mm * self.radius_mm
-        least = -(1.5 if jkr else 2.0) * unit
-        require(force_n >= least, "force_n", force_n, f"must be ≥ {least:.3g}, the pull-off")
-        if not jkr:
-            return force_n + 2 * unit
-        return force_n + 3 * unit + float(np.sqrt(max(6 * unit * force_n + 9 * unit**2, 0.0)))
-
     def least_force_n(self, tolerance: float) -> float:
         """Force from which on adhesion widens the contact by no more than `tolerance`: where the change equals it.
 

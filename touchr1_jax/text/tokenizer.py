@@ -98,16 +98,6 @@ def word_level(language: Language, extra_words: Iterable[str] = ()) -> Tokenizer
     return Tokenizer(pieces=tuple(pieces), pad_id=0, end_ids=(1,), tactile_id=2, view_id=3, encoder=encode)
 
 
-def character_level() -> Tokenizer:
-    """One id per UTF-8 byte, which for ASCII is one per character: id 4 + b writes byte b, ids 0 to 3 are special."""
-    pieces = (b"", b"", b"", b"", *(bytes([b]) for b in range(256)))
-
-    def encode(text: str) -> list[int]:
-        return [4 + b for b in text.encode()]
-
-    return Tokenizer(pieces=pieces, pad_id=0, end_ids=(1,), tactile_id=2, view_id=3, encoder=encode)
-
-
 def from_tokenizers(
     library: tokenizers.Tokenizer,
     *,

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
+from tests.touchr1_jax.text.vocabularies import character_level
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.rl.rollout import SampleConfig, sample
 from touchr1_jax.text.constraint import compile_constraint
 from touchr1_jax.text.oracle import read
 from touchr1_jax.text.parser import compile_parser
-from touchr1_jax.text.tokenizer import Tokenizer, character_level
+from touchr1_jax.text.tokenizer import Tokenizer
 
 TOKENIZERS = {"words": tiny.TOKENIZER, "characters": character_level()}
 

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.touchr1_jax.text.vocabularies import LANGUAGES, make_tokenizer, spell, token_sequences
+from tests.touchr1_jax.text.vocabularies import LANGUAGES, character_level, make_tokenizer, spell, token_sequences
 from touchr1_jax.text.language import HARDNESS, MATERIAL, TOUCH_LANGUAGE, Attribute
 from touchr1_jax.text.oracle import read
 from touchr1_jax.text.parser import compile_parser
-from touchr1_jax.text.tokenizer import character_level, word_level
+from touchr1_jax.text.tokenizer import word_level
 
 LENGTH = {"word": 40, "character": 200, "bpe": 120, "straddling": 80}
 GOOD = (

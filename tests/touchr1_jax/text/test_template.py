@@ -3,11 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.touchr1_jax.text.vocabularies import trained_bpe
+from tests.touchr1_jax.text.vocabularies import character_level, trained_bpe
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import QUESTIONS, answer_text, build_layout, encode_answer, prompt_words, question_ids
-from touchr1_jax.text.tokenizer import character_level, from_tokenizers, word_level
+from touchr1_jax.text.tokenizer import from_tokenizers, word_level
 
 WORD = word_level(TOUCH_LANGUAGE, prompt_words())
 TOKENIZERS = {"word": WORD, "character": character_level(), "bpe": from_tokenizers(trained_bpe(TOUCH_LANGUAGE))}

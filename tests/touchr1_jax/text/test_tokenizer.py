@@ -7,10 +7,10 @@ import pytest
 import tokenizers
 from tokenizers import models
 
-from tests.touchr1_jax.text.vocabularies import SPECIALS, phrases, tags, trained_bpe
+from tests.touchr1_jax.text.vocabularies import SPECIALS, character_level, phrases, tags, trained_bpe
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.template import prompt_words
-from touchr1_jax.text.tokenizer import Tokenizer, character_level, from_file, from_tokenizers, word_level
+from touchr1_jax.text.tokenizer import Tokenizer, from_file, from_tokenizers, word_level
 
 ANSWER = "<perceive> xense soft dm-tac x firm </perceive> <compare> firm </compare> <conclude> hard </conclude>"
 LIBRARY = trained_bpe(TOUCH_LANGUAGE)

@@ -7,7 +7,7 @@ import tokenizers
 from tokenizers import AddedToken, decoders, models, pre_tokenizers, trainers
 
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Attribute, Language, Sensor
-from touchr1_jax.text.tokenizer import Tokenizer, character_level, from_tokenizers, word_level
+from touchr1_jax.text.tokenizer import Tokenizer, from_tokenizers, word_level
 
 TRICKY = Language(
     attributes=(
@@ -71,6 +71,16 @@ def level_phrases(language: Language) -> list[str]:
 
 def phrases(language: Language) -> list[str]:
     return sensor_phrases(language) + level_phrases(language)
+
+
+def character_level() -> Tokenizer:
+    """One id per UTF-8 byte, which for ASCII is one per character: id 4 + b writes byte b, ids 0 to 3 are special."""
+    pieces = (b"", b"", b"", b"", *(bytes([b]) for b in range(256)))
+
+    def encode(text: str) -> list[int]:
+        return [4 + b for b in text.encode()]
+
+    return Tokenizer(pieces=pieces, pad_id=0, end_ids=(1,), tactile_id=2, view_id=3, encoder=encode)
 
 
 def trained_bpe(language: Language, merges: int = 150) -> tokenizers.Tokenizer:
