@@ -26,7 +26,7 @@ def test_it_ends_with_its_block_even_by_an_error(well):
     seen = {}
 
     def fail():
-        seen.update(setting=jax.config.values[SETTING], flags=os.environ[FLAGS])
+        seen.update(setting=jax.config.values[SETTING], flags=os.environ.get(FLAGS, ""))
         raise KeyError
 
     with pytest.raises(KeyError), compiled_quickly():
