@@ -11,8 +11,8 @@ from experiments.running.artifacts import DamagedFileError, read_json
 MINUTE, HOUR = 60, 3600
 """In seconds."""
 
-TOLD = frozenset({"experiment", "scale", "config", "git", "versions", "machine", "command"})
-"""What `config.json` of a run holds, and that of a model does not."""
+TOLD = frozenset({"experiment", "scale", "config", "git", "command"})
+"""What tells `config.json` of a run from that of a model."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
