@@ -23,6 +23,7 @@ from sensors_io.schema import CLIP_ARRAYS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.text.template import answer_text, encode_answer
+from touchr1_jax.training.packing import PackedRows, Packing, existing_tokens, pack_rows
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.types import TouchBatch
 
@@ -84,13 +85,23 @@ def random_streams(present: np.ndarray, full_share: float, rng: np.random.Genera
     return np.where(use, subset, present)
 
 
+FULL_SHARE = 0.5
+"""Share of the questions of SFT that all present sensors feel."""
+
+
+def falling_share(step: int, steps: int) -> float:
+    """The same share where it falls from 1 within so many steps, 1 − (1 − `FULL_SHARE`) min(step / steps, 1)."""
+    return 1 - (1 - FULL_SHARE) * min(step / steps, 1) if steps else FULL_SHARE
+
+
 class AnswerFeed(Feed):
     """SFT batches: each contact with Q questions, for different attributes at random, and the verified answers to them.
 
     `evidence` [contact, S, A, K] are out-of-fold log-probabilities of each sensor's probe: `perceive` says the level
     most likely to each sensor alone, `compare` the one most likely to the present sensors together, `conclude` the
-    label.  `augment` changes what is felt at random; the evidence stays that of the unchanged contact.  Where several
-    processes share a batch, each reads the rows `own` of it.
+    label.  `augment` changes what is felt at random; the evidence stays that of the unchanged contact.  In the
+    first `easy_steps` batches more questions than later are felt by all sensors.  With `packing` the tokens are put
+    into rows.  Where several processes share a batch, each reads the rows `own` of it.
     """
 
     def __init__(
@@ -104,6 +115,8 @@ class AnswerFeed(Feed):
         seed: int,
         blind: bool = False,
         augment: AugmentConfig | None = None,
+        easy_steps: int = 0,
+        packing: Packing | None = None,
         own: np.ndarray | None = None,
     ) -> None:
         clips = clip_batches(
@@ -120,7 +133,7 @@ class AnswerFeed(Feed):
         super().__init__(clips, seed)
         self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own
         self._assembly, self._evidence, self._blind = assembly, evidence, blind
-        self._questions = questions
+        self._questions, self._packing, self._easy_steps = questions, packing, easy_steps
 
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> SFTBatch:
         """Write the answers of one batch of clips; what is drawn for them is drawn for the whole batch."""
@@ -129,7 +142,8 @@ class AnswerFeed(Feed):
         present = np.ones((self._batch_size, element["stream_mask"].shape[1]), bool)
         present[self._own] = element["stream_mask"]
         present = np.repeat(present, q, 0)
-        streams = np.zeros_like(present) if self._blind else random_streams(present, 0.5, rng)
+        full_share = falling_share(self._count - 1, self._easy_steps)
+        streams = np.zeros_like(present) if self._blind else random_streams(present, full_share, rng)
         streams = streams.reshape(self._batch_size, q, -1)[self._own]
         pairs = [
             self._answer(element["contact"][i], chosen[i, j], element["label"][i], streams[i, j])
@@ -144,7 +158,15 @@ class AnswerFeed(Feed):
             "tokens": tokens,
             "token_mask": masks,
         }
-        return SFTBatch(touch=host_touch(element), **written)
+        touch = host_touch(element)
+        return SFTBatch(touch=touch, rows=self._rows(touch, written), **written)
+
+    def _rows(self, touch: TouchBatch, written: dict[str, np.ndarray]) -> PackedRows | None:
+        if self._packing is None:
+            return None
+        agent, token_mask = self._assembly.agent, written["token_mask"]
+        exists = existing_tokens(agent.policy, agent.slots, touch, written["mask"], written["streams"], token_mask)
+        return pack_rows(exists, token_mask, self._packing)
 
     def _answer(
         self, contact: int, question: int, label: np.ndarray, streams: np.ndarray

@@ -6,6 +6,7 @@ run goes on from its last checkpoint.
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
+from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
@@ -34,7 +36,8 @@ from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
-from touchr1_jax.training.sft import SFTState, make_sft_step
+from touchr1_jax.training.packing import Packing
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
 
 ENCODE_BATCH = 8
@@ -54,6 +57,14 @@ class SFTConfig:
     """Contacts of a micro-batch of the gradient; two stay in cache, which on a CPU is a third faster than sixteen."""
     max_logits: int = MAX_LOGITS
     """Logits that may exist at once; more tokens than that are scored in blocks."""
+    pack: int = 0
+    """Tokens of a row that several questions with their answers share; 0 pads each to the longest instead."""
+    lora_rank: int = 0
+    """Rank of adapters that are trained in the place of the decoder's weights; 0 trains the weights."""
+    lora_alpha: float = 32.0
+    """The adapters' change is multiplied by lora_alpha / lora_rank."""
+    curriculum: float = 0.0
+    """Share of the steps within which the share of questions that all sensors feel falls from 1 to a half."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
     augment: AugmentConfig = AugmentConfig()
     """How what is felt is changed at random; by default not at all."""
@@ -63,6 +74,33 @@ class SFTConfig:
             raise ValueError(
                 f"micro_contacts is {self.micro_contacts}: must divide batch_size = {self.batch_size}; change either"
             )
+        for field in ("pack", "lora_rank"):
+            if getattr(self, field) < 0:
+                raise ValueError(f"{field} is {getattr(self, field)}: must be at least 0, which is none; raise it")
+
+        if not 0 <= self.curriculum <= 1:
+            raise ValueError(f"curriculum is {self.curriculum}: must be 0 … 1, a share of the steps; correct it")
+
+    @property
+    def lora(self) -> LoraConfig | None:
+        """Adapters of the decoder, or none."""
+        return LoraConfig(rank=self.lora_rank, alpha=self.lora_alpha) if self.lora_rank else None
+
+    def packing(self, devices: int) -> Packing | None:
+        """Rows that the contacts of a micro-batch share on each of the devices; `None` pads.
+
+        Raises:
+          ValueError: a micro-batch that the devices cannot share.
+        """
+        if not self.pack:
+            return None
+        if self.micro_contacts % devices:
+            raise ValueError(
+                f"micro_contacts is {self.micro_contacts}: must be a multiple of the {devices} devices that share a "
+                "micro-batch, for none reads the rows of another; raise it, or leave pack at 0"
+            )
+        micro_batches = self.batch_size // self.micro_contacts
+        return Packing(width=self.pack, contacts=self.micro_contacts // devices, micro_batches=micro_batches)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,7 +168,10 @@ def run_sft(
     blind: bool = False,
     tactile: Params | None = None,
 ) -> Params:
-    """Train a policy on verified answers, from scratch or from a tactile encoder; a blind one never feels anything."""
+    """Train a policy on verified answers, from scratch or from a tactile encoder; a blind one never feels anything.
+
+    Adapters are merged into the decoder's weights in the end, so that what follows need not know of them.
+    """
     feed = AnswerFeed(
         assembly,
         data,
@@ -140,6 +181,8 @@ def run_sft(
         seed=seed,
         blind=blind,
         augment=config.augment,
+        easy_steps=round(config.curriculum * config.steps),
+        packing=config.packing(math.prod(context.devices.shape[:2])),
         own=context.devices.rows(config.batch_size),
     )
     optimizer, step = sft_program(assembly.agent, config, blind)
@@ -147,20 +190,40 @@ def run_sft(
     params = assembly.init(seed, touch_batch(next(iter(clips))))
     if tactile is not None:
         params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
-    state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
+    frozen = {} if config.lora is None else {name: params[name] for name in config.lora.towers}
+    trained = params if config.lora is None else _trainable(params, frozen, config.lora, seed)
+    state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
-    step, state, batches = context.devices.spread(step, state, feed, config.batch_size)
-    return context.devices.whole(_fit(step, state, batches, loop, context, stage).params)
+    step, state, batches = context.devices.spread(step, state, feed, config.batch_size, *([frozen] if frozen else []))
+    found = context.devices.whole(_fit(step, state, batches, loop, context, stage).params)
+    return found if config.lora is None else {**merge(frozen, found.adapters, config.lora), **found.towers}
+
+
+def _trainable(params: Params, frozen: Params, lora: LoraConfig, seed: int) -> Trainable:
+    """Adapters of the frozen towers, and the other towers."""
+    adapters = init_adapters(jax.random.fold_in(jax.random.key(seed), 1), frozen, lora)
+    return Trainable(adapters=adapters, towers={name: params[name] for name in params if name not in frozen})
 
 
 @functools.cache
 def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
-    """Optimizer and compiled step, made once for all seeds."""
+    """Optimizer and compiled step, made once for all seeds; with adapters, (state, batch, frozen towers) → …"""
     optimizer = make_optimizer(config.optimizer, config.steps)
-    step = make_sft_step(
-        agent, optimizer, blind=blind, max_logits=config.max_logits, micro_contacts=config.micro_contacts
+    make = functools.partial(
+        make_sft_step,
+        optimizer=optimizer,
+        blind=blind,
+        max_logits=config.max_logits,
+        micro_contacts=config.micro_contacts,
     )
-    return optimizer, step
+    if config.lora is None:
+        return optimizer, make(agent)
+    lora = config.lora
+
+    def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, Array]]:
+        return make(adapt(agent, frozen, lora))(state, batch)
+
+    return optimizer, jax.jit(step, donate_argnums=0)
 
 
 def _fit(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.lm import LayerCache, PrefixCache
-from touchr1_jax.models.policy import Features, Policy, Slots
+from touchr1_jax.models.policy import Features, Policy, Row, Slots
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -103,6 +103,10 @@ class Agent:
         """
         first, prefix = self._apply(params, Policy.prefill_state, features, ids, mask, self.slots, known, start)
         return self._apply(params, Policy.completion_states, tokens, first, prefix), prefix
+
+    def packed_states(self, params: Params, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
+        """Hidden states at the places of a row of prompts with their completions, as `group_states` has them."""
+        return self._apply(params, Policy.packed_states, features, row)
 
     def logits(self, params: Params, states: Float[Array, "*n D"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts, banned ids out of reach."""

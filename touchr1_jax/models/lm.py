@@ -11,6 +11,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
@@ -53,6 +54,17 @@ class PrefixCache(NamedTuple):
     layers: tuple[LayerCache, ...]
     mask: Bool[Array, "L"]
     next_position: Int[Array, ""]
+
+
+@struct.dataclass
+class Segments:
+    """Which example each token of a row belongs to, −1 for padding; the tokens of an example stand together.
+
+    None has more than `reach` tokens: keys further away are left out before they are masked.
+    """
+
+    number: Int[Array, "W"]
+    reach: int = struct.field(pytree_node=False)
 
 
 class DecoderLayer(nn.Module):
@@ -107,11 +119,26 @@ class DecoderLayer(nn.Module):
         causal = jnp.tri(x.shape[-2], dtype=bool)
         return self.finish(x, attend(q, [KeySource(past.k, past.v, mask), KeySource(own.k, own.v, causal)]))
 
+    def over_row(self, x: Float[Array, "W D"], rotation: Rotation, segments: Segments) -> Float[Array, "W D"]:
+        """A row of examples, of which none sees another."""
+        q, own = self.project(x, rotation)
+        return self.finish(x, attend_in_segments(q, own, segments))
+
+    def over_places(
+        self, x: Float[Array, "W D"], rotation: Rotation, segments: Segments, places: Int[Array, "K"]
+    ) -> Float[Array, "K D"]:
+        """As `over_row`, but the tokens at some places alone are answered."""
+        x_K, at_K = x[places], Rotation(rotation.cos[places], rotation.sin[places])
+        q, own = self.project(x_K, at_K)[0], self.project(x, rotation)[1]
+        own_segment = segments.number[places, None] == segments.number
+        seen = own_segment & (jnp.arange(x.shape[0]) <= places[:, None])
+        return self.finish(x_K, attend(q, [KeySource(own.k, own.v, seen)]))
+
 
 Rematerialised = nn.remat(
     DecoderLayer,
     policy=product_with_weights,
-    methods=("over_prompt", "over_end", "over_completion"),
+    methods=("over_prompt", "over_end", "over_completion", "over_row", "over_places"),
 )
 """A layer of which the backward pass keeps matrix products with weights alone.  Layer by layer: the recomputation waits
 for the gradient of its layer, where that of all layers at once may begin with all of them and hold what it makes."""
@@ -193,6 +220,26 @@ class Decoder(nn.Module):
             x = layer.over_completion(x, rotation, past, prefix.mask)
         return x
 
+    def packed_states(
+        self,
+        x: Float[Array, "W D"],
+        positions: Int[Array, "3 W"],
+        segments: Segments,
+        places: Int[Array, "K"],
+    ) -> Float[Array, "K D"]:
+        """Hidden states at some places of a row of examples, each of which sees what precedes it in its own alone.
+
+        Args:
+          x: embedded tokens.
+          positions: (time, row, column) of each token.
+          segments: the example of each token.
+          places: whose states are wanted.
+        """
+        rotation = self._rotation(positions)
+        for layer in self.layers[:-1]:
+            x = layer.over_row(x, rotation, segments)
+        return self.layers[-1].over_places(x, rotation, segments, places)
+
     def decode(
         self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: tuple[LayerCache, ...]
     ) -> tuple[Float[Array, "D"], tuple[LayerCache, ...]]:
@@ -229,6 +276,25 @@ def attend_causally(q: Float[Array, "n KV R d"], cache: LayerCache, mask: Bool[A
         keys = before + end
         seen = jnp.tri(end - begin, keys, before + begin, dtype=bool) & mask[:keys]
         blocks.append(attend(q[begin:end], [KeySource(cache.k[:, :keys], cache.v[:, :keys], seen)]))
+    return jnp.concatenate(blocks)
+
+
+ROW_QUERIES = 64
+"""Queries that a row of examples answers at a time: few, for each block is given all keys within reach."""
+
+ROW_BLOCKS = 16
+"""Blocks of a row at most."""
+
+
+def attend_in_segments(q: Float[Array, "W KV R d"], cache: LayerCache, segments: Segments) -> Float[Array, "W hd"]:
+    """Attention of each token over those of its own segment up to itself, in blocks of queries."""
+    width, blocks = q.shape[0], []
+    rows = max(ROW_QUERIES, -(-width // ROW_BLOCKS))
+    for begin in range(0, width, rows):
+        end, first = min(begin + rows, width), max(0, begin + 1 - segments.reach)
+        causal = jnp.tri(end - begin, end - first, begin - first, dtype=bool)
+        seen = causal & (segments.number[begin:end, None] == segments.number[first:end])
+        blocks.append(attend(q[begin:end], [KeySource(cache.k[:, first:end], cache.v[:, first:end], seen)]))
     return jnp.concatenate(blocks)
 
 

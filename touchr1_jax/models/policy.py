@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import RMSNorm
-from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache
+from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache, Segments
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
 from touchr1_jax.types import Params, TouchBatch
 
@@ -46,6 +46,20 @@ class Slots(NamedTuple):
     touch: np.ndarray  # [S, N]
     view: np.ndarray  # [Nv]
     stream_text: np.ndarray  # [L]: stream whose text a token is, S for the view's marks, −1 for other tokens
+
+
+class Row(NamedTuple):
+    """Examples, prompts with their completions, one after the other in W tokens.
+
+    `feature` is the row of an array of features [n, D] that is a token's embedding, −1 for a word; at `places` the
+    hidden states are wanted.
+    """
+
+    ids: Int[Array, "W"]
+    feature: Int[Array, "W"]
+    positions: Int[Array, "3 W"]
+    segments: Segments
+    places: Int[Array, "K"]
 
 
 class ViewConfig(Protocol):
@@ -158,6 +172,13 @@ class Policy(nn.Module):
         """
         first = jnp.broadcast_to(first, (*tokens.shape[:-1], 1, *first.shape))
         return jnp.concatenate([first, self.decoder.extend(tokens[..., :-1], prefix)], -2)
+
+    def packed_states(self, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
+        """Hidden states at the places of a row that ask for them; `features` as in `Row`."""
+        x = self.decoder.embed(row.ids)
+        seen = features[jnp.maximum(row.feature, 0)].astype(x.dtype)
+        x = jnp.where((row.feature >= 0)[:, None], seen, x)
+        return self.decoder.packed_states(x, row.positions, row.segments, row.places)
 
     def logits(self, states: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts."""

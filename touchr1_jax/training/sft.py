@@ -1,10 +1,12 @@
 """Stage 2, supervised fine-tuning: imitate verified answers, the loss on the answer's tokens alone.
 
 Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  The gradient is summed over
-micro-batches of contacts, and logits of a large vocabulary exist for some tokens at a time only.
+micro-batches of contacts, and logits of a large vocabulary exist for some tokens at a time only.  Questions with their
+answers are padded to one length, or packed into rows (`packing`), which gives the same gradient.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +19,9 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax import masked
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS, Rows, by_blocks
+from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.losses import token_log_probs
+from touchr1_jax.training.packing import PackedRows, Tokens, padded_tokens, row_of
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -31,6 +35,8 @@ class SFTBatch:
     streams: Bool[Array, "P Q S"]
     tokens: Int[Array, "P Q T"]
     token_mask: Bool[Array, "P Q T"]
+    rows: PackedRows | None = None
+    """Where the tokens stand in rows; `None` pads every question and answer."""
 
 
 @struct.dataclass
@@ -83,16 +89,22 @@ def sft_gradient(
 ) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], Params]:
     """What `sft_loss` says of the batch, and the gradient of the loss, summed over micro-batches.
 
-    Neighbours are in different micro-batches: where devices share the contacts, each then has some of every one.
+    Neighbours are in different micro-batches: where devices share the contacts, each then has some of every one.  Of a
+    packed batch the rows are computed, group beside group and one row of each after the other.
 
     Raises:
-      ValueError: contacts that do not divide into micro-batches.
+      ValueError: contacts that do not divide into micro-batches, or rows that were packed for others.
     """
     contacts = batch.tokens.shape[0]
     micro = contacts if micro_contacts is None else micro_contacts
     if micro < 1 or contacts % micro:
         raise ValueError(
             f"micro_contacts is {micro_contacts}: must divide the {contacts} contacts of a batch; change either"
+        )
+    if batch.rows is not None and batch.rows.micro_batches != contacts // micro:
+        raise ValueError(
+            f"rows were packed for {batch.rows.micro_batches} micro-batches: must be as many as the gradient's, "
+            f"{contacts // micro}; pack with that number"
         )
     most = jnp.maximum(jnp.sum(batch.token_mask), 1)
 
@@ -101,6 +113,8 @@ def sft_gradient(
         return cost / most, right / most
 
     def body(total: Any, chunk: SFTBatch) -> tuple[Any, None]:
+        if (rows := chunk.rows) is not None:
+            return _add_rows(agent, params, chunk, rows, total, most, blind=blind, max_logits=max_logits), None
         return jax.tree.map(jnp.add, total, jax.value_and_grad(share, has_aux=True)(params, chunk)), None
 
     zero = jnp.zeros(())
@@ -112,7 +126,10 @@ def sft_gradient(
 def sft_loss(
     agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cross-entropy of the answer's tokens, −mean log π(o_t | q, touch, o_<t), and the share predicted right."""
+    """Cross-entropy of the answer's tokens, −mean log π(o_t | q, touch, o_<t), and the share predicted right.
+
+    Questions and answers are padded here, even those of a packed batch.
+    """
     most = jnp.maximum(jnp.sum(batch.token_mask), 1)
     cost, right = sft_sums(agent, params, batch, blind=blind, max_logits=max_logits)
     return cost / most, right / most
@@ -128,17 +145,94 @@ def sft_sums(
         seen = dataclasses.replace(features, stream_mask=features.stream_mask & streams)
         return agent.group_states(params, seen, ids, mask, tokens[None])[0][0]
 
-    def score(rows: Rows) -> Rows:
-        logits = agent.logits(params, rows["state"])
-        log_prob = token_log_probs(jax.nn.log_softmax(logits), rows["token"])
-        return {"log_prob": log_prob, "right": jnp.argmax(logits, -1) == rows["token"]}
-
     per_question = jax.vmap(answer, in_axes=(None, 0, 0, 0, 0))
     states = jax.vmap(per_question)(features, batch.ids, batch.mask, batch.streams, batch.tokens)
     contacts = len(batch.tokens)
     rows = {"state": states.reshape(contacts, -1, states.shape[-1]), "token": batch.tokens.reshape(contacts, -1)}
     # contact by contact, each its share of the bound: blocks over all of them would cut across the devices
     most = max(1, max_logits // contacts)
-    found = jax.vmap(lambda r: by_blocks(score, r, width=len(agent.banned), most=most))(rows)
+    found = jax.vmap(lambda r: _scored(agent, params, r, most))(rows)
     log_prob, right = (found[name].reshape(batch.tokens.shape) for name in ("log_prob", "right"))
     return -masked.total(log_prob, batch.token_mask), masked.total(right, batch.token_mask).astype(jnp.float32)
+
+
+def _scored(agent: Agent, params: Params, rows: Rows, max_logits: int) -> Rows:
+    """Log-probability of each token after its state, and whether it is the likeliest."""
+
+    def score(rows: Rows) -> Rows:
+        logits = agent.logits(params, rows["state"])
+        log_prob = token_log_probs(jax.nn.log_softmax(logits), rows["token"])
+        return {"log_prob": log_prob, "right": jnp.argmax(logits, -1) == rows["token"]}
+
+    return by_blocks(score, rows, width=len(agent.banned), most=max_logits)
+
+
+def row_scores(
+    agent: Agent,
+    params: Params,
+    seen: Float[Array, "n D"],
+    tokens: Tokens,
+    source: Int[Array, "W"],
+    predicts: Int[Array, "K"],
+    max_logits: int = MAX_LOGITS,
+) -> Rows:
+    """Log-probability `log_prob` [K] of what follows each predicting place of a row, and whether it is `right`.
+
+    Args:
+      agent, params, max_logits: as in `sft_gradient`.
+      seen: encoded touch and view of the contacts of a group.
+      tokens: of the examples of the group.
+      source, predicts: the row, as in `PackedRows`; what is said of places that are none means nothing.
+    """
+    row, following = row_of(tokens, source, predicts)
+    states = agent.packed_states(params, seen, row)
+    return _scored(agent, params, {"state": states, "token": following}, max_logits)
+
+
+def encoded_group(
+    agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False
+) -> tuple[Float[Array, "P n D"], Features]:
+    """Tokens of each contact's streams and view, one after the other, and the features that they are of."""
+    features = agent.encode(params, batch.touch, blind=blind)
+    touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1])
+    return jnp.concatenate([touch, features.view.astype(touch.dtype)], 1), features
+
+
+def _add_rows(
+    agent: Agent,
+    params: Params,
+    chunk: SFTBatch,
+    rows: PackedRows,
+    total: Any,
+    most: Array,
+    *,
+    blind: bool,
+    max_logits: int,
+) -> Any:
+    """`total`, values with their gradient, and what the rows of a micro-batch add to them.
+
+    As many rows are computed as the fullest group has.  Their gradients with respect to the encoded contacts are
+    summed, and go through the encoder once.
+    """
+    encode = lambda p: encoded_group(agent, p, chunk, blind=blind)
+    encoded, back, features = jax.vjp(encode, params, has_aux=True)
+    groups = len(encoded) // rows.contacts
+    by_group = lambda x: x.reshape(groups, -1, *x.shape[2:])
+    prompt = chunk.ids, chunk.mask, chunk.streams, chunk.tokens
+    made = padded_tokens(agent.policy, agent.slots, features, *prompt, rows.contacts)
+    source, predicts, tokens = jax.tree.map(by_group, (rows.source, rows.predicts, made))
+    of_group = functools.partial(row_scores, agent, max_logits=max(1, max_logits // groups))
+
+    def share(params: Params, seen: Array, i: Array) -> tuple[Array, Array]:
+        found = jax.vmap(of_group, in_axes=(None, 0, 0, 0, 0))(params, seen, tokens, source[:, i], predicts[:, i])
+        log_prob, right = (masked.total(found[name], predicts[:, i] >= 0) for name in ("log_prob", "right"))
+        return -log_prob / most, right.astype(jnp.float32) / most
+
+    def body(i: Array, carry: Any) -> Any:
+        sums, to_encoder = carry
+        values, (grads, to_seen) = jax.value_and_grad(share, argnums=(0, 1), has_aux=True)(params, by_group(encoded), i)
+        return jax.tree.map(jnp.add, (sums, to_encoder), ((values, grads), to_seen))
+
+    used = jnp.max(jnp.sum(jnp.any(source >= 0, -1), -1))
+    (values, grads), to_seen = jax.lax.fori_loop(0, used, body, (total, jnp.zeros_like(by_group(encoded))))
+    return values, jax.tree.map(jnp.add, grads, back(to_seen.reshape(encoded.shape))[0])

@@ -8,12 +8,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.policies.feeds import AnswerFeed, Feed, QuestionFeed, each, question_batch, random_streams, take
+from experiments.policies.feeds import (
+    AnswerFeed,
+    Feed,
+    QuestionFeed,
+    each,
+    falling_share,
+    question_batch,
+    random_streams,
+    take,
+)
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
+from touchr1_jax.training.packing import Packing
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +49,18 @@ def answers(assembly, data, evidence):
     return lambda **changes: AnswerFeed(
         assembly, data, evidence, **{"batch_size": 3, "questions": 3, "seed": 1, **changes}
     )
+
+
+@pytest.fixture
+def packed(answers):
+    """Every contact by itself, so that whoever reads some contacts packs those alone."""
+    return lambda **changes: answers(packing=Packing(width=128, contacts=1), **changes)
+
+
+@pytest.fixture
+def easy(answers):
+    """All sensors first, for longer than a test looks."""
+    return lambda **changes: answers(easy_steps=10, **changes)
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +157,25 @@ def test_what_is_felt_can_be_changed_at_random(answers):
         np.testing.assert_array_equal(getattr(plain, name), getattr(changed, name))
 
 
+def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(assembly, answers):
+    plain, packed = (next(answers(packing=packing)) for packing in (None, Packing(width=128, contacts=3)))
+    assert equal([leaves(plain)], [leaves(packed.replace(rows=None))])
+    n = packed.ids.shape[-1] + packed.tokens.shape[-1]
+    tokens = np.concatenate([packed.ids, packed.tokens], -1).reshape(-1)
+    said = [tokens[row[at[at >= 0] + 1]] for row, at in rows_of(packed.rows)]
+    assert sorted(np.concatenate(said)) == sorted(packed.tokens[packed.token_mask])
+    felt = np.concatenate([row for row, _ in rows_of(packed.rows)])
+    touch = np.isin(felt % n, assembly.layout.touch.ravel())
+    steps = packed.streams[..., None] & packed.touch.frame_mask[:, None]  # a step is a frame here
+    assert touch.sum() == steps.sum() * assembly.model.tactile.tokens_per_step
+
+
+def rows_of(rows):
+    """Source and predicting places of each row of one group."""
+    for row, at in zip(rows.source.reshape(-1, 128), rows.predicts.reshape(-1, rows.predicts.shape[-1]), strict=True):
+        yield row[row >= 0], at
+
+
 @pytest.mark.parametrize("kind", ["answers", "questions"])
 def test_one_seed_is_one_sequence_of_batches(request, kind):
     make = request.getfixturevalue(kind)
@@ -144,7 +185,7 @@ def test_one_seed_is_one_sequence_of_batches(request, kind):
     assert not equal(first[:1], first[1:2])
 
 
-@pytest.mark.parametrize("kind", ["answers", "questions"])
+@pytest.mark.parametrize("kind", ["answers", "questions", "packed", "easy"])
 def test_a_state_resumes_exactly(request, kind):
     make = request.getfixturevalue(kind)
     feed = make()
@@ -158,7 +199,7 @@ def test_a_state_resumes_exactly(request, kind):
     assert equal(rest[:1], [leaves(next(feed))])
 
 
-@pytest.mark.parametrize("kind", ["answers", "questions"])
+@pytest.mark.parametrize("kind", ["answers", "questions", "packed"])
 def test_processes_that_share_batches_make_them_together(request, kind):
     """What is drawn is drawn for the whole batch, so that it does not matter who makes which rows."""
     make = request.getfixturevalue(kind)
@@ -237,6 +278,18 @@ def test_all_streams_are_felt_as_often_as_is_asked(full_share):
     full = full_share + (1 - full_share) / 4  # a random subset of 1 to 4 sensors may be all of them
     assert streams.all(1).mean() == pytest.approx(full, abs=0.01)
     assert np.ptp(streams.mean(0)) < 0.02  # no sensor is favoured
+
+
+def test_a_curriculum_begins_with_all_sensors(answers, data):
+    """Of batch after batch, as many questions are felt by all sensors as `falling_share` says; then as without it."""
+    assert [falling_share(step, 4) for step in range(6)] == [1, 0.875, 0.75, 0.625, 0.5, 0.5]
+    assert falling_share(0, 0) == falling_share(100, 0) == 0.5
+    feed, plain = answers(easy_steps=3), answers()
+    felt = [(np.asarray(next(feed).streams), np.asarray(next(plain).streams)) for _ in range(5)]
+    assert felt[0][0].all()
+    assert (felt[0][0] != felt[0][1]).any()
+    assert all((mine >= other).all() for mine, other in felt)
+    assert all((mine == other).all() for mine, other in felt[3:])
 
 
 def test_blocks_have_one_size_and_tell_how_many_rows_are_real():

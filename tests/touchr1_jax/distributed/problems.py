@@ -19,6 +19,7 @@ from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
 from touchr1_jax.training.dynamics import DynamicsConfig, make_dynamics_step, start_dynamics
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
+from touchr1_jax.training.packing import Packing, existing_tokens, pack_rows
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Parsed, Target
 
@@ -35,6 +36,8 @@ class Problem:
     state: Any
     item: Callable[[int], Any]
     shared: tuple[Any, ...] = ()
+    finish: Callable[[Any], Any] = lambda batch: batch
+    """What is made of a batch of items, or of those rows of it that a process reads."""
 
 
 def feed(problem: Problem, own: np.ndarray | None = None) -> Any:
@@ -42,7 +45,8 @@ def feed(problem: Problem, own: np.ndarray | None = None) -> Any:
     mine = np.arange(ROWS) if own is None else own
     drawn = grain.MapDataset.range(64).seed(3).shuffle().repeat().batch(ROWS)
     stack = lambda items: jax.tree.map(lambda *x: np.stack(x), *items)
-    return iter(drawn.map(lambda rows: stack([problem.item(int(i)) for i in rows[mine]])).to_iter_dataset())
+    batch = lambda rows: problem.finish(stack([problem.item(int(i)) for i in rows[mine]]))
+    return iter(drawn.map(batch).to_iter_dataset())
 
 
 def contact(i: int) -> Any:
@@ -95,6 +99,18 @@ def sft() -> Problem:
     return Problem(make_sft_step(AGENT, OPTIMIZER), state, item)
 
 
+def packed() -> Problem:
+    """The same in rows, which the questions of two contacts share; a mesh of eight splits each two between devices."""
+    problem = sft()
+
+    def finish(batch: SFTBatch) -> SFTBatch:
+        prompt = batch.touch, batch.mask, batch.streams, batch.token_mask
+        exists = existing_tokens(AGENT.policy, AGENT.slots, *prompt)
+        return batch.replace(rows=pack_rows(exists, batch.token_mask, Packing(width=40, contacts=2)))
+
+    return dataclasses.replace(problem, finish=finish)
+
+
 def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
     """Share of tokens that are the label modulo 3."""
     level = jnp.where(target.asked, tokens[0] % 3, -1)
@@ -143,4 +159,10 @@ def dynamics() -> Problem:
     return Problem(make_dynamics_step(config, OPTIMIZER), state, contact)
 
 
-PROBLEMS: dict[str, Callable[[], Problem]] = {"words": words, "sft": sft, "grpo": grpo, "dynamics": dynamics}
+PROBLEMS: dict[str, Callable[[], Problem]] = {
+    "words": words,
+    "sft": sft,
+    "packed": packed,
+    "grpo": grpo,
+    "dynamics": dynamics,
+}

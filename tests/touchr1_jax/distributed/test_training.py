@@ -80,7 +80,7 @@ def test_losses_on_a_mixed_mesh_and_after_resuming_on_one_device(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("problem", ["sft", "grpo", "dynamics"])
+@pytest.mark.parametrize("problem", ["sft", "packed", "grpo", "dynamics"])
 def test_losses_on_every_mesh(problem, tmp_path):
     """One after the other: two cores would not be faster with four times eight devices."""
     expected = plain_losses(PROBLEMS[problem]())
