@@ -136,9 +136,10 @@ def _shared(path: Path, make: Callable[[], Params], context: Context, stage: str
 
 
 def fingerprint(values: dict[str, Any], arrays: dict[str, np.ndarray], source: str) -> str:
-    """Sixteen digits of the hash of configurations, arrays, package versions, the kind of device, and source."""
+    """Sixteen digits of the hash of configurations, arrays, package versions, device, compilation, and source."""
     sum_ = hashlib.sha256()
-    about = {**jsonable(values), "versions": versions(), "device": jax.default_backend(), "source": source}
+    machine = {"device": jax.default_backend(), "quickly": jax.config.values["jax_disable_most_optimizations"]}
+    about = {**jsonable(values), **machine, "versions": versions(), "source": source}
     sum_.update(json.dumps(about, sort_keys=True).encode())
     for name, x in sorted(arrays.items()):
         sum_.update(f"{name} {x.dtype.str} {x.shape}".encode())

@@ -181,3 +181,16 @@ def test_what_sft_is_built_on_counts():
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(later):
                     assert node.module in used, f"{name} imports {node.module}"
+
+
+def test_what_was_compiled_quickly_is_another_checkpoint():
+    """Its numbers differ by rounding, and a report must not show them as those of a program that was compiled well."""
+    name = "jax_disable_most_optimizations"
+    before, found = jax.config.values[name], []
+    try:
+        for quickly in (False, True):
+            jax.config.update(name, quickly)
+            found.append(fingerprint({}, {}, "source"))
+    finally:
+        jax.config.update(name, before)
+    assert found[0] != found[1]
