@@ -3,6 +3,7 @@
 import contextlib
 import signal
 import sys
+import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
@@ -11,8 +12,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Control-C, and what a scheduler sends before it takes the machine away."""
 
 
-AGAIN_S = 0.01
-"""Until `Stopped` is raised again where it was lost."""
+AGAIN_S = 0.02
+"""Between two looks whether the `Stopped` that was raised is still on its way."""
 
 
 class Stopped(BaseException):
@@ -33,6 +34,7 @@ class Stopping:
     def __init__(self) -> None:
         self._number: int | None = None
         self._patient = False
+        self._raised: weakref.ref[Stopped] | None = None
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
@@ -74,23 +76,29 @@ class Stopping:
         finally:
             self._patient = False
         if stop or self._number is not None:
-            raise Stopped(self._number or signal.SIGTERM)
+            raise self._stopped(self._number or signal.SIGTERM)
 
     def _hear(self, number: int, frame: FrameType | None) -> None:
         del frame
         for n in SIGNALS:
             signal.signal(n, signal.SIG_DFL)
         self._number = number
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
         if not self._patient:
-            raise Stopped(number)
+            raise self._stopped(number)
 
     def _lost(self, lost: Any, report: Callable[[Any], Any]) -> None:
-        if isinstance(lost.exc_value, Stopped):
-            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
-        else:
+        if not isinstance(lost.exc_value, Stopped):
             report(lost)
 
     def _again(self, number: int, frame: FrameType | None) -> None:
+        """Raise another where the last one is gone; one that is on its way up, through what is put away, is alive."""
         del number, frame
-        if self._number is not None and not self._patient:
-            raise Stopped(self._number)
+        alive = self._raised is not None and self._raised() is not None
+        if self._number is not None and not self._patient and not alive:
+            raise self._stopped(self._number)
+
+    def _stopped(self, number: int) -> Stopped:
+        stopped = Stopped(number)
+        self._raised = weakref.ref(stopped)
+        return stopped

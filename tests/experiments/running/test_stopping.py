@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from experiments.running.stopping import SIGNALS, Stopped, Stopping
+from experiments.running.stopping import AGAIN_S, SIGNALS, Stopped, Stopping
 
 
 @pytest.fixture(autouse=True)
@@ -117,6 +117,22 @@ def test_a_stop_that_the_garbage_collector_swallows_is_raised_again(times):
     finally:
         gc.callbacks.remove(strike)
     assert len(asked) == times
+
+
+def test_what_is_put_away_on_the_way_up_is_not_disturbed():
+    closed = []
+
+    def train() -> None:
+        with Stopping().listening():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                time.sleep(5 * AGAIN_S)
+                closed.append(True)
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train()
+    assert closed == [True]
 
 
 def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
