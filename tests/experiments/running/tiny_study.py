@@ -8,6 +8,7 @@ import importlib
 import signal
 import sys
 
+from experiments.ladder.presets import SMALL_QUOTA
 from experiments.policies.feeds import AnswerFeed
 from experiments.running.runner import main
 from tests.experiments import tiny
@@ -36,7 +37,7 @@ if __name__ == "__main__":
     if name == "ablation_ordinal":
         module.ARMS = {"ordinal": module.ARMS["ordinal"]}
     if name == "main_table":
-        quota = dataclasses.replace(module.SMALL, identify=8, scale=0, compose=3, compare=2, order=0, conflict=0)
+        quota = dataclasses.replace(SMALL_QUOTA, identify=8, scale=0, compose=3, compare=2, order=0, conflict=0)
         config = module.MainConfig(study=config, quota=quota)
     module.EXPERIMENT = dataclasses.replace(module.EXPERIMENT, config=config)
     sys.exit(main([name, *arguments]))
