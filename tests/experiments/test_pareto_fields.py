@@ -70,8 +70,11 @@ class _Ball:
         return height - np.sqrt(3.155**2 - touch[2] ** 2), *slopes
 
 
+TAKES_LONG = ("perceptron", "polynomial, colour only", "colour table", "kernel features")
+
+
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "perceptron" else name for name in MAPS]
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in TAKES_LONG else name for name in MAPS]
 )
 def test_every_map_reads_a_press(name):
     presses = generated_presses(6.31, 8, 0)

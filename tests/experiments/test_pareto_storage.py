@@ -59,6 +59,7 @@ def test_every_codec_gives_every_bit_back(codec, tmp_path):
     assert stored_bytes(tmp_path) > 0
 
 
+@pytest.mark.slow
 def test_the_report_holds_every_codec_on_every_kind_of_clips(results):
     tables = {table["title"]: table["rows"] for table in results["tables"]}
     names = {codec.name for codec in all_codecs() if codec.kind != "video"}

@@ -24,6 +24,7 @@ TINY = dataclasses.replace(
 )
 
 
+@pytest.mark.slow
 def test_sheets_without_a_solver_are_drawn() -> None:
     for sheet in (scene_gallery.views(TINY), scene_gallery.varied(TINY)):
         assert sheet.content.startswith(b"\x89PNG")

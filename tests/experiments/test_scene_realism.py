@@ -52,6 +52,7 @@ def directory(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return found
 
 
+@pytest.mark.slow
 def test_the_fit_is_the_optics_that_made_the_pictures(directory: Path) -> None:
     results = read_json(directory / "results.json")
     (stored,) = results["requirements"]
@@ -61,6 +62,7 @@ def test_the_fit_is_the_optics_that_made_the_pictures(directory: Path) -> None:
     assert min(held_out[1:4]) > 95
 
 
+@pytest.mark.slow
 def test_fitted_pictures_are_nearer_than_those_by_eye(directory: Path) -> None:
     rows = {row[0]: row[1:] for row in read_json(directory / "results.json")["tables"][0]["rows"]}
     by_eye, fitted = rows["lamps by eye"], rows["fitted optics and noise"]
@@ -69,6 +71,7 @@ def test_fitted_pictures_are_nearer_than_those_by_eye(directory: Path) -> None:
     assert rows["lamps by eye"][4] > 90
 
 
+@pytest.mark.slow
 def test_the_constants_are_written_as_a_module(directory: Path) -> None:
     made: dict[str, object] = {}
     exec((directory / "mini_optics.py").read_text(), made)
@@ -79,6 +82,7 @@ def test_the_constants_are_written_as_a_module(directory: Path) -> None:
     assert len(made["READ_NOISE"]) == len(made["SHOT_NOISE"]) == len(made["GRAIN"]) == 3
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_presses(directory: Path) -> None:
     page = (directory / "report.html").read_text(encoding="utf-8")
     assert all(name in page for name in ("lamps by eye", "fitted, with grain", "told apart", "Held-out presses"))

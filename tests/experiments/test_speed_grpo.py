@@ -63,6 +63,7 @@ def jobs():
     return {name: (job, jax.device_get(job.step())) for name, job in every.items()}
 
 
+@pytest.mark.slow
 def test_the_repeated_way_does_the_same_number_of_rollouts():
     job = Job(TINY, 16, config_of(TINY), repeated=True)
     metrics = jax.device_get(job.step())
