@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.faults.victim import ARM, MODEL
 from experiments.policies.arrays import flat, nested
-from experiments.policies.assembly import Assembly, assemble
+from experiments.policies.assembly import Assembly, assemble, touch_shapes
 from experiments.policies.feeds import QuestionFeed
 from experiments.policies.scores import PUBLISHED
 from experiments.policies.stages import grpo_program
@@ -36,7 +36,7 @@ from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import Fixed, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.training.loop import LoopConfig
-from touchr1_jax.types import Params, TouchBatch
+from touchr1_jax.types import Params
 
 STAGE = f"grpo/{ARM}/0"
 
@@ -131,17 +131,7 @@ def _decoder(assembly: Assembly, path: Path) -> Params:
 
 def _drawn(assembly: Assembly) -> Params:
     """Parameters of a fresh policy."""
-    streams, px, view_px = (1, len(SENSORS), MODEL.frames), MODEL.image_px, MODEL.vision.image_px
-    nothing = TouchBatch(
-        frames=jnp.zeros((*streams, px, px, 3), jnp.uint8),
-        force_n=jnp.zeros((*streams, 3)),
-        frame_index=jnp.zeros(streams, jnp.int32),
-        frame_mask=jnp.ones(streams, bool),
-        stream_mask=jnp.ones(streams[:2], bool),
-        view=jnp.zeros((1, view_px, view_px, 3), jnp.uint8),
-        view_mask=jnp.ones(1, bool),
-        label=jnp.zeros((1, len(assembly.levels)), jnp.int32),
-    )
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, SENSORS))
     return assembly.init(0, nothing)
 
 

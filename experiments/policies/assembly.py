@@ -125,12 +125,8 @@ def prove_rewards(arms: Mapping[str, Weights]) -> None:
             raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
 
 
-def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
-    """Build a model without computing anything, so that sizes which contradict each other show before data are made.
-
-    Raises:
-      SizeError: they do.
-    """
+def touch_shapes(model: ModelConfig, sensors: tuple[str, ...]) -> TouchBatch:
+    """Shapes and types of a batch of one contact."""
     p, s, f, px, view = 1, len(sensors), model.frames, model.image_px, model.vision.image_px
     of: dict[str, Any] = {
         "frames": ((p, s, f, px, px, 3), jnp.uint8),
@@ -143,10 +139,18 @@ def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
         "label": ((p, len(TOUCH_LANGUAGE.attributes)), jnp.int32),
     }
     shapes: dict[str, Any] = {name: jax.ShapeDtypeStruct(*shape) for name, shape in of.items()}
-    batch = TouchBatch(**shapes)
+    return TouchBatch(**shapes)
+
+
+def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
+    """Build a model without computing anything, so that sizes which contradict each other show before data are made.
+
+    Raises:
+      SizeError: they do.
+    """
     try:
         made = assemble(model, sensors)
-        jax.eval_shape(functools.partial(made.init, 0), batch)
+        jax.eval_shape(functools.partial(made.init, 0), touch_shapes(model, sensors))
     except (ValueError, TypeError) as error:
         raise SizeError(f"no model can be built of these sizes: {error}") from error
 
