@@ -21,8 +21,8 @@ from experiments.faults.victim import ARM, MODEL
 from experiments.policies.arrays import flat, nested
 from experiments.policies.assembly import Assembly, assemble, touch_shapes
 from experiments.policies.feeds import QuestionFeed
+from experiments.policies.reinforcement import grpo_program
 from experiments.policies.scores import PUBLISHED
-from experiments.policies.stages import grpo_program
 from experiments.policies.watching import watched_log
 from experiments.reporting.findings import Findings
 from experiments.running.artifacts import write_bytes

@@ -5,13 +5,13 @@ from collections.abc import Mapping
 
 from experiments.encoder.pretrain import PretrainConfig, pretrain
 from experiments.policies.assembly import assemble
+from experiments.policies.reinforcement import Asked, make_arm, run_grpo
 from experiments.policies.scores import PUBLISHED
 from experiments.policies.stages import (
     encode_contacts,
     gather_evidence,
     noise_bank,
     probe_features,
-    run_grpo,
     run_sft,
 )
 from experiments.policies.study import StudyConfig, open_study_data
@@ -50,8 +50,9 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     params = run_sft(assembly, data, evidence, sft, context, seed=0, stage=STAGES[0])
     features = encode_contacts(assembly, params, data, data.parts["grpo"], context)
     noise = noise_bank(assembly.agent, params, data, seed=0)
-    label, score = data.label[data.parts["grpo"]], assembly.score(PUBLISHED, data.prior())
-    run_grpo(assembly, params, features, label, noise, score, study.grpo, loop, context, seed=0, stage=STAGES[1])
+    asked = Asked(features=features, label=data.label[data.parts["grpo"]], noise=noise)
+    arm = make_arm(assembly, PUBLISHED, data.prior(), study.grpo, loop)
+    run_grpo(assembly, arm, asked, params, context, seed=0, stage=STAGES[1])
     blind = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)
     run_sft(assembly, data, evidence, blind, context, seed=0, stage=STAGES[2], blind=True)
     dynamics = dataclasses.replace(config.dynamics, steps=config.steps, probe_every=config.steps)

@@ -15,14 +15,14 @@ from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Weights
 from experiments.policies.baselines import level_answers
 from experiments.policies.feeds import touch_batch
-from experiments.policies.stages import encode_contacts, noise_bank, run_grpo
+from experiments.policies.reinforcement import Asked, make_arm, run_grpo
+from experiments.policies.stages import encode_contacts, noise_bank
 from experiments.policies.study import Trained, Way
 from sensors_io.pipeline import clip_batches
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 
 
@@ -51,19 +51,12 @@ def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> 
     assembly, data, config = trained.assembly, trained.data, trained.config
     params = _fresh(trained)
     encode = functools.partial(encode_contacts, assembly, params, data, context=trained.context)
-    tuned = run_grpo(
-        assembly,
-        params,
-        encode(rows=data.parts["grpo"]),
-        trained.grpo_label,
-        noise_bank(assembly.agent, params, data, seed=trained.seed),
-        assembly.score(weights, data.prior()),
-        dataclasses.replace(config.grpo, algorithm=algorithm),
-        LoopConfig(steps=config.grpo_steps, save_every=config.grpo_save_every),
-        trained.context,
-        seed=trained.seed,
-        stage=f"grpo/no_sft/{trained.seed}",
-    )
+    grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
+    arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop)
+    noise = noise_bank(assembly.agent, params, data, seed=trained.seed)
+    asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
+    stage = f"grpo/no_sft/{trained.seed}"
+    tuned = run_grpo(assembly, arm, asked, params, trained.context, seed=trained.seed, stage=stage)
     return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label)
 
 

@@ -17,19 +17,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
 from experiments.policies.arrays import flat, nested
-from experiments.policies.assembly import Assembly, Weights
+from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
-from experiments.policies.stages import SFTConfig, run_grpo, run_sft
+from experiments.policies.reinforcement import Arm, Asked, run_grpo
+from experiments.policies.stages import SFTConfig, run_sft
 from experiments.running.artifacts import jsonable, write_bytes
 from experiments.running.context import Context, read_metrics
 from experiments.running.runs import ROOT, versions
-from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.scoring import ScoreFn
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 
 NEVER = ("touchr1_jax/bench", "touchr1_jax/distributed", "sensors_io/commands", "sensors_io/viewer")
@@ -83,42 +79,22 @@ def shared_sft(
 
 
 def shared_grpo(
-    assembly: Assembly,
-    params: Params,
-    features: Features,
-    label: np.ndarray,
-    noise: Float[Array, "K S N D"],
-    score: ScoreFn,
-    config: GRPOConfig,
-    loop: LoopConfig,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-    weights: Weights,
-    prior: np.ndarray,
+    assembly: Assembly, arm: Arm, asked: Asked, params: Params, context: Context, *, seed: int, stage: str
 ) -> Params:
-    """What `run_grpo` gives for these arguments, from the cache where some experiment already made it.
-
-    Args:
-      assembly, params, features, label, noise, score, config, loop, context, seed, stage: as in `run_grpo`.
-      weights, prior: what `score` is made of, as in `Assembly.score`; a function itself has no hash.
-    """
+    """What `run_grpo` gives for these arguments, from the cache where some experiment already made it."""
     values = {
-        "weights": list(weights.items()),
-        "config": config,
-        "steps": loop.steps,
+        "weights": list(arm.weights.items()),
+        "config": arm.config,
+        "steps": arm.loop.steps,
         "model": assembly.model,
         "seed": seed,
         "mesh": context.devices.shape,
     }
-    named = dataclasses.asdict(features) | {"label": label, "noise": noise, "prior": prior}
+    named = dataclasses.asdict(asked.features) | {"label": asked.label, "noise": asked.noise, "prior": arm.prior}
     arrays = flat(params) | {f"input/{name}": np.asarray(x) for name, x in named.items()}
     return _shared(
         context.cache_dir / "grpo" / f"{fingerprint(values, arrays, source_digest(NEVER))}.npz",
-        lambda: run_grpo(
-            assembly, params, features, label, noise, score, config, loop, context, seed=seed, stage=stage
-        ),
+        lambda: run_grpo(assembly, arm, asked, params, context, seed=seed, stage=stage),
         context,
         stage,
     )

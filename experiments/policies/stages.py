@@ -1,4 +1,4 @@
-"""The stages that experiments are made of: evidence, SFT, encoding, GRPO.
+"""The stages that experiments are made of before GRPO: evidence, SFT, encoding.
 
 Each is a function of its configuration and inputs; what it leaves behind lies in the run's directory, so that a stopped
 run goes on from its last checkpoint.
@@ -17,10 +17,9 @@ from jaxtyping import Array, Float
 
 from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import AnswerFeed, QuestionFeed, touch_batch
-from experiments.policies.watching import watched_log
+from experiments.policies.feeds import AnswerFeed, touch_batch
 from experiments.running.context import Context
-from experiments.running.loops import plain_log, run_loop
+from experiments.running.loops import run_loop
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -28,14 +27,9 @@ from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
-from touchr1_jax.rl.guard import check_streams, stream_influence
-from touchr1_jax.rl.scoring import ScoreFn
-from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig
-from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
@@ -195,7 +189,7 @@ def run_sft(
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
     step, state, batches = context.devices.spread(step, state, feed, config.batch_size, *([frozen] if frozen else []))
-    found = context.devices.whole(_fit(step, state, batches, loop, context, stage).params)
+    found = context.devices.whole(run_loop(step, state, batches, loop, context, stage).params)
     return found if config.lora is None else {**merge(frozen, found.adapters, config.lora), **found.towers}
 
 
@@ -224,13 +218,6 @@ def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.Gra
         return make(adapt(agent, frozen, lora))(state, batch)
 
     return optimizer, jax.jit(step, donate_argnums=0)
-
-
-def _fit(
-    step: Any, state: Any, feed: Any, loop: LoopConfig, context: Context, stage: str, *, watched: bool = False
-) -> Any:
-    """`run_loop`; a watched stage logs alarms too."""
-    return run_loop(step, state, feed, loop, context, stage, make_log=watched_log if watched else plain_log)
 
 
 def encode_contacts(
@@ -312,56 +299,6 @@ def _statistics(x: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.nd
     shape = [1 if i in axes else size for i, size in enumerate(x.shape)]
     square = np.where(known, (x - mean.reshape(shape)) ** 2, 0.0).sum(axes)
     return mean.astype(np.float32), np.sqrt(square / n).astype(np.float32)
-
-
-def run_grpo(
-    assembly: Assembly,
-    params: Params,
-    features: Features,
-    label: np.ndarray,
-    noise: Float[Array, "K S N D"],
-    score: ScoreFn,
-    config: GRPOConfig,
-    loop: LoopConfig,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-) -> Params:
-    """Reinforce the decoder of an SFT policy; both encoders stay as they are.
-
-    Raises:
-      ValueError: a stream whose touch does not reach the policy.
-    """
-    new_feed = functools.partial(QuestionFeed, assembly, features, label, batch_size=config.drawn, seed=seed)
-    constraint = assembly.constraint if config.algorithm.constrained else None
-    optimizer, step = grpo_program(assembly.agent, score, config, loop.steps, constraint)
-    decoder = {"decoder": params["decoder"]}
-    influence = influence_program(assembly.agent, config.length)
-    check_streams(*jax.device_get(influence(decoder, next(new_feed()), noise, jax.random.key(seed))))
-    feed = new_feed(own=context.devices.rows(config.drawn))
-    state = start_state(decoder, optimizer, jax.random.key(seed), config)
-    fixed = Fixed(reference=decoder, noise=noise)
-    step, state, batches = context.devices.spread(step, state, feed, config.drawn, fixed)
-    end = _fit(step, state, batches, loop, context, stage, watched=True)
-    return {**params, **context.devices.whole(end.params)}
-
-
-@functools.cache
-def grpo_program(
-    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int, constraint: Constraint | None
-) -> tuple[optax.GradientTransformation, Any]:
-    """Optimizer and compiled step, made once for all seeds of an arm."""
-    learning_rate = config.learning_rate * config.lr_scale
-    updates = steps * config.algorithm.updates
-    optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    return optimizer, make_grpo_step(agent, score, optimizer, config, constraint)
-
-
-@functools.cache
-def influence_program(agent: Agent, length: int) -> Any:
-    """Compiled `stream_influence`, made once for all arms and seeds."""
-    return jax.jit(lambda p, batch, noise, key: stream_influence(agent, p, batch, noise, key, length))
 
 
 def force_only(data: Dataset, probed: Probed, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:

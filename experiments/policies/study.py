@@ -17,6 +17,7 @@ from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_model, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
+from experiments.policies.reinforcement import Arm, Asked, make_arm, run_grpo
 from experiments.policies.shared import shared_grpo, shared_sft
 from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
@@ -26,7 +27,6 @@ from experiments.policies.stages import (
     gather_evidence,
     noise_bank,
     probe_features,
-    run_grpo,
     run_sft,
 )
 from experiments.running.artifacts import write_bytes
@@ -37,7 +37,6 @@ from sensors_io.scenes import SceneConfig
 from sensors_io.schema import SENSORS, UNKNOWN, Flag
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
-from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
@@ -76,6 +75,11 @@ class StudyConfig:
     """What GRPO asks about; the arms may differ in how they pay for it."""
     grpo_steps: int = 900
     grpo_save_every: int = 200
+
+    @property
+    def grpo_loop(self) -> LoopConfig:
+        """Steps of GRPO and when they are saved."""
+        return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
@@ -203,10 +207,10 @@ def run_study(
     probed = probe_features(data, context)
     evidence = gather_evidence(data, probed, config.probe)
     prior = data.prior()
-    scores = {name: assembly.score(weights, prior) for name, weights in arms.items()}
+    made = {arm: make_arm(assembly, weights, prior, configs[arm], config.grpo_loop) for arm, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
     for seed in range(config.seeds):
-        one = _Seed(config, data, assembly, tactile, evidence, prior, arms, scores, configs, ways, context, seed)
+        one = _Seed(config, data, assembly, tactile, evidence, made, ways, context, seed)
         for name, said in one.answers().items():
             answers[name].append(said)
     further = {name: answers.pop(name) for name in ways}
@@ -265,10 +269,7 @@ class _Seed:
     assembly: Assembly
     tactile: Params | None
     evidence: np.ndarray
-    prior: np.ndarray
-    arms: Mapping[str, Weights]
-    scores: Mapping[str, ScoreFn]
-    configs: Mapping[str, GRPOConfig]
+    arms: Mapping[str, Arm]
     ways: Mapping[str, Way]
     context: Context
     seed: int
@@ -286,10 +287,11 @@ class _Seed:
         encode = functools.partial(encode_contacts, assembly, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(assembly.agent, params, data, seed=seed)
+        asked = Asked(features=train, label=self._grpo_label(), noise=noise)
         self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
         self._ask_further(SFT, params, test, noise)
         for arm in self.arms:
-            tuned = self._grpo(arm, params, train, noise)
+            tuned = self._grpo(arm, params, asked)
             self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
             self._ask_further(arm, tuned, test, noise)
         self._ask(BLIND, self._blind)
@@ -313,23 +315,10 @@ class _Seed:
             tactile=tactile,
         )
 
-    def _grpo(self, arm: str, params: Params, features: Features, noise: Array) -> Params:
-        make: Callable[..., Params] = run_grpo
-        if self.config.share:
-            make = functools.partial(shared_grpo, weights=self.arms[arm], prior=self.prior)
-        return make(
-            self.assembly,
-            params,
-            features,
-            self._grpo_label(),
-            noise,
-            self.scores[arm],
-            self.configs[arm],
-            LoopConfig(steps=self.config.grpo_steps, save_every=self.config.grpo_save_every),
-            self.context,
-            seed=self.seed,
-            stage=f"grpo/{arm}/{self.seed}",
-        )
+    def _grpo(self, arm: str, params: Params, asked: Asked) -> Params:
+        make = shared_grpo if self.config.share else run_grpo
+        stage = f"grpo/{arm}/{self.seed}"
+        return make(self.assembly, self.arms[arm], asked, params, self.context, seed=self.seed, stage=stage)
 
     def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:
         if not self._path(name).exists():

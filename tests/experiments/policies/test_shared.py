@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from experiments.policies import shared
+from experiments.policies.reinforcement import Asked, make_arm
 from experiments.policies.shared import LATER, NEVER, USED, fingerprint, shared_grpo, shared_sft, source_digest
 from experiments.policies.stages import SFTConfig
 from experiments.running.context import Context
@@ -80,7 +81,7 @@ def reinforce(assembly, params, data, tmp_path, monkeypatch):
     """An arm in a run of its own, and the stages that were trained; training adds one to the decoder and logs it."""
     trained = []
 
-    def add_one(assembly, params, features, label, noise, score, config, loop, context, *, seed, stage):
+    def add_one(assembly, arm, asked, params, context, *, seed, stage):
         trained.append(stage)
         context.log(stage, step=0, reward=0.5)
         return {**params, "decoder": jax.tree.map(lambda x: x + 1, params["decoder"])}
@@ -90,11 +91,12 @@ def reinforce(assembly, params, data, tmp_path, monkeypatch):
     def run(name: str, *, weights=(("accuracy", 1.0),), moved: float = 0.0, steps: int = 1, seed: int = 0):
         (tmp_path / name).mkdir()
         context = Context(tmp_path / name, tmp_path / "cache", Console(quiet=True))
-        prior, felt = data.prior(), tiny.features(2)
+        felt = tiny.features(2)
         felt = dataclasses.replace(felt, touch=felt.touch + moved)
-        label, noise, loop = np.zeros((2, 4), int), np.zeros((1, 4, 2, 8)), LoopConfig(steps=steps, save_every=1)
-        told = {"seed": seed, "stage": "grpo/a/0", "weights": dict(weights), "prior": prior}
-        made = shared_grpo(assembly, params, felt, label, noise, None, tiny.STUDY.grpo, loop, context, **told)
+        asked = Asked(features=felt, label=np.zeros((2, 4), int), noise=np.zeros((1, 4, 2, 8)))
+        loop = LoopConfig(steps=steps, save_every=1)
+        arm = make_arm(assembly, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
+        made = shared_grpo(assembly, arm, asked, params, context, seed=seed, stage="grpo/a/0")
         context.close()
         return made, (tmp_path / name / "metrics.jsonl").read_bytes()
 
