@@ -33,8 +33,10 @@ MOST_BYTES = 16 * 2**30
 def pytest_configure(config: pytest.Config) -> None:
     """Keep compiled programs for the length of the session, for its files and workers to share, and compile quickly.
 
-    Most of XLA's optimisations are left out: they take longer here than all the arithmetic.
+    Most of XLA's optimisations are left out: they take longer here than all the arithmetic.  A worker's products of
+    matrices keep to one thread: each has a core, and threads that wait for that of another take eight times as long.
     """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     quick = contextlib.ExitStack()
     quick.enter_context(compiled_quickly())
     config.add_cleanup(quick.close)

@@ -12,7 +12,6 @@ from experiments.policies.feeds import touch_batch
 from experiments.policies.pretrained import PretrainedEncoder
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
-from sensors_io.pipeline import clip_batches
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.video import VideoConfig, VideoState, make_video_step, start_video
@@ -54,7 +53,7 @@ def train_film(
     """
     feed = ClipFeed(data.store, rows, data.clip, batch_size=config.batch_size, seed=seed)
     optimizer = make_optimizer(config.optimizer, config.steps)
-    one = next(iter(clip_batches(data.store, rows[:1], data.clip, batch_size=1, seed=0, repeat=False)))
+    one = next(iter(data.batches(rows[:1], batch_size=1, seed=0, repeat=False)))
     state: VideoState = jax.jit(lambda key, batch: start_video(video, optimizer, key, batch))(
         jax.random.key(seed), touch_batch(one)
     )

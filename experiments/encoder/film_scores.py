@@ -11,7 +11,6 @@ import numpy as np
 
 from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import touch_batch
-from sensors_io.pipeline import clip_batches
 from touchr1_jax.bench.lpips import lpips
 from touchr1_jax.bench.ssim import ssim
 from touchr1_jax.models.predictor import layer_norm
@@ -112,7 +111,7 @@ def mean_frames(data: Dataset, rows: np.ndarray) -> np.ndarray:
     """Mean frame of every sensor at every position of its clip, float32 [S, F, H, W, 3] in [0, 1]; 0 where none was."""
     total: Any = 0.0
     count: Any = 0.0
-    for clip in clip_batches(data.store, rows, data.clip, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
+    for clip in data.batches(rows, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
         seen = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
         total = total + np.where(seen, clip["frames"], 0).sum(0, dtype=np.float64)
         count = count + seen.sum(0)
@@ -165,7 +164,7 @@ def answer_all(
 def batches(data: Dataset, rows: np.ndarray) -> Iterator[tuple[TouchBatch, int]]:
     """Batches of one size, and how many of their contacts count."""
     padded = rows[np.minimum(np.arange(-(-len(rows) // SCORE_BATCH) * SCORE_BATCH), len(rows) - 1)]
-    clips = clip_batches(data.store, padded, data.clip, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
+    clips = data.batches(padded, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
     for start, clip in zip(range(0, len(padded), SCORE_BATCH), clips, strict=True):
         yield touch_batch(clip), min(SCORE_BATCH, len(rows) - start)
 

@@ -100,6 +100,7 @@ GPU_SMALL, GPU_LARGE = _resized(512, 10), _resized(1024, 16)
 GPU = StudyConfig(
     scenes=SceneConfig(objects=10_000, sites=1, image_px=224, view_px=224),
     clip_memory_gib=40.0,
+    read_threads=12,
     model=GPU_MODEL,
     sft=_sft(4_000, 64, 30.0),
     blind=_sft(4_000, 64, 30.0),
@@ -122,6 +123,7 @@ PAPER = StudyConfig(
     seeds=3,
     scenes=SceneConfig(objects=paper.OBJECTS, sequences=paper.SEQUENCES, image_px=448, view_px=448),
     clip_memory_gib=0.0,
+    read_threads=12,
     model=PAPER_MODEL,
     sft=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),
     blind=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),

@@ -19,7 +19,6 @@ from experiments.policies.stages import ENCODE_BATCH, encode_program, sft_progra
 from experiments.policies.study import Study, StudyConfig, run_study
 from experiments.running.context import Context, read_metrics
 from experiments.running.loops import STEPPING
-from sensors_io.pipeline import clip_batches
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
@@ -111,7 +110,7 @@ def calls_of(study: Study) -> Calls:
     """A step of SFT and a block of questions about some test contacts, ready to be timed."""
     data, assembly = study.data, study.assembly
     rows = data.parts["test"][:ENCODE_BATCH]
-    clips = clip_batches(data.store, rows, data.clip, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
+    clips = data.batches(rows, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
     touch = touch_batch(next(iter(clips)))
     params = assembly.init(0, touch)
     contact, _ = labelled(data.label[rows])

@@ -18,7 +18,6 @@ from experiments.policies.feeds import touch_batch
 from experiments.policies.reinforcement import Asked, make_arm, run_grpo
 from experiments.policies.stages import encode_contacts, noise_bank
 from experiments.policies.study import Trained, Way
-from sensors_io.pipeline import clip_batches
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm
@@ -120,5 +119,5 @@ def _controlled(control: str, trained: Trained) -> Evaluated:
 def _fresh(trained: Trained) -> Params:
     """The parameters that SFT of this seed starts from."""
     data = trained.data
-    clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
+    clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
     return trained.assembly.init(trained.seed, touch_batch(next(iter(clips))))

@@ -4,9 +4,10 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import grain
 import numpy as np
 
-from sensors_io.pipeline import ClipConfig, ClipMemory
+from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, LEVELS
 
@@ -18,7 +19,7 @@ class Dataset:
     """Contacts on disk and what the stages need to know of them.
 
     `parts` maps each of `PARTS` to contact indices; no object is in two of them.  `label` is int32 [contact, A].
-    Every seed reads the same clips, so `memory` keeps them.
+    Every seed reads the same clips, so `memory` keeps them; `threads` read those of the batches to come.
     """
 
     store: RecordStore
@@ -29,6 +30,11 @@ class Dataset:
     object_ids: np.ndarray
     visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
     has_force: bool
+    threads: int = 1
+
+    def batches(self, rows: np.ndarray, **order: Any) -> grain.IterDataset:
+        """Clips of some contacts, as `clip_batches` takes the other arguments, through the memory and the threads."""
+        return clip_batches(self.store, rows, self.clip, memory=self.memory, threads=self.threads, **order)
 
     def prior(self) -> np.ndarray:
         """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0.
@@ -79,8 +85,8 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     return parts
 
 
-def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: float = 0.0) -> Dataset:
-    """Open records and split them; `memory_gib` of their clips stay in memory once they were read."""
+def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: float = 0.0, threads: int = 1) -> Dataset:
+    """Open records and split them; `memory_gib` of their clips stay in memory once so many threads have read them."""
     store = RecordStore(path)
     clip = dataclasses.replace(clip, sensors=store.meta.sensors)
     cards = [store.objects[key.object_id] for key in store.contacts]
@@ -93,4 +99,5 @@ def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: fl
         object_ids=np.array([card.object_id for card in cards]),
         visual_lies=np.array([bool(card.visual_lies) for card in cards]),
         has_force=any(sequence.force_n is not None for sequence in store.contact(0).values()),
+        threads=threads,
     )

@@ -18,7 +18,6 @@ from jaxtyping import Int
 from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
 from sensors_io.augment import AugmentConfig
-from sensors_io.pipeline import clip_batches
 from sensors_io.schema import CLIP_ARRAYS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.objective import GRPOBatch
@@ -119,16 +118,8 @@ class AnswerFeed(Feed):
         packing: Packing | None = None,
         own: np.ndarray | None = None,
     ) -> None:
-        clips = clip_batches(
-            data.store,
-            data.parts["sft"],
-            data.clip,
-            batch_size=batch_size,
-            seed=seed,
-            own=own,
-            felt=not blind,
-            augment=augment,
-            memory=data.memory,
+        clips = data.batches(
+            data.parts["sft"], batch_size=batch_size, seed=seed, own=own, felt=not blind, augment=augment
         )
         super().__init__(clips, seed)
         self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own

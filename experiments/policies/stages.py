@@ -21,7 +21,6 @@ from experiments.policies.feeds import AnswerFeed, touch_batch
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
 from sensors_io.augment import AugmentConfig
-from sensors_io.pipeline import clip_batches
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
@@ -116,9 +115,7 @@ def probe_features(data: Dataset, context: Context) -> Probed:
 
 
 def _features(data: Dataset, rows: np.ndarray, context: Context) -> dict[str, np.ndarray]:
-    clips = clip_batches(
-        data.store, rows, data.clip, batch_size=32, seed=0, shuffle=False, repeat=False, memory=data.memory
-    )
+    clips = data.batches(rows, batch_size=32, seed=0, shuffle=False, repeat=False)
     streams, present, force = [], [], []
     with context.progress("reading touch", len(rows)) as advance:
         for clip in clips:
@@ -180,7 +177,7 @@ def run_sft(
         own=context.devices.rows(config.batch_size),
     )
     optimizer, step = sft_program(assembly.agent, config, blind)
-    clips = clip_batches(data.store, data.parts["sft"][:1], data.clip, batch_size=1, seed=0, repeat=False)
+    clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
     params = assembly.init(seed, touch_batch(next(iter(clips))))
     if tactile is not None:
         params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
@@ -230,17 +227,7 @@ def encode_contacts(
 def _encoded(
     assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool
 ) -> Features:
-    clips = clip_batches(
-        data.store,
-        rows,
-        data.clip,
-        batch_size=ENCODE_BATCH,
-        seed=0,
-        shuffle=False,
-        repeat=False,
-        felt=not blind,
-        memory=data.memory,
-    )
+    clips = data.batches(rows, batch_size=ENCODE_BATCH, seed=0, shuffle=False, repeat=False, felt=not blind)
     encode = encode_program(assembly.agent, blind)
     parts = []
     with context.progress("encoding", len(rows)) as advance:
@@ -264,7 +251,7 @@ def noise_bank(
     The statistics are those of the recorded frames of `probe` SFT contacts; frame times are those of the same contacts,
     so that nothing but the touch itself is out of the ordinary.
     """
-    clips = clip_batches(data.store, data.parts["sft"], data.clip, batch_size=probe, seed=seed, repeat=False)
+    clips = data.batches(data.parts["sft"], batch_size=probe, seed=seed, repeat=False)
     clip = next(iter(clips))
     seen = np.where(clip["frame_mask"], 1.0, np.nan).astype(np.float32)
     pixels = _statistics(clip["frames"].astype(np.float32) * seen[..., None, None, None], (0, 2, 3, 4))

@@ -61,6 +61,8 @@ class StudyConfig:
     """Share of the training objects that SFT never sees."""
     clip_memory_gib: float = 1.5
     """Clips that stay in memory once they were read; all of the default's."""
+    read_threads: int = 1
+    """Threads that read clips ahead; on two cores a second one would only take time from the step."""
     model: ModelConfig = ModelConfig()
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
@@ -257,7 +259,7 @@ def open_study_data(config: StudyConfig, context: Context) -> Dataset:
         view_px=config.model.vision.image_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
     )
-    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib)
+    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib, config.read_threads)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.policies import stages
+from experiments.policies.dataset import Dataset
 from experiments.policies.stages import Probed, gather_evidence, noise_bank
 from sensors_io.schema import CLIP_ARRAYS, LEVELS
 from touchr1_jax.training.evidence import ProbeConfig
@@ -62,7 +62,7 @@ def bank(data, monkeypatch):
     """Draw noise from given clips; returns pixels, forces, frame indices and masks, leading [K, S, F]."""
 
     def draw(clip: dict[str, np.ndarray], draws: int):
-        monkeypatch.setattr(stages, "clip_batches", lambda *args, **kwargs: iter([clip]))
+        monkeypatch.setattr(Dataset, "batches", lambda *args, **kwargs: iter([clip]))
         made = np.asarray(noise_bank(Mirror(), {}, data, seed=3, draws=draws))[:, :, 0]
         s, f, h, w = clip["frames"].shape[1:5]
         ends = np.cumsum([f * h * w * 3, f * 3, f])

@@ -1,0 +1,1 @@
+"""What accelerators ask of the cores beside them, and what those deliver."""

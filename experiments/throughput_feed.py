@@ -1,0 +1,304 @@
+"""Can the cores beside an accelerator keep it fed?
+
+    make experiment EXP=throughput_feed [ARGS="--scale smoke"]
+
+Batches of SFT and of GRPO as a study makes them at `--scale gpu`, one H200, and at `--scale paper`, sixteen: what one
+takes of a core, from records and from the memory that the scale keeps clips in, against the shortest step that the
+devices allow, counted from shapes at an assumed share of their peak.  Then the training loop itself with these
+batches, and in the place of the device one that computes nothing for as long: what share of the time it stands still.
+A device has `cores` cores; where fewer are here the stand-in's steps last longer in proportion, and as many threads
+read as there are here, so that supply and demand stand to each other as there.
+
+No accelerator is needed and none is measured: the step's time is a prediction, and what a device loses to the transfer
+of a batch does not show.
+
+Cost: about five minutes on two cores, most of it making the records; `--scale smoke` half a minute.
+
+Expected: below 2 % for either stage at either scale; without threads the GPU would wait for records most of the time.
+"""
+
+import dataclasses
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.feeding.charts import cores_needed
+from experiments.feeding.demand import grpo_seconds, sft_seconds
+from experiments.feeding.supply import Made, idle_share, make_seconds
+from experiments.ladder import presets
+from experiments.policies.assembly import Assembly, assemble
+from experiments.policies.dataset import Dataset
+from experiments.policies.feeds import AnswerFeed, Feed, QuestionFeed
+from experiments.policies.stages import encode_program
+from experiments.policies.study import SMOKE as TINY_STUDY
+from experiments.policies.study import StudyConfig, open_study_data
+from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
+from experiments.running.context import Context
+from experiments.running.runner import Experiment
+from sensors_io.pipeline import ClipMemory
+from touchr1_jax.distributed.work import Machine
+from touchr1_jax.models.policy import Features
+from touchr1_jax.types import TouchBatch
+
+MOST_IDLE = 0.02
+"""Share of the time that a device may stand still for want of a batch."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scale:
+    """A study, its devices, and how many contacts its feed is tried on."""
+
+    study: StudyConfig
+    devices: int
+    contacts: int
+
+    def __post_init__(self) -> None:
+        for name, size in (("sft.batch_size", self.study.sft.batch_size), ("grpo.drawn", self.study.grpo.drawn)):
+            if size % self.devices:
+                raise ValueError(f"devices is {self.devices}: must divide {name} = {size}; change either")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeedingConfig:
+    """Scales, and how long each feed is watched."""
+
+    scales: Mapping[str, Scale] = dataclasses.field(
+        default_factory=lambda: {
+            "gpu": Scale(study=presets.GPU, devices=1, contacts=48),
+            "paper": Scale(study=presets.PAPER, devices=16, contacts=16),
+        }
+    )
+    cores: int = 16
+    """Beside each device."""
+    machine: Machine = Machine()
+    batches: int = 4
+    """Whose processor time is measured."""
+    steps: int = 12
+    """Of the loop."""
+
+    def __post_init__(self) -> None:
+        for name in ("cores", "batches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be at least 1; raise it")
+        if self.steps < 2:
+            raise ValueError(f"steps is {self.steps}: must be at least 2, the first is not watched; raise it")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Fed:
+    """One feed: what a batch takes, how long a step lasts, and how long the device stood still.
+
+    `configured`: whether the study would feed it so; else it shows what memory is good for.
+    """
+
+    scale: str
+    stage: str
+    source: str
+    made: Made
+    step_s: float
+    idle: float
+    configured: bool
+
+    @property
+    def cores(self) -> float:
+        """That a device needs for its batches."""
+        return self.made.cpu_s / self.step_s
+
+    @property
+    def name(self) -> str:
+        """Such as `gpu, SFT, from records`."""
+        return f"{self.scale}, {self.stage}, {self.source}"
+
+
+def run(config: FeedingConfig, context: Context) -> Findings:
+    """Measure every feed, then run each beside a device that stands in."""
+    fed = [one for name, scale in config.scales.items() for one in feeds_of(config, name, scale, context)]
+    return Findings(
+        verdict=verdict(config, fed),
+        requirements=tuple(
+            Requirement(
+                name=f"{one.name}: device stands still",
+                measured=one.idle,
+                bound=MOST_IDLE,
+                better="lower",
+                note="a stand-in",
+            )
+            for one in fed
+            if one.configured
+        ),
+        tables=(feed_table(config, fed),),
+        pictures=(
+            Picture(
+                name="cores",
+                title="Cores that a device needs for its batches",
+                caption="Processor time of a batch over the predicted time of a step; the line is what it has.",
+                content=cores_needed({one.name: one.cores for one in fed}, config.cores),
+            ),
+        ),
+        settings={"cores here": cores_here(), "cores beside a device": config.cores},
+    )
+
+
+def cores_here() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def feeds_of(config: FeedingConfig, name: str, scale: Scale, context: Context) -> Iterator[Fed]:
+    """The feeds of one scale: SFT from records, SFT with the scale's memory where it has one, and GRPO."""
+    study = dataclasses.replace(
+        scale.study,
+        scenes=dataclasses.replace(scale.study.scenes, objects=scale.contacts, sites=1, sequences=None),
+        clip_memory_gib=0.0,
+        read_threads=min(scale.study.read_threads, cores_here()),
+    )
+    data = open_study_data(study, context)
+    data = dataclasses.replace(data, parts={**data.parts, "sft": np.arange(len(data.store))})
+    assembly = assemble(study.model, data.clip.sensors)
+    sft = answers(assembly, data, scale)
+    batch = next(answers(assembly, data, scale))
+    whole = jax.tree.map(lambda x: jax.ShapeDtypeStruct((study.sft.batch_size, *x.shape[1:]), x.dtype), batch)
+    step_s = sft_seconds(assembly, study.sft, whole, scale.devices, config.machine)
+    kept = memory_share(scale.study, data, batch.touch)
+    yield watch(config, f"{name}/sft/records", sft, step_s, context, configured=not kept)
+    if kept:
+        clip_bytes = sum(x.nbytes for x in jax.tree.leaves(batch.touch)) // len(batch.streams)
+        remembering = dataclasses.replace(
+            data, memory=ClipMemory(data.clip, round(kept * len(data.store)) * clip_bytes)
+        )
+        feed = answers(assembly, remembering, scale)
+        yield watch(config, f"{name}/sft/memory", feed, step_s, context, configured=True, warm=len(data.store))
+    grpo_s = grpo_seconds(assembly, study.grpo, scale.devices, config.machine)
+    asked = questions(assembly, batch.touch, data, scale)
+    yield watch(config, f"{name}/grpo/memory", asked, grpo_s, context, configured=True)
+
+
+def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
+    """Share of the study's clips that its memory holds."""
+    clip_bytes = sum(x.nbytes for x in jax.tree.leaves(touch)) / len(touch.stream_mask)
+    scenes = study.scenes
+    contacts = scenes.objects * scenes.sites if scenes.sequences is None else scenes.sequences // len(data.clip.sensors)
+    return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes))
+
+
+def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
+    """Batches of SFT, those rows that the first device reads; the evidence is equal for all levels."""
+    config = scale.study.sft
+    shape = (len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels))
+    return AnswerFeed(
+        assembly,
+        data,
+        np.zeros(shape, np.float32),
+        batch_size=config.batch_size,
+        questions=config.questions,
+        seed=0,
+        augment=config.augment,
+        own=np.arange(config.batch_size // scale.devices),
+    )
+
+
+def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: Scale) -> QuestionFeed:
+    """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
+    params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
+    one = jax.eval_shape(encode_program(assembly.agent, False), params, touch)
+    n = len(data.store)
+    zeros: Features = jax.tree.map(lambda x: np.zeros((n, *x.shape[1:]), x.dtype), one)
+    there: Any = np.ones(zeros.stream_mask.shape, bool)
+    features = dataclasses.replace(zeros, stream_mask=there)
+    drawn = scale.study.grpo.drawn
+    return QuestionFeed(assembly, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))
+
+
+def watch(
+    config: FeedingConfig, stage: str, feed: Feed, step_s: float, context: Context, *, configured: bool, warm: int = 1
+) -> Fed:
+    """Time some batches of a feed, then run it beside a stand-in.
+
+    Args:
+      config: how many batches and steps.
+      stage: scale, stage and source, by slashes.
+      feed: of the stage.
+      step_s: that a step takes there.
+      context: the run.
+      configured: whether the scale's study would feed it so.
+      warm: batches that are drawn first.
+    """
+    if not context.done(stage):
+        made = make_seconds(feed, config.batches, warm)
+        stretch = max(1.0, config.cores / cores_here())
+        idle = idle_share(feed, step_s * stretch, config.steps, context, stage)
+        context.save_stage(stage, {"made": made._asdict(), "idle": idle})
+    saved = context.load_stage(stage)
+    scale, name, source = stage.split("/")
+    return Fed(
+        scale=scale,
+        stage=name,
+        source=source,
+        made=Made(**saved["made"]),
+        step_s=step_s,
+        idle=saved["idle"],
+        configured=configured,
+    )
+
+
+def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:
+    """What every feed delivers, and what the device asks."""
+    return Table(
+        title="What a batch takes, and what a device asks",
+        columns=(
+            Column(name="scale"),
+            Column(name="stage"),
+            Column(name="clips or features from"),
+            Column(name="batch", unit="MB", meaning="of one device"),
+            Column(name="made in", unit="core s", meaning="processor time, all threads"),
+            Column(name="step", unit="s", meaning="predicted"),
+            Column(name="cores needed", format=".2g", meaning=f"of {config.cores} beside a device"),
+            Column(name="device stands still", unit="%", format=".2f", meaning="a stand-in, in the loop that trains"),
+        ),
+        rows=tuple(
+            (
+                one.scale,
+                one.stage,
+                one.source if one.configured else f"{one.source} alone",
+                one.made.size_bytes / 1e6,
+                one.made.cpu_s,
+                one.step_s,
+                one.cores,
+                100 * one.idle,
+            )
+            for one in fed
+        ),
+        note=f"Steps are as short as {config.machine.flops_share:.0%} of {config.machine.flops / 1e12:.0f} TFLOP/s "
+        "make them.",
+    )
+
+
+def verdict(config: FeedingConfig, fed: Sequence[Fed]) -> tuple[str, ...]:
+    """Which feed is the hardest, how long devices stand still, and that it is no measurement of one."""
+    used = [one for one in fed if one.configured]
+    worst, hardest = max(used, key=lambda one: one.idle), max(used, key=lambda one: one.cores)
+    said = [
+        "No accelerator was at work: what its steps take is predicted, and a stand-in waited for the batches.",
+        f"It stands still for at most {worst.idle:.2%} of the time ({worst.name}); the hardest to feed asks for "
+        f"{hardest.cores:.2g} of {config.cores} cores ({hardest.name}).",
+    ]
+    said += [
+        f"Without the memory {one.name} would ask for {one.cores:.2g}, and stand still for {one.idle:.1%}."
+        for one in fed
+        if not one.configured
+    ]
+    return tuple(said)
+
+
+DEFAULT = FeedingConfig()
+SMOKE = FeedingConfig(
+    scales={"smoke": Scale(study=dataclasses.replace(TINY_STUDY, clip_memory_gib=0.002), devices=2, contacts=24)},
+    machine=Machine(flops=2e10),
+    batches=1,
+    steps=3,
+)
+
+EXPERIMENT = Experiment(name="throughput_feed", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
