@@ -6,13 +6,13 @@ Batches of SFT and of GRPO as a study makes them at `--scale gpu`, one H200, and
 takes of a core, from records and from the memory that the scale keeps clips in, against the shortest step that the
 devices allow, counted from shapes at an assumed share of their peak.  Then the training loop itself with these
 batches, and in the place of the device one that computes nothing for as long: what share of the time it stands still.
-A device has `cores` cores; where fewer are here the stand-in's steps last longer in proportion, and as many threads
-read as there are here, so that supply and demand stand to each other as there.
+A device has `cores` cores; where fewer are here, and the batches need more than half of them, the stand-in's steps last
+longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here.
 
 No accelerator is needed and none is measured: the step's time is a prediction, and what a device loses to the transfer
 of a batch does not show.
 
-Cost: about five minutes on two cores, most of it making the records; `--scale smoke` half a minute.
+Cost: about three minutes on two cores, most of it making the records; `--scale smoke` half a minute.
 
 Expected: below 2 % for either stage at either scale; without threads the GPU would wait for records most of the time.
 """
@@ -228,8 +228,7 @@ def watch(
     """
     if not context.done(stage):
         made = make_seconds(feed, config.batches, warm)
-        stretch = max(1.0, config.cores / cores_here())
-        idle = idle_share(feed, step_s * stretch, config.steps, context, stage)
+        idle = idle_share(feed, step_s * stretch(config, made.cpu_s / step_s), config.steps, context, stage)
         context.save_stage(stage, {"made": made._asdict(), "idle": idle})
     saved = context.load_stage(stage)
     scale, name, source = stage.split("/")
@@ -242,6 +241,11 @@ def watch(
         idle=saved["idle"],
         configured=configured,
     )
+
+
+def stretch(config: FeedingConfig, needed: float) -> float:
+    """How many times longer a stand-in's steps last: until half of the cores here are enough, if so many are there."""
+    return min(max(1.0, 2 * needed / cores_here()), max(1.0, config.cores / cores_here()))
 
 
 def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:

@@ -55,3 +55,11 @@ def test_bad_settings_are_named(changes, message):
 def test_devices_must_share_a_batch_evenly():
     with pytest.raises(ValueError, match=r"devices is 3: must divide sft\.batch_size = 64"):
         Scale(study=presets.GPU, devices=3, contacts=8)
+
+
+def test_steps_last_longer_where_fewer_cores_are_here(monkeypatch):
+    monkeypatch.setattr(throughput_feed, "cores_here", lambda: 2)
+    by_need = {need: throughput_feed.stretch(FeedingConfig(cores=16), need) for need in (0.1, 1.0, 3.0, 8.0, 50.0)}
+    assert by_need == {0.1: 1, 1.0: 1, 3.0: 3, 8.0: 8, 50.0: 8}
+    monkeypatch.setattr(throughput_feed, "cores_here", lambda: 32)
+    assert throughput_feed.stretch(FeedingConfig(cores=16), 50.0) == 1
