@@ -77,7 +77,9 @@ class FeedingConfig:
     batches: int = 4
     """Whose processor time is measured."""
     steps: int = 12
-    """Of the loop."""
+    """Of the loop, at most."""
+    most_s: float = 60.0
+    """About which the loop ends, but for two steps."""
 
     def __post_init__(self) -> None:
         for name in ("cores", "batches"):
@@ -228,7 +230,9 @@ def watch(
     """
     if not context.done(stage):
         made = make_seconds(feed, config.batches, warm)
-        idle = idle_share(feed, step_s * stretch(config, made.cpu_s / step_s), config.steps, context, stage)
+        lasts_s = step_s * stretch(config, made.cpu_s / step_s)
+        steps = min(config.steps, max(2, round(config.most_s / lasts_s)))
+        idle = idle_share(feed, lasts_s, steps, context, stage)
         context.save_stage(stage, {"made": made._asdict(), "idle": idle})
     saved = context.load_stage(stage)
     scale, name, source = stage.split("/")
