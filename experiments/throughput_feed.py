@@ -7,7 +7,8 @@ takes of a core, from records and from the memory that the scale keeps clips in,
 devices allow, counted from shapes at an assumed share of their peak.  Then the training loop itself with these
 batches, and in the place of the device one that computes nothing for as long: what share of the time it stands still.
 A device has `cores` cores; where fewer are here, and the batches need more than half of them, the stand-in's steps last
-longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here.
+longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here; that
+more of them share the work without waiting for each other is supposed.
 
 No accelerator is needed and none is measured: the step's time is a prediction, and what a device loses to the transfer
 of a batch does not show.
@@ -257,10 +258,8 @@ def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:
     return Table(
         title="What a batch takes, and what a device asks",
         columns=(
-            Column(name="scale"),
-            Column(name="stage"),
-            Column(name="clips or features from"),
-            Column(name="batch", unit="MB", meaning="of one device"),
+            Column(name="feed", meaning="scale, stage, where clips or features lie"),
+            Column(name="batch", unit="MB", meaning="what one device gets"),
             Column(name="made in", unit="core s", meaning="processor time, all threads"),
             Column(name="step", unit="s", meaning="predicted"),
             Column(name="cores needed", format=".2g", meaning=f"of {config.cores} beside a device"),
@@ -268,9 +267,7 @@ def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:
         ),
         rows=tuple(
             (
-                one.scale,
-                one.stage,
-                one.source if one.configured else f"{one.source} alone",
+                one.name,
                 one.made.size_bytes / 1e6,
                 one.made.cpu_s,
                 one.step_s,

@@ -34,7 +34,7 @@ def test_every_feed_of_a_scale_is_held_to_the_bound(results):
 def test_cores_are_the_batch_over_the_step(results):
     (table,) = results.tables
     rows = [dict(zip((c.name for c in table.columns), row, strict=True)) for row in table.rows]
-    assert [row["clips or features from"] for row in rows] == ["records alone", "memory", "memory"]
+    assert [row["feed"] for row in rows] == ["tiny, sft, records", "tiny, sft, memory", "tiny, grpo, memory"]
     for row in rows:
         assert row["cores needed"] == pytest.approx(row["made in"] / row["step"])
 
