@@ -7,8 +7,8 @@ takes of a core, from records and from the memory that the scale keeps clips in,
 devices allow, counted from shapes at an assumed share of their peak.  Then the training loop itself with these
 batches, and in the place of the device one that computes nothing for as long: what share of the time it stands still.
 A device has `cores` cores; where fewer are here, and the batches need more than half of them, the stand-in's steps last
-longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here; that
-more of them share the work without waiting for each other is supposed.
+longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here: it
+is supposed that more of them would not wait for each other.
 
 No accelerator is needed and none is measured: the step's time is a prediction, and what a device loses to the transfer
 of a batch does not show.
@@ -21,45 +21,27 @@ Expected: below 2 % for either stage at either scale; without threads the GPU wo
 import dataclasses
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
 from experiments.feeding.charts import cores_needed
 from experiments.feeding.demand import grpo_seconds, sft_seconds
+from experiments.feeding.scales import Scale, answers, memory_share, questions
 from experiments.feeding.supply import Made, idle_share, make_seconds
 from experiments.ladder import presets
-from experiments.policies.assembly import Assembly, assemble
-from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import AnswerFeed, Feed, QuestionFeed
-from experiments.policies.stages import encode_program
+from experiments.policies.assembly import assemble
+from experiments.policies.feeds import Feed
 from experiments.policies.study import SMOKE as TINY_STUDY
-from experiments.policies.study import StudyConfig, open_study_data
+from experiments.policies.study import open_study_data
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.pipeline import ClipMemory
 from touchr1_jax.distributed.work import Machine
-from touchr1_jax.models.policy import Features
-from touchr1_jax.types import TouchBatch
 
 MOST_IDLE = 0.02
 """Share of the time that a device may stand still for want of a batch."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Scale:
-    """A study, its devices, and how many contacts its feed is tried on."""
-
-    study: StudyConfig
-    devices: int
-    contacts: int
-
-    def __post_init__(self) -> None:
-        for name, size in (("sft.batch_size", self.study.sft.batch_size), ("grpo.drawn", self.study.grpo.drawn)):
-            if size % self.devices:
-                raise ValueError(f"devices is {self.devices}: must divide {name} = {size}; change either")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -177,42 +159,6 @@ def feeds_of(config: FeedingConfig, name: str, scale: Scale, context: Context) -
     grpo_s = grpo_seconds(assembly, study.grpo, scale.devices, config.machine)
     asked = questions(assembly, batch.touch, data, scale)
     yield watch(config, f"{name}/grpo/memory", asked, grpo_s, context, configured=True)
-
-
-def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
-    """Share of the study's clips that its memory holds."""
-    clip_bytes = sum(x.nbytes for x in jax.tree.leaves(touch)) / len(touch.stream_mask)
-    scenes = study.scenes
-    contacts = scenes.objects * scenes.sites if scenes.sequences is None else scenes.sequences // len(data.clip.sensors)
-    return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes))
-
-
-def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
-    """Batches of SFT, those rows that the first device reads; the evidence is equal for all levels."""
-    config = scale.study.sft
-    shape = (len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels))
-    return AnswerFeed(
-        assembly,
-        data,
-        np.zeros(shape, np.float32),
-        batch_size=config.batch_size,
-        questions=config.questions,
-        seed=0,
-        augment=config.augment,
-        own=np.arange(config.batch_size // scale.devices),
-    )
-
-
-def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: Scale) -> QuestionFeed:
-    """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
-    params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
-    one = jax.eval_shape(encode_program(assembly.agent, False), params, touch)
-    n = len(data.store)
-    zeros: Features = jax.tree.map(lambda x: np.zeros((n, *x.shape[1:]), x.dtype), one)
-    there: Any = np.ones(zeros.stream_mask.shape, bool)
-    features = dataclasses.replace(zeros, stream_mask=there)
-    drawn = scale.study.grpo.drawn
-    return QuestionFeed(assembly, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))
 
 
 def watch(

@@ -6,9 +6,10 @@ import pytest
 from rich.console import Console
 
 from experiments import throughput_feed
+from experiments.feeding.scales import Scale
 from experiments.ladder import presets
 from experiments.running.context import Context
-from experiments.throughput_feed import SMOKE, FeedingConfig, Scale
+from experiments.throughput_feed import SMOKE, FeedingConfig
 from tests.experiments import tiny
 
 STUDY = dataclasses.replace(tiny.STUDY, clip_memory_gib=0.0002)  # of a quarter of the clips, more or less
