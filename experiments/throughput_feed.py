@@ -252,4 +252,4 @@ SMOKE = FeedingConfig(
     steps=3,
 )
 
-EXPERIMENT = Experiment(name="throughput_feed", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="throughput_feed", config=DEFAULT, scales={"smoke": SMOKE}, run=run, quick=("smoke",))
