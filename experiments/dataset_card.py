@@ -31,7 +31,7 @@ from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.items import KINDS, Item, write_items
 
 

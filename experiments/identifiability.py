@@ -45,8 +45,7 @@ from experiments.reporting.findings import Findings, Requirement
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.live import LiveScenes
-from sensors_io.scenes import SceneConfig
-from sensors_io.scenes.config import require
+from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.validity import STRAIN_LIMIT
 from sensors_io.schema import SENSORS
 from touchr1_jax.training.evidence import ProbeConfig

@@ -31,7 +31,7 @@ from experiments.storage.clips import GENERATED, IMPORTED, generated_clips, reco
 from experiments.storage.codecs import OWN, PLAIN, Codec, all_codecs
 from experiments.storage.feed import FeedConfig, feed_rates, make_store, stage_ms
 from experiments.storage.measure import Measured, chosen_filters, measure
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 
 Rows = Mapping[str, Sequence[Measured]]
 """Kind of clips → codecs measured on them."""

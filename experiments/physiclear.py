@@ -35,7 +35,7 @@ from experiments.reporting.findings import Cell, Column, Findings, Picture, Requ
 from experiments.running.artifacts import write_bytes, write_json
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
 
 NAMES = ("hardness", "roughness", "bumps")

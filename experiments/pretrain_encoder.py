@@ -31,7 +31,7 @@ from experiments.policies.pretrained import save_encoder
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context, read_metrics
 from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import Interval
 

@@ -22,7 +22,9 @@ from experiments.reporting.findings import Cell, Column, Findings, Picture, Tabl
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from experiments.scenes.sheets import depth_picture, field_picture, picture_rows, strips
-from sensors_io.scenes import SceneConfig, appearance, contact_key, make_contact, objects, properties, surface
+from sensors_io.scenes import appearance, objects, properties, surface
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.protocol import contact_key, make_contact
 from sensors_io.schema import MATERIALS, SENSORS, Sequence
 
 VIEW_PX = 96

@@ -27,8 +27,8 @@ from experiments.contact.scenes import Scenes, displacement_error, exact, make_b
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
+from sensors_io.layer import Layer
 from sensors_io.scenes import contact
-from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 from sensors_io.scenes.validity import STRAIN_LIMIT
 

@@ -33,7 +33,7 @@ from experiments.reporting.findings import Cell, Column, Findings, Picture, Requ
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.pipeline import clip_batches
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.predictor import PredictorConfig

@@ -33,7 +33,7 @@ from experiments.scenes import stages as scene_stages
 from experiments.scenes.kills import Kept
 from experiments.scenes.rates import Rate
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import padded_size
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import SENSORS, Flag

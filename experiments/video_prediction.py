@@ -31,7 +31,7 @@ from experiments.policies.pretrained import PretrainedEncoder, load_encoder
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.lpips import check_weights
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig

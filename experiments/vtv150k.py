@@ -37,7 +37,7 @@ from experiments.reporting.findings import Findings, Picture
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from sensors_io.live import LiveScenes
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.training.evidence import ProbeConfig

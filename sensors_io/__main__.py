@@ -1,68 +1,43 @@
-"""`python -m sensors_io`: import recordings, generate scenes, check and list records."""
+"""`python -m sensors_io`: import recordings, generate scenes, check and list records, watch and record sensors."""
 
+import ast
+import difflib
+import importlib
+import pathlib
 import sys
-from typing import Annotated
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import tyro
 
-from sensors_io.calibration.geometry import GeometryError
-from sensors_io.commands.calibrate import Calibrate
-from sensors_io.commands.choices import sections, with_devices
-from sensors_io.commands.console import ERR, complain
-from sensors_io.commands.devices import Devices
-from sensors_io.commands.extract import Extract
-from sensors_io.commands.force_zero import ForceZeroing
-from sensors_io.commands.generate import Generate
-from sensors_io.commands.geometry import Geometry
-from sensors_io.commands.imports import Import
-from sensors_io.commands.label import Label, LabelsError
-from sensors_io.commands.record import Record
-from sensors_io.commands.records import Check, List
-from sensors_io.commands.sync import Sync
-from sensors_io.commands.view import View
-from sensors_io.commands.zero import Zero
-from sensors_io.devices.errors import DeviceError
-from sensors_io.fields.sources import SourceError
-from sensors_io.fields.types import CalibrationError
-from sensors_io.force import ForceError
-from sensors_io.importers.keep import ImportSourceError
-from sensors_io.offsets import OffsetsError
-from sensors_io.recording.journal import JournalError
-from sensors_io.records import RecordsError
-from sensors_io.schema import SchemaError
+from sensors_io.commands.console import ERR, OUT, complain
+from sensors_io.errors import UserError
 
-Command = (
-    Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[Generate, tyro.conf.subcommand("generate")]
-    | Annotated[Check, tyro.conf.subcommand("check")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Label, tyro.conf.subcommand("label")]
-    | Annotated[Geometry, tyro.conf.subcommand("geometry")]
-    | Annotated[Devices, tyro.conf.subcommand("devices")]
-    | Annotated[Record, tyro.conf.subcommand("record")]
-    | Annotated[Zero, tyro.conf.subcommand("zero")]
-    | Annotated[ForceZeroing, tyro.conf.subcommand("force-zero")]
-    | Annotated[Sync, tyro.conf.subcommand("sync")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[Extract, tyro.conf.subcommand("extract")]
-)
+PROG = "python -m sensors_io"
 
-KNOWN_ERRORS = (
-    RecordsError,
-    SchemaError,
-    ImportSourceError,
-    LabelsError,
-    DeviceError,
-    ForceError,
-    OffsetsError,
-    JournalError,
-    SourceError,
-    CalibrationError,
-    GeometryError,
-    OSError,
-)
-"""Whose message says all that a user needs."""
+COMMANDS: Mapping[str, str] = {
+    "import": "imports.Import",
+    "generate": "generate.Generate",
+    "check": "check.Check",
+    "list": "list.List",
+    "label": "label.Label",
+    "devices": "devices.Devices",
+    "view": "view.View",
+    "record": "record.Record",
+    "calibrate": "calibrate.Calibrate",
+    "geometry": "geometry.Geometry",
+    "extract": "extract.Extract",
+    "zero": "zero.Zero",
+    "force-zero": "force_zero.ForceZeroing",
+    "sync": "sync.Sync",
+}
+"""Module and class of each, in `sensors_io.commands`.
+
+The one that is asked for is imported alone: all together take seconds.
+"""
+
+PLUS = "+"
+"""Stands between devices."""
 
 
 def main(args: list[str] | None = None) -> int:
@@ -71,16 +46,65 @@ def main(args: list[str] | None = None) -> int:
     Args:
       args: the command line; None takes that of the process.
     """
-    first, *others = sections(sys.argv[1:] if args is None else args)
-    command = tyro.cli(Command, args=first, prog="sensors_io", config=(tyro.conf.OmitArgPrefixes,))
+    args = sys.argv[1:] if args is None else args
+    if not args or args[0] in ("-h", "--help"):
+        OUT.print("\n".join(usage()), markup=False, highlight=False, soft_wrap=True)
+        return 0 if args else 2
+    if args[0] not in COMMANDS:
+        close = difflib.get_close_matches(args[0], COMMANDS)
+        asked = f" Did you mean {' or '.join(close)}?" if close else ""
+        told = [f"There is no command {args[0]!r}.{asked}", *usage()]
+        ERR.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
+        return 2
     try:
-        return with_devices(command, others).run()
-    except KNOWN_ERRORS as error:
+        return read(args).run()
+    except (UserError, OSError) as error:
         complain(error)
         return 1
     except KeyboardInterrupt:
         ERR.print("interrupted: run the same command again to go on")
         return 130
+
+
+def read(args: list[str]) -> Any:
+    """The command that a command line asks for, ready to run.
+
+    Raises:
+      SystemExit: code 2 after an answer to what is not understood, 0 after help.
+      DeviceNotFoundError: devices for a command that takes none.
+    """
+    first, *others = _sections(args[1:])
+    module, _, kind = COMMANDS[args[0]].partition(".")
+    made = getattr(importlib.import_module(f"sensors_io.commands.{module}"), kind)
+    command = tyro.cli(made, args=first, prog=f"{PROG} {args[0]}", config=(tyro.conf.OmitArgPrefixes,))
+    if not others:
+        return command
+    from sensors_io.commands.choices import with_devices  # every device's code, of use to commands on devices alone
+
+    return with_devices(command, others)
+
+
+def usage() -> Iterator[str]:
+    """How to call it, and every command with the first line of what it says of itself."""
+    yield f"usage: {PROG} COMMAND …       {PROG} COMMAND --help"
+    width = max(map(len, COMMANDS))
+    for name, place in COMMANDS.items():
+        module, _, kind = place.partition(".")
+        source = pathlib.Path(__file__).with_name("commands") / f"{module}.py"
+        tree = ast.parse(source.read_text(encoding="utf-8"))
+        [found] = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == kind]
+        yield f"  {name:<{width}}  {(ast.get_docstring(found) or '').partition(chr(10))[0]}"
+
+
+def _sections(args: list[str]) -> list[list[str]]:
+    """Arguments, cut at every +."""
+    found: list[list[str]] = [[]]
+    for arg in args:
+        if arg == PLUS:
+            found.append([])
+        else:
+            found[-1].append(arg)
+    return found
 
 
 if __name__ == "__main__":

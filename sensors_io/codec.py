@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.deltas import FILTERS, accumulate, choose_filter, difference
+from sensors_io.errors import UserError
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, ObjectCard, SchemaError, Sequence, Spec
 
 TOLERANCE: Mapping[str, float] = {
@@ -50,7 +51,7 @@ _CARD_ARRAYS: Mapping[str, Spec] = {
 }
 
 
-class RecordsError(ValueError):
+class RecordsError(UserError, ValueError):
     """Records that cannot be written or read; the message names the path, the problem and the fix."""
 
 

@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
+from sensors_io.errors import UserError
 
 GRAVITY_M_PER_S2 = 9.80665
 _WORST_CONDITION = 100.0  # of the poses: errors of a reading grow by at most this
@@ -21,7 +22,7 @@ _DEGREE = 3  # of the gel's response to force
 _LEAST_WEIGHT_N = 0.02  # 2 g: below it a centre of mass cannot be told
 
 
-class ForceError(ValueError):
+class ForceError(UserError, ValueError):
     """Readings from which nothing can be told; the message says what to do about it."""
 
 

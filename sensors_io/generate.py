@@ -5,7 +5,9 @@ import pathlib
 from collections.abc import Callable
 
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards
+from sensors_io.scenes.cards import object_cards
+from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.scenes.protocol import contacts
 from sensors_io.schema import SENSORS
 
 RECORDS_PER_SHARD = 2880

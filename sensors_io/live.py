@@ -11,7 +11,9 @@ import functools
 
 import numpy as np
 
-from sensors_io.scenes import SceneConfig, contact_key, make_contact, object_cards
+from sensors_io.scenes.cards import object_cards
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.protocol import contact_key, make_contact
 from sensors_io.schema import SENSORS, ContactKey, ObjectCard, Sequence, contacts_of_split
 
 

@@ -6,10 +6,11 @@ import pathlib
 from collections.abc import Mapping
 from typing import Self
 
+from sensors_io.errors import UserError
 from sensors_io.json_files import write_json
 
 
-class OffsetsError(ValueError):
+class OffsetsError(UserError, ValueError):
     """A file that holds no offsets; the message says what to do about it."""
 
 

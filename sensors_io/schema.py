@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.errors import UserError
+
 SENSORS: tuple[str, ...] = ("gelsight_mini", "xense", "tac3d", "dmtac_x")
 """Canonical sensor names.  Stream s of a clip is always sensor s of the data set's sensor tuple."""
 
@@ -72,7 +74,7 @@ class Flag(enum.IntFlag):
     NO_ZERO_LEVEL = 8192  # hardly any gel looks untouched, so that absolute depth hangs on nothing
 
 
-class SchemaError(ValueError):
+class SchemaError(UserError, ValueError):
     """A recording that breaks the schema; the message names the field, the value, the constraint and the fix."""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as Seq
 from typing import TypeVar
 
-import grain
+from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
@@ -77,7 +77,7 @@ class Entries:
             shard.check(root)
         self._files = [(root / shard.file, shard.entries) for shard in shards]
         paths = [f"{file}[0:{entries}]" for file, entries in self._files]  # the range spares opening each to count it
-        self._source = grain.sources.ArrayRecordDataSource(paths) if paths else []
+        self._source = ArrayRecordDataSource(paths) if paths else []
 
     def decode(self, i: int, decode: Callable[[bytes], _T]) -> _T:
         """Entry i, decoded; errors get the path of its file."""

@@ -28,6 +28,7 @@ TOUCHR1_LAYERS = (
 """Lowest first: a module may import its own layer and those before it."""
 
 SENSORS_LAYERS = (
+    {"errors"},
     {"schema"},
     {"clock", "json_files"},
     {"sync", "taps", "force", "offsets"},
@@ -35,6 +36,7 @@ SENSORS_LAYERS = (
     {"deltas"},
     {"quality"},
     {"measures"},
+    {"layer"},
     {"codec"},
     {"augment"},
     {"shards", "selection"},
@@ -233,7 +235,7 @@ def unknown_globals(source: str, known: set[str]) -> set[str]:
 @pytest.mark.parametrize("path", FILES, ids=name_of)
 def test_every_global_name_exists(path):
     if path.name == "__main__.py":
-        known = {n for top in ast.parse(path.read_text()).body for n in bound_names(top)} | {"__name__"}
+        known = {n for top in ast.parse(path.read_text()).body for n in bound_names(top)} | {"__name__", "__file__"}
     else:
         known = set(vars(importlib.import_module(name_of(path))))
     assert not unknown_globals(path.read_text(), known)

@@ -15,8 +15,7 @@ from experiments.bench.__main__ import Command as Bench
 from experiments.running.catalogue import find
 from experiments.running.commands import COMMANDS, Command
 from experiments.running.runner import parse
-from sensors_io.__main__ import Command as Sensors
-from sensors_io.commands.choices import sections, with_devices
+from sensors_io.__main__ import read as sensors_command
 from touchr1_jax.models.load import Load
 from touchr1_jax.rewards.__main__ import Command as Rewards
 
@@ -61,8 +60,8 @@ def read(module: str, arguments: str) -> None:
     """Parse a command line; `SystemExit` and every error of a configuration come out."""
     words = [STANDS_FOR.get(word, word) for word in shlex.split(arguments)]
     if module == "sensors_io":
-        first, *others = sections(words)
-        with_devices(tyro.cli(Sensors, args=first, config=(tyro.conf.OmitArgPrefixes,)), others)
+        if words[0] not in ("-h", "--help"):
+            sensors_command(words)
     elif module == "experiments" and words[0] in EXPERIMENTS:
         parse(importlib.import_module(f"experiments.{words[0]}").EXPERIMENT, words[1:], "")
     elif module == "experiments" and words[0] not in {"NAME", *WRITTEN_BY_TUTORIAL}:

@@ -11,8 +11,7 @@ from experiments.bench.draw import QuotaError
 from experiments.bench.facts import FactsError
 from experiments.bench.sheets import SheetError
 from sensors_io.commands.console import complain
-from sensors_io.records import RecordsError
-from sensors_io.schema import SchemaError
+from sensors_io.errors import UserError
 from touchr1_jax.bench.items import ItemError
 from touchr1_jax.bench.json_lines import LinesError
 
@@ -34,8 +33,7 @@ KNOWN_ERRORS = (
     ItemError,
     LinesError,
     SheetError,
-    RecordsError,
-    SchemaError,
+    UserError,
     OSError,
 )
 """Whose message says all that a user needs."""

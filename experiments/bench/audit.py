@@ -5,6 +5,9 @@ say nothing of the item's kind, author or place in the file; the key that does s
 """
 
 import dataclasses
+import json
+import os
+import pathlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -46,6 +49,28 @@ def sample(items: Sequence[Item], count: int, seed: int) -> dict[str, str]:
     chosen = np.random.default_rng(seed).choice(len(items), count, replace=False)
     width = len(str(count))
     return {f"{number:0{width}d}": items[i].ask.id for number, i in enumerate(chosen, 1)}
+
+
+def read_key(path: str | os.PathLike[str], items: Sequence[Item]) -> dict[str, str]:
+    """A key that `sample` drew from these items.
+
+    Raises:
+      SheetError: no such file, one that holds no key, or one of other items.
+    """
+    try:
+        key = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise SheetError(f"{path} is missing: must be the .key.json that lies beside the sheet; correct it") from None
+    except (OSError, ValueError) as error:
+        raise SheetError(
+            f"{path} cannot be read ({error}): must be the .key.json beside the sheet; correct it"
+        ) from error
+    if not isinstance(key, dict) or not all(isinstance(name, str) for name in key.values()):
+        raise SheetError(f"{path} holds no key: must be the .key.json beside the sheet; correct the path")
+    strange = sorted(set(key.values()) - {item.ask.id for item in items})
+    if strange:
+        raise SheetError(f"{path} names item {strange[0]!r}, which is not there: must be of the same items; give those")
+    return key
 
 
 def write_blank(path: str, items: Sequence[Item], key: Mapping[str, str], contacts: Mapping[Touch, Contact]) -> None:

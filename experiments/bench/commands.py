@@ -14,7 +14,7 @@ from experiments.bench.facts import gather
 from experiments.bench.filters import Filtered, sift
 from experiments.bench.generate import Source, ask_about, generate, read_source
 from experiments.bench.sheets import SheetError
-from experiments.running.artifacts import read_json, write_json
+from experiments.running.artifacts import write_json
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import read_items, write_items
 from touchr1_jax.bench.json_lines import read_lines, write_lines
@@ -97,8 +97,10 @@ class Score:
 
     def run(self) -> int:
         items = read_items(self.items)
-        said = examine.understood(read_lines(self.answers), items)
-        seen = None if self.by_sight is None else examine.understood(read_lines(self.by_sight), items)
+        said = examine.understood(read_lines(self.answers), items, str(self.answers))
+        seen = None
+        if self.by_sight is not None:
+            seen = examine.understood(read_lines(self.by_sight), items, str(self.by_sight))
         table = Table("metric", "", "95 %, over objects", "values", "meaning")
         for row in examine.table(items, said, seen):
             spec, span = row.metric.format, row.interval
@@ -195,7 +197,8 @@ class Audit:
     def run(self) -> int:
         if not 1 <= len(self.sheets) <= 2:
             raise SheetError(f"sheets holds {len(self.sheets)}: must be one or two; score judges in pairs")
-        items, key = read_items(self.items), read_json(self.key)
+        items = read_items(self.items)
+        key = audit.read_key(self.key, items)
         judged = [audit.read_judgement(str(sheet), key) for sheet in self.sheets]
         for sheet, judgement in zip(self.sheets, judged, strict=True):
             OUT.print(_rates(sheet.name, audit.pass_rates(judgement, key, items)))

@@ -39,23 +39,26 @@ def ask_all(items: Iterable[Item], answer: Callable[[Item], str]) -> dict[str, t
     return {item.ask.id: understand(item.ask, answer(item))[1] for item in items}
 
 
-def understood(rows: Iterable[tuple[int, Mapping[str, Any]]], items: Sequence[Item]) -> dict[str, tuple[int, ...]]:
+def understood(
+    rows: Iterable[tuple[int, Mapping[str, Any]]], items: Sequence[Item], where: str = "answers"
+) -> dict[str, tuple[int, ...]]:
     """Answers from a file; a question without one is unparsable.
 
     Args:
       rows: line numbers and objects {"id", "text"}, as `read_lines` gives them.
       items: the bench.
+      where: the file's name, for errors.
 
     Raises:
       LinesError: other fields, an unknown id, one that occurs twice, or a text that is none.
     """
     by_id, texts = {item.ask.id: item for item in items}, dict[str, str]()
     for number, tree in rows:
-        if set(tree) != {"id", "text"} or not isinstance(tree["text"], str):
-            raise LinesError(f"line {number} is {dict(tree)!r}: must have id and text, a string; correct it")
+        if set(tree) != {"id", "text"} or not all(isinstance(value, str) for value in tree.values()):
+            raise LinesError(f"{where}, line {number} is {dict(tree)!r}: must have id and text, strings; correct it")
         if tree["id"] not in by_id or tree["id"] in texts:
             fix = "answer each once" if tree["id"] in texts else "take the ids of the items"
-            raise LinesError(f"line {number}: id is {tree['id']!r}: must be that of an open question; {fix}")
+            raise LinesError(f"{where}, line {number}: id is {tree['id']!r}: must be that of an open question; {fix}")
         texts[tree["id"]] = tree["text"]
     return ask_all(items, lambda item: texts.get(item.ask.id, ""))
 

@@ -42,25 +42,34 @@ def read_sheet(
       wanted: the keys that must be there, each once.
 
     Raises:
-      SheetError: another key, one missing or twice, a column missing, or a word that is none of the allowed ones.
+      SheetError: no such file, one that is no text, another key, one missing or twice, a column missing, or a word that
+        is none of the allowed ones.
     """
     path, names = pathlib.Path(path), set(wanted)
     rows: dict[str, dict[str, str]] = {}
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        reader = csv.DictReader(file)
-        missing = [column for column in (key, *cells) if column not in (reader.fieldnames or ())]
-        if missing:
-            raise SheetError(f"{path} lacks the columns {missing}: must have {key}, {', '.join(cells)}; add them")
-        for row in reader:
-            where, name = f"{path}, line {reader.line_num}", row[key]
-            if name not in names or name in rows:
-                why = "occurs twice" if name in rows else "is not asked for"
-                raise SheetError(f"{where}: {key} {name!r} {why}; each row of the blank sheet belongs there once")
-            rows[name] = {column: _word(where, column, row[column], words) for column, words in cells.items()}
+    reader = csv.DictReader(io.StringIO(_text(path), newline=""))
+    missing = [column for column in (key, *cells) if column not in (reader.fieldnames or ())]
+    if missing:
+        raise SheetError(f"{path} lacks the columns {missing}: must have {key}, {', '.join(cells)}; add them")
+    for row in reader:
+        where, name = f"{path}, line {reader.line_num}", row[key]
+        if name not in names or name in rows:
+            why = "occurs twice" if name in rows else "is not asked for"
+            raise SheetError(f"{where}: {key} {name!r} {why}; each row of the blank sheet belongs there once")
+        rows[name] = {column: _word(where, column, row[column], words) for column, words in cells.items()}
     absent = sorted(names - set(rows))
     if absent:
         raise SheetError(f"{path} lacks {len(absent)} rows, the first {absent[0]!r}; fill in all of the blank sheet")
     return rows
+
+
+def _text(path: pathlib.Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise SheetError(f"{path} is missing: must be a filled-in sheet; correct the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SheetError(f"{path} cannot be read ({error}): must be CSV in UTF-8; save it so") from error
 
 
 def _word(where: str, column: str, cell: str | None, words: Sequence[str]) -> str:

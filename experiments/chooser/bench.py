@@ -17,7 +17,8 @@ from scipy.ndimage import zoom
 
 from experiments.chooser.draw import Batch
 from experiments.running.timing import interleaved
-from sensors_io.scenes import chooser, contact, layer, nested
+from sensors_io import layer
+from sensors_io.scenes import chooser, contact, nested
 from sensors_io.scenes.batching import chunks, gather, map_live
 from sensors_io.scenes.chooser import Stage
 from sensors_io.scenes.chooser_law import Setting, Survey

@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Array
 
 from experiments.chooser import bench
-from sensors_io.scenes import SceneConfig, contact, effort, layer, nested, protocol
+from sensors_io import layer
+from sensors_io.scenes import contact, effort, nested, protocol
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import Draw, draw
 from sensors_io.scenes.press import Grid, Kernels, Path, Press, Scene, make_kernels
 from sensors_io.scenes.readout import Unit

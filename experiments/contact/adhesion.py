@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.reporting.findings import Column, Table
-from sensors_io.scenes import SceneConfig, adhesion, contact, hertz, layer, press
+from sensors_io import layer
+from sensors_io.scenes import adhesion, contact, hertz, press
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.sensors import MODELS, SensorModel
 
 RADII_MM = (5.0, 15.0, 40.0)

@@ -9,7 +9,8 @@ import numpy as np
 
 from experiments.contact import oracles as contact_oracles
 from experiments.reporting.findings import Cell, Column, Table
-from sensors_io.scenes import contact, layer
+from sensors_io import layer
+from sensors_io.scenes import contact
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.objects import rough_waves
 from sensors_io.scenes.reference import solve_reference

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from experiments.contact.scenes import Bench
-from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
+from sensors_io.layer import Layer, normal_compliance, wave_numbers
 
 SIDE_MM = 16.0
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)

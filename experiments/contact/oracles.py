@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 
 
 def installed() -> tuple[str, ...]:

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sensors_io.scenes import layer, objects, press, surface
+from sensors_io import layer
+from sensors_io.scenes import objects, press, surface
 from sensors_io.scenes.reference import convolve, solve_reference
 from sensors_io.scenes.sensors import BODY, SensorModel
 

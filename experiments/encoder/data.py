@@ -11,7 +11,7 @@ from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
 from touchr1_jax.training.evidence import ProbeConfig
 

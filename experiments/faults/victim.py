@@ -16,7 +16,7 @@ from experiments.policies.study import StudyConfig, run_study
 from experiments.reporting.findings import Findings
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig

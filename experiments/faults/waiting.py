@@ -17,7 +17,7 @@ from experiments.policies.stages import (
 from experiments.policies.study import StudyConfig, open_study_data
 from experiments.running.context import Context
 from experiments.running.loops import STEPPING, WAITING
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.training.loop import LoopConfig
 
 STAGES = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")

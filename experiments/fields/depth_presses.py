@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 
 from sensors_io.calibration.presses import BallPresses
+from sensors_io.layer import Layer
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.fitting import Profiles
-from sensors_io.scenes.layer import Layer
 
 WINDOW_PX, WINDOW_MM = 160, 15.2
 """Side of the pictures."""

@@ -13,7 +13,7 @@ from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.fields.helmholtz import decompose
 from sensors_io.fields.inversion import InverseConfig
 from sensors_io.fields.shear import ShearReader
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 from sensors_io.scenes.sensors import TAC3D
 from sensors_io.schema import Flag
 

@@ -7,7 +7,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, UInt32
 
-from sensors_io.scenes import SceneConfig, draws, schedule, surface
+from sensors_io.scenes import draws, schedule, surface
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import Press
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import SensorModel

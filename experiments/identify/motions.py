@@ -14,8 +14,8 @@ from experiments.identify.geometry import statistics
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import features_of, field_counts
 from sensors_io.live import LiveScenes
-from sensors_io.scenes import SceneConfig
 from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import slot
 from sensors_io.schema import SENSORS, Phase, Sequence

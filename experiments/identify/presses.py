@@ -12,8 +12,9 @@ from experiments.identify.geometry import statistics
 from experiments.identify.motions import force_of
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import Felt, Tier, feel
-from sensors_io.scenes import SceneConfig, schedule
-from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes import schedule
+from sensors_io.scenes.cards import shortest_wave_mm, solid_of
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 
 
@@ -44,9 +45,9 @@ def press(
       advance: called after each tier of each sensor.
     """
     draws = [identify_draw.touches(tiers[0][0].config(config), order) for order in range(len(SENSORS))]
-    waves = {tier.config(config).shortest_wave_mm: tier.config(config) for tier, _ in tiers}
+    waves = {shortest_wave_mm(tier.config(config)): tier.config(config) for tier, _ in tiers}
     skins = {wave: identify_draw.skins(at) for wave, at in waves.items()}
-    skins_of = lambda tier: skins[tier.config(config).shortest_wave_mm]
+    skins_of = lambda tier: skins[shortest_wave_mm(tier.config(config))]
 
     def work(job: tuple[tuple[Tier, tuple[float, ...]], int]) -> Felt:
         (tier, factors), order = job

@@ -15,7 +15,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, UInt8
 
 from experiments.identify.draw import Touch, noisier
-from sensors_io.scenes import SceneConfig, contact, noise, readout, surface, traction
+from sensors_io.scenes import contact, noise, readout, surface, traction
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import Grid, Kernels, make_kernels
 from sensors_io.scenes.readout import Fields, Gel, Unit
 from sensors_io.scenes.sensors import MODELS, SensorModel

@@ -20,7 +20,7 @@ from experiments.policies.assembly import ModelConfig
 from experiments.policies.stages import SFTConfig
 from experiments.policies.study import SMOKE, StudyConfig
 from experiments.running.machine import Machine
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.qwen.config import RELEASED
 from touchr1_jax.models.tactile_vit import TactileViTConfig

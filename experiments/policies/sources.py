@@ -12,7 +12,7 @@ from experiments.running.context import Context
 from experiments.running.progress import Advance
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
-from sensors_io.scenes import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
 

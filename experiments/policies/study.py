@@ -33,7 +33,7 @@ from experiments.running.artifacts import write_bytes
 from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS, UNKNOWN, Flag
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig

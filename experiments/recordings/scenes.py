@@ -23,7 +23,7 @@ from experiments.running.artifacts import write_bytes
 from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.schema import ATTRIBUTES, LEVELS
 
 SENSOR = "gelsight_mini"

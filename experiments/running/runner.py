@@ -36,9 +36,7 @@ from experiments.running.machine import Machine, MachineError, require_machine
 from experiments.running.quick import compiled_quickly
 from experiments.running.stopping import Stopped, Stopping
 from experiments.running.watcher import Watcher
-from sensors_io.importers.keep import ImportSourceError
-from sensors_io.records import RecordsError
-from sensors_io.schema import SchemaError
+from sensors_io.errors import UserError
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
@@ -61,9 +59,7 @@ COMPILED = "compiled"
 
 KNOWN_ERRORS = (
     runs.RunInUse,
-    RecordsError,
-    SchemaError,
-    ImportSourceError,
+    UserError,
     CheckpointError,
     NonFiniteGradientError,
     DamagedFileError,

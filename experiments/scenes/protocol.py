@@ -5,8 +5,9 @@ import itertools
 
 import numpy as np
 
-from sensors_io.scenes import SceneConfig, object_cards, schedule
-from sensors_io.scenes.config import stream
+from sensors_io.scenes import schedule
+from sensors_io.scenes.cards import object_cards
+from sensors_io.scenes.config import SceneConfig, stream
 from sensors_io.scenes.protocol import plan
 from sensors_io.schema import MATERIALS, PRESS_FORCE_N
 

@@ -10,7 +10,8 @@ import numpy as np
 from sensors_io.generate import generate_records
 from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
-from sensors_io.scenes import SceneConfig, make_contact
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.protocol import make_contact
 from sensors_io.schema import SENSORS
 
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.scenes.rates import Stopwatch
-from sensors_io.scenes import SceneConfig, contact, surface
+from sensors_io.scenes import contact, surface
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels, record
 from sensors_io.scenes.schedule import Slot

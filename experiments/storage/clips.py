@@ -8,7 +8,7 @@ from sensors_io.importers.keep import Keep
 from sensors_io.importers.pictures import numbered, read_picture
 from sensors_io.importers.video import read_video
 from sensors_io.live import LiveScenes
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 
 GENERATED, IMPORTED, WHOLE, STILLS = "generated", "videos as imported", "videos, whole frames", "camera stills"
 """Kinds of clips, and what is found where: `<data_dir>/physiclear/videos`, `<data_dir>/gelslam/6.310mm`."""

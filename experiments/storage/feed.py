@@ -16,7 +16,7 @@ from sensors_io.codec import decode_sequence, encode_sequence
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig, clip_batches, make_clip
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 
 CHANGES: Mapping[str, AugmentConfig | None] = {
     "as recorded": None,

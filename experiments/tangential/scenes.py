@@ -11,7 +11,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Complex, Float
 
-from sensors_io.scenes import contact, drag, layer, motions, objects, partial_slip, press, schedule, surface
+from sensors_io import layer
+from sensors_io.scenes import contact, drag, motions, objects, partial_slip, press, schedule, surface
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
 from sensors_io.scenes.traction import Compliance, Response, in_series, make_compliance, make_response
 

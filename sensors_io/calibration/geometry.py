@@ -24,13 +24,15 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
+from sensors_io.errors import UserError
+
 _FOLDS = 9
 _INVERSIONS = 25  # Newton steps on the radius; six do where the pins are, the rest is for the far corners
 _START = 0.5  # of λ: mild pincushion, from where either sign is found
 _BEST_SHARE = 0.25  # of the strongest spots' contrast: what a pin shows at least
 
 
-class GeometryError(ValueError):
+class GeometryError(UserError, ValueError):
     """A board, or presses of a ball, from which no geometry can be told; the message says what to do about it."""
 
 

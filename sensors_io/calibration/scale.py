@@ -26,7 +26,7 @@ from scipy import optimize, special
 from sensors_io.calibration.circles import Circles, find_circles
 from sensors_io.calibration.geometry import GeometryError
 from sensors_io.calibration.presses import BallPresses
-from sensors_io.scenes.layer import Layer, normal_compliance
+from sensors_io.layer import Layer, normal_compliance
 
 _TERMS = 5  # of the pressure
 _RADII = 0.98 * np.sin(np.linspace(0, np.pi / 2, 16))  # r/a at which the gel must lie on the ball

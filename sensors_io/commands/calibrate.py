@@ -15,7 +15,7 @@ from sensors_io.commands.console import OUT
 from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.sources import Pictures, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 
 _POISSON = 0.48  # of silicone, nearly incompressible
 

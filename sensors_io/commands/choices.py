@@ -35,7 +35,6 @@ AnyDevice = (
     | Annotated[RgbdCameraConfig, tyro.conf.subcommand("rgbd")]
 )
 
-PLUS = "+"
 _FORCE_CAPACITY = 8192  # readings: a second at the 7 kHz of a Net F/T
 
 
@@ -87,17 +86,6 @@ class Parts:
 
 
 SomeCommand = TypeVar("SomeCommand")
-
-
-def sections(args: Seq[str]) -> list[list[str]]:
-    """The command line, cut at every +."""
-    found: list[list[str]] = [[]]
-    for arg in args:
-        if arg == PLUS:
-            found.append([])
-        else:
-            found[-1].append(arg)
-    return found
 
 
 def with_devices(command: SomeCommand, others: Seq[Seq[str]]) -> SomeCommand:

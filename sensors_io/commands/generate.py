@@ -7,7 +7,7 @@ from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.generate import generate_records
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 
 

@@ -10,6 +10,7 @@ import tyro
 from sensors_io import overview
 from sensors_io.cards import replace_cards
 from sensors_io.commands.console import OUT
+from sensors_io.errors import UserError
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import Shares
 from sensors_io.records import RecordStore
@@ -25,7 +26,7 @@ LEAST = {"hardness": "soft", "roughness": "smooth", "protrusion": "flat"}
 Row = Mapping[str, str]
 
 
-class LabelsError(ValueError):
+class LabelsError(UserError, ValueError):
     """A table of labels that does not fit; the message names the place, the value, the constraint and the fix."""
 
 

@@ -1,7 +1,9 @@
 """What can go wrong with a device; every message names the device, the problem and the fix."""
 
+from sensors_io.errors import UserError
 
-class DeviceError(RuntimeError):
+
+class DeviceError(UserError, RuntimeError):
     """A device that does not do what it is asked for."""
 
 

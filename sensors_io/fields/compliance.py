@@ -4,7 +4,7 @@ The layer's response to a traction (τ_x, τ_y) along its surface and a pressure
 
     û_i = [G_l e_i e_j + G_t (δ_ij − e_i e_j)] τ̂_j + i U e_i p̂,     û_z = N p̂ − i S e_j τ̂_j,
 
-the five functions of `scenes.layer.DepthResponse`.  Its impulse responses fill a matrix from the tractions of all nodes
+the five functions of `layer.DepthResponse`.  Its impulse responses fill a matrix from the tractions of all nodes
 to the displacements of all nodes, so that nothing need vanish outside the window and nothing is periodic in it.
 """
 
@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 from scipy import fft
 
-from sensors_io.scenes.layer import DepthResponse, Layer, depth_response
+from sensors_io.layer import DepthResponse, Layer, depth_response
 
 COMPONENTS = 3
 """Of displacement (x, y, into the gel) and of load (τ_x, τ_y, p)."""

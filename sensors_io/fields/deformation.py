@@ -6,6 +6,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from sensors_io.errors import UserError
 from sensors_io.fields.evidence import Evidence, Pattern, examine
 from sensors_io.fields.markers import inside
 from sensors_io.fields.spline import Densifier
@@ -22,7 +23,7 @@ _NEAR_CELL_PX = 8  # of the map that says where found points are near
 _REACH = 1.5  # pitches from the nearest found point up to which the field counts as read
 
 
-class NoPatternError(ValueError):
+class NoPatternError(UserError, ValueError):
     """A gel whose picture at rest carries neither dots nor a dense pattern: its lateral motion cannot be read."""
 
 

@@ -14,8 +14,8 @@ from sensors_io.fields.evidence import Pattern, examine
 from sensors_io.fields.inversion import InverseConfig
 from sensors_io.fields.shear import ShearReader
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.layer import Layer
 from sensors_io.quality import QualityConfig, saturated, time_gap
-from sensors_io.scenes.layer import Layer
 from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
 
 

@@ -28,7 +28,7 @@ from scipy import linalg
 
 from sensors_io.fields.compliance import COMPONENTS, NodeGrid, compliance_matrix
 from sensors_io.fields.helmholtz import shear_matrix
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 
 _WEIGHTS = np.geomspace(1e-7, 1e3, 50)  # α over the largest squared singular value: from none to all of the signal
 _PRESSING = 0.05  # of the greatest pressure of the linear solution, from which a node may press

@@ -15,7 +15,7 @@ import numpy as np
 from sensors_io.fields.compliance import NodeGrid, total_force, total_moment
 from sensors_io.fields.inversion import InverseConfig, LayerInverse
 from sensors_io.fields.spline import ThinPlate
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from sensors_io.errors import UserError
 from sensors_io.importers import pictures
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
@@ -18,7 +19,7 @@ PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv"})
 
 
-class SourceError(ValueError):
+class SourceError(UserError, ValueError):
     """An input that holds no pictures, or none that fit together."""
 
 

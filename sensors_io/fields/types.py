@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from sensors_io.errors import UserError
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.schema import SchemaError, Spec, check_arrays
 
@@ -66,7 +67,7 @@ class Fields:
         return {name: getattr(self, name) for name in FIELD_ARRAYS}
 
 
-class CalibrationError(ValueError):
+class CalibrationError(UserError, ValueError):
     """A calibration that cannot be made, read or used; the message says why and what to do."""
 
 

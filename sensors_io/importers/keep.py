@@ -5,8 +5,10 @@ import dataclasses
 import cv2
 import numpy as np
 
+from sensors_io.errors import UserError
 
-class ImportSourceError(ValueError):
+
+class ImportSourceError(UserError, ValueError):
     """A source that cannot be imported; the message names the path, the problem and the fix."""
 
 

@@ -20,13 +20,15 @@ from typing import Any, Self
 
 import numpy as np
 
+from sensors_io.errors import UserError
+
 _MAGIC = b"TJR1"
 _PREFIX = struct.Struct("<4sII")
 _HEADER_SIZE = struct.Struct("<I")
 _SYNC_EVERY_S = 1.0
 
 
-class JournalError(ValueError):
+class JournalError(UserError, ValueError):
     """A file that is no journal, or is damaged before its end."""
 
 

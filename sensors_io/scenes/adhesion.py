@@ -13,8 +13,8 @@ import dataclasses
 
 import numpy as np
 
+from sensors_io.layer import Layer
 from sensors_io.scenes.config import require
-from sensors_io.scenes.layer import Layer
 
 RANGE_MM = 3e-7
 """Range of the surface forces, 0.3 nm, an interatomic distance."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from sensors_io.scenes import appearance, objects
 from sensors_io.scenes.config import SceneConfig, stream
-from sensors_io.scenes.sensors import SensorModel
+from sensors_io.scenes.sensors import MODELS, SensorModel
 from sensors_io.schema import ObjectCard
 
 
@@ -22,10 +22,15 @@ def solid_of(config: SceneConfig, index: int) -> objects.Solid:
     return objects.sample(
         stream(config.seed, "object", index),
         config.visual_lie_share,
-        config.shortest_wave_mm,
+        shortest_wave_mm(config),
         config.part_share,
         config.graded_share,
     )
+
+
+def shortest_wave_mm(config: SceneConfig) -> float:
+    """Shortest wave of the roughness: 2.5 pixels of the coarsest contact grid."""
+    return max(0.8, 2.5 * max(m.window_mm for m in MODELS) / config.contact_grid)
 
 
 def object_id(index: int) -> str:

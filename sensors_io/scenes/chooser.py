@@ -16,12 +16,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from sensors_io.scenes import contact, layer, nested
+from sensors_io import layer
+from sensors_io.layer import Layer
+from sensors_io.scenes import contact, nested
 from sensors_io.scenes.batching import chunks, gather, map_live
 from sensors_io.scenes.chooser_law import LAW, LOOK, MENU, Law, Survey, log_error, pick
 from sensors_io.scenes.chooser_survey import gel_share, survey
 from sensors_io.scenes.config import require
-from sensors_io.scenes.layer import Layer
 
 LOOK_GRIDS = (LOOK.grid, 2 * LOOK.grid, 4 * LOOK.grid)
 """Sides of the grids on which a look takes the gap."""

@@ -5,11 +5,9 @@ import hashlib
 import json
 from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from sensors_io.scenes.sensors import MODELS
+from sensors_io.schema import SENSORS
 
 GENERATOR = 2
 """Version of the generator: part of the hash, raised whenever the same config would give other records."""
@@ -111,7 +109,7 @@ class SceneConfig:
     def _check_sequences(self) -> None:
         if self.sequences is None:
             return
-        sensors = len(MODELS)
+        sensors = len(SENSORS)
         whole = f"must be a multiple of {sensors}: all sensors see every contact"
         require(self.sequences % sensors == 0, "sequences", self.sequences, whole)
         enough = f"must be ≥ {sensors * self.objects}: every one of {self.objects} objects is pressed by all sensors"
@@ -132,12 +130,7 @@ class SceneConfig:
     @property
     def contact_count(self) -> int:
         """Contacts of the data set; each gives one sequence per sensor."""
-        return self.objects * self.sites if self.sequences is None else self.sequences // len(MODELS)
-
-    @property
-    def shortest_wave_mm(self) -> float:
-        """Shortest wave of the roughness: 2.5 pixels of the coarsest contact grid."""
-        return max(0.8, 2.5 * max(m.window_mm for m in MODELS) / self.contact_grid)
+        return self.objects * self.sites if self.sequences is None else self.sequences // len(SENSORS)
 
 
 def config_hash(config: SceneConfig) -> str:
@@ -153,11 +146,6 @@ def config_hash(config: SceneConfig) -> str:
 def stream(seed: int, name: str, *index: int) -> np.random.Generator:
     """Randomness of one thing, independent of that of all others and of the order in which they are made."""
     return np.random.default_rng([seed, _STREAMS[name], *index])
-
-
-def as_f32(value: float | np.ndarray) -> jax.Array:
-    """A number or an array of the host for a compiled program."""
-    return jnp.asarray(value, jnp.float32)
 
 
 def require(ok: bool, field: str, value: object, constraint: str) -> None:

@@ -9,14 +9,14 @@ import functools
 
 import numpy as np
 
+from sensors_io.layer import Layer
 from sensors_io.scenes import history, motions, noise, objects, schedule, surface
 from sensors_io.scenes.cards import solid_of
-from sensors_io.scenes.config import SceneConfig, as_f32, stream
-from sensors_io.scenes.layer import Layer
+from sensors_io.scenes.config import SceneConfig, stream
 from sensors_io.scenes.press import Path, Press
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
-from sensors_io.scenes.units import UNITS, on_one_day, place, unit_of
+from sensors_io.scenes.units import UNITS, as_f32, on_one_day, place, unit_of
 from sensors_io.schema import Phase
 
 SITE_MM = 8.0

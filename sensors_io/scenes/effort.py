@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sensors_io.scenes import contact, layer, motions, nested, surface
+from sensors_io import layer
+from sensors_io.scenes import contact, motions, nested, surface
 from sensors_io.scenes.chooser_law import LAW, LOOK, SLACK, TOLERANCES, Setting, log_error, margin_at
 from sensors_io.scenes.chooser_survey import gel_share, survey
 from sensors_io.scenes.press import Path, Press, padded_size

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage, optimize
 
-from sensors_io.scenes import contact, layer, photometric
+from sensors_io import layer
+from sensors_io.scenes import contact, photometric
 from sensors_io.scenes.photometric import FLAT_DEGREE, SLOPE_DEGREE, PhotometricOptics, basis
 
 NEAR_MM = 4.2

@@ -21,8 +21,8 @@ import dataclasses
 
 import numpy as np
 
+from sensors_io.layer import Layer, normal_compliance
 from sensors_io.scenes.config import require
-from sensors_io.scenes.layer import Layer, normal_compliance
 
 _ENERGY_WAVE = 1.5
 

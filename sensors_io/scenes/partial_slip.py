@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
-from sensors_io.scenes.layer import Layer, longitudinal_compliance, normal_compliance, shear_compliance
+from sensors_io.layer import Layer, longitudinal_compliance, normal_compliance, shear_compliance
 from sensors_io.scenes.traction import Compliance, shear_displacement
 
 WIDE_WAVE, NARROW_WAVE = 1.5, 10.0

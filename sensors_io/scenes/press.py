@@ -9,7 +9,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Complex, Float, Int, UInt8, UInt32
 
-from sensors_io.scenes import contact, drag, failures, layer, motions, noise, readout, surface, traction
+from sensors_io import layer
+from sensors_io.scenes import contact, drag, failures, motions, noise, readout, surface, traction
 from sensors_io.scenes.readout import Fields, Gel, Resampling, Unit
 from sensors_io.scenes.sensors import BODY, SensorModel
 

@@ -20,8 +20,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sensors_io.layer import Layer
 from sensors_io.scenes import mini_optics, optics, photometric
-from sensors_io.scenes.layer import Layer
 from sensors_io.schema import SENSORS
 
 Renderer = Callable[[optics.DeformedGel, optics.Light], optics.Array]

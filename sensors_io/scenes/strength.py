@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sensors_io.scenes import contact, layer, surface
+from sensors_io import layer
+from sensors_io.scenes import contact, surface
 from sensors_io.scenes.press import padded_size
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
 from sensors_io.scenes.validity import STRAIN_LIMIT

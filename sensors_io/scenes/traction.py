@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Complex, Float
 
-from sensors_io.scenes.layer import Layer, depth_response, longitudinal_compliance, shear_compliance, wave_numbers
+from sensors_io.layer import Layer, depth_response, longitudinal_compliance, shear_compliance, wave_numbers
 
 
 @struct.dataclass

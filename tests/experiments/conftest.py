@@ -10,7 +10,7 @@ from experiments.policies.dataset import open_dataset
 from experiments.running.context import Context
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
-from sensors_io.scenes import config_hash
+from sensors_io.scenes.config import config_hash
 from tests.experiments import tiny
 
 

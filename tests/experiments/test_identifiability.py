@@ -18,7 +18,8 @@ from experiments.identify.studies import SOURCES, STATIC
 from experiments.identify.threads import in_threads
 from experiments.identify.touch import Felt, Tier, feel, means, see
 from experiments.running.artifacts import read_json
-from sensors_io.scenes import SceneConfig, schedule, surface
+from sensors_io.scenes import schedule, surface
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import make_kernels
 from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
 from sensors_io.scenes.sequence import make_sequence

@@ -11,7 +11,8 @@ from experiments import scene_gallery
 from experiments.running.artifacts import read_json
 from experiments.scenes import sheets as scene_sheets
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig, objects
+from sensors_io.scenes import objects
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import run_shrunk
 

@@ -15,7 +15,9 @@ from experiments.scenes import rates as scene_rates
 from experiments.scenes import stages as scene_stages
 from sensors_io import generate, live
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig, contact_key, protocol, strength
+from sensors_io.scenes import protocol, strength
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.protocol import contact_key
 from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import run_shrunk
 from tests.sensors_io import fakes

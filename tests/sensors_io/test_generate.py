@@ -9,7 +9,7 @@ import pytest
 from sensors_io import generate
 from sensors_io.codec import encode_sequence
 from sensors_io.records import IncompleteRecordsError, RecordsExistError, RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes
 
 

@@ -9,7 +9,7 @@ from sensors_io import live
 from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.records import RecordStore
-from sensors_io.scenes import SceneConfig
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import CLIP_ARRAYS, SchemaError
 from tests.sensors_io import fakes
 

@@ -4,6 +4,8 @@ import io
 import pathlib
 import re
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -121,10 +123,37 @@ def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
     assert len(err.strip().splitlines()) == 1
 
 
-def test_a_wrong_command_is_told_the_right_ones(run, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        run("lst")
-    assert stopped.value.code == 2
+def test_a_wrong_command_is_told_the_right_ones(run):
+    status, out, err = run("lst")
+    assert (status, out) == (2, "")
+    assert "There is no command 'lst'. Did you mean list?" in err
+    assert "  label       Give recorded objects labels" in err
+
+
+def test_help_names_every_command(run):
+    status, out, _ = run("--help")
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()[1:]] == list(cli.COMMANDS)
+
+
+def test_only_generating_scenes_waits_for_jax():
+    """Importing it takes longer than most commands work; `list` begins without SciPy, too."""
+    others = {place.partition(".")[0] for place in cli.COMMANDS.values()} - {"generate"}
+    for modules, heavy in (({"list"}, "jax scipy grain"), (others, "jax grain")):
+        source = f"""
+import importlib, sys
+import sensors_io.__main__
+for module in {sorted(modules)}:
+    importlib.import_module(f"sensors_io.commands.{{module}}")
+sys.exit(bool({set(heavy.split())} & set(sys.modules)))
+"""
+        assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0
+
+
+def test_devices_are_for_commands_that_take_them(run, tmp_path):
+    status, _, err = run("list", tmp_path, "+", "tac3d")
+    assert status == 1
+    assert err.startswith("DeviceNotFoundError: list takes no device after a +")
 
 
 def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):

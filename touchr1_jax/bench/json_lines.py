@@ -8,7 +8,7 @@ from typing import Any
 
 
 class LinesError(ValueError):
-    """A file that is no JSON Lines; the message names the line."""
+    """A file that is absent or no JSON Lines; the message names it, and the line."""
 
 
 def write_lines(path: str | os.PathLike[str], trees: Iterable[Mapping[str, Any]]) -> None:
@@ -27,10 +27,10 @@ def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, Any]]:
     """Line numbers, from 1, and objects of a file of JSON Lines; blank lines are skipped.
 
     Raises:
-      LinesError: a line that is no JSON object.
+      LinesError: no such file, one that is no text, or a line that is no JSON object.
     """
     rows = []
-    for number, line in enumerate(pathlib.Path(path).read_text(encoding="utf-8").split("\n"), 1):
+    for number, line in enumerate(_text(pathlib.Path(path)).split("\n"), 1):
         if not line.strip():
             continue
         try:
@@ -41,3 +41,14 @@ def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, Any]]:
             raise LinesError(f"{path}, line {number} is {tree!r}: must be a JSON object; write one per line")
         rows.append((number, tree))
     return rows
+
+
+def _text(path: pathlib.Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise LinesError(
+            f"{path} is missing: must be a file of JSON Lines; correct the path, or write it first"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise LinesError(f"{path} cannot be read ({error}): must be text, one JSON object per line") from error

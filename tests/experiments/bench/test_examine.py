@@ -36,7 +36,7 @@ def test_silence_is_unparsable(items):
 
 
 @pytest.mark.parametrize(
-    ("row", "message"), [({"id": "x"}, "must have id and text"), ({"id": "identify-0000", "text": 3}, "a string")]
+    ("row", "message"), [({"id": "x"}, "must have id and text"), ({"id": "identify-0000", "text": 3}, "text, strings")]
 )
 def test_what_is_no_answer_is_named(items, row, message):
     with pytest.raises(LinesError, match=message):

@@ -1,6 +1,7 @@
 """What people fill in: blank sheets, every way to fill them in wrong, agreement, adjudication, doubts, audits."""
 
 import csv
+import json
 
 import pytest
 
@@ -170,3 +171,24 @@ def test_annotation_by_command(tmp_path, records, capsys):
     fill(folder / "open.csv", lambda row: {"decision": annotate.WORDS["hardness"][truth[odd]["hardness"]]})
     assert main(["annotate", str(records), str(folder)]) == 0
     assert read_json(folder / "labels.json") == truth
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe", b"[]", b'{"1": 2}', b'{"1": "another"}'])
+def test_a_file_that_is_none_of_ours_is_named(items, tmp_path, capsys, content):
+    """A key, a sheet or answers that are absent, no text, or something else: one line each, and exit status 1."""
+    write_items(tmp_path / "q.jsonl", items[:3])
+    (tmp_path / "key.json").write_text(json.dumps({"1": items[0].ask.id}))
+    wrong = tmp_path / "wrong"
+    if content is not None:
+        wrong.write_bytes(content)
+    for command in (
+        ["audit", "q.jsonl", "wrong", "a.csv"],
+        ["audit", "q.jsonl", "key.json", "wrong"],
+        ["score", "q.jsonl", "wrong"],
+    ):
+        arguments = [command[0], *(str(tmp_path / name) for name in command[1:])]
+        assert main(arguments) == 1
+        said = capsys.readouterr().err
+        assert "Error: " in said
+        assert str(wrong) in said
+        assert len(said.splitlines()) == 1

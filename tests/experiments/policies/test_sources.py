@@ -10,7 +10,7 @@ from experiments.policies.sources import SourceConfig, prepare_records
 from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.records import RecordsExistError
-from sensors_io.scenes import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 
 GENERATED = SourceConfig(kind="generated", directory=None, scenes=tiny.SCENES, physiclear=PhysiclearConfig())

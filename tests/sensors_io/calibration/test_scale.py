@@ -6,7 +6,7 @@ import pytest
 from sensors_io.__main__ import main
 from sensors_io.calibration.geometry import GeometryError
 from sensors_io.calibration.scale import approach_mm, contact_radius_mm, measure_scale, scale_from_presses
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 from tests.sensors_io.calibration.test_calibrate import CLIPS
 

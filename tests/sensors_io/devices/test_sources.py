@@ -7,8 +7,9 @@ import pytest
 from sensors_io.clock import JumpingClock
 from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.devices.replay import Disconnect, Faults, Replay, ReplayConfig
-from sensors_io.devices.scene import SceneDeviceConfig, SceneSource
-from sensors_io.scenes import SceneConfig
+from sensors_io.devices.scene import SceneDeviceConfig
+from sensors_io.devices.scene_source import SceneSource
+from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes as records
 from tests.sensors_io.devices.fakes import Ramp
 
@@ -65,7 +66,7 @@ def test_a_generated_sensor_is_a_device():
     assert samples[0].frame is None
     assert samples[2].arrays["force_n"][2] < samples[0].arrays["force_n"][2] < 0
     assert round((samples[2].host_time_ns - samples[1].host_time_ns) / 1e5) == 327
-    with pytest.raises(ValueError, match="sensor is 'digit'"):
+    with pytest.raises(DeviceNotFoundError, match="sensor is 'digit'"):
         SceneSource(sensor="digit")
 
 

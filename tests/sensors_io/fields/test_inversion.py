@@ -10,7 +10,7 @@ from sensors_io.fields.compliance import NodeGrid, compliance_matrix, total_forc
 from sensors_io.fields.helmholtz import decompose, shear_matrix
 from sensors_io.fields.inversion import InverseConfig, LayerInverse
 from sensors_io.fields.shear import ShearReader
-from sensors_io.scenes.layer import Layer
+from sensors_io.layer import Layer
 from sensors_io.scenes.traction import displacement, make_response
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=3.5)

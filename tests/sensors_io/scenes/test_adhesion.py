@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer
 from sensors_io.scenes.adhesion import Adhesion, adhesive_ramp, plane_modulus_mpa, work_left
-from sensors_io.scenes.layer import Layer
 
 GEL_MODULUS = 0.3 / (1 - 0.48**2)
 SOFT = Adhesion(radius_mm=8.0, plane_modulus_mpa=GEL_MODULUS, work_n_per_mm=5e-5)  # 0.05 J/m²

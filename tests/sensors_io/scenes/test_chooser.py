@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.scenes import chooser, chooser_law, contact, layer, nested
+from sensors_io import layer
+from sensors_io.layer import Layer
+from sensors_io.scenes import chooser, chooser_law, contact, nested
 from sensors_io.scenes.batching import CHUNK, chunks, gather, map_live
 from sensors_io.scenes.chooser_law import LAW, LOOK, MENU, SLACK, Setting
 from sensors_io.scenes.chooser_survey import FEATURES, PLAIN, survey
-from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.sensors import BODY, TAC3D
 
 WINDOW_MM, GEL = TAC3D.window_mm, TAC3D.gel

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes import contact, spg
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
-from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes.objects import rough_waves
 from sensors_io.scenes.reference import convolve, solve_reference
 

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes import nested, spg, winkler
-from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
 
 N, M, SPACING = 32, 48, 0.5
 X = (np.arange(N) + 0.5) * SPACING - N * SPACING / 2

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer
 from sensors_io.scenes import drag, tangential, traction
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
-from sensors_io.scenes.layer import Layer
 from sensors_io.scenes.motions import plan
 
 N, M, WINDOW_MM = 40, 80, 16.0

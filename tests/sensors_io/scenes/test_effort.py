@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sensors_io import codec
-from sensors_io.scenes import SceneConfig, config_hash, effort, protocol
+from sensors_io.scenes import effort, protocol
+from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.sensors import TAC3D
 from sensors_io.scenes.sequence import make_sequence

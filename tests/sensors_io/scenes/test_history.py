@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sensors_io.layer import Layer
 from sensors_io.scenes import history, properties
-from sensors_io.scenes.layer import Layer
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 RAMP = np.linspace(0, 5, 4001)

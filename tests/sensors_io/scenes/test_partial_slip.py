@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes import contact, partial_slip, tangential, traction
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
-from sensors_io.scenes.layer import Layer, normal_compliance, wave_numbers
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N

@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from sensors_io.scenes import SceneConfig, config_hash, contacts, object_cards, readout
 from sensors_io.scenes import press as press_module
+from sensors_io.scenes import readout
+from sensors_io.scenes.cards import object_cards
+from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.scenes.draws import site_of
-from sensors_io.scenes.protocol import make_contact
+from sensors_io.scenes.protocol import contacts, make_contact
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
 

@@ -6,7 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.scenes import SceneConfig, motions, schedule
+from sensors_io.scenes import motions, schedule
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.strength import Limits
 from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N
 

@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.scenes import SceneConfig, history, make_contact, motions, protocol, schedule, strength
+from sensors_io.scenes import history, motions, protocol, schedule, strength
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw, site_of
+from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.scenes.sequence import _light, make_sequence
 from sensors_io.schema import SENSORS, Flag, Phase

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sensors_io.layer import Layer, depth_response, wave_numbers
 from sensors_io.scenes import tangential, traction
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
-from sensors_io.scenes.layer import Layer, depth_response, wave_numbers
 
 N, WINDOW_MM = 48, 16.0
 SPACING = WINDOW_MM / N

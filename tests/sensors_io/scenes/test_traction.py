@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.scenes import traction
-from sensors_io.scenes.layer import (
+from sensors_io.layer import (
     Layer,
     depth_response,
     longitudinal_compliance,
     shear_compliance,
     wave_numbers,
 )
+from sensors_io.scenes import traction
 
 N, M, SPACING = 24, 36, 0.5
 X = (np.arange(N) + 0.5) * SPACING - N * SPACING / 2

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sensors_io.scenes.layer import Layer, depth_response, normal_compliance, shear_compliance, wave_numbers
+from sensors_io.layer import Layer, depth_response, normal_compliance, shear_compliance, wave_numbers
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 Q = np.geomspace(1e-3, 50, 60)

@@ -1,4 +1,4 @@
-"""`python -m sensors_io check` and `list`."""
+"""`python -m sensors_io check`."""
 
 import collections
 import dataclasses
@@ -150,17 +150,3 @@ def _background(sequence: Sequence) -> str:
     """File of the gel at rest that was recorded with a sequence, empty where none was."""
     name: str = sequence.camera.get("recording", {}).get("background") or ""
     return name
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class List:
-    """Print the objects with their split, labels and number of contacts."""
-
-    records: tyro.conf.Positional[pathlib.Path]
-    """Directory of the records."""
-
-    def run(self) -> int:
-        store = RecordStore(self.records, allow_incomplete=True)
-        OUT.print(overview.object_table(store))
-        OUT.print(overview.summary_table(store))
-        return 0
