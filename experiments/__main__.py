@@ -2,9 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 import sys
 
-from experiments.running.runner import main
+from experiments.running.commands import answer, complain
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -26,5 +27,20 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
+def main() -> None:
+    """Answer the command line and end the process."""
+    arguments = sys.argv[1:]
+    try:
+        status = answer(arguments, "experiments")
+        if status is None:
+            from experiments.running.runner import run  # JAX and charts, which only runs need
+
+            status = run(arguments)
+    except KeyboardInterrupt:  # a run that has begun hears it by itself
+        complain("Stopped before anything was begun.")
+        status = SIGNALLED + signal.SIGINT
+    leave(status)
+
+
 if __name__ == "__main__":
-    leave(main())
+    main()

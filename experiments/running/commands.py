@@ -10,13 +10,18 @@ import tyro
 from rich.console import Console
 
 from experiments.running.artifacts import DamagedFileError
-from experiments.running.catalogue import find
-from experiments.running.compare import ComparisonError, compare_runs
+from experiments.running.catalogue import find, listing
 from experiments.running.history import listing_of_runs, listing_with_runs, locate, read_run
 from experiments.running.new import NewError, write_new
 from experiments.running.runs import ROOT
 
 PROG = "python -m experiments"
+
+USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorboard] [--distributed] [overrides]
+       {PROG} list [NAME]            what ran, its cost, its result
+       {PROG} new NAME [--reward]    a template that runs
+       {PROG} compare RUN_A RUN_B    two runs, figure by figure
+"""
 
 COMMANDS = ("list", "new", "compare")
 """Names that no experiment can have."""
@@ -100,6 +105,8 @@ class Compare:
     def run(self, package: str) -> int:
         """Print the comparison and return the exit status."""
         del package
+        from experiments.running.compare import ComparisonError, compare_runs  # SciPy, which no other command needs
+
         try:
             a, b = (read_run(locate(name, self.runs_dir)) for name in (self.run_a, self.run_b))
             say(compare_runs(a, b, self.most))
@@ -116,9 +123,18 @@ Command = (
 )
 
 
-def run_command(arguments: Sequence[str], package: str) -> int:
-    """Run one of `COMMANDS`; returns the exit status."""
-    return tyro.cli(Command, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,)).run(package)
+def answer(arguments: Sequence[str], package: str) -> int | None:
+    """Run one of `COMMANDS`, give help or name what there is; the exit status, `None` where an experiment is named."""
+    if arguments and arguments[0] in COMMANDS:
+        return tyro.cli(Command, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,)).run(package)
+    questions = find(package)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        say(USAGE, listing(questions))
+        return 0 if arguments else 2
+    if arguments[0] in questions:
+        return None
+    complain(f"{unknown(arguments[0], questions)}\n{listing(questions)}")
+    return 2
 
 
 def unknown(name: str, questions: dict[str, str]) -> str:

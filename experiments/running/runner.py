@@ -27,8 +27,7 @@ from experiments.reporting.report_findings import write_findings
 from experiments.reporting.results import Results
 from experiments.running import events, runs
 from experiments.running.artifacts import DamagedFileError, jsonable, read_json, write_json
-from experiments.running.catalogue import find, listing
-from experiments.running.commands import COMMANDS, PROG, complain, run_command, say, unknown
+from experiments.running.commands import PROG, answer, complain, say
 from experiments.running.context import Context
 from experiments.running.distributed import Launch, NoTeam, Team, devices_of, joined
 from experiments.running.history import seconds_of_last
@@ -42,12 +41,6 @@ from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.loop import NonFiniteGradientError
-
-USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorboard] [--distributed] [overrides]
-       {PROG} list [NAME]            what ran, its cost, its result
-       {PROG} new NAME [--reward]    a template that runs
-       {PROG} compare RUN_A RUN_B    two runs, figure by figure
-"""
 
 EVENTS = "events"
 """Folder of a run that holds its TensorBoard events."""
@@ -127,16 +120,13 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
       package: the package to find experiments in.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments and arguments[0] in COMMANDS:
-        return run_command(arguments, package)
-    questions = find(package)
-    if not arguments or arguments[0] in ("-h", "--help"):
-        say(USAGE, listing(questions))
-        return 0 if arguments else 2
+    status = answer(arguments, package)
+    return run(arguments, package) if status is None else status
+
+
+def run(arguments: Sequence[str], package: str = "experiments") -> int:
+    """Run or continue the experiment that the first argument names; returns the exit code."""
     name, *rest = arguments
-    if name not in questions:
-        complain(f"{unknown(name, questions)}\n{listing(questions)}")
-        return 2
     module = importlib.import_module(f"{package}.{name}")
     if module.EXPERIMENT.name != name:
         raise ValueError(

@@ -6,7 +6,6 @@ python -m touchr1_jax.rewards explain --text "…" --label hardness firm --weigh
 """
 
 import dataclasses
-import functools
 import itertools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
 
@@ -187,13 +187,19 @@ def terms_table(
       RewardError: as `total_reward` does where it is traced, as training will: what cannot be trained is not shown.
     """
     table = Table("if it is", "reward", "value", "weight", "adds", title="What it earns")
-    for words, target in targets:
-        jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
+
+    @jax.jit  # one program for all targets: one for each operation would take seconds to compile
+    def score(target: Target) -> tuple[Array, Mapping[str, Array], Mapping[str, tuple[Array, Array]]]:
         total, parts = total_reward(rewards, weights, parsed, target)
+        terms = {name: (rewards[name].value(parsed, target), rewards[name].applies(target)) for name in weights}
+        return total, parts, terms
+
+    for words, target in targets:
+        total, parts, terms = score(target)
         for name, weight in weights.items():
-            applies = bool(rewards[name].applies(target))
-            value = f"{float(rewards[name].value(parsed, target)):.3f}" if applies else NOT_DEFINED
-            table.add_row(words, name, value, f"{weight:g}", f"{float(parts[name]):+.3f}")
+            value, applies = terms[name]
+            shown = f"{float(value):.3f}" if applies else NOT_DEFINED
+            table.add_row(words, name, shown, f"{weight:g}", f"{float(parts[name]):+.3f}")
             words = ""
         table.add_row("", "total", "", "", f"{float(total):+.3f}", style="bold", end_section=True)
     return table

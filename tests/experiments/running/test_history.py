@@ -1,6 +1,8 @@
 """What ran, as `list` shows it, and how a run is named."""
 
 import dataclasses
+import subprocess
+import sys
 
 import pytest
 
@@ -109,3 +111,9 @@ def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
 
 def test_columns_are_aligned():
     assert aligned([("a", "bb", ""), ("ccc", "d", "e")]) == "a    bb\nccc  d   e"
+
+
+def test_listing_runs_waits_for_nothing_heavy():
+    """JAX, SciPy and charts take seconds to import, of use to runs alone."""
+    source = "import sys, experiments.__main__; sys.exit(bool({'jax', 'scipy', 'matplotlib'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0

@@ -13,7 +13,8 @@ import pytest
 
 from experiments.running import runner, runs
 from experiments.running.artifacts import read_json
-from experiments.running.runner import Experiment, find, main, parse
+from experiments.running.catalogue import find
+from experiments.running.runner import Experiment, main, parse
 from tests.experiments.fakes import coin
 
 FAKES = "tests.experiments.fakes"
