@@ -15,6 +15,7 @@ reads 5 to 12 times slower; WebP and FFV1 are at best a third smaller and read 2
 """
 
 import dataclasses
+import datetime
 import fcntl
 import hashlib
 import os
@@ -302,17 +303,28 @@ def write_lock(root: pathlib.Path) -> IO[str]:
     return file
 
 
+def _content(root: pathlib.Path, index: Index) -> str:
+    """What an index lists, for whoever is about to write over it."""
+    state = "complete" if index.complete else "unfinished"
+    when = datetime.datetime.fromtimestamp((root / INDEX).stat().st_mtime)
+    return (
+        f"{len(index.contacts)} contacts of {len(index.objects)} objects already (source: {index.meta.source}; "
+        f"{state}, last written {when:%Y-%m-%d %H:%M})"
+    )
+
+
 def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool) -> Index:
     """The index to go on from; files that no index lists are the remains of a killed writer and are removed."""
     index = Index(meta=meta)
     if (root / INDEX).exists():
-        if not resume:
-            raise RecordsExistError(f"{root} holds records already; delete it, choose another path, or resume")
         index = Index.read(root)
+        if not resume:
+            raise RecordsExistError(f"{root} holds {_content(root, index)}; choose another path, or resume behind them")
         if index.meta.config_hash != meta.config_hash:
             raise RecordsExistError(
-                f"{root} was made by config {index.meta.config_hash!r}, not {meta.config_hash!r}; "
-                "delete it or choose another path"
+                f"{root} holds {_content(root, index)}, made by config {index.meta.config_hash!r}, not "
+                f"{meta.config_hash!r}: one directory holds records of one making; choose another directory, or go on "
+                "with the options that made these; nothing was changed"
             )
         index.complete = False
     listed = {shard.file for shard in index.object_shards + index.contact_shards}

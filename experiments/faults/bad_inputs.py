@@ -195,8 +195,8 @@ def records() -> tuple[Case, ...]:
             arguments=lambda folder: ["generate", "--out", folder / "records"],
             prepare=write_records,
             error="RecordsExistError",
-            where="was made by config 'made up'",
-            fix="delete it or choose another path",
+            where="made by config 'made up'",
+            fix="choose another directory",
         ),
         Case(
             kind="records",

@@ -59,7 +59,7 @@ def test_an_interrupted_generation_goes_on(tmp_path, asked):
 
 def test_another_config_does_not_mix_in(tmp_path, asked):
     generate.generate_records(CONFIG, tmp_path)
-    with pytest.raises(RecordsExistError, match="was made by config"):
+    with pytest.raises(RecordsExistError, match="made by config"):
         generate.generate_records(SceneConfig(objects=5, sites=1, seed=1), tmp_path)
 
 

@@ -190,10 +190,14 @@ os.kill(os.getpid(), signal.SIGKILL)
 
     def test_records_are_not_overwritten_mixed_or_shared(self, tmp_path):
         fakes.write(tmp_path, 2)
-        with pytest.raises(records.RecordsExistError, match=r"holds records already; delete it, .* or resume"):
+        with pytest.raises(
+            records.RecordsExistError, match=r"holds 2 contacts of \d objects already .*choose another path, or resume"
+        ):
             RecordWriter(tmp_path, meta=fakes.META)
         other = records.RecordsMeta(source="fake", licence="none", config_hash="beef", sensors=SENSORS)
-        with pytest.raises(records.RecordsExistError, match="was made by config 'c0ffee', not 'beef'"):
+        with pytest.raises(
+            records.RecordsExistError, match=r"contacts of .*complete, last written .*config 'c0ffee', not 'beef'"
+        ):
             RecordWriter(tmp_path, meta=other, resume=True)
         with (
             RecordWriter(tmp_path, meta=fakes.META, resume=True),

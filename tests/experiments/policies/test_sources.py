@@ -73,7 +73,7 @@ def test_a_directory_of_other_records_is_not_mixed_with(monkeypatch, cache_dir, 
     monkeypatch.setattr(sources, "config_hash", lambda config: config_hash(tiny.SCENES))
     other = dataclasses.replace(GENERATED, scenes=dataclasses.replace(tiny.SCENES, seed=1))
     context = Context(tmp_path, cache_dir, Console(quiet=True))
-    with pytest.raises(RecordsExistError, match="was made by config"):
+    with pytest.raises(RecordsExistError, match="made by config"):
         prepare_records(other, context)
     context.close()
 

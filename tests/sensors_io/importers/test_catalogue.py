@@ -110,7 +110,7 @@ def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
 
 def test_other_records_are_not_touched(tmp_path):
     import_catalogue(catalogue(), tmp_path)
-    with pytest.raises(RecordsExistError, match="was made by config 'c0ffee', not 'abcd'"):
+    with pytest.raises(RecordsExistError, match="made by config 'c0ffee', not 'abcd'"):
         import_catalogue(dataclasses.replace(catalogue(), identity="abcd"), tmp_path)
 
 

@@ -104,7 +104,7 @@ def test_an_interrupted_import_goes_on(tmp_path):
     assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole
     assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole  # a finished one is kept
     assert RecordStore(tmp_path / "parts").contacts == RecordStore(tmp_path / "whole").contacts
-    with pytest.raises(RecordsExistError, match="was made by config"):
+    with pytest.raises(RecordsExistError, match="made by config"):
         import_physiclear(source, tmp_path / "parts", config=dataclasses.replace(KEEP, stride=2))
 
 
