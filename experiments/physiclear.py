@@ -34,6 +34,7 @@ from experiments.recordings.validation import Row, constants, deal_folds, fold_t
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.artifacts import write_bytes, write_json
 from experiments.running.context import Context
+from experiments.running.errors import ConfigurationError
 from experiments.running.runner import Experiment
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
@@ -87,14 +88,14 @@ def run(config: PhysiclearStudy, context: Context) -> Findings:
     """Validate and train, or predict.
 
     Raises:
-      ValueError: neither or only half of what either needs.
+      ConfigurationError: neither or only half of what either needs.
     """
     if (config.predict is None) != (config.out is None):
-        raise ValueError(f"predict is {config.predict}, out {config.out}: give both to predict, neither to validate")
+        raise ConfigurationError(f"predict is {config.predict}, out {config.out}: give both to predict, or neither")
     if config.predict is not None and config.out is not None:
         return predict(config, config.predict, config.out, context)
     if config.data_dir is None:
-        raise ValueError("data_dir is None: must be the folder with labels.json and videos/ to train on; give it")
+        raise ConfigurationError("data_dir is None: must be the folder of labels.json and videos/; give --data-dir")
     return validate(config, config.data_dir, context)
 
 

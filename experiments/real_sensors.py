@@ -19,6 +19,7 @@ from experiments.fields.real_folders import FOLDERS, Folder, read_folder
 from experiments.fields.real_pictures import Row, field_rows
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Table
 from experiments.running.context import Context
+from experiments.running.errors import ConfigurationError
 from experiments.running.runner import Experiment
 from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
 from sensors_io.calibration.presses import BallPresses
@@ -47,11 +48,12 @@ class RealConfig:
 def run(config: RealConfig, context: Context) -> Findings:
     """Calibrate each folder, extract, draw."""
     if config.data_dir is None:
-        raise ValueError("data_dir is None: must be the folder of recordings; give --data-dir")
+        raise ConfigurationError("data_dir is None: must be the folder of recordings; give --data-dir")
     rows: list[tuple[Cell, ...]] = []
     notes: list[tuple[Cell, ...]] = []
     pictures = []
-    for folder in [f for f in FOLDERS if (config.data_dir / f.path).is_dir()][: config.folders]:
+    there = [f for f in FOLDERS if (config.data_dir / f.path).is_dir()][: config.folders]
+    for folder in context.each("folders", there):
         context.say(folder.name)
         row, note, picture = study(folder, config.data_dir, config)
         rows.append(row)

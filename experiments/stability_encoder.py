@@ -31,6 +31,7 @@ from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import touch_batch
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
+from experiments.running.errors import DataError
 from experiments.running.runner import Experiment
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
@@ -122,11 +123,11 @@ def run(config: Config, context: Context) -> Findings:
     """Every arm, all seeds at once.
 
     Raises:
-      ValueError: a single contact to watch.
+      DataError: a single contact to watch.
     """
     data = open_touch(config.touch, config.frames, config.touch.scenes.image_px, context)
     if len(data.parts["val"]) < 2:
-        raise ValueError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
+        raise DataError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
     contacts, label, train = load(data, config)
     watched = batch_of(data, config, data.parts["val"])
     encoder = dataclasses.replace(config.encoder, sensors=config.sensors)

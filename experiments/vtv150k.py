@@ -35,6 +35,7 @@ from experiments.identify.probes import transfer
 from experiments.ladder.tables import differences_table
 from experiments.reporting.findings import Findings, Picture
 from experiments.running.context import Context
+from experiments.running.errors import DataError
 from experiments.running.runner import Experiment
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
@@ -124,14 +125,14 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
     """The first contact of every motion with each object that has one of all, objects in the same order.
 
     Raises:
-      ValueError: no object has one of each.
+      DataError: no object has one of each.
     """
     first: dict[str, dict[str, int]] = {
         name: {scenes.contacts[row].object_id: row for row in reversed(rows_of(scenes, name))} for name in MOTIONS
     }
     shared = sorted(set.intersection(*(set(rows) for rows in first.values())))
     if not shared:
-        raise ValueError(f"no object has a contact of each of {', '.join(MOTIONS)}: raise scenes.sequences")
+        raise DataError(f"no object has a contact of each of {', '.join(MOTIONS)}: raise scenes.sequences")
     return {name: [rows[object_id] for object_id in shared] for name, rows in first.items()}
 
 

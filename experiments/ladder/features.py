@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from experiments.running.errors import DataError
 from sensors_io.records import RecordStore
 from sensors_io.schema import Sequence as Recording
 
@@ -43,7 +44,7 @@ class Seen:
           seed: of the draw.
 
         Raises:
-          ValueError: there is only one object.
+          DataError: there is only one object.
         """
         return self.rows(other_objects(objects, seed))
 
@@ -56,11 +57,11 @@ def other_objects(objects: np.ndarray, seed: int) -> Int[np.ndarray, "n"]:
       seed: of the draw.
 
     Raises:
-      ValueError: there is only one object.
+      DataError: there is only one object.
     """
     names, index = np.unique(objects, return_inverse=True)
     if len(names) < 2:
-        raise ValueError(f"objects holds only {names.tolist()}: another object's touch needs two; use more contacts")
+        raise DataError(f"objects holds only {names.tolist()}: another object's touch needs two; use more contacts")
     rng, order = np.random.default_rng(seed), np.argsort(index, kind="stable")
     sizes = np.bincount(index)
     first = np.cumsum(sizes) - sizes

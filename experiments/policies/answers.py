@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import io
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +13,7 @@ from jaxtyping import Float
 
 from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.feeds import each, labelled, question_batch
+from experiments.running.artifacts import write_bytes
 from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
@@ -107,3 +110,24 @@ def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: 
 def reward_of(assembly: Assembly, done: Evaluated, weights: Weights, prior: np.ndarray) -> Float[np.ndarray, "N"]:
     """Total reward of each answer under the given weights."""
     return sum(reward_terms(assembly, done, weights, prior).values(), start=np.zeros(len(done.contact), np.float32))
+
+
+def save_answers(path: Path, answers: Evaluated) -> None:
+    """Publish answers as one file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    flat: dict[str, Any] = {f: getattr(answers, f) for f in _FLAT if getattr(answers, f) is not None}
+    flat |= {f"parsed_{f}": getattr(answers.parsed, f) for f in _PARSED}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **flat)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_answers(path: Path) -> Evaluated:
+    """Answers that `save_answers` published."""
+    with np.load(path) as file:
+        flat: dict[str, Any] = {f: file.get(f) for f in _FLAT}
+        return Evaluated(**flat, parsed=Parsed(**{f: file[f"parsed_{f}"] for f in _PARSED}))
+
+
+_FLAT = tuple(f.name for f in dataclasses.fields(Evaluated) if f.name != "parsed")
+_PARSED = tuple(f.name for f in dataclasses.fields(Parsed))

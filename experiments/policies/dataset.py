@@ -7,6 +7,7 @@ from typing import Any
 import grain
 import numpy as np
 
+from experiments.running.errors import DataError
 from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -67,7 +68,7 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
 
     Raises:
-      ValueError: a part without a contact.
+      DataError: a part without a contact.
     """
     train = store.contacts_of_split("train")
     ids = np.array([store.contacts[i].object_id for i in train])
@@ -78,9 +79,9 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
     for name, rows in parts.items():
         if not len(rows):
-            raise ValueError(
-                f"part {name!r} of the data set holds no contact: every part needs one; use more objects or "
-                f"another grpo_share (now {grpo_share})"
+            raise DataError(
+                f"part {name!r} of the data set holds no contact: every part needs one; use more objects, another "
+                f"grpo_share (now {grpo_share}), or splits with objects in train, val and test"
             )
     return parts
 

@@ -17,6 +17,7 @@ from jaxtyping import Int
 
 from experiments.policies.assembly import Assembly
 from experiments.policies.dataset import Dataset
+from experiments.running.errors import DataError
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import CLIP_ARRAYS
 from touchr1_jax.models.policy import Features
@@ -215,11 +216,11 @@ def labelled(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:
     """Contact and attribute of every question that has an answer.
 
     Raises:
-      ValueError: no label is known.
+      DataError: no label is known.
     """
     contact, attribute = np.nonzero(label >= 0)
     if not len(contact):
-        raise ValueError(f"label has {len(label)} rows and none is known (≥ 0): annotate some contacts of this part")
+        raise DataError(f"label has {len(label)} rows and none is known (≥ 0): annotate some contacts of this part")
     return contact, attribute
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,15 @@ import numpy as np
 
 from experiments.policies.arrays import flat, nested
 from experiments.running.artifacts import jsonable, write_bytes
+from sensors_io.errors import UserError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params
 
 _ABOUT = "about"  # entry of the file that holds its JSON; parameters are named by their path, joined by "/"
+
+
+class EncoderError(UserError, ValueError):
+    """A file that is no encoder to start from; the message names it and the fix."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -49,20 +55,24 @@ def load_encoder(path: Path) -> PretrainedEncoder:
     """Read an encoder that `save_encoder` wrote; a run's directory stands for its `encoder.npz`.
 
     Raises:
-      FileNotFoundError: there is no such file.
-      ValueError: the file is no encoder, or one of another version of its config.
+      EncoderError: there is no such file, it is no encoder, or one of another version of its config.
     """
     path = path / "encoder.npz" if path.is_dir() else path
     if not path.exists():
-        raise FileNotFoundError(f"encoder is {path}: no such file; give the run directory of pretrain_encoder")
-    with np.load(path) as file:
-        if _ABOUT not in file:
-            raise ValueError(f"encoder is {path}: it has no entry {_ABOUT!r}; give a file that pretrain_encoder wrote")
-        about = json.loads(file[_ABOUT].tobytes())
-        params = nested({name: file[name] for name in file.files if name != _ABOUT})
+        raise EncoderError(f"encoder is {path}: no such file; give the run directory of pretrain_encoder")
+    fix = "give a file that pretrain_encoder wrote"
+    try:
+        with np.load(path) as file:
+            entries = {name: file[name] for name in file.files}
+    except (OSError, ValueError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+        raise EncoderError(f"encoder is {path}: cannot be read ({error}); {fix}") from error
+    if _ABOUT not in entries:
+        raise EncoderError(f"encoder is {path}: it has no entry {_ABOUT!r}; {fix}")
+    about = json.loads(entries.pop(_ABOUT).tobytes())
+    params = nested(entries)
     known = {f.name for f in dataclasses.fields(TactileViTConfig)}
     if set(about["config"]) != known:
         odd = sorted(set(about["config"]) ^ known)
-        raise ValueError(f"encoder {path} has a config that differs in {odd}: it is of another version; train it again")
+        raise EncoderError(f"encoder is {path}: its config differs in {odd}, it is of another version; train it again")
     config = TactileViTConfig(**about["config"])
     return PretrainedEncoder(config=config, sensors=tuple(about["sensors"]), params=params, notes=about["notes"])

@@ -19,23 +19,25 @@ Source = Literal["generated", "physiclear", "records"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SourceConfig:
-    """Which data; `directory` holds the recordings or records, and is not used for generated scenes."""
+    """Which data; `directory` holds the recordings or records, and is not used for generated scenes.
+
+    Raises:
+      ValueError: recordings or records without a directory, or a directory given for generated scenes.
+    """
 
     kind: Source
     directory: Path | None
     scenes: SceneConfig
     physiclear: PhysiclearConfig
 
+    def __post_init__(self) -> None:
+        if (self.directory is None) != (self.kind == "generated"):
+            need = "takes no data_dir: drop it" if self.kind == "generated" else "needs data_dir: the folder to read"
+            raise ValueError(f"data_dir is {self.directory}: data {self.kind!r} {need}")
+
 
 def prepare_records(config: SourceConfig, context: Context) -> Path:
-    """Directory of the records, made or imported first where the cache lacks them; an interrupted making goes on.
-
-    Raises:
-      ValueError: recordings or records without a directory, or a directory given for generated scenes.
-    """
-    if (config.directory is None) != (config.kind == "generated"):
-        need = "takes no data_dir: drop it" if config.kind == "generated" else "needs data_dir: the folder to read"
-        raise ValueError(f"data_dir is {config.directory}: data {config.kind!r} {need}")
+    """Directory of the records, made or imported first where the cache lacks them; an interrupted making goes on."""
     if config.directory is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
         _make(context, "making scenes", lambda tell: generate_records(config.scenes, path, progress=tell))

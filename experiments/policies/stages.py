@@ -22,6 +22,7 @@ from experiments.running.context import Context
 from experiments.running.loops import run_loop
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge
@@ -63,16 +64,14 @@ class SFTConfig:
     """How what is felt is changed at random; by default not at all."""
 
     def __post_init__(self) -> None:
-        if self.micro_contacts < 1 or self.batch_size % self.micro_contacts:
+        at_least(self, 0, "steps", "pack", "lora_rank")
+        at_least(self, 1, "batch_size", "questions", "save_every", "micro_contacts", "max_logits")
+        above(self, 0, "lora_alpha")
+        within(self, 0, 1, "curriculum")
+        if self.batch_size % self.micro_contacts:
             raise ValueError(
                 f"micro_contacts is {self.micro_contacts}: must divide batch_size = {self.batch_size}; change either"
             )
-        for field in ("pack", "lora_rank"):
-            if getattr(self, field) < 0:
-                raise ValueError(f"{field} is {getattr(self, field)}: must be at least 0, which is none; raise it")
-
-        if not 0 <= self.curriculum <= 1:
-            raise ValueError(f"curriculum is {self.curriculum}: must be 0 … 1, a share of the steps; correct it")
 
     @property
     def lora(self) -> LoraConfig | None:

@@ -5,15 +5,13 @@ What a finished policy said lies in `answers/NAME-SEED.npz` of the run, so a res
 
 import dataclasses
 import functools
-import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Array
 
-from experiments.policies.answers import Evaluated, evaluate_policy
+from experiments.policies.answers import Evaluated, evaluate_policy, load_answers, save_answers
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_model, prove_rewards
 from experiments.policies.dataset import Dataset, open_dataset
 from experiments.policies.pretrained import load_encoder
@@ -29,18 +27,18 @@ from experiments.policies.stages import (
     probe_features,
     run_sft,
 )
-from experiments.running.artifacts import write_bytes
 from experiments.running.context import Context
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS, UNKNOWN, Flag
+from touchr1_jax.limits import at_least
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
-from touchr1_jax.types import Params, Parsed
+from touchr1_jax.types import Params
 
 SFT, BLIND = "sft", "tactile_blind"
 
@@ -84,8 +82,17 @@ class StudyConfig:
         return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
 
     def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise ValueError(f"seeds is {self.seeds}: must be at least 1; raise it")
+        at_least(self, 1, "seeds", "grpo_save_every", "read_threads")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps")
+        if not 0 < self.grpo_share < 1:
+            raise ValueError(
+                f"grpo_share is {self.grpo_share}: must lie between 0 and 1: SFT and GRPO both need objects; change it"
+            )
+        if self.grpo.group < 2:
+            raise ValueError(
+                f"grpo.group is {self.grpo.group}: must be at least 2: a rollout is held against its group; raise it"
+            )
+        self.source()
         known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
         unknown = sorted(set(self.grpo_attributes) - set(known))
         if unknown or not self.grpo_attributes:
@@ -103,6 +110,14 @@ class StudyConfig:
                 f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
                 "the length that SFT teaches; set both"
             )
+
+    def source(self) -> SourceConfig:
+        """Where its data come from.
+
+        Raises:
+          ValueError: recordings or records without a folder, or a folder for generated scenes.
+        """
+        return SourceConfig(kind=self.data, directory=self.data_dir, scenes=self.scenes, physiclear=self.physiclear)
 
 
 SMOKE = StudyConfig(
@@ -193,10 +208,12 @@ def run_study(
 
     Raises:
       ValueError: a way that asks a policy that is not there, or has the name of one.
-      RewardError, SizeError: as `prove_rewards` and `prove_model`.
+      RewardError, SizeError, EncoderError: as `prove_rewards`, `prove_model` and `load_encoder`.
     """
     prove_rewards(arms)
     prove_model(config.model, SENSORS)
+    if config.encoder is not None:
+        load_encoder(config.encoder)  # what is no encoder is named before data are made
     ways = ways or {}
     _check_ways(ways, arms)
     configs = {
@@ -249,10 +266,7 @@ def open_study_data(config: StudyConfig, context: Context) -> Dataset:
 
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
     """
-    source = SourceConfig(
-        kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
-    )
-    path = prepare_records(source, context)
+    path = prepare_records(config.source(), context)
     clip = ClipConfig(
         frames=config.model.frames,
         image_px=config.model.image_px,
@@ -356,24 +370,3 @@ class _Seed:
 
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
-
-
-def save_answers(path: Path, answers: Evaluated) -> None:
-    """Publish answers as one file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    flat: dict[str, Any] = {f: getattr(answers, f) for f in _FLAT if getattr(answers, f) is not None}
-    flat |= {f"parsed_{f}": getattr(answers.parsed, f) for f in _PARSED}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **flat)
-    write_bytes(path, buffer.getvalue())
-
-
-def load_answers(path: Path) -> Evaluated:
-    """Answers that `save_answers` published."""
-    with np.load(path) as file:
-        flat: dict[str, Any] = {f: file.get(f) for f in _FLAT}
-        return Evaluated(**flat, parsed=Parsed(**{f: file[f"parsed_{f}"] for f in _PARSED}))
-
-
-_FLAT = tuple(f.name for f in dataclasses.fields(Evaluated) if f.name != "parsed")
-_PARSED = tuple(f.name for f in dataclasses.fields(Parsed))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from experiments.recordings.policy import COMBINATIONS, LANGUAGE, LEVELS
 from experiments.reporting.findings import Cell, Column, Table
+from experiments.running.errors import ConfigurationError
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 
@@ -29,11 +30,11 @@ def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, s
     videos nor the random generator's version matters.
 
     Raises:
-      ValueError: fewer objects than folds.
+      ConfigurationError: fewer objects than folds.
     """
     names, first = np.unique(objects, return_index=True)
     if len(names) < count:
-        raise ValueError(f"folds is {count}: must be ≤ {len(names)}, the number of objects; lower it")
+        raise ConfigurationError(f"folds is {count}: must be ≤ {len(names)}, the number of objects; lower it")
     digest = [hashlib.sha256(f"{seed}/{name}".encode()).hexdigest() for name in names]
     order = sorted(range(len(names)), key=lambda i: (tuple(label[first[i]]), digest[i]))
     fold = {names[i]: place % count for place, i in enumerate(order)}

@@ -134,7 +134,8 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
         )
     try:
         command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
-    except ValueError as error:  # a configuration refuses its own values
+        jsonable(command.config, where="config")
+    except ValueError as error:  # a configuration refuses its own values, or one is not finite
         complain(f"{type(error).__name__}: {error}")
         return 2
     with compiled_quickly() if command.scale in module.EXPERIMENT.quick else contextlib.nullcontext():

@@ -94,6 +94,9 @@ class SceneConfig:
         ok = 0 < self.min_force_n <= self.max_force_n
         require(ok, "min_force_n", self.min_force_n, f"must lie in (0, max_force_n = {self.max_force_n}]")
         require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
+        require(0 <= self.force_gain_error <= 1, "force_gain_error", self.force_gain_error, "must lie in [0, 1]")
+        require(self.force_noise_n >= 0, "force_noise_n", self.force_noise_n, "must be ≥ 0")
+        require(self.ramp_s > 0, "ramp_s", self.ramp_s, "must be > 0")
         require(self.adhesion_j_per_m2 >= 0, "adhesion_j_per_m2", self.adhesion_j_per_m2, "must be ≥ 0")
         require(self.adhesion_tolerance > 0, "adhesion_tolerance", self.adhesion_tolerance, "must be > 0")
         for name in ("part_share", "graded_share"):
@@ -104,7 +107,9 @@ class SceneConfig:
         require(ok, "split_shares", self.split_shares, "must be ≥ 0 and sum to 1")
         ok = self.error is None or 0 < self.error <= 1
         require(ok, "error", self.error, "must lie in (0, 1], or be None")
-        require(self.solver_tolerance > 0, "solver_tolerance", self.solver_tolerance, "must be > 0")
+        require(0 < self.solver_tolerance < 1, "solver_tolerance", self.solver_tolerance, "must lie in (0, 1)")
+        require(self.solver_max_iterations >= 1, "solver_max_iterations", self.solver_max_iterations, "must be ≥ 1")
+        require(self.seed >= 0, "seed", self.seed, "must be ≥ 0")
 
     def _check_sequences(self) -> None:
         if self.sequences is None:

@@ -21,15 +21,15 @@ class SizeError(ValueError):
     """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
 
 
-def check_sizes(config: Any, *fields: str) -> None:
-    """Refuse a config with a size below 1.
+def check_sizes(config: Any, *fields: str, least: int = 1) -> None:
+    """Refuse a config with a size below the least.
 
     Raises:
       SizeError: naming the field.
     """
     for field in fields:
-        if getattr(config, field) < 1:
-            raise SizeError(f"{field} is {getattr(config, field)}: must be at least 1; raise it")
+        if getattr(config, field) < least:
+            raise SizeError(f"{field} is {getattr(config, field)}: must be at least {least}; raise it")
 
 
 def check_heads(width: int, heads: int) -> None:

@@ -15,7 +15,19 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, check_sizes, mrope, rotate
+from touchr1_jax.limits import above
+from touchr1_jax.models.layers import (
+    MASKED,
+    GatedMLP,
+    KeySource,
+    RMSNorm,
+    Rotation,
+    SizeError,
+    attend,
+    check_sizes,
+    mrope,
+    rotate,
+)
 from touchr1_jax.models.linear import Dense, Embed, product_with_weights
 
 
@@ -38,7 +50,10 @@ class DecoderConfig:
     def __post_init__(self) -> None:
         check_sizes(self, "hidden_size", "num_layers", "num_heads", "num_kv_heads", "head_dim", "intermediate_size")
         if self.num_heads % self.num_kv_heads:
-            raise ValueError(f"num_heads {self.num_heads} must be a multiple of num_kv_heads {self.num_kv_heads}")
+            raise SizeError(
+                f"num_heads is {self.num_heads}: must be a multiple of num_kv_heads {self.num_kv_heads}; change either"
+            )
+        above(self, 0, "rope_theta", "norm_epsilon")
 
 
 class LayerCache(NamedTuple):

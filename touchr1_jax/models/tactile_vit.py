@@ -53,6 +53,7 @@ class TactileViTConfig:
     def __post_init__(self) -> None:
         check_sizes(self, "width", "num_heads", "mlp_ratio", "stem_px", "stem_width", "patch_cells")
         check_sizes(self, "frames_per_step", "tokens_per_step")
+        check_sizes(self, "num_layers", least=0)
         check_heads(self.width, self.num_heads)
 
 

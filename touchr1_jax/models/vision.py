@@ -27,6 +27,7 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         check_sizes(self, "image_px", "patch_px", "width", "num_heads", "mlp_ratio")
+        check_sizes(self, "num_layers", least=0)
         check_heads(self.width, self.num_heads)
         if self.image_px % (2 * self.patch_px):
             raise SizeError(

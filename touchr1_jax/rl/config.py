@@ -8,6 +8,7 @@ import enum
 
 import jax
 
+from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.rl.kl import KLEstimator
 
@@ -226,6 +227,10 @@ class GRPOConfig:
     """Compute forward passes in bfloat16; parameters, softmax, losses and optimizer stay in float32."""
 
     def __post_init__(self) -> None:
+        at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
+        at_least(self, 0, "learning_rate", "lr_scale")
+        within(self, 0, 1, "final_share")
+        above(self, 0, "max_grad_norm")
         if self.prompts % self.micro_prompts:
             raise ValueError(
                 f"micro_prompts {self.micro_prompts} must divide prompts {self.prompts}; choose a divisor of it"
@@ -234,8 +239,6 @@ class GRPOConfig:
             raise ValueError(
                 f"buckets is {self.buckets}: must ascend within 2 … length − 1 = {self.length - 1}; sort it"
             )
-        if self.max_logits < 1:
-            raise ValueError(f"max_logits is {self.max_logits}: must be at least 1; a token's logits exist in any case")
 
     @property
     def drawn(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
+from touchr1_jax.limits import above, at_least
 from touchr1_jax.models.tactile_vit import force_features
 
 TINY = 1e-4  # keeps log(energy) of a constant image finite; energies are in units of full scale
@@ -27,6 +28,11 @@ class ProbeConfig:
     folds: int = 5
     penalty: float = 0.03
     iterations: int = 60
+
+    def __post_init__(self) -> None:
+        at_least(self, 2, "folds")
+        above(self, 0, "penalty")
+        at_least(self, 1, "iterations")
 
 
 @jax.jit

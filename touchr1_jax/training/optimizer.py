@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int
 
+from touchr1_jax.limits import above, at_least, within
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OptimizerConfig:
@@ -23,6 +25,13 @@ class OptimizerConfig:
     weight_decay: float = 0.0
     b2: float = 0.95
     max_grad_norm: float = 1.0
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "learning_rate", "lr_scale", "warmup_steps", "weight_decay")
+        within(self, 0, 1, "final_share")
+        above(self, 0, "max_grad_norm")
+        if not 0 <= self.b2 < 1:
+            raise ValueError(f"b2 is {self.b2}: must lie in 0 ≤ b2 < 1, a share of what was; lower it")
 
     @property
     def peak(self) -> float:

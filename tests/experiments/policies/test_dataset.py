@@ -42,7 +42,7 @@ def test_all_contacts_of_an_object_stay_together(tmp_path):
 )
 def test_an_empty_part_is_refused(tmp_path, contacts, share, part):
     store = RecordStore(fakes.write(tmp_path, contacts))  # objects 0 and 1 train, 2 validate, 3 tests
-    with pytest.raises(ValueError, match=f"part '{part}' .*more objects or another grpo_share .now {share}"):
+    with pytest.raises(ValueError, match=f"part '{part}' .*more objects, another grpo_share .now {share}"):
         split_parts(store, share)
 
 

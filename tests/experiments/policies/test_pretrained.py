@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.policies.assembly import ModelConfig
-from experiments.policies.pretrained import PretrainedEncoder, load_encoder, save_encoder
+from experiments.policies.pretrained import EncoderError, PretrainedEncoder, load_encoder, save_encoder
 from tests.experiments import tiny
 
 CONFIG = dataclasses.replace(tiny.MODEL.tactile, sensors=2, causal=True)
@@ -44,7 +44,7 @@ def test_sensors_are_picked_by_name(encoder):
 
 
 def test_what_is_no_encoder_is_refused(encoder, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no such file; give the run directory of pretrain_encoder"):
+    with pytest.raises(EncoderError, match=r"no such file; give the run directory of pretrain_encoder"):
         load_encoder(tmp_path)
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="it has no entry 'about'"):

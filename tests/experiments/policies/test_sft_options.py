@@ -87,7 +87,7 @@ def test_numbers_must_not_be_negative(field):
 def test_a_curriculum_is_a_share_of_the_steps(train, padded):
     """Here of all of them: it learns from other questions."""
     assert train(curriculum=1.0)[1][0] != padded[1][0]
-    with pytest.raises(ValueError, match=r"curriculum is 1\.5: must be 0 … 1"):
+    with pytest.raises(ValueError, match=r"curriculum is 1\.5: must lie in 0 … 1"):
         SFTConfig(curriculum=1.5)
 
 

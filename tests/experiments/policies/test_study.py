@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.policies.answers import Evaluated
+from experiments.policies.answers import Evaluated, load_answers, save_answers
 from experiments.policies.assembly import ModelConfig
 from experiments.policies.baselines import baselines, constant_answers, joint_mode, level_answers
 from experiments.policies.scores import score, score_study
 from experiments.policies.stages import Probed
-from experiments.policies.study import SFT, Study, StudyConfig, Way, load_answers, run_study, save_answers
+from experiments.policies.study import SFT, Study, StudyConfig, Way, run_study
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
 from touchr1_jax.bench.metrics import evaluate

@@ -103,7 +103,7 @@ def test_row_write_refuses_an_index_per_rollout():
 
 
 def test_heads_must_group():
-    with pytest.raises(ValueError, match="num_heads 3 must be a multiple of num_kv_heads 2"):
+    with pytest.raises(ValueError, match="num_heads is 3: must be a multiple of num_kv_heads 2"):
         DecoderConfig(vocab_size=8, num_heads=3, num_kv_heads=2)
 
 

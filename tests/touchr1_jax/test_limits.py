@@ -1,0 +1,29 @@
+"""Bounds: what lies on them, what lies outside, and what is no number."""
+
+import dataclasses
+import math
+
+import pytest
+
+from touchr1_jax.limits import above, at_least, within
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    share: float
+
+
+@pytest.mark.parametrize(
+    ("check", "kept", "refused", "said"),
+    [
+        (lambda c: at_least(c, 1, "share"), (1, 2), (0.5, math.nan), "must be at least 1; raise it"),
+        (lambda c: above(c, 0, "share"), (1e-9,), (0, -1, math.nan), "must be above 0; raise it"),
+        (lambda c: within(c, 0, 1, "share"), (0, 1), (-1, 1.1, math.nan), "must lie in 0 … 1; change it"),
+    ],
+)
+def test_bounds(check, kept, refused, said):
+    for value in kept:
+        check(Config(value))
+    for value in refused:
+        with pytest.raises(ValueError, match=f"share is {value}: {said}"):
+            check(Config(value))
