@@ -1,6 +1,7 @@
 """How a run hears that it should stop: at once, or, inside a training loop, once the step is done and saved."""
 
 import contextlib
+import os
 import signal
 import sys
 import weakref
@@ -11,6 +12,12 @@ from typing import Any
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Control-C, and what a scheduler sends before it takes the machine away."""
 
+
+PATIENCE = b"\nstopping once this step is done and saved; a second signal ends at once, unsaved\n"
+"""Told on standard error where a stop has to wait, for minutes where the step is one that compiles."""
+
+STDERR = 2
+"""Its descriptor: what stands in for `sys.stderr`, as in a notebook, may have none."""
 
 AGAIN_S = 0.02
 """Between two looks whether the `Stopped` that was raised is still on its way."""
@@ -86,6 +93,8 @@ class Stopping:
         signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
         if not self._patient:
             raise self._stopped(number)
+        with contextlib.suppress(OSError):  # nobody may be reading
+            os.write(STDERR, PATIENCE)  # a print could strike within another
 
     def _lost(self, lost: Any, report: Callable[[Any], Any]) -> None:
         if not isinstance(lost.exc_value, Stopped):

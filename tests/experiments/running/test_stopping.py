@@ -148,3 +148,9 @@ def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
         broken = Broken()
         del broken
     assert [str(x) for x in said] == ["the disk is gone"]
+
+
+def test_a_stop_that_has_to_wait_says_so(capfd):
+    with pytest.raises(Stopped):
+        patiently(lambda: None)
+    assert "stopping once this step is done and saved" in capfd.readouterr().err
