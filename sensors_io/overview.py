@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Iterable
 
 import numpy as np
-from rich.table import Table
+from rich.table import Column, Table
 
 from sensors_io.importers.catalogue import ImportReport
 from sensors_io.importers.keep import Skip
@@ -66,7 +66,7 @@ def summary_table(store: RecordStore) -> Table:
 
 def object_table(store: RecordStore) -> Table:
     """One row per object: split, labels, contacts."""
-    table = Table("object", "split", *ATTRIBUTES, "contacts")
+    table = Table(Column("object", overflow="fold"), "split", *ATTRIBUTES, "contacts")  # names that end alike differ
     contacts = collections.Counter(key.object_id for key in store.contacts)
     for name, card in store.objects.items():
         levels = [card.labels.get(attribute, UNKNOWN) for attribute in ATTRIBUTES]

@@ -1,6 +1,7 @@
 """From presses of a ball to a calibration with its held-out error, or a refusal that says what is wrong."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -61,7 +62,11 @@ class CalibrationReport:
 
 
 def calibrate(
-    presses: BallPresses, names: tuple[str, ...], sensor: str, config: CalibrateConfig | None = None
+    presses: BallPresses,
+    names: tuple[str, ...],
+    sensor: str,
+    config: CalibrateConfig | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibration, CalibrationReport]:
     """Find circles, leave bad presses out, fit the map, measure it on held-out presses.
 
@@ -70,6 +75,7 @@ def calibrate(
       names: of the presses, for the report.
       sensor: canonical name that the calibration is for.
       config: limits.
+      progress: called with the number of fits done and of all: one of all presses, one for each fold.
 
     Raises:
       CalibrationError: a set that nothing can be learnt from; it says why and what to do.
@@ -85,7 +91,10 @@ def calibrate(
     kept = presses.chosen(remaining)
     _check_size(kept, circles.touches, config)
     colours, touches, choice = fit_map(kept, circles.touches, seed=config.seed, folds=config.folds)
-    errors = cross_validate(kept, sensor, folds=config.folds, seed=config.seed)
+    fits = 1 + config.folds
+    progress(1, fits)
+    told = lambda done: progress(1 + done, fits)
+    errors = cross_validate(kept, sensor, folds=config.folds, seed=config.seed, progress=told)
     _check_errors(errors, config)
     report = CalibrationReport(
         kept=tuple(names[i] for i in remaining),

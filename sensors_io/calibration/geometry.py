@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from sensors_io.errors import UserError
+from sensors_io.json_files import write_json
 
 _FOLDS = 9
 _INVERSIONS = 25  # Newton steps on the radius; six do where the pins are, the rest is for the far corners
@@ -103,17 +104,14 @@ class Geometry:
 
     def save(self, path: pathlib.Path) -> None:
         """Write it as JSON, whole or not at all."""
-        tree = {name: _plain(value) for name, value in dataclasses.asdict(self).items()}
-        temporary = path.with_name(path.name + ".tmp")
-        temporary.write_text(json.dumps(tree, indent=1))
-        temporary.replace(path)
+        write_json(path, {name: _plain(value) for name, value in dataclasses.asdict(self).items()})
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Self:
         """Read what `save` wrote.
 
         Raises:
-          GeometryError: it is something else.
+          GeometryError: there is no such file, or it is something else.
         """
         try:
             tree = json.loads(path.read_text())
@@ -126,8 +124,10 @@ class Geometry:
                 rms_mm=float(tree["rms_mm"]),
                 held_out_mm=float(tree["held_out_mm"]),
             )
-        except (ValueError, KeyError, TypeError) as error:
-            raise GeometryError(f"{path} holds no geometry ({error!r}); calibrate again") from error
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise GeometryError(
+                f"{path} is no geometry ({error}); make one with `python -m sensors_io geometry`"
+            ) from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

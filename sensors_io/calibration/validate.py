@@ -1,6 +1,7 @@
 """How good a calibration is, on presses that it has not seen: depth and radius of the ball it reconstructs."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from scipy import optimize
@@ -93,10 +94,18 @@ def score_presses(calibration: Calibration, presses: BallPresses, touches: np.nd
     return BallErrors(depth_um=depth_um, radius_share=radius, tip_mm=tip)
 
 
-def cross_validate(presses: BallPresses, sensor: str, *, folds: int = 5, seed: int = 0) -> BallErrors:
+def cross_validate(
+    presses: BallPresses,
+    sensor: str,
+    *,
+    folds: int = 5,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda done: None,
+) -> BallErrors:
     """Errors of every press under a calibration made without it: circles, degrees and map from the other folds alone.
 
     The circle of a left-out press is found with the optics of the others; it says which pixels are scored, no more.
+    `progress` is called with the number of folds that are done.
     """
     order = np.random.default_rng(seed).permutation(len(presses))
     rows = np.full((3, len(presses)), np.nan)
@@ -111,4 +120,5 @@ def cross_validate(presses: BallPresses, sensor: str, *, folds: int = 5, seed: i
         rest = presses.chosen(out)
         errors = score_presses(made, rest, align_circles(rest, circles.optics).touches.stacked())
         rows[:, out] = errors.depth_um, errors.radius_share, errors.tip_mm
+        progress(k + 1)
     return BallErrors(depth_um=rows[0], radius_share=rows[1], tip_mm=rows[2])

@@ -11,7 +11,7 @@ from rich.table import Table
 from sensors_io.calibration.calibrate import CalibrateConfig, CalibrationReport, calibrate
 from sensors_io.calibration.presses import BallPresses
 from sensors_io.calibration.scale import measure_scale
-from sensors_io.commands.console import OUT
+from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.sources import Pictures, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError
@@ -60,7 +60,8 @@ class Calibrate:
             mm_per_px=straight.mm_per_px,
         )
         OUT.print(f"{len(presses)} pictures; finding circles, fitting, leaving out each fifth in turn …")
-        made, report = calibrate(presses, pictures.names, self.sensor, self.config)
+        with progress_bar("fits") as progress:
+            made, report = calibrate(presses, pictures.names, self.sensor, self.config, progress)
         made = straight.signed(made)
         made.save(self.out)
         OUT.print(report_table(made, report))

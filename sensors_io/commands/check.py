@@ -34,7 +34,7 @@ class Check:
     background: pathlib.Path | None = None
     """Picture of the gel at rest, where none was recorded."""
     calibration: pathlib.Path | None = None
-    """Of the colours, from `calibrate`: contact is then told by depth."""
+    """Of the colours, from `calibrate`: contact is then told by depth, and the pitch by it where none was recorded."""
 
     def run(self) -> int:
         store = RecordStore(self.records, allow_incomplete=True)
@@ -67,7 +67,8 @@ class Check:
         OUT.print(overview.flag_table(recorded, "flags as recorded"))
         OUT.print(overview.flag_table(judged, "flags by the filters"))
         if self.pictures:
-            OUT.print(overview.flag_table(looked, "flags by the pictures"))
+            if looked.frames:
+                OUT.print(overview.flag_table(looked, "flags by the pictures"))
             for reason, count in unseen.items():
                 OUT.print(f"not looked at: {count} sequences, {reason}", highlight=False)
         if not store.complete:
@@ -116,8 +117,8 @@ class _Eye:
             return (
                 f"their pictures are {sequence.frames.shape[1:3]}, the gel at rest is {rest.shape[:2]}: crop them alike"
             )
-        if sequence.mm_per_px is None:
-            return "nothing tells their mm per px: record them with it"
+        if self._pitch(sequence) is None:
+            return "nothing tells their mm per px: give --calibration, or record with the device's --mm-per-px"
         try:
             self._extractor(sequence)
         except (SchemaError, CalibrationError) as error:
@@ -133,13 +134,19 @@ class _Eye:
 
     def _extractor(self, sequence: Sequence) -> Extractor:
         """Made once for each gel at rest."""
-        rest = self._at_rest(sequence)
-        assert sequence.mm_per_px is not None
+        rest, pitch = self._at_rest(sequence), self._pitch(sequence)
+        assert pitch is not None
         assert rest is not None
-        gel = _background(sequence), sequence.mm_per_px
+        gel = _background(sequence), pitch
         if gel not in self._extractors:
-            self._extractors[gel] = Extractor(rest, sequence.mm_per_px, self._calibration)
+            self._extractors[gel] = Extractor(rest, pitch, self._calibration)
         return self._extractors[gel]
+
+    def _pitch(self, sequence: Sequence) -> float | None:
+        """The one that was recorded, else the calibration's."""
+        if sequence.mm_per_px is None and self._calibration is not None:
+            return self._calibration.mm_per_px
+        return sequence.mm_per_px
 
     def _at_rest(self, sequence: Sequence) -> np.ndarray | None:
         name = _background(sequence)

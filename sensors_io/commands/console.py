@@ -1,14 +1,26 @@
 """What all commands print with: standard output, complaints, a progress bar."""
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 
 import rich.console
 import rich.live
 import rich.progress
 
-OUT = rich.console.Console()
-ERR = rich.console.Console(stderr=True)
+WIDTH = 110
+"""Columns where there is no terminal: tables in files and pipes keep their names whole."""
+
+PLAIN_EVERY_S = 10.0
+"""Between two lines of progress where there is no terminal."""
+
+
+def _console(*, stderr: bool) -> rich.console.Console:
+    console = rich.console.Console(stderr=stderr)
+    return console if console.is_terminal else rich.console.Console(stderr=stderr, width=WIDTH)
+
+
+OUT, ERR = _console(stderr=False), _console(stderr=True)
 
 
 def complain(error: Exception) -> None:
@@ -32,7 +44,17 @@ def live_display(
 
 @contextlib.contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar with rate and time left on stderr; nothing where stderr is no terminal."""
+    """Rate and time left of a loop on stderr: a bar, or a line every `PLAIN_EVERY_S` where stderr is no terminal.
+
+    Args:
+      what: is counted.
+
+    Yields:
+      (done, total) → None, to be called as the loop comes on.
+    """
+    if not ERR.is_terminal:
+        yield _Plain(what).show
+        return
     columns = (
         rich.progress.TextColumn("{task.description}"),
         rich.progress.BarColumn(),
@@ -40,11 +62,31 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
         rich.progress.TextColumn("{task.fields[rate]}"),
         rich.progress.TimeRemainingColumn(),
     )
-    with rich.progress.Progress(*columns, console=ERR, disable=not ERR.is_terminal) as bar:
+    with rich.progress.Progress(*columns, console=ERR) as bar:
         task = bar.add_task(what, total=None, rate="")
 
         def show(done: int, total: int) -> None:
             speed = bar.tasks[0].speed
-            bar.update(task, completed=done, total=total, rate=f"{speed:.1f}/s" if speed else "")
+            bar.update(task, completed=done, total=total, rate=f"{speed:.3g}/s" if speed else "")
 
         yield show
+
+
+class _Plain:
+    """The same figures as lines of text."""
+
+    def __init__(self, what: str) -> None:
+        self._what, self._began_s = what, time.monotonic()
+        self._printed_s = self._began_s
+        self._first: int | None = None
+
+    def show(self, done: int, total: int) -> None:
+        """Print a line if the last one is old enough; what an earlier command did does not count into the rate."""
+        now = time.monotonic()
+        self._first = done - 1 if self._first is None else self._first
+        if now - self._printed_s < PLAIN_EVERY_S or done >= total:
+            return
+        self._printed_s = now
+        rate = (done - self._first) / (now - self._began_s)
+        line = f"{self._what}: {done}/{total}, {rate:.3g}/s, {(total - done) / rate:.0f} s left"
+        ERR.print(line, markup=False, highlight=False, soft_wrap=True)

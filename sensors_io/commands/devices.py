@@ -5,7 +5,7 @@ import dataclasses
 from rich.table import Table
 
 from sensors_io.commands.console import OUT
-from sensors_io.devices.cameras import find_cameras
+from sensors_io.devices.cameras import SYSFS, find_cameras
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.devices.netft import NetFtConfig
 from sensors_io.devices.tac3d import PORT, Tac3dConfig
@@ -24,7 +24,10 @@ class Devices:
 
     def run(self) -> int:
         table = Table("device", "product", "serial", "at")
-        for camera in find_cameras():
+        cameras = find_cameras()
+        if not cameras:
+            table.add_row("camera", "absent", "–", f"none: {SYSFS} names no video device; look at its cable")
+        for camera in cameras:
             interface = "" if camera.interface is None else f", interface {camera.interface}"
             where = f"{camera.node} ({camera.usb_id or 'not USB'}{interface})"
             table.add_row("camera", camera.product, camera.serial or "–", where)

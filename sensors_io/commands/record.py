@@ -195,7 +195,8 @@ def drawn(status: Status) -> rich.console.RenderableType:
     top = max(advice.target_n * 1.25, 1.0)
     table = rich.table.Table.grid(padding=(0, 2))
     bar = rich.progress_bar.ProgressBar(total=top, completed=min(max(advice.normal_n, 0.0), top), width=50)
-    table.add_row("force", bar, f"{advice.normal_n:6.2f} N of {advice.target_n:g} N")
+    normal_n = advice.normal_n + 0.0  # nothing measured is −0
+    table.add_row("force", bar, f"{normal_n:6.2f} N" + (f" of {advice.target_n:g} N" if advice.target_n else ""))
     for stream in status.streams:
         counts = stream.counts
         words = f"lost {counts.lost}, twice {counts.duplicates}, waiting {counts.waiting}"

@@ -6,11 +6,14 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from sensors_io import __main__ as cli
+from sensors_io.commands import console as printing
 from sensors_io.commands import generate as generating
 from sensors_io.commands.console import ERR, OUT
 from sensors_io.importers.pictures import read_picture
@@ -184,3 +187,15 @@ def test_check_looks_at_pictures_where_it_can(run, tmp_path):
     assert re.search(r"no_contact\W+1 ", looked)
     assert "not looked at: 1 sequences, they hold no pictures" in out
     assert "not looked at: 1 sequences, no gel at rest was recorded" in out
+
+
+def test_progress_without_a_terminal_is_told_in_lines(monkeypatch):
+    """The first contact was there before; what came within ten seconds of the last line, or ends it, is not told."""
+    told = io.StringIO()
+    monkeypatch.setattr(printing, "ERR", Console(file=told, width=200))
+    clock = iter([0.0, 5.0, 10.0, 12.0, 20.0])
+    monkeypatch.setattr(printing, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))
+    with printing.progress_bar("contacts") as progress:
+        for done in (2, 3, 4, 5):
+            progress(done, 5)
+    assert told.getvalue() == "contacts: 3/5, 0.2/s, 10 s left\n"

@@ -86,7 +86,7 @@ def test_a_geometry_is_saved_and_loaded(tmp_path):
     point = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(loaded.to_mm(point), lens().to_mm(point))
     (tmp_path / "g.json").write_text("{}")
-    with pytest.raises(GeometryError, match="holds no geometry"):
+    with pytest.raises(GeometryError, match="is no geometry"):
         Geometry.load(tmp_path / "g.json")
 
 
