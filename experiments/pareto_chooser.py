@@ -106,7 +106,7 @@ def _batch(name: str, sensor: int, index: int, config: ChooserConfig) -> Batch:
 def _outcomes(name: str, batches: int, config: ChooserConfig, menu: tuple[Setting, ...], context: Context) -> Outcomes:
     """Measured batches of every gel, each a stage."""
     parts = []
-    for i, sensor in itertools.product(range(batches), range(config.sensors)):
+    for i, sensor in context.each(name, itertools.product(range(batches), range(config.sensors))):
         stage = f"{name}/{MODELS[sensor].name}/{i}"
         if not context.done(stage):
             with context.timed(stage):
@@ -123,7 +123,8 @@ def _trials(
 ) -> list[Trial]:
     """The chooser on the tested batches, each a stage; one trial for every error asked for."""
     parts = []
-    for k, (i, sensor) in enumerate(itertools.product(range(config.tested_batches), range(config.sensors))):
+    batches = itertools.product(range(config.tested_batches), range(config.sensors))
+    for k, (i, sensor) in context.each("trials", enumerate(batches)):
         stage = f"trial/{MODELS[sensor].name}/{i}"
         if not context.done(stage):
             with context.timed(stage):
@@ -140,7 +141,7 @@ def _trials(
 def _sequences(config: ChooserConfig, context: Context) -> list[Kept]:
     """Generated sequences of every sensor, each a stage; one account for every error asked for."""
     parts = []
-    for sensor in range(config.sensors):
+    for sensor in context.each("sequences", range(config.sensors)):
         stage = f"sequences/{MODELS[sensor].name}"
         if not context.done(stage):
             with context.timed(stage):

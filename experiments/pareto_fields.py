@@ -79,7 +79,7 @@ class FieldsConfig:
 def run(config: FieldsConfig, context: Context) -> Findings:
     """Measure field by field, gather."""
     panels: list[Panel] = []
-    for name, make in panels_of(config).items():
+    for name, make in context.each("panels", panels_of(config).items()):
         context.say(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
             panels += make()

@@ -93,7 +93,9 @@ def run(config: ScaleConfig, context: Context) -> Findings:
     """Count every setup, compile the first, predict."""
     training = config.training
     lines = {setup: counted(training, setup) for setup in config.setups}
-    reserved = {setup: compiled(config, setup, context) for setup in config.setups[: config.compiled]}
+    reserved = {
+        setup: compiled(config, setup, context) for setup in context.each("compilers", config.setups[: config.compiled])
+    }
     full = tuple(setup for setup in config.setups if setup.lora is None)
     return Findings(
         verdict=verdict(config, lines, reserved),

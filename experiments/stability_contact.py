@@ -78,8 +78,7 @@ class Outcome:
 def run(config: StabilityConfig, context: Context) -> Findings:
     """Suite, maps, ordinary scenes."""
     cases = suite(config.grid)
-    outcomes = {case.name: attempt(case) for case in cases}
-    context.say(f"{len(cases)} cases of the suite done")
+    outcomes = {case.name: attempt(case) for case in context.each("cases", cases)}
     by_roughness = sweep(config.roughness, config.forces_n, lambda rms: _rough_case(rms, config))
     by_thickness = sweep(config.thickness_mm, config.forces_n, lambda h: _thin_case(h, config))
     context.say(f"maps done; {config.scenes} ordinary scenes")

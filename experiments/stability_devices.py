@@ -77,12 +77,11 @@ class StabilityConfig:
 
 def run(config: StabilityConfig, context: Context) -> Findings:
     """Replay, check the vendor's recordings, time the decoders."""
-    outcomes = {name: _replay(name, config, context) for name in (BY_COUNTER, BY_STAMPS, SLOW)}
+    outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
     context.say(f"{config.traced_seconds:g} s with Python's memory traced")
     short = dataclasses.replace(config, seconds=config.traced_seconds)
     traced = endure(_source(short), short.seconds, _faults(short, hidden=False), capacity=256, traced=True)
-    context.say("jitter")
-    sweep = over_jitter(config)
+    sweep = over_jitter(config, context)
     paths = recordings(config.data_dir)
     checked = [vendor.check(path) for path in paths]
     decode = vendor.decode_ms(vendor.message(paths[0] if paths else None), config.rounds)
@@ -130,11 +129,11 @@ def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     return found
 
 
-def over_jitter(config: StabilityConfig) -> dict[str, np.ndarray]:
+def over_jitter(config: StabilityConfig, context: Context) -> dict[str, np.ndarray]:
     """Share of the losses by which the count is off, with a counter and without one, for every jitter, [J] each."""
     short = dataclasses.replace(config, seconds=config.sweep_seconds)
     found: dict[str, list[float]] = {BY_COUNTER: [], BY_STAMPS: []}
-    for share in config.jitter_shares:
+    for share in context.each("jitter", config.jitter_shares):
         jittery = dataclasses.replace(short, jitter_s=share / config.rate_hz)
         for name, values in found.items():
             o = endure(_source(short), short.seconds, _faults(jittery, hidden=name == BY_STAMPS), capacity=256)

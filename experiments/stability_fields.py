@@ -17,6 +17,7 @@ is matched from frame to frame or to the nearest dot breaks at half a pitch and 
 
 import collections
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Mapping, Sequence
 
@@ -77,11 +78,10 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     """Break everything, draw it, judge the gels."""
     chosen = gels(config.data_dir)[: config.gels]
     outcomes: dict[str, dict[tuple[str, float], list[Outcome]]] = {}
-    for rest in chosen:
-        for seed in range(config.seed, config.seed + config.seeds):
-            for method, stress, level, outcome in attempt(rest, config.methods, seed):
-                outcomes.setdefault(method, {}).setdefault((stress, level), []).append(outcome)
-        context.say(f"{rest.name} done")
+    seeds = range(config.seed, config.seed + config.seeds)
+    for rest, seed in context.each("motions", itertools.product(chosen, seeds)):
+        for method, stress, level, outcome in attempt(rest, config.methods, seed):
+            outcomes.setdefault(method, {}).setdefault((stress, level), []).append(outcome)
     shear = attempt_shear(config.slide_frames, config.seed)
     context.say("depth")
     depth = attempt_depth(config.ball_presses, config.seeds, config.seed)

@@ -9,9 +9,9 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich.console import Console
 
@@ -20,6 +20,8 @@ from experiments.running.distributed import ALONE, Devices, Team
 from experiments.running.progress import Advance, Loop, progress
 from experiments.running.stopping import Stopping
 from experiments.running.watcher import Watcher
+
+T = TypeVar("T")
 
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
@@ -147,6 +149,14 @@ class Context:
         finally:
             self._loops.remove(loop)
         self._looping()
+
+    def each(self, title: str, items: Iterable[T]) -> Iterator[T]:
+        """The items one after the other, under a progress bar; an item counts once the next is asked for."""
+        listed = tuple(items)
+        with self.progress(title, len(listed)) as advance:
+            for item in listed:
+                yield item
+                advance()
 
     def require_logged(self, stage: str, steps: int) -> None:
         """Hold the log to a checkpoint: every step before it is there, so that no run ends with a part of its log.

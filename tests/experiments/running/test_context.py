@@ -130,3 +130,10 @@ def test_a_log_with_a_flipped_byte_is_named(context, flipped):
     path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
     with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start the run anew with --fresh"):
         read_metrics(context.directory)
+
+
+def test_items_one_after_the_other_count_when_the_next_is_asked_for(context):
+    seen = [(item, context._loops[0].completed) for item in context.each("panels", "abc")]
+    assert seen == [("a", 0), ("b", 1), ("c", 2)]
+    assert not context._loops
+    assert "panels: 3/3" in context.console.file.getvalue()
