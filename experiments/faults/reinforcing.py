@@ -131,7 +131,7 @@ def _decoder(assembly: Assembly, path: Path) -> Params:
 
 def _drawn(assembly: Assembly) -> Params:
     """Parameters of a fresh policy."""
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, SENSORS))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, MODEL.vision.image_px, SENSORS))
     return assembly.init(0, nothing)
 
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from experiments.ladder.baselines import Known, probed
 from experiments.ladder.features import Seen, other_objects
+from experiments.policies import stages
 from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.assembly import Weights
 from experiments.policies.baselines import level_answers
-from experiments.policies.feeds import touch_batch
 from experiments.policies.reinforcement import Asked, make_arm, run_grpo
 from experiments.policies.stages import encode_contacts, noise_bank
 from experiments.policies.study import Trained, Way
@@ -22,7 +22,6 @@ from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
-from touchr1_jax.types import Params
 
 
 def under_controls(policy: str) -> dict[str, Way]:
@@ -40,7 +39,7 @@ def control_name(policy: str, control: str) -> str:
 
 def untrained(trained: Trained) -> Evaluated:
     """The policy as it is before SFT."""
-    params = _fresh(trained)
+    params = stages.untrained(trained.assembly, trained.data, trained.seed)
     test = encode_contacts(trained.assembly, params, trained.data, trained.data.parts["test"], trained.context)
     return evaluate_policy(trained.assembly, params, test, trained.label)
 
@@ -48,10 +47,10 @@ def untrained(trained: Trained) -> Evaluated:
 def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> Evaluated:
     """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
     assembly, data, config = trained.assembly, trained.data, trained.config
-    params = _fresh(trained)
+    params = stages.untrained(assembly, data, trained.seed)
     encode = functools.partial(encode_contacts, assembly, params, data, context=trained.context)
     grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
-    arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop)
+    arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
     noise = noise_bank(assembly.agent, params, data, seed=trained.seed)
     asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
     stage = f"grpo/no_sft/{trained.seed}"
@@ -114,10 +113,3 @@ def _controlled(control: str, trained: Trained) -> Evaluated:
     }
     changed = jax.device_get(change[control]())
     return evaluate_policy(trained.assembly, trained.params, changed, trained.label, alone=False)
-
-
-def _fresh(trained: Trained) -> Params:
-    """The parameters that SFT of this seed starts from."""
-    data = trained.data
-    clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
-    return trained.assembly.init(trained.seed, touch_batch(next(iter(clips))))

@@ -29,12 +29,10 @@ Weights = Mapping[str, float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ModelConfig:
-    """Sizes of the towers, 0.64 million parameters by default; sensors and vocabulary come from the data."""
+class TouchConfig:
+    """What a policy feels, by which encoder, and how long it answers; the number of sensors comes from the data."""
 
     tactile: TactileViTConfig = TactileViTConfig(sensors=0)
-    vision: VisionConfig = VisionConfig()
-    decoder: DecoderConfig = DecoderConfig(vocab_size=0)
     frames: int = 4
     image_px: int = 112
     completion_tokens: int = 20
@@ -42,17 +40,35 @@ class ModelConfig:
     def __post_init__(self) -> None:
         check_sizes(self, "frames", "image_px", "completion_tokens")
 
+    @property
+    def stream_tokens(self) -> int:
+        """Tactile tokens of a stream."""
+        return self.frames // self.tactile.frames_per_step * self.tactile.tokens_per_step
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelConfig(TouchConfig):
+    """Sizes of all towers, 0.64 million parameters by default; the vocabulary comes from the language."""
+
+    vision: VisionConfig = VisionConfig()
+    decoder: DecoderConfig = DecoderConfig(vocab_size=0)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Assembly:
     """Everything static that the stages share."""
 
-    model: ModelConfig
+    model: TouchConfig
     language: Language
     tokenizer: Tokenizer
     layout: PromptLayout
     agent: Agent
     parser: Parser
+
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """Towers whose weights no stage trains, but by adapters."""
+        return ()
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -125,9 +141,9 @@ def prove_rewards(arms: Mapping[str, Weights]) -> None:
             raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
 
 
-def touch_shapes(model: ModelConfig, sensors: tuple[str, ...]) -> TouchBatch:
-    """Shapes and types of a batch of one contact."""
-    p, s, f, px, view = 1, len(sensors), model.frames, model.image_px, model.vision.image_px
+def touch_shapes(model: TouchConfig, view: int, sensors: tuple[str, ...]) -> TouchBatch:
+    """Shapes and types of a batch of one contact, whose object's picture has `view` rows and columns."""
+    p, s, f, px = 1, len(sensors), model.frames, model.image_px
     of: dict[str, Any] = {
         "frames": ((p, s, f, px, px, 3), jnp.uint8),
         "force_n": ((p, s, f, 3), jnp.float32),
@@ -150,13 +166,13 @@ def prove_model(model: ModelConfig, sensors: tuple[str, ...]) -> None:
     """
     try:
         made = assemble(model, sensors)
-        jax.eval_shape(functools.partial(made.init, 0), touch_shapes(model, sensors))
+        jax.eval_shape(functools.partial(made.init, 0), touch_shapes(model, model.vision.image_px, sensors))
     except (ValueError, TypeError) as error:
         raise SizeError(f"no model can be built of these sizes: {error}") from error
 
 
-def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
-    """Put tokenizer, prompt layout, policy and parser together for a set of sensors.
+def language_of(sensors: tuple[str, ...]) -> Language:
+    """The language of touch with some of its sensors, in their order.
 
     Raises:
       ValueError: a sensor that the language does not know.
@@ -165,20 +181,23 @@ def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
     unknown = [s for s in sensors if s not in known]
     if unknown:
         raise ValueError(f"sensors {unknown} are not in the language, which knows {', '.join(known)}; add them to it")
-    language = dataclasses.replace(TOUCH_LANGUAGE, sensors=tuple(known[s] for s in sensors))
+    return dataclasses.replace(TOUCH_LANGUAGE, sensors=tuple(known[s] for s in sensors))
+
+
+def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
+    """Put tokenizer, prompt layout, policy and parser together for a set of sensors.
+
+    Raises:
+      ValueError: a sensor that the language does not know.
+    """
+    language = language_of(sensors)
     tokenizer = word_level(language, prompt_words())
     policy_config = PolicyConfig(
         tactile=dataclasses.replace(model.tactile, sensors=len(sensors)),
         vision=model.vision,
         decoder=dataclasses.replace(model.decoder, vocab_size=tokenizer.vocab_size),
     )
-    steps = model.frames // model.tactile.frames_per_step
-    layout = build_layout(
-        tokenizer,
-        language,
-        tactile_tokens=steps * model.tactile.tokens_per_step,
-        view_tokens=model.vision.grid**2,
-    )
+    layout = build_layout(tokenizer, language, tactile_tokens=model.stream_tokens, view_tokens=model.vision.grid**2)
     agent = Agent(
         policy=Policy(policy_config),
         slots=Slots(layout.touch, layout.view, layout.stream_text),

@@ -15,14 +15,17 @@ from jaxtyping import Array, Float, Int
 
 from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.feeds import QuestionFeed
+from experiments.policies.stages import fresh_adapters
 from experiments.policies.watching import watched_log
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
 from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lora import LoraConfig, adapt, merge
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import LEAN, Fixed, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.guard import check_streams, stream_influence
+from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.training.loop import LoopConfig
@@ -40,6 +43,7 @@ class Arm:
       score: total reward that both make; the same object for all seeds, so that it is compiled once.
       config: of GRPO.
       loop: its steps and when it saves.
+      lora: adapters that are trained in the place of the decoder's weights; `None` trains those.
     """
 
     weights: Weights
@@ -47,13 +51,20 @@ class Arm:
     score: ScoreFn
     config: GRPOConfig
     loop: LoopConfig
+    lora: LoraConfig | None = None
 
 
 def make_arm(
-    assembly: Assembly, weights: Weights, prior: Float[np.ndarray, "A K"], config: GRPOConfig, loop: LoopConfig
+    assembly: Assembly,
+    weights: Weights,
+    prior: Float[np.ndarray, "A K"],
+    config: GRPOConfig,
+    loop: LoopConfig,
+    lora: LoraConfig | None = None,
 ) -> Arm:
     """An arm whose total reward is made of its weights and the prior."""
-    return Arm(weights=weights, prior=prior, score=assembly.score(weights, prior), config=config, loop=loop)
+    score = assembly.score(weights, prior)
+    return Arm(weights=weights, prior=prior, score=score, config=config, loop=loop, lora=lora)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,35 +87,54 @@ def run_grpo(
 ) -> Params:
     """Reinforce the decoder of an SFT policy; both encoders stay as they are.
 
+    Adapters begin at nothing, so that the policy without them is the reference; they are merged in the end.
+
     Raises:
       ValueError: a stream whose touch does not reach the policy.
     """
-    config = arm.config
+    config, lora = arm.config, arm.lora
     new_feed = functools.partial(
         QuestionFeed, assembly, asked.features, asked.label, batch_size=config.drawn, seed=seed
     )
     constraint = assembly.constraint if config.algorithm.constrained else None
-    optimizer, step = grpo_program(assembly.agent, arm.score, config, arm.loop.steps, constraint)
+    optimizer, step = grpo_program(assembly.agent, arm.score, config, arm.loop.steps, constraint, lora)
     decoder = {"decoder": params["decoder"]}
     influence = influence_program(assembly.agent, config.length)
     check_streams(*jax.device_get(influence(decoder, next(new_feed()), asked.noise, jax.random.key(seed))))
     feed = new_feed(own=context.devices.rows(config.drawn))
-    state = start_state(decoder, optimizer, jax.random.key(seed), config)
-    fixed = Fixed(reference=decoder, noise=asked.noise)
-    step, state, batches = context.devices.spread(step, state, feed, config.drawn, fixed)
+    trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
+    state = start_state(trained, optimizer, jax.random.key(seed), config)
+    shared = (Fixed(reference=trained, noise=asked.noise), *(() if lora is None else (decoder,)))
+    step, state, batches = context.devices.spread(step, state, feed, config.drawn, *shared)
     end = run_loop(step, state, batches, arm.loop, context, stage, make_log=watched_log)
-    return {**params, **context.devices.whole(end.params)}
+    found = context.devices.whole(end.params)
+    return {**params, **(found if lora is None else merge(decoder, found.adapters, lora))}
 
 
 @functools.cache
 def grpo_program(
-    agent: Agent, score: ScoreFn, config: GRPOConfig, steps: int, constraint: Constraint | None
+    agent: Agent,
+    score: ScoreFn,
+    config: GRPOConfig,
+    steps: int,
+    constraint: Constraint | None,
+    lora: LoraConfig | None = None,
 ) -> tuple[optax.GradientTransformation, Any]:
-    """Optimizer and compiled step, made once for all seeds of an arm."""
+    """Optimizer and compiled step, made once for all seeds of an arm; with adapters the frozen decoder comes last."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    return optimizer, make_grpo_step(agent, score, optimizer, config, constraint)
+    plain = make_grpo_step(agent, score, optimizer, config, constraint)
+    if lora is None:
+        return optimizer, plain
+    # a jitted step inside another takes no options of the compiler: the outer one gets them
+    inner = dataclasses.replace(config, lean_compilation=False)
+
+    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params) -> tuple[GRPOState, dict[str, Array]]:
+        adapted = adapt(agent, frozen, lora)
+        return make_grpo_step(adapted, score, optimizer, inner, constraint)(state, batch, fixed)
+
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
 @functools.cache

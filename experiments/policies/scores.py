@@ -9,7 +9,8 @@ from experiments.policies.answers import Evaluated, reward_of
 from experiments.policies.assembly import Weights
 from experiments.policies.baselines import baselines
 from experiments.policies.estimates import estimate
-from experiments.policies.study import SFT, Study, StudyConfig
+from experiments.policies.study import SFT, Study
+from experiments.policies.training import TrainingConfig
 from experiments.reporting.results import Estimate
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import Scores, evaluate
@@ -64,7 +65,7 @@ def score(study: Study, said: Evaluated) -> dict[str, Scores]:
     return evaluate(said.answers(reward), ATTRIBUTES, study.assembly.levels)
 
 
-def study_settings(config: StudyConfig) -> dict[str, str | float]:
+def study_settings(config: TrainingConfig) -> dict[str, str | float]:
     """The preset of the engine, and the factors on the paper's learning rates."""
     return {
         "preset": preset_name(config.grpo),

@@ -86,6 +86,7 @@ def shared_grpo(
         "weights": list(arm.weights.items()),
         "config": arm.config,
         "steps": arm.loop.steps,
+        "lora": arm.lora,
         "model": assembly.model,
         "seed": seed,
         "mesh": context.devices.shape,

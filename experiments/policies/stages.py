@@ -25,6 +25,7 @@ from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge
 from touchr1_jax.models.policy import Features
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
@@ -57,6 +58,8 @@ class SFTConfig:
     """Rank of adapters that are trained in the place of the decoder's weights; 0 trains the weights."""
     lora_alpha: float = 32.0
     """The adapters' change is multiplied by lora_alpha / lora_rank."""
+    remat: bool = False
+    """Keep only matrix products of the decoder for the backward pass and compute the rest again: less memory."""
     curriculum: float = 0.0
     """Share of the steps within which the share of questions that all sensors feel falls from 1 to a half."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
@@ -161,7 +164,14 @@ def run_sft(
     """Train a policy on verified answers, from scratch or from a tactile encoder; a blind one never feels anything.
 
     Adapters are merged into the decoder's weights in the end, so that what follows need not know of them.
+
+    Raises:
+      SizeError: towers that stand still, and no adapters.
     """
+    if assembly.frozen and config.lora is None:
+        raise SizeError(
+            f"sft.lora_rank is 0: must be at least 1 where {' and '.join(assembly.frozen)} stand still; raise it"
+        )
     feed = AnswerFeed(
         assembly,
         data,
@@ -176,12 +186,13 @@ def run_sft(
         own=context.devices.rows(config.batch_size),
     )
     optimizer, step = sft_program(assembly.agent, config, blind)
-    clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
-    params = assembly.init(seed, touch_batch(next(iter(clips))))
+    params = untrained(assembly, data, seed)
     if tactile is not None:
         params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
-    frozen = {} if config.lora is None else {name: params[name] for name in config.lora.towers}
-    trained = params if config.lora is None else _trainable(params, frozen, config.lora, seed)
+    still = () if config.lora is None else {*assembly.frozen, *config.lora.towers}
+    frozen = {name: tree for name, tree in params.items() if name in still}
+    others = {name: tree for name, tree in params.items() if name not in still}
+    trained = params if config.lora is None else fresh_adapters(frozen, others, config.lora, seed)
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
     step, state, batches = context.devices.spread(step, state, feed, config.batch_size, *([frozen] if frozen else []))
@@ -189,16 +200,23 @@ def run_sft(
     return found if config.lora is None else {**merge(frozen, found.adapters, config.lora), **found.towers}
 
 
-def _trainable(params: Params, frozen: Params, lora: LoraConfig, seed: int) -> Trainable:
-    """Adapters of the frozen towers, and the other towers."""
+def untrained(assembly: Assembly, data: Dataset, seed: int) -> Params:
+    """The parameters that SFT of a seed starts from."""
+    clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
+    return assembly.init(seed, touch_batch(next(iter(clips))))
+
+
+def fresh_adapters(frozen: Params, towers: Params, lora: LoraConfig, seed: int) -> Trainable:
+    """What is trained where some towers stand still: their adapters, and the other towers."""
     adapters = init_adapters(jax.random.fold_in(jax.random.key(seed), 1), frozen, lora)
-    return Trainable(adapters=adapters, towers={name: params[name] for name in params if name not in frozen})
+    return Trainable(adapters=adapters, towers=towers)
 
 
 @functools.cache
 def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds; with adapters, (state, batch, frozen towers) → …"""
     optimizer = make_optimizer(config.optimizer, config.steps)
+    agent = dataclasses.replace(agent, policy=agent.policy.clone(remat=True)) if config.remat else agent
     make = functools.partial(
         make_sft_step,
         optimizer=optimizer,

@@ -13,11 +13,10 @@ from jaxtyping import Array
 
 from experiments.policies.answers import Evaluated, evaluate_policy, load_answers, save_answers
 from experiments.policies.assembly import Assembly, ModelConfig, Weights, assemble, prove_model, prove_rewards
-from experiments.policies.dataset import Dataset, open_dataset
+from experiments.policies.dataset import Dataset
 from experiments.policies.pretrained import load_encoder
 from experiments.policies.reinforcement import Arm, Asked, make_arm, run_grpo
 from experiments.policies.shared import shared_grpo, shared_sft
-from experiments.policies.sources import Source, SourceConfig, prepare_records
 from experiments.policies.stages import (
     Probed,
     SFTConfig,
@@ -27,89 +26,28 @@ from experiments.policies.stages import (
     probe_features,
     run_sft,
 )
+from experiments.policies.training import TrainingConfig, open_data, starting_model
 from experiments.running.context import Context
-from sensors_io.importers.physiclear import PhysiclearConfig
-from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import SENSORS, UNKNOWN, Flag
-from touchr1_jax.limits import at_least
+from sensors_io.schema import SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
-from touchr1_jax.text.language import TOUCH_LANGUAGE
-from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 
 SFT, BLIND = "sft", "tactile_blind"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StudyConfig:
-    """Everything that a study depends on."""
+class StudyConfig(TrainingConfig):
+    """Everything that a study depends on, whose towers start from drawn parameters."""
 
-    seeds: int = 5
-    """Training seeds, paired between arms."""
-    data: Source = "generated"
-    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
-    data_dir: Path | None = None
-    """Folder of the videos or records."""
-    scenes: SceneConfig = SceneConfig(objects=2400, sites=1)
-    physiclear: PhysiclearConfig = PhysiclearConfig()
-    grpo_share: float = 0.35
-    """Share of the training objects that SFT never sees."""
-    clip_memory_gib: float = 1.5
-    """Clips that stay in memory once they were read; all of the default's."""
-    read_threads: int = 1
-    """Threads that read clips ahead; on two cores a second one would only take time from the step."""
     model: ModelConfig = ModelConfig()
-    encoder: Path | None = None
-    """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
-    probe: ProbeConfig = ProbeConfig()
-    sft: SFTConfig = SFTConfig()
-    blind: SFTConfig = SFTConfig(micro_contacts=16)
-    """Without touch there is no encoder, and micro-batches would only cost."""
     share: bool = True
     """Take policies from the cache where an experiment with the same data, settings and code trained them."""
-    grpo: GRPOConfig = GRPOConfig.paper()
-    grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
-    """What GRPO asks about; the arms may differ in how they pay for it."""
-    grpo_steps: int = 900
-    grpo_save_every: int = 200
-
-    @property
-    def grpo_loop(self) -> LoopConfig:
-        """Steps of GRPO and when they are saved."""
-        return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "seeds", "grpo_save_every", "read_threads")
-        at_least(self, 0, "clip_memory_gib", "grpo_steps")
-        if not 0 < self.grpo_share < 1:
-            raise ValueError(
-                f"grpo_share is {self.grpo_share}: must lie between 0 and 1: SFT and GRPO both need objects; change it"
-            )
-        if self.grpo.group < 2:
-            raise ValueError(
-                f"grpo.group is {self.grpo.group}: must be at least 2: a rollout is held against its group; raise it"
-            )
-        self.source()
-        known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
-        unknown = sorted(set(self.grpo_attributes) - set(known))
-        if unknown or not self.grpo_attributes:
-            raise ValueError(
-                f"grpo_attributes is {self.grpo_attributes}: must be some of {', '.join(known)}; correct it"
-            )
-        told = {"tactile.sensors": self.model.tactile.sensors, "decoder.vocab_size": self.model.decoder.vocab_size}
-        for field, value in told.items():
-            if value:
-                raise ValueError(
-                    f"model.{field} is {value}: must be 0, the data and the language tell it; leave it out"
-                )
-        if self.grpo.length != self.model.completion_tokens:
-            raise ValueError(
-                f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
-                "the length that SFT teaches; set both"
-            )
+        super().__post_init__()
+        self.check_told("decoder.vocab_size", self.model.decoder.vocab_size)
 
     def source(self) -> SourceConfig:
         """Where its data come from.
@@ -145,7 +83,7 @@ class Trained:
 
     assembly: Assembly
     data: Dataset
-    config: StudyConfig
+    config: TrainingConfig
     context: Context
     seed: int
     params: Params
@@ -175,7 +113,7 @@ class Study:
     `further[name][seed]` are those that were got in another way.
     """
 
-    config: StudyConfig
+    config: TrainingConfig
     data: Dataset
     assembly: Assembly
     probed: Probed
@@ -214,22 +152,45 @@ def run_study(
     prove_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
-    ways = ways or {}
-    _check_ways(ways, arms)
+    check_ways(ways or {}, arms)
+    data = open_study_data(config, context)
+    model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
+    start = Start(data=data, assembly=assemble(model, data.clip.sensors), tactile=tactile, share=config.share)
+    return train_study(config, start, arms, context, algorithms, ways)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Start:
+    """What a study begins with: data, policy, perhaps a tactile encoder, and whether policies are shared."""
+
+    data: Dataset
+    assembly: Assembly
+    tactile: Params | None = None
+    share: bool = False
+
+
+def train_study(
+    config: TrainingConfig,
+    start: Start,
+    arms: Mapping[str, Weights],
+    context: Context,
+    algorithms: Mapping[str, AnyAlgorithm] | None = None,
+    ways: Mapping[str, Way] | None = None,
+) -> Study:
+    """Train every arm of every seed, ask every policy; arguments as in `run_study`, which has checked them."""
+    data, assembly, ways = start.data, start.assembly, ways or {}
     configs = {
         arm: dataclasses.replace(config.grpo, algorithm=(algorithms or {}).get(arm, config.grpo.algorithm))
         for arm in arms
     }
-    data = open_study_data(config, context)
-    model, tactile = starting_model(config, data.clip.sensors)
-    assembly = assemble(model, data.clip.sensors)
     probed = probe_features(data, context)
     evidence = gather_evidence(data, probed, config.probe)
     prior = data.prior()
-    made = {arm: make_arm(assembly, weights, prior, configs[arm], config.grpo_loop) for arm, weights in arms.items()}
+    make = functools.partial(make_arm, assembly, prior=prior, loop=config.grpo_loop, lora=config.grpo_lora)
+    made = {arm: make(weights, config=configs[arm]) for arm, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
     for seed in range(config.seeds):
-        one = _Seed(config, data, assembly, tactile, evidence, made, ways, context, seed)
+        one = _Seed(config, start, evidence, made, ways, context, seed)
         for name, said in one.answers().items():
             answers[name].append(said)
     further = {name: answers.pop(name) for name in ways}
@@ -245,7 +206,12 @@ def run_study(
     )
 
 
-def _check_ways(ways: Mapping[str, Way], arms: Mapping[str, Weights]) -> None:
+def check_ways(ways: Mapping[str, Way], arms: Mapping[str, Weights]) -> None:
+    """Refuse ways that no study with these arms has room for.
+
+    Raises:
+      ValueError: a way that asks a policy that is not there, or has the name of one.
+    """
     for name, way in ways.items():
         if way.of not in (SFT, *arms):
             raise ValueError(f"way {name!r} asks {way.of!r}: must be one of {', '.join((SFT, *arms))}; correct it")
@@ -253,56 +219,48 @@ def _check_ways(ways: Mapping[str, Way], arms: Mapping[str, Weights]) -> None:
             raise ValueError(f"way {name!r} has the name of a policy: its answers would take their place; rename it")
 
 
-def starting_model(config: StudyConfig, sensors: tuple[str, ...]) -> tuple[ModelConfig, Params | None]:
-    """The sizes to train and the tactile encoder to start from, if one is given: then its shape is the encoder's."""
-    if config.encoder is None:
-        return config.model, None
-    pretrained = load_encoder(config.encoder).for_sensors(sensors)
-    return dataclasses.replace(config.model, tactile=pretrained.config), pretrained.params
-
-
 def open_study_data(config: StudyConfig, context: Context) -> Dataset:
-    """Records of the configured source, with clips of the model's size.
-
-    Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
-    """
-    path = prepare_records(config.source(), context)
-    clip = ClipConfig(
-        frames=config.model.frames,
-        image_px=config.model.image_px,
-        view_px=config.model.vision.image_px,
-        rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
-    )
-    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib, config.read_threads)
+    """Records of the configured source, with clips of the model's size."""
+    return open_data(config, config.model.vision.image_px, context)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Seed:
     """One seed: its SFT checkpoint, the arms that start from it, and its blind baseline."""
 
-    config: StudyConfig
-    data: Dataset
-    assembly: Assembly
-    tactile: Params | None
+    config: TrainingConfig
+    start: Start
     evidence: np.ndarray
     arms: Mapping[str, Arm]
     ways: Mapping[str, Way]
     context: Context
     seed: int
 
+    @property
+    def assembly(self) -> Assembly:
+        """The policy's."""
+        return self.start.assembly
+
+    @property
+    def data(self) -> Dataset:
+        """The study's."""
+        return self.start.data
+
     def answers(self) -> dict[str, Evaluated]:
         """Answers of all policies of this seed, from disk where they are there."""
         names = (SFT, *self.arms, BLIND, *self.ways)
         if not all(self._path(name).exists() for name in names):
             self._train()
+            self._ask(BLIND, self._blind)
         return {name: load_answers(self._path(name)) for name in names}
 
     def _train(self) -> None:
+        """Everything that feels."""
         config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
-        params = self._sft(config.sft, f"sft/{seed}", tactile=self.tactile)
+        params = self._sft(config.sft, f"sft/{seed}", tactile=self.start.tactile)
         encode = functools.partial(encode_contacts, assembly, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
-        noise = noise_bank(assembly.agent, params, data, seed=seed)
+        noise = noise_bank(assembly.agent, params, data, seed=seed, probe=config.noise_contacts)
         asked = Asked(features=train, label=self._grpo_label(), noise=noise)
         self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
         self._ask_further(SFT, params, test, noise)
@@ -310,7 +268,6 @@ class _Seed:
             tuned = self._grpo(arm, params, asked)
             self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
             self._ask_further(arm, tuned, test, noise)
-        self._ask(BLIND, self._blind)
 
     def _blind(self) -> Evaluated:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
@@ -318,7 +275,7 @@ class _Seed:
         return evaluate_policy(self.assembly, params, features, self._label("test"))
 
     def _sft(self, sft: SFTConfig, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
-        make = shared_sft if self.config.share else run_sft
+        make = shared_sft if self.start.share else run_sft
         return make(
             self.assembly,
             self.data,
@@ -332,7 +289,7 @@ class _Seed:
         )
 
     def _grpo(self, arm: str, params: Params, asked: Asked) -> Params:
-        make = shared_grpo if self.config.share else run_grpo
+        make = shared_grpo if self.start.share else run_grpo
         stage = f"grpo/{arm}/{self.seed}"
         return make(self.assembly, self.arms[arm], asked, params, self.context, seed=self.seed, stage=stage)
 

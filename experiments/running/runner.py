@@ -37,6 +37,7 @@ from experiments.running.stopping import Stopped, Stopping
 from experiments.running.watcher import Watcher
 from sensors_io.errors import UserError
 from touchr1_jax.models.layers import SizeError
+from touchr1_jax.models.load import WeightsError
 from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
@@ -60,6 +61,7 @@ KNOWN_ERRORS = (
     MachineError,
     RewardError,
     SizeError,
+    WeightsError,
     OSError,
 )
 """Whose message says all that a user needs; others come with their traceback."""

@@ -12,7 +12,7 @@ from experiments.encoder.pretrain import PretrainConfig
 from experiments.policies.assembly import assemble
 from experiments.policies.pretrained import load_encoder
 from experiments.policies.stages import run_sft
-from experiments.policies.study import starting_model
+from experiments.policies.training import starting_model
 from experiments.running.artifacts import read_json
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
@@ -47,7 +47,7 @@ def test_everything_is_reported(directory):
 
 def test_a_study_starts_from_it(directory, data, context):
     """Before the first step of SFT its encoder is the pretrained one, causal as it was trained."""
-    model, tactile = starting_model(dataclasses.replace(tiny.STUDY, encoder=directory), data.clip.sensors)
+    model, tactile = starting_model(tiny.STUDY.model, directory, data.clip.sensors)
     assert model.tactile.causal
     evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
     untouched = dataclasses.replace(tiny.STUDY.sft, steps=0)
@@ -57,4 +57,4 @@ def test_a_study_starts_from_it(directory, data, context):
     assert jax.tree.structure(params["tactile"]) == jax.tree.structure(wanted)
     for a, b in zip(jax.tree.leaves(params["tactile"]), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert starting_model(tiny.STUDY, data.clip.sensors) == (tiny.STUDY.model, None)
+    assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)

@@ -30,6 +30,10 @@ from touchr1_jax.types import Params
 TOKENIZER_FILE = "tokenizer.json"
 
 
+class WeightsError(ValueError):
+    """Released weights, or a file beside them, that cannot be used; the message says which, why, and what to do."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
     """What a directory holds; `params` is the tree of `QwenVL`, `budget` the pixels that a picture may have."""
@@ -49,9 +53,16 @@ def load_checkpoint(directory: str | Path, dtype: jnp.dtype | type = jnp.bfloat1
       dtype: type of all parameters.
 
     Raises:
-      FileNotFoundError, ValueError: a file that is missing or does not fit.
+      FileNotFoundError: a file that is missing.
+      WeightsError: one that does not fit.
     """
-    directory = Path(directory)
+    try:
+        return _read(Path(directory), dtype)
+    except ValueError as error:
+        raise WeightsError(str(error)) from error
+
+
+def _read(directory: Path, dtype: jnp.dtype | type) -> Checkpoint:
     config = read_config(directory)
     tokenizer = from_file(directory / TOKENIZER_FILE, vocab_size=config.decoder.vocab_size)
     check_ids(tokenizer, config)
@@ -85,13 +96,13 @@ def check_finite(params: Params) -> None:
     """Refuse weights that are no numbers; a loader that reads every release need not look, the command does.
 
     Raises:
-      ValueError: NaN or infinity.
+      WeightsError: NaN or infinity.
     """
     whole = jax.jit(lambda x: jnp.isfinite(x).all())
     broken = [name for name, x in flax.traverse_util.flatten_dict(params, sep="/").items() if not whole(x)]
     if broken:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-        raise ValueError(f"{broken[0]}{more} holds NaN or infinity: must be finite; fetch the weights again")
+        raise WeightsError(f"{broken[0]}{more} holds NaN or infinity: must be finite; fetch the weights again")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from experiments.released import tiny
+
 DATA = Path(__file__).resolve().parents[3] / "data" / "qwen"
-TEMPLATE, GOLDEN = DATA / "chat_template.jinja", DATA / "chats.json"
+TEMPLATE, GOLDEN = tiny.TEMPLATE, DATA / "chats.json"
 
 CONVERSATIONS: list[list[tuple[str, list[str]]]] = [
     [("user", ["How hard is it?"])],
