@@ -271,9 +271,9 @@ SMOKE = dataclasses.replace(
         completion_tokens=48,
         view_px=32,
     ),
-    sft=adapted_sft(12, batch_size=8, micro_contacts=4, lora_rank=4),
-    blind=adapted_sft(12, batch_size=8, micro_contacts=8, lora_rank=4),
-    grpo=dataclasses.replace(GRPO, prompts=4, micro_prompts=2, length=48),
+    sft=adapted_sft(8, batch_size=4, micro_contacts=2, lora_rank=4),
+    blind=adapted_sft(8, batch_size=4, micro_contacts=4, lora_rank=4),
+    grpo=dataclasses.replace(GRPO, prompts=2, group=4, micro_prompts=1, length=48),
     grpo_steps=4,
     grpo_lora_rank=4,
 )

@@ -62,7 +62,7 @@ EXPERIMENTS_LAYERS = (
     {"chooser", "tangential", "identify"},
     {"grpo"},
     {"fields"},
-    {"loading"},
+    {"loading", "released"},
     {"scale"},
     {"gpu"},
     {"encoder"},

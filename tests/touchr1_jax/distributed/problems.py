@@ -14,17 +14,21 @@ import optax
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.layers import GatedMLP, RMSNorm
+from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.training.dynamics import DynamicsConfig, make_dynamics_step, start_dynamics
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.training.packing import Packing, existing_tokens, pack_rows
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
-from touchr1_jax.types import Parsed, Target
+from touchr1_jax.types import Params, Parsed, Target
 
 ROWS, STEPS, TOKENS = 8, 20, 6
 AGENT = tiny.SHALLOW
+LORA = LoraConfig(rank=2, alpha=4.0)
+GRPO = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algorithm=Paper(beta=0.1, gamma=0.05))
 OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), STEPS)
 
 
@@ -111,6 +115,46 @@ def packed() -> Problem:
     return dataclasses.replace(problem, finish=finish)
 
 
+def adapters() -> Problem:
+    """SFT whose decoder stands still under adapters of rank 2, beside encoders that are trained in full."""
+    plain = sft()
+    frozen, towers = _apart(plain.state.params)
+    trained = Trainable(adapters=_adapters(frozen), towers=towers)
+    state = SFTState(params=trained, opt_state=OPTIMIZER.init(trained), step=jnp.int32(0))
+
+    def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, jax.Array]]:
+        return make_sft_step(adapt(AGENT, frozen, LORA), OPTIMIZER)(state, batch)
+
+    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (frozen,))
+
+
+def adapters_grpo() -> Problem:
+    """GRPO of adapters; others are the reference."""
+    plain = grpo()
+    frozen, _ = _apart(plain.state.params)
+    trained = Trainable(adapters=_adapters(frozen), towers={})
+    optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
+    state = start_state(trained, optimizer, jax.random.key(0), GRPO)
+    fixed = Fixed(reference=Trainable(adapters=_adapters(frozen, 1), towers={}), noise=plain.shared[0].noise)
+
+    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params):
+        return make_grpo_step(adapt(AGENT, frozen, LORA), score, optimizer, GRPO)(state, batch, fixed)
+
+    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (fixed, frozen))
+
+
+def _apart(params: Params) -> tuple[Params, Params]:
+    """The decoder, and the other towers."""
+    return {"decoder": params["decoder"]}, {name: x for name, x in params.items() if name != "decoder"}
+
+
+def _adapters(frozen: Params, seed: int = 0) -> Any:
+    """Drawn and loud: of fresh ones half have no gradient at first."""
+    shapes = jax.eval_shape(lambda key: init_adapters(key, frozen, LORA), jax.random.key(0))
+    rng = np.random.default_rng(seed)
+    return jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.2, x.shape), x.dtype), shapes)
+
+
 def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
     """Share of tokens that are the label modulo 3."""
     level = jnp.where(target.asked, tokens[0] % 3, -1)
@@ -129,15 +173,13 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
 
 def grpo() -> Problem:
     """The decoder, groups of four; both divergences count."""
-    algorithm = Paper(beta=0.1, gamma=0.05)
-    config = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algorithm=algorithm)
     optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
-    state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), config)
+    state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), GRPO)
     noise = np.random.default_rng(5).normal(size=(3, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size))
     fixed = Fixed(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
     item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
     questions = tiny.question_batch(0, 16)
-    return Problem(make_grpo_step(AGENT, score, optimizer, config), state, item, (fixed,))
+    return Problem(make_grpo_step(AGENT, score, optimizer, GRPO), state, item, (fixed,))
 
 
 def dynamics() -> Problem:
@@ -163,6 +205,8 @@ PROBLEMS: dict[str, Callable[[], Problem]] = {
     "words": words,
     "sft": sft,
     "packed": packed,
+    "adapters": adapters,
+    "adapters_grpo": adapters_grpo,
     "grpo": grpo,
     "dynamics": dynamics,
 }

@@ -90,6 +90,14 @@ def test_losses_on_every_mesh(problem, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("problem", ["adapters", "adapters_grpo"])
+def test_adapters_learn_on_a_mesh_what_they_learn_on_one_device(problem, tmp_path):
+    expected = plain_losses(PROBLEMS[problem]())
+    finish(start(problem, MESHES["mixed"], tmp_path, 8))
+    same(json.loads((tmp_path / "found-0.json").read_text()), expected)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", ["sft", "grpo"])
 def test_two_processes_over_loopback(problem, tmp_path):
     """Parameters split between the processes, heads inside each; each reads its half of every batch."""
