@@ -10,14 +10,15 @@ trains the encoder and adapters in the decoder on verified answers, GRPO with th
 counterfactual KL trains new adapters over that, and each stage merges its own.  Scored on unseen objects beside the
 model as it was released, which sees the picture and no touch, the same training without touch, and constants; asked
 again under each control of touch.  The policy is written to `weights/SEED` of the run, readable by whatever reads the
-release, with its tactile encoder beside it, and asked from there.  `--scale smoke` makes a tiny checkpoint of the
-released format itself where none is given: it tries the code, and its figures say nothing.
+release, with its tactile encoder beside it, and asked from there: what is scored is what was written, adapters rounded
+into weights of the released type.  `--scale smoke` makes a tiny checkpoint of the released format itself where none is
+given: it tries the code, and its figures say nothing.
 
 Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
 Several devices: `--distributed --mesh.fsdp N` as in every study; each process reads the whole weights first.
 
-Cost: not measured, for neither such weights nor such a machine were at hand; sized for the 3B or 7B on one H200, where
-the report counts the memory ahead (about 35 GB for the 3B and 70 GB for the 7B).  `--scale smoke` under two minutes.
+Cost: not measured, for neither such weights nor such a machine were at hand; sized for the 3B or 7B on one H200, of
+which GRPO holds 28 or 52 GB by the count that every run makes ahead.  `--scale smoke` under two minutes.
 
 Expected: the released model without touch near the constant, and much above it after SFT; from GRPO what the paper's
 ladder has (`ablation_cumulative`), of which small policies show only a part.
@@ -44,7 +45,7 @@ from experiments.policies.stages import SFTConfig
 from experiments.policies.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
 from experiments.policies.training import TrainingConfig, open_data, starting_model
 from experiments.released.memory import counted, memory_table
-from experiments.released.policy import ReleasedModel, assemble_released, instruction, prove_released
+from experiments.released.policy import ReleasedAssembly, ReleasedModel, assemble_released, instruction, prove_released
 from experiments.released.tiny import write_tiny
 from experiments.released.ways import written, zero_shot
 from experiments.reporting.findings import Requirement
@@ -56,7 +57,6 @@ from sensors_io.schema import ATTRIBUTES, SENSORS
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.load import WeightsError, load_checkpoint
-from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -126,46 +126,53 @@ class TouchR1Config(TrainingConfig):
 
 def run(config: TouchR1Config, context: Context) -> Results:
     """Load, train, score, write."""
-    prove_rewards({ARM: PUBLISHED})
+    arms = {ARM: PUBLISHED}
+    prove_rewards(arms)
     source = released_folder(config, context)
-    found = load_checkpoint(source, jnp.dtype(config.model.dtype))
-    prove_released(
-        assemble_released(config.model, found, SENSORS), touch_shapes(config.model, config.model.view_px, SENSORS)
-    )
     ways = {
         ZERO: Way(of=SFT, ask=zero_shot),
         WRITTEN: Way(of=ARM, ask=functools.partial(written, source)),
         **under_controls(ARM),
     }
-    check_ways(ways, {ARM: PUBLISHED})
-    data = open_data(config, config.model.view_px, context)
-    model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
-    assembly = assemble_released(model, found, data.clip.sensors)
-    memory = counted(config, config.grpo_lora or LoraConfig(), assembly, data, context.devices.shape)
+    check_ways(ways, arms)
+    assembly, start = begin(config, source, context)
+    memory = counted(config, assembly, start.data, context.devices.shape)
     context.say(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
-    study = train_study(
-        config, Start(data=data, assembly=assembly, tactile=tactile), {ARM: PUBLISHED}, context, ways=ways
-    )
+    study = train_study(config, start, arms, context, ways=ways)
     scored = score_study(study)
     zero = [score(study, said) for said in study.further[ZERO]]
-    rows = {**scored.rows, ZERO: zero}
     baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
     pictures, tables = level_report(study)
     use = touch_worth(study)
-    same = differing(study)
     return Results(
         arms=scored.arms,
         baselines=baselines,
         settings=settings(config, source),
-        comparisons=tuple(compared(rows, scored.objects, config.seeds)),
+        comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
         verdict=verdict(config, {**scored.arms, **baselines}, use),
-        requirements=(same,),
+        requirements=(differing(study),),
         tables=(use_table({(ARM, "all"): use}), memory_table(memory), *tables),
         pictures=pictures,
         data=study.data.summary(),
         curves=CURVES,
         examples=rollout_examples(study, ARM, PUBLISHED, {c: study.further[control_name(ARM, c)][0] for c in CONTROLS}),
     )
+
+
+def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[ReleasedAssembly, Start]:
+    """The policy and its data; weights and sizes are looked at before data are made.
+
+    Raises:
+      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released` and `prove_released`.
+    """
+    model = config.model
+    found = load_checkpoint(source, jnp.dtype(model.dtype))
+    require_same(source, context)
+    prove_released(assemble_released(model, found, SENSORS), touch_shapes(model, model.view_px, SENSORS))
+    data = open_data(config, model.view_px, context)
+    model, tactile = starting_model(model, config.encoder, data.clip.sensors)
+    assembly = assemble_released(model, found, data.clip.sensors)
+    return assembly, Start(data=data, assembly=assembly, tactile=tactile)
 
 
 def released_folder(config: TouchR1Config, context: Context) -> Path:
@@ -186,6 +193,23 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
         context.team.once(lambda: write_tiny(made, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE)))
         context.save_stage("tiny", {})
     return made
+
+
+def require_same(source: Path, context: Context) -> None:
+    """Hold the weights of a run that goes on to those that it began with, by the names and sizes of their files.
+
+    Raises:
+      WeightsError: they are others.
+    """
+    sizes = {path.name: path.stat().st_size for path in sorted(source.iterdir()) if path.is_file()}
+    if not context.done("weights"):
+        context.save_stage("weights", sizes)
+    began = context.load_stage("weights")
+    changed = sorted(name for name in {*began, *sizes} if began.get(name) != sizes.get(name))
+    if changed:
+        raise WeightsError(
+            f"{source} is not what this run began with: {', '.join(changed)} changed; put it back, or say --fresh"
+        )
 
 
 def estimates(seeds: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> dict[str, Estimate]:

@@ -11,7 +11,6 @@ from experiments.reporting.findings import Column, Table
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.training.optimizer import falling_adamw
 
 GB = 1e9
@@ -19,9 +18,7 @@ GB = 1e9
 STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encoded contacts, on the host"
 
 
-def counted(
-    config: TrainingConfig, lora: LoraConfig, assembly: ReleasedAssembly, data: Dataset, mesh: tuple[int, ...]
-) -> dict[str, int]:
+def counted(config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, mesh: tuple[int, ...]) -> dict[str, int]:
     """Bytes by what they are for; the first two on each device, on the first one of each process at least.
 
     The step holds the decoder that SFT left; beside it stand the released towers, from which other seeds and the
@@ -29,7 +26,6 @@ def counted(
 
     Args:
       config: of the training.
-      lora: adapters that GRPO trains.
       assembly: the policy.
       data: its contacts are encoded once for GRPO, once for the test.
       mesh: devices along its axes.
@@ -48,7 +44,7 @@ def counted(
     )
     text = layout.ids.shape[1] - streams * touch - view
     prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
-    step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=lora)
+    step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.grpo_lora)
     lines = grpo_bytes(shape, step.state, step.batch, step.fixed, step.base)
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
     of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)

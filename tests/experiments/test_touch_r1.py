@@ -17,7 +17,7 @@ from experiments.running.runner import main
 from experiments.touch_r1 import ARM, DEFAULT, SMOKE, WRITTEN, ZERO
 from tests.experiments.shrunk import only_run
 from touchr1_jax.bench.grounding import CONTROLS
-from touchr1_jax.models.load import Load
+from touchr1_jax.models.load import Load, WeightsError
 
 
 @pytest.mark.parametrize(
@@ -65,6 +65,17 @@ def test_only_a_trial_makes_weights_of_its_own():
     assert not DEFAULT.tiny
     assert SMOKE.tiny
     assert SMOKE.weights is DEFAULT.weights is None
+
+
+def test_a_run_goes_on_with_the_weights_that_it_began_with(tmp_path, context):
+    source = tmp_path / "released"
+    source.mkdir()
+    (source / "config.json").write_text("{}")
+    for _ in range(2):
+        touch_r1.require_same(source, context)
+    (source / "model.safetensors").write_bytes(b"0")
+    with pytest.raises(WeightsError, match=r"not what this run began with: model\.safetensors changed; put it back"):
+        touch_r1.require_same(source, context)
 
 
 def run(home: Path, cache: Path) -> int:
