@@ -14,7 +14,7 @@ from experiments.running.artifacts import read_json
 from experiments.running.context import Context
 from experiments.running.loops import STEPPING, WAITING
 from experiments.running.runner import main
-from experiments.touch_r1 import ARM, DEFAULT, SMOKE, WRITTEN, ZERO
+from experiments.touch_r1 import ARM, DEFAULT, SMOKE, WRITTEN, ZERO, require_same
 from tests.experiments.shrunk import only_run
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.load import Load, WeightsError
@@ -72,10 +72,10 @@ def test_a_run_goes_on_with_the_weights_that_it_began_with(tmp_path, context):
     source.mkdir()
     (source / "config.json").write_text("{}")
     for _ in range(2):
-        touch_r1.require_same(source, context)
+        require_same(source, context)
     (source / "model.safetensors").write_bytes(b"0")
     with pytest.raises(WeightsError, match=r"not what this run began with: model\.safetensors changed; put it back"):
-        touch_r1.require_same(source, context)
+        require_same(source, context)
 
 
 def run(home: Path, cache: Path) -> int:
