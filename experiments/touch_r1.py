@@ -40,6 +40,7 @@ from experiments.ladder.ways import control_name, under_controls
 from experiments.policies.assembly import prove_rewards, touch_shapes
 from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.policies.examples import rollout_examples
+from experiments.policies.pretrained import load_encoder
 from experiments.policies.scores import PUBLISHED, score, score_study, study_settings
 from experiments.policies.stages import SFTConfig
 from experiments.policies.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
@@ -169,6 +170,8 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     found = load_checkpoint(source, jnp.dtype(model.dtype))
     require_same(source, context)
     prove_released(assemble_released(model, found, SENSORS), touch_shapes(model, model.view_px, SENSORS))
+    if config.encoder is not None:
+        load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)
     model, tactile = starting_model(model, config.encoder, data.clip.sensors)
     assembly = assemble_released(model, found, data.clip.sensors)
