@@ -49,14 +49,6 @@ class StudyConfig(TrainingConfig):
         super().__post_init__()
         self.check_told("decoder.vocab_size", self.model.decoder.vocab_size)
 
-    def source(self) -> SourceConfig:
-        """Where its data come from.
-
-        Raises:
-          ValueError: recordings or records without a folder, or a folder for generated scenes.
-        """
-        return SourceConfig(kind=self.data, directory=self.data_dir, scenes=self.scenes, physiclear=self.physiclear)
-
 
 SMOKE = StudyConfig(
     seeds=2,
