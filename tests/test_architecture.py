@@ -64,7 +64,7 @@ EXPERIMENTS_LAYERS = (
     {"fields"},
     {"loading", "released"},
     {"scale"},
-    {"gpu"},
+    {"gpu", "feeding"},
     {"encoder"},
     {"recordings"},
     {"bench"},
