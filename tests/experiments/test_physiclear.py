@@ -53,6 +53,8 @@ def test_a_kept_policy_answers_for_a_folder(run):
     ("arguments", "message"),
     [(["--predict", "x"], "give both to predict"), ([], "data_dir is None")],
 )
-def test_half_a_question_is_refused(arguments, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        main(["physiclear", *arguments, "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "c")])
+def test_half_a_question_is_refused(arguments, message, tmp_path, capsys):
+    assert main(["physiclear", *arguments, "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "c")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("ConfigurationError: ")
+    assert message in said
