@@ -135,7 +135,7 @@ def _rotations(three: np.ndarray) -> list[np.ndarray]:
     return [np.roll(three, turn) for turn in range(3)]
 
 
-def _differing(label: np.ndarray, turn: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "count"]:
+def _differing(label: np.ndarray, turn: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n"]:
     """Recordings of different levels of the attribute whose turn it is."""
     column = label[:, turn % len(ATTRIBUTES)]
     levels = rng.permutation(LEVELS)[:count]

@@ -127,7 +127,7 @@ def pretrain(effort: Effort, world: World, key: Array) -> Params:
 
 def reinforce(
     effort: Effort, variant: Variant, world: World, dials: Dials, start: Params, key: Array
-) -> tuple[Params, dict[str, Float[Array, "steps"]]]:
+) -> tuple[Params, dict[str, Float[Array, "n"]]]:
     """GRPO from a supervised policy, which is also the reference: what it becomes, and every metric of every step."""
     algorithm = dataclasses.replace(
         variant.algorithm, beta=dials.beta, gamma=dials.gamma, entropy_weight=dials.entropy_weight

@@ -218,7 +218,7 @@ class Checkpoints:
 
 
 @jax.jit
-def digest(state: Any) -> UInt32[Array, "leaf"]:
+def digest(state: Any) -> UInt32[Array, "n"]:
     """One number for each array of a pytree, Σ_i w_i b_i mod 2³² with bits b_i and odd weights w_i of their places.
 
     A changed element always changes it: an odd weight has an inverse.  Sums of integers come out the same in any order,

@@ -55,7 +55,7 @@ def video(grid: Grid, merge: int, seconds_per_step: float, tokens_per_second: in
     return Seen(times, grid.rows // merge, grid.columns // merge)
 
 
-def tactile(frame_index: Int[np.ndarray, "step"], tokens_per_step: int) -> Seen:
+def tactile(frame_index: Int[np.ndarray, "n"], tokens_per_step: int) -> Seen:
     """A tactile stream: step i at its integer frame index; its tokens lie in one row.
 
     A departure from videos: sensors run at 25 to 120 frames a second, where ids by the second would coincide and the
