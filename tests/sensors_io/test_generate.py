@@ -72,13 +72,14 @@ class SceneConfig:
     contact_count: int = 7
     frame_count: int = 8
 
-scenes = types.ModuleType("sensors_io.scenes")  # without JAX, which takes seconds to import
-scenes.SceneConfig, scenes.config_hash = SceneConfig, str
-scenes.object_cards = lambda config: [fakes.card(n) for n in range(config.contact_count)]
-scenes.contacts = lambda config, start=0: (
+cards, config, protocol = (types.ModuleType(f"sensors_io.scenes.{name}") for name in ("cards", "config", "protocol"))
+config.SceneConfig, config.config_hash = SceneConfig, str
+cards.object_cards = lambda config: [fakes.card(n) for n in range(config.contact_count)]
+protocol.contacts = lambda config, start=0: (
     [fakes.sequence(i, "xense"), fakes.sequence(i, "tac3d")] for i in range(start, config.contact_count)
 )
-sys.modules["sensors_io.scenes"] = scenes
+for module in (cards, config, protocol):  # without JAX, which takes seconds to import
+    sys.modules[module.__name__] = module
 from sensors_io import generate, index, shards
 
 out, place, count = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])

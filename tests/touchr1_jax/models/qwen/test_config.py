@@ -90,7 +90,7 @@ def test_missing_and_broken_files(tmp_path):
         ({"rope_scaling": {"type": "yarn", "mrope_section": [16, 24, 24]}}, r"rope_scaling.type is \['yarn'\]"),
         ({"rope_scaling": {"type": "mrope", "mrope_section": [32, 32]}}, r"mrope_section is \[32, 32\]: must be three"),
         ({"rope_scaling": {"type": "mrope"}}, "lacks rope_scaling.mrope_section"),
-        ({"num_key_value_heads": 5}, "num_heads 28 must be a multiple of num_kv_heads 5"),
+        ({"num_key_value_heads": 5}, "num_heads is 28: must be a multiple of num_kv_heads 5"),
         ({"num_hidden_layers": "28"}, "num_hidden_layers is '28': must be a whole number above 0; correct config.json"),
         ({"vision_config": SEVEN_B["vision_config"] | {"depth": 0}}, "vision_config.depth is 0: must be a whole"),
         ({"image_token_id": 151656}, "must be four different ids"),
