@@ -52,7 +52,8 @@ def run(installed: Path, empty: Path, *arguments: str) -> subprocess.CompletedPr
 def test_every_source_is_there_and_nothing_else(wheel):
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     sources = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
-    assert held == sources | {f"{package}/py.typed" for package in PACKAGES}
+    data = {f"{package}/py.typed" for package in PACKAGES} | {"experiments/released/chat_template.jinja"}
+    assert held == sources | data
 
 
 def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):
