@@ -27,7 +27,7 @@ import numpy as np
 
 from experiments.feeding.charts import cores_needed
 from experiments.feeding.demand import grpo_seconds, sft_seconds
-from experiments.feeding.scales import Scale, answers, memory_share, questions
+from experiments.feeding.scales import Scale, answers, clip_bytes, memory_share, questions
 from experiments.feeding.supply import Made, idle_share, make_seconds
 from experiments.ladder import presets
 from experiments.policies.assembly import assemble
@@ -150,10 +150,8 @@ def feeds_of(config: FeedingConfig, name: str, scale: Scale, context: Context) -
     kept = memory_share(scale.study, data, batch.touch)
     yield watch(config, f"{name}/sft/records", sft, step_s, context, configured=not kept)
     if kept:
-        clip_bytes = sum(x.nbytes for x in jax.tree.leaves(batch.touch)) // len(batch.streams)
-        remembering = dataclasses.replace(
-            data, memory=ClipMemory(data.clip, round(kept * len(data.store)) * clip_bytes)
-        )
+        memory = ClipMemory(data.clip, round(kept * len(data.store)) * clip_bytes(batch.touch))
+        remembering = dataclasses.replace(data, memory=memory)
         feed = answers(assembly, remembering, scale)
         yield watch(config, f"{name}/sft/memory", feed, step_s, context, configured=True, warm=len(data.store))
     grpo_s = grpo_seconds(assembly, study.grpo, scale.devices, config.machine)

@@ -29,12 +29,16 @@ class Scale:
                 raise ValueError(f"devices is {self.devices}: must divide {name} = {size}; change either")
 
 
+def clip_bytes(touch: TouchBatch) -> int:
+    """Bytes of each clip of a batch."""
+    return sum(x.nbytes for x in jax.tree.leaves(touch)) // len(touch.stream_mask)
+
+
 def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
     """Share of the study's clips that its memory holds."""
-    clip_bytes = sum(x.nbytes for x in jax.tree.leaves(touch)) / len(touch.stream_mask)
     scenes = study.scenes
     contacts = scenes.objects * scenes.sites if scenes.sequences is None else scenes.sequences // len(data.clip.sensors)
-    return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes))
+    return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes(touch)))
 
 
 def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
