@@ -24,6 +24,7 @@ from experiments.loading.readers import Reading, measure
 from experiments.loading.shapes import SHAPES
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
+from experiments.running.progress import in_megabytes
 from experiments.running.runner import Experiment
 from touchr1_jax.models.qwen.model import abstract_params
 
@@ -86,9 +87,13 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
     directory = Path(tempfile.mkdtemp(prefix=f"weights-{size}-", dir=config.scratch))
     try:
         context.say(f"{size}: writing {weight_bytes(size) / 1e9:.1f} GB to {directory}")
-        random_checkpoint(directory, SHAPES[size], config.shard_bytes, config.seed)
-        readers = (OURS, PLAIN) if size in config.compare else (OURS,)
-        readings = {name: measure(name, directory, SHAPES[size]) for name in readers}
+        with context.told(f"writing {size}, MB") as tell:
+            random_checkpoint(directory, SHAPES[size], config.shard_bytes, config.seed, in_megabytes(tell))
+        readings = {}
+        for name in (OURS, PLAIN) if size in config.compare else (OURS,):
+            with context.told(f"reading {size}, {name}, MB") as tell:
+                in_megabytes(tell)(0, weight_bytes(size))
+                readings[name] = measure(name, directory, SHAPES[size], in_megabytes(tell))
     finally:
         shutil.rmtree(directory)
     for name, r in readings.items():

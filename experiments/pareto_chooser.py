@@ -112,7 +112,7 @@ def _outcomes(name: str, batches: int, config: ChooserConfig, menu: tuple[Settin
             with context.timed(stage):
                 batch = _batch(name, sensor, i, config)
                 true = bench.reference(batch, config.reference)
-                context.save_stage(stage, bench.measure(batch, menu, true).to_json())
+                context.save_stage(stage, bench.measure(batch, context.each(stage, menu), true).to_json())
             context.say(f"{stage}: {config.batch} scenes under {len(menu)} settings")
         parts.append(context.load_stage(stage))
     return bench.join(parts)
@@ -131,7 +131,8 @@ def _trials(
                 batch = _batch("unseen", sensor, i, config)
                 errors = tested.errors[k * config.batch : (k + 1) * config.batch]
                 true = bench.reference(batch, config.reference)
-                made = [trial.try_out(batch, menu, errors, cost, a, true) for a in config.asked]
+                shown = context.each(stage, config.asked)
+                made = [trial.try_out(batch, menu, errors, cost, a, true) for a in shown]
                 context.save_stage(stage, [t.to_json() for t in made])
             context.say(f"{stage}: {config.batch} scenes at {len(config.asked)} errors asked for")
         parts.append(context.load_stage(stage))

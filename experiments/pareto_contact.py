@@ -77,11 +77,12 @@ def run(config: ParetoConfig, context: Context) -> Findings:
     """Measure, compare, chart."""
     context.say(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
     bench, scenes = make_bench(SENSOR, config.grid), sample(SENSOR, config.scenes, config.grid, config.seed)
-    rows = measure(methods(), scenes, bench, config.rounds)
-    ladder = grid_ladder(config)
-    oracles = contact_checks.against_oracles(config.oracle_scenes, config.grid // 2, config.seed)
-    published = contact_checks.published(config.oracle_scenes, config.grid, config.seed)
-    hertz = contact_checks.hertz(config.grid)
+    rows = measure(methods(), scenes, bench, config.rounds, context)
+    ladder = grid_ladder(config, context)
+    drawn = context.each("other solvers' scenes", range(config.oracle_scenes))
+    oracles = contact_checks.against_oracles(drawn, config.grid // 2, config.seed)
+    published = contact_checks.published(config.oracle_scenes, config.grid, config.seed, context)
+    hertz = contact_checks.hertz(config.grid, context)
     main = rows[MAIN]
     return Findings(
         verdict=verdict(rows, hertz),
@@ -100,12 +101,14 @@ def run(config: ParetoConfig, context: Context) -> Findings:
     )
 
 
-def measure(tiers: tuple[Method, ...], scenes: Scenes, bench: Bench, rounds: int) -> dict[str, dict[str, Any]]:
+def measure(
+    tiers: tuple[Method, ...], scenes: Scenes, bench: Bench, rounds: int, context: Context
+) -> dict[str, dict[str, Any]]:
     """Time, ratio to the baseline, convolutions and errors of every method."""
-    true = exact(scenes, bench)
+    true = exact(context.each("exact scenes", scenes), bench)
     calls = {m.name: _call(m, scenes, bench) for m in tiers}
-    found = {name: jax.device_get(call()) for name, call in calls.items()}
-    seconds = interleaved(calls, rounds)
+    found = {name: jax.device_get(call()) for name, call in context.each("compiling methods", calls.items())}
+    seconds = interleaved(calls, context.rounds("timing methods", rounds))
     baseline = seconds[BASELINE]
     rows: dict[str, dict[str, Any]] = {}
     for method in tiers:
@@ -123,20 +126,20 @@ def measure(tiers: tuple[Method, ...], scenes: Scenes, bench: Bench, rounds: int
     return rows
 
 
-def grid_ladder(config: ParetoConfig) -> dict[int, dict[str, float]]:
+def grid_ladder(config: ParetoConfig, context: Context) -> dict[int, dict[str, float]]:
     """The package's solver on every grid, by its solution on the finest one."""
     finest = max(config.ladder)
-    draws = {n: sample(SENSOR, config.ladder_scenes, n, config.seed + 1) for n in config.ladder}
-    benches = {n: make_bench(SENSOR, n) for n in config.ladder}
-    method = Method(name="nested", kind="", solve=spg_nested(1e-3))
-    calls = {n: _call(method, draws[n], benches[n]) for n in config.ladder}
-    found = {n: np.asarray(call()[0], np.float64) for n, call in calls.items()}
-    tight = Method(name="tight", kind="", solve=spg_nested(1e-4))
-    true = np.asarray(_call(tight, draws[finest], benches[finest])()[0], np.float64)
-    seconds = interleaved({str(n): call for n, call in calls.items()}, config.rounds)
+    tiers = {str(n): (1e-3, n) for n in config.ladder} | {_EXACT: (1e-4, finest)}
+    calls, found = {}, {}
+    for name, (tolerance, n) in context.each("compiling grids", tiers.items()):
+        calls[name] = _on_grid(tolerance, n, config)
+        found[name] = np.asarray(calls[name]()[0], np.float64)
+    true = found[_EXACT]
+    del calls[_EXACT]
+    seconds = interleaved(calls, context.rounds("timing grids", config.rounds))
     ladder = {}
-    for n in config.ladder:
-        up = np.stack([zoom(u, finest / n, order=3, mode="nearest", grid_mode=True) for u in found[n]])
+    for n in context.each("comparing grids", config.ladder):
+        up = np.stack([zoom(u, finest / n, order=3, mode="nearest", grid_mode=True) for u in found[str(n)]])
         slope, displacement = slope_error(up, true), displacement_error(up, true)
         ladder[n] = {
             "ms": 1e3 * float(np.median(seconds[str(n)])) / config.ladder_scenes,
@@ -188,6 +191,13 @@ def verdict(rows: Mapping[str, Mapping[str, Any]], hertz: Mapping[str, float]) -
     )
 
 
+def _on_grid(tolerance: float, grid: int, config: ParetoConfig) -> Callable[[], Any]:
+    """The scenes of the ladder of grids on one of them, by the package's solver."""
+    method = Method(name="nested", kind="", solve=spg_nested(tolerance))
+    return _call(method, sample(SENSOR, config.ladder_scenes, grid, config.seed + 1), make_bench(SENSOR, grid))
+
+
+_EXACT = "finest"  # by which the others are judged
 _TOLERANCES = ("1e-2", "1e-3", "1e-4", "1e-5")
 
 
@@ -210,7 +220,7 @@ def _convolution_ms(bench: Bench, grid: int, repeats: int = 50) -> float:
     field = jnp.ones((grid, grid), jnp.float32)
     chain = jax.jit(lambda p: jax.lax.fori_loop(0, repeats, lambda _, q: convolve(q, spectrum), p))
     jax.block_until_ready(chain(field))
-    return 1e3 / repeats * float(np.median(interleaved({"": lambda: chain(field)}, 7)[""]))
+    return 1e3 / repeats * float(np.median(interleaved({"": lambda: chain(field)}, range(7))[""]))
 
 
 def _tier_table(rows: Mapping[str, Mapping[str, Any]], config: ParetoConfig) -> Table:

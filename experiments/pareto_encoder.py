@@ -89,12 +89,14 @@ def run(config: Config, context: Context) -> Findings:
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
     ladder = variants(config.pretrain)
     encoders, right = {}, {}
-    for number, variant in enumerate(ladder):
+    for number, variant in enumerate(context.each("variants", ladder)):
         encoders[variant.name], right[variant.name] = learn(config, variant, data, context, f"variant{number}")
     programs = {
-        v.name: forward(v.config.dynamics(len(data.clip.sensors)), encoders[v.name], prompts(v, data)) for v in ladder
+        v.name: forward(v.config.dynamics(len(data.clip.sensors)), encoders[v.name], prompts(v, data))
+        for v in context.each("compiling variants", ladder)
     }
-    seconds = medians({**programs, "product": matrix_product()}, config.rounds)
+    product = matrix_product()
+    seconds = medians({**programs, "product": product}, context.rounds("timing variants", config.rounds))
     between = len(data.parts["val"])
     measured = {
         v.name: Measured(
@@ -106,13 +108,13 @@ def run(config: Config, context: Context) -> Findings:
         )
         for v in ladder
     }
-    peak = matrix_product().gflop / seconds["product"]
+    peak = product.gflop / seconds["product"]
     objects = data.object_ids[data.parts["test"]]
     best = choose(measured)
-    pieces = parts(
-        best.variant.config.dynamics(len(data.clip.sensors)), encoders[best.variant.name], prompts(best.variant, data)
-    )
-    spent = medians(pieces, config.rounds)
+    networks = best.variant.config.dynamics(len(data.clip.sensors))
+    makers = parts(networks, encoders[best.variant.name], prompts(best.variant, data))
+    pieces = {name: make() for name, make in context.each("compiling parts", makers.items())}
+    spent = medians(pieces, context.rounds("timing parts", config.rounds))
     where = pieces_table(best, spent, {name: p.gflop for name, p in pieces.items()}, peak)
     return findings(config, data, measured, best, peak, objects, where)
 

@@ -17,6 +17,7 @@ without touch.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 
 import jax
@@ -27,6 +28,7 @@ from experiments.grpo.job import Job
 from experiments.grpo.size import Size
 from experiments.reporting.findings import Cell, Column, Findings, Picture, Table
 from experiments.running.context import Context
+from experiments.running.progress import Advance
 from experiments.running.runner import Experiment
 from experiments.running.timing import interleaved
 from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable
@@ -72,12 +74,14 @@ class ParetoConfig:
 def run(config: ParetoConfig, context: Context) -> Findings:
     """Every algorithm at every group size."""
     rewards, last = {}, {}
-    for name, algorithm in ALGORITHMS.items():
-        for group in config.groups:
+    keys = tuple(itertools.product(ALGORITHMS, config.groups))
+    with context.progress("seeds", len(keys) * config.seeds) as advance:
+        for name, group in keys:
             key = name, group
-            rewards[key], last[key] = learn(config, algorithm, group)
+            rewards[key], last[key] = learn(config, ALGORITHMS[name], group, advance)
             context.say(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
-    seconds = interleaved({f"{name} {group}": job.step for (name, group), job in last.items()}, config.timed)
+    calls = {f"{name} {group}": job.step for (name, group), job in last.items()}
+    seconds = interleaved(calls, context.rounds("timing steps", config.timed))
     courses = {
         (name, group): Course(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
         for name, group in rewards
@@ -95,8 +99,8 @@ def run(config: ParetoConfig, context: Context) -> Findings:
     )
 
 
-def learn(config: ParetoConfig, algorithm: AnyAlgorithm, group: int) -> tuple[np.ndarray, Job]:
-    """Mean reward of every seed's steps, [seeds, steps], and the last seed's job."""
+def learn(config: ParetoConfig, algorithm: AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
+    """Mean reward of every seed's steps, [seeds, steps], and the last seed's job; `advance` is called after a seed."""
     prompts = config.rollouts // group
     size = dataclasses.replace(config.size, prompts=prompts, group=group)
     step = GRPOConfig(
@@ -111,6 +115,7 @@ def learn(config: ParetoConfig, algorithm: AnyAlgorithm, group: int) -> tuple[np
     for seed in range(config.seeds):
         job = Job(size, config.prefix, step, learning_rate=config.learning_rate, seed=seed)
         rewards.append(jax.device_get([job.step()["reward"] for _ in range(config.steps)]))
+        advance()
     return np.array(rewards), job
 
 

@@ -66,22 +66,21 @@ class StorageConfig:
 
 def run(config: StorageConfig, context: Context) -> Findings:
     """Store, feed, compare."""
-    context.say("making scenes and reading recordings")
-    clips = {GENERATED: generated_clips(config.scenes, config.contacts)}
+    clips = {GENERATED: generated_clips(config.scenes, context.each("making scenes", range(config.contacts)))}
     if config.data_dir is not None:
-        clips |= recorded_clips(config.data_dir, config.videos, config.frames)
+        clips |= recorded_clips(config.data_dir, config.videos, config.frames, context)
     rows: dict[str, list[Measured]] = {}
     missing: dict[str, str] = {}
     for kind, group in clips.items():
         context.say(f"{kind}: {len(group)} clips, {sum(map(len, group))} frames")
-        rows[kind], absent = measure(all_codecs(), group, config.rounds)
+        rows[kind], absent = measure(all_codecs(), group, config.rounds, context)
         missing |= absent
-    context.say("the feed")
-    store = make_store(config.feed, context.directory / "records")
-    stages, rates = stage_ms(config.feed, store, config.rounds), feed_rates(config.feed, store, config.rounds)
+    store = make_store(config.feed, context.directory / "records", context)
+    stages = stage_ms(config.feed, store, context.rounds("timing the parts of a clip", config.rounds))
+    rates = feed_rates(config.feed, store, config.rounds, context)
     need = config.training_fps / config.core_share
     best = fastest_small(rows, need)
-    filters = {kind: chosen_filters(group) for kind, group in clips.items()}
+    filters = {kind: chosen_filters(context.each(f"filters, {kind}", group)) for kind, group in clips.items()}
     return Findings(
         verdict=verdict(rows, best, need, stages, rates),
         requirements=requirements(rows, best),

@@ -130,8 +130,8 @@ def run(config: TangentialConfig, context: Context) -> Findings:
     with context.timed("methods"):
         tasks = measure(gels, config, context)
     with context.timed("closed-forms"):
-        mindlin = tangential_checks.cattaneo_mindlin(config.closed_grid)
-        torque = tangential_checks.lubkin(config.closed_grid)
+        mindlin = tangential_checks.cattaneo_mindlin(config.closed_grid, context)
+        torque = tangential_checks.lubkin(config.closed_grid, context)
     with context.timed("coupling"):
         coupled = couple(config, context)
     promises = hold_promises(gels, tasks["force"][SUPERPOSED])
@@ -184,8 +184,9 @@ def measure(gels: Sequence[Gel], config: TangentialConfig, context: Context) -> 
         for task, tiers in every.items():
             true = _exact(task, gels)
             calls = {m.name: _call(task, m, gels) for m in tiers}
-            errors = {name: _errors(task, call(), true, gels) for name, call in calls.items()}
-            seconds = interleaved(calls, config.rounds)
+            shown = context.each(f"{task}: methods", calls.items())
+            errors = {name: _errors(task, call(), true, gels) for name, call in shown}
+            seconds = interleaved(calls, context.rounds(f"{task}: timing", config.rounds))
             units = sum(len(gel.kinds) if task != SEQUENCE else len(gel.sequences) * config.frames for gel in gels)
             ms = {name: 1e3 * float(np.median(s)) / units for name, s in seconds.items()}
             tasks[task] = {m.name: Row(kind=m.kind, label=m.label, ms=ms[m.name], errors=errors[m.name]) for m in tiers}

@@ -92,7 +92,7 @@ class ScaleConfig:
 def run(config: ScaleConfig, context: Context) -> Findings:
     """Count every setup, compile the first, predict."""
     training = config.training
-    lines = {setup: counted(training, setup) for setup in config.setups}
+    lines = {setup: counted(training, setup) for setup in context.each("counting", config.setups)}
     reserved = {
         setup: compiled(config, setup, context) for setup in context.each("compilers", config.setups[: config.compiled])
     }
@@ -135,7 +135,7 @@ def counted(training: Training, setup: Setup) -> dict[str, int]:
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:
     """What the compiler reserves at both depths, each of which is remembered, and on their line at the model's."""
     found: dict[int, Compiled] = {}
-    for layers in config.layers:
+    for layers in context.each(setup.name, config.layers):
         stage = f"compile/{config.setups.index(setup)}/{layers}"
         if not context.done(stage):
             outcome = compiled_alone(config.training.of_depth(layers), setup, config.compiler)

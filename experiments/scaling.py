@@ -155,7 +155,8 @@ def timed(sized: Mapping[str, Sized], rounds: int, context: Context) -> dict[str
         f"{name}/{call}": s.calls.by_name[call] for name, s in sized.items() for call in CALLS
     }
     with context.timed("timing"):
-        seconds = {name: float(np.median(s)) for name, s in interleaved(calls, rounds).items()}
+        measured = interleaved(calls, context.rounds("timing sizes", rounds))
+        seconds = {name: float(np.median(s)) for name, s in measured.items()}
     return {
         name: Cost(
             parameters=s.calls.parameters,

@@ -67,12 +67,13 @@ def run(config: RealismConfig, context: Context) -> Findings:
         mm_per_px=config.mm_per_px,
         image_px=config.image_px,
     )
-    study = realism.fit(presses)
+    study = realism.fit(presses, context)
     write_text(context.directory / "mini_optics.py", realism.source(study.fitted, study.noise, study.presses))
     real = _bytes(study.presses.pictures[study.held_out])
-    ways = realism.candidates(study)
-    rendered = {name: realism.render(study, way, config.seed) for name, way in ways.items()}
-    rows = {name: compare(real, made, study, config.judge) for name, made in rendered.items()}
+    rendered, rows = {}, {}
+    for name, way in context.each("candidates", realism.candidates(study).items()):
+        rendered[name] = realism.render(study, way, config.seed)
+        rows[name] = compare(real, rendered[name], study, config.judge)
     shadows = shadow_gain(study.presses, study.profiles, study.touches, study.fitted, study.held_out)
     drift = float(np.sqrt(np.mean((realism.clean(study, study.fitted) - realism.clean(study, photometric.MINI)) ** 2)))
     return Findings(

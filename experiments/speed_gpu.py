@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 
 import jax
 
-from experiments.gpu.attention import draw_heads, errors
+from experiments.gpu.attention import Heads, draw_heads, errors
 from experiments.gpu.config import GpuConfig
 from experiments.gpu.device import Sheet, accelerator, sheet_of
 from experiments.gpu.pieces import Learning, Piece, attention, product, tactile_encoder, vision_tower, ways
@@ -35,7 +35,7 @@ from touchr1_jax.distributed.memory import Compiled
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 
-PRODUCT = "matrix product"
+PRODUCT, STEP = "matrix product", "GRPO step"
 
 TACTILE = "tactile encoder, float32"
 
@@ -48,21 +48,16 @@ GB = 1e9
 def run(config: GpuConfig, context: Context) -> Findings:
     """Time every piece, then compare attention and memory with what they must be."""
     device = accelerator(anywhere=config.anywhere)
-    timed = {PRODUCT: measure(PRODUCT, functools.partial(product, config), config.rounds, context)}
     heads = draw_heads(config.prompts, config.tokens, config.heads, config.kv_heads, config.head_dim)
-    for name, way in ways(config).items():
-        for gradient in (False, True):
-            title = f"attention, {name}{', with gradient' if gradient else ''}"
-            make = functools.partial(attention, config, heads, way, gradient=gradient)
-            timed[title] = measure(title, make, config.rounds, context)
-    off = errors(heads, ways(config))
+    timed = measured("pieces", without_policy(config, heads), config.rounds, context)
+    off = errors(heads, ways(config), context)
     del heads
-    for name, encoder in {TACTILE: tactile_encoder, "vision tower": vision_tower}.items():
-        timed[name] = measure(name, functools.partial(encoder, config), config.rounds, context)
-    learning = Learning(config)
-    reserved, counted = learning.memory()
-    timed["decoding"] = measure("decoding", learning.decoding, config.rounds, context)
-    timed["GRPO step"] = measure("GRPO step", learning.step, config.rounds, context)
+    with context.progress("making the policy", 2) as advance:
+        learning = Learning(config)
+        advance()
+        reserved, counted = learning.memory()
+        advance()
+    timed |= measured("the policy", {"decoding": learning.decoding, STEP: learning.step}, config.rounds, context)
     sheet = sheet_of(device.device_kind)
     first = timed[PRODUCT]
     peak = first.flops / min(first.seconds) if sheet is None else sheet.flops
@@ -85,13 +80,31 @@ def run(config: GpuConfig, context: Context) -> Findings:
     )
 
 
+def without_policy(config: GpuConfig, heads: Heads) -> dict[str, Callable[[], Piece]]:
+    """How to make the product, attention and the encoders."""
+    pieces: dict[str, Callable[[], Piece]] = {PRODUCT: functools.partial(product, config)}
+    for name, way in ways(config).items():
+        for gradient in (False, True):
+            title = f"attention, {name}{', with gradient' if gradient else ''}"
+            pieces[title] = functools.partial(attention, config, heads, way, gradient=gradient)
+    return pieces | {
+        TACTILE: functools.partial(tactile_encoder, config),
+        "vision tower": functools.partial(vision_tower, config),
+    }
+
+
+def measured(title: str, pieces: Mapping[str, Callable[[], Piece]], rounds: int, context: Context) -> dict[str, Timed]:
+    """The times of some pieces."""
+    return {name: measure(name, make, rounds, context) for name, make in context.each(title, pieces.items())}
+
+
 def measure(name: str, make: Callable[[], Piece], rounds: int, context: Context) -> Timed:
     """Make a piece, run it twice, time it."""
     with context.timed(re.sub(r"\W+", "_", name)):
         piece = make()
         for _ in range(2):
             jax.block_until_ready(piece.call())
-        seconds = interleaved({name: piece.call}, rounds)[name]
+        seconds = interleaved({name: piece.call}, context.rounds(f"timing {name}", rounds))[name]
     timed = Timed(tuple(seconds.tolist()), piece.flops, piece.read_bytes, piece.made, piece.unit)
     context.say(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / timed.median_s / 1e12:.3g} TFLOP/s")
     return timed
@@ -118,7 +131,7 @@ def memory_table(reserved: Compiled, counted: int, device: jax.Device) -> Table:
 
 def verdict(device: jax.Device, timed: Mapping[str, Timed], peak: float, sheet: Sheet | None) -> tuple[str, ...]:
     """What the device is, what a step takes of it, what flash attention would gain."""
-    step, decoding = timed["GRPO step"], timed["decoding"]
+    step, decoding = timed[STEP], timed["decoding"]
     read = decoding.read_share(sheet)
     engine, flash = (t for name, t in timed.items() if name.startswith("attention") and name.endswith("gradient"))
     said = [

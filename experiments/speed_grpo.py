@@ -18,6 +18,7 @@ it.  On two cores of about 240 GFLOP/s: at most .55 s at prefix 64 and 1.3 s at 
 """
 
 import dataclasses
+import itertools
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -33,7 +34,6 @@ from experiments.grpo.speed import (
     Alone,
     Course,
     Option,
-    in_own_process,
     many_steps,
     options,
     parser_seconds,
@@ -54,6 +54,7 @@ from experiments.grpo.speed_tables import (
     requirements,
 )
 from experiments.reporting.findings import Findings, Picture
+from experiments.running.apart import in_own_process
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
 from touchr1_jax.rl.grpo import compiles_leanly
@@ -114,19 +115,23 @@ def run(config: SpeedConfig, context: Context) -> Findings:
     with tempfile.TemporaryDirectory() as folder:
         first, alone = every_prefix(config, Path(folder), context)
         step = dataclasses.replace(config_of(config.size, config.micro_prompts), lean_compilation=True)
-        lean: dict[int, Alone] = {}
-        if compiles_leanly():
-            lean = {lean_at: in_own_process(time_alone, config.size, lean_at, step, 1, Path(folder))}
+        lean = {
+            prefix: in_own_process(time_alone, config.size, prefix, step, 1, Path(folder))
+            for prefix in context.each("lean compilation", (lean_at,) if compiles_leanly() else ())
+        }
         words = many_words(config, Path(folder), context)
-    jobs = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
-    found = side_by_side(jobs, config.rounds)
+    makers = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
+    found = side_by_side(makers, config.rounds, "options", context)
     context.say(f"options at prefix {config.options_at}: {said(found)}")
     twice = {}
     for prefix in config.repeated_at:
-        twice[prefix] = side_by_side(repeated(config.size, prefix, config.micro_prompts), max(2, config.rounds // 2))
+        makers = repeated(config.size, prefix, config.micro_prompts)
+        twice[prefix] = side_by_side(makers, max(2, config.rounds // 2), f"prefix {prefix}", context)
         context.say(f"prefix {prefix}: {said(twice[prefix])}")
     short = min(config.prefixes)
-    course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps)
+    with context.told("steps") as tell:
+        tell(0, config.steps)
+        course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps, tell=tell)
     peers, failed = measure_peers(config, context)
     return Findings(
         verdict=(*verdict(alone, twice, peers), *failed),
@@ -152,7 +157,7 @@ def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[di
     """Each prefix in a process that compiles, and in one that reads what the first compiled."""
     first, alone = {}, {}
     step = config_of(config.size, config.micro_prompts)
-    for prefix in config.prefixes:
+    for prefix in context.each("prefixes", config.prefixes):
         first[prefix] = in_own_process(time_alone, config.size, prefix, step, 1, cache)
         alone[prefix] = in_own_process(time_alone, config.size, prefix, step, config.rounds, cache)
         a, b = alone[prefix], first[prefix]
@@ -168,7 +173,8 @@ def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, 
     blocks = config_of(size)
     whole = dataclasses.replace(blocks, max_logits=size.group * size.length * size.vocab_size)
     found = {}
-    for name, step in {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}.items():
+    ways = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
+    for name, step in context.each("many words", ways.items()):
         found[name] = in_own_process(time_alone, size, min(config.prefixes), step, 2, cache)
         context.say(f"{config.words} words, {name}: {median(found[name].seconds):.2f} s, {found[name].peak_gb:.2f} GB")
     return found
@@ -192,18 +198,17 @@ def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[s
         context.say(f"not measured, for want of an interpreter that has them: {', '.join(sorted(absent))}")
     found: dict[tuple[str, int], PeerTimes] = {}
     failed: list[str] = []
-    for prefix in config.prefixes:
-        for peer in peers:
-            job = PeerJob(prefix=prefix, rounds=max(1, config.peer_tokens // prefix), size=config.size)
-            try:
-                times = found[peer.name, prefix] = peer.measure(job)
-            except PeerFailed as failure:
-                if prefix == config.prefixes[0]:
-                    raise
-                failed.append(f"{peer.name} has no figure at {prefix}: its process ended with {failure.code}.")
-                context.say(str(failure))
-            else:
-                context.say(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
+    for prefix, peer in context.each("other engines", itertools.product(config.prefixes, peers)):
+        job = PeerJob(prefix=prefix, rounds=max(1, config.peer_tokens // prefix), size=config.size)
+        try:
+            times = found[peer.name, prefix] = peer.measure(job)
+        except PeerFailed as failure:
+            if prefix == config.prefixes[0]:
+                raise
+            failed.append(f"{peer.name} has no figure at {prefix}: its process ended with {failure.code}.")
+            context.say(str(failure))
+        else:
+            context.say(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
     return found, tuple(failed)
 
 

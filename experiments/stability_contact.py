@@ -12,6 +12,7 @@ package's solver nowhere without a flag.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 
 import jax
@@ -79,11 +80,10 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     """Suite, maps, ordinary scenes."""
     cases = suite(config.grid)
     outcomes = {case.name: attempt(case) for case in context.each("cases", cases)}
-    by_roughness = sweep(config.roughness, config.forces_n, lambda rms: _rough_case(rms, config))
-    by_thickness = sweep(config.thickness_mm, config.forces_n, lambda h: _thin_case(h, config))
-    context.say(f"maps done; {config.scenes} ordinary scenes")
-    ordinary = ordinary_scenes(config)
-    sticky = contact_adhesion.thresholds(config.adhesion_grid)
+    by_roughness = sweep("roughness", config.roughness, lambda rms: _rough_case(rms, config), config, context)
+    by_thickness = sweep("thickness", config.thickness_mm, lambda h: _thin_case(h, config), config, context)
+    ordinary = ordinary_scenes(config, context)
+    sticky = contact_adhesion.thresholds(config.adhesion_grid, context)
     every = [*outcomes.values(), *by_roughness.values(), *by_thickness.values()]
     kept = [outcomes[c.name].flagged for c in cases if c.refused]
     return Findings(
@@ -140,20 +140,20 @@ def attempt(case: Case) -> Outcome:
 
 
 def sweep(
-    rows: Sequence[float], forces: Sequence[float], make: Callable[[float], Case]
+    title: str, rows: Sequence[float], make: Callable[[float], Case], config: StabilityConfig, context: Context
 ) -> dict[tuple[int, int], Outcome]:
     """Outcomes over rows × forces; `make` turns a row's value into a case."""
+    cells = itertools.product(enumerate(rows), enumerate(config.forces_n))
     return {
         (i, j): attempt(dataclasses.replace(make(value), force_n=force))
-        for i, value in enumerate(rows)
-        for j, force in enumerate(forces)
+        for (i, value), (j, force) in context.each(title, cells)
     }
 
 
-def ordinary_scenes(config: StabilityConfig) -> dict[str, float]:
+def ordinary_scenes(config: StabilityConfig, context: Context) -> dict[str, float]:
     """Of random scenes, how many are flagged though the oracle calls them good, and how many are wrong in silence."""
     scenes, bench = sample(SENSOR, config.scenes, config.grid, config.seed), make_bench(SENSOR, config.grid)
-    true = exact(scenes, bench)
+    true = exact(context.each("ordinary scenes", scenes), bench)
     gel, body = jnp.asarray(bench.gel, jnp.float32), jnp.asarray(bench.body, jnp.float32)
 
     def solve(scene: tuple[jax.Array, jax.Array, jax.Array]) -> contact.Contact:

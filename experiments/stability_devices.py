@@ -78,15 +78,17 @@ class StabilityConfig:
 def run(config: StabilityConfig, context: Context) -> Findings:
     """Replay, check the vendor's recordings, time the decoders."""
     outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
-    context.say(f"{config.traced_seconds:g} s with Python's memory traced")
     short = dataclasses.replace(config, seconds=config.traced_seconds)
-    traced = endure(_source(short), short.seconds, _faults(short, hidden=False), capacity=256, traced=True)
+    faults = _faults(short, hidden=False)
+    with context.told("device time with Python's memory traced, s") as tell:
+        traced = endure(_source(short), short.seconds, faults, capacity=256, traced=True, tell=tell)
     sweep = over_jitter(config, context)
     paths = recordings(config.data_dir)
-    checked = [vendor.check(path) for path in paths]
-    decode = vendor.decode_ms(vendor.message(paths[0] if paths else None), config.rounds)
-    context.say("watched recordings, and a bridge")
-    seen = [watching.watched(_source(config), config.watch_seconds, n) for n in (None, *config.browsers)]
+    checked = [vendor.check(path) for path in context.each("recordings", paths)]
+    rounds = context.rounds("timing decoders", config.rounds)
+    decode = vendor.decode_ms(vendor.message(paths[0] if paths else None), rounds)
+    watchers = context.each("watched recordings", (None, *config.browsers))
+    seen = [watching.watched(_source(config), config.watch_seconds, n) for n in watchers]
     carried = watching.bridged(config.bridge_frames)
     return Findings(
         verdict=(*verdict(outcomes, checked, decode), _watched(seen, carried)),
@@ -207,12 +209,12 @@ def _watched(seen: Sequence[watching.Watched], carried: watching.Bridged) -> str
 
 
 def _replay(name: str, config: StabilityConfig, context: Context) -> Outcome:
-    context.say(f"{config.seconds:g} s of device time, {name}")
     capacity, every = (16, 24) if name == SLOW else (256, 1)
     faults = _faults(config, hidden=name == BY_STAMPS)
-    with context.timed(name.replace(" ", "_")), warnings.catch_warnings():
+    shown = context.told(f"device time {name}, s")
+    with context.timed(name.replace(" ", "_")), shown as tell, warnings.catch_warnings():
         warnings.simplefilter("ignore", OverloadWarning)  # meant, and counted
-        return endure(_source(config), config.seconds, faults, capacity=capacity, every=every)
+        return endure(_source(config), config.seconds, faults, capacity=capacity, every=every, tell=tell)
 
 
 def _source(config: StabilityConfig) -> Loop:

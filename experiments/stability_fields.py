@@ -82,12 +82,14 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     for rest, seed in context.each("motions", itertools.product(chosen, seeds)):
         for method, stress, level, outcome in attempt(rest, config.methods, seed):
             outcomes.setdefault(method, {}).setdefault((stress, level), []).append(outcome)
-    shear = attempt_shear(config.slide_frames, config.seed)
-    context.say("depth")
-    depth = attempt_depth(config.ball_presses, config.seeds, config.seed)
+    shear = attempt_shear(config.slide_frames, config.seed, context)
+    depth = attempt_depth(config.ball_presses, config.seeds, config.seed, context)
     panels = [_tracking(outcomes), _shear(shear), _depth(depth)]
     if config.data_dir is not None:
-        panels += [motion_alarms.panel(config.data_dir), motion_evidence.panel(config.data_dir, config.pictures)]
+        panels += [
+            motion_alarms.panel(config.data_dir, context),
+            motion_evidence.panel(config.data_dir, config.pictures, context),
+        ]
     return Findings(
         verdict=tuple(v for p in panels for v in p.verdict),
         requirements=tuple(r for p in panels for r in p.requirements),

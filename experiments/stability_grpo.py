@@ -16,7 +16,7 @@ places.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -57,10 +57,9 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     """Drive every knob, judge every seed, listen to the alarms."""
     courses = Courses(config.effort, range(config.first_seed, config.first_seed + config.seeds))
     outcomes = []
-    for scenario in SCENARIOS:
-        if scenario.code in config.codes:
-            outcomes.append(drive(scenario, config, courses, context))
-            context.say(outcomes[-1].sentence)
+    for scenario in context.each("failures", [s for s in SCENARIOS if s.code in config.codes]):
+        outcomes.append(drive(scenario, config, courses, context))
+        context.say(outcomes[-1].sentence)
     sound = undriven(config, courses, context)
     return Findings(
         verdict=verdict(outcomes, sound),
@@ -91,7 +90,8 @@ def drive(scenario: Scenario, config: StabilityConfig, courses: Courses, context
     for variant in (scenario.failing, STABLE):
         stage = f"drive/{scenario.slug}/{'stable' if variant is STABLE else 'failing'}"
         if not context.done(stage):
-            context.save_stage(stage, _drive_side(scenario, variant, values, config, courses))
+            shown = context.each(stage, values)
+            context.save_stage(stage, _drive_side(scenario, variant, shown, config, courses))
         kept = context.load_stage(stage)
         raised = [[_firsts(run) for run in runs] for runs in kept["raised"]]
         sides.append(Side(failed=np.array(kept["failed"], bool), raised=raised))
@@ -99,7 +99,7 @@ def drive(scenario: Scenario, config: StabilityConfig, courses: Courses, context
 
 
 def _drive_side(
-    scenario: Scenario, variant: Variant, values: Sequence[float], config: StabilityConfig, courses: Courses
+    scenario: Scenario, variant: Variant, values: Iterable[float], config: StabilityConfig, courses: Courses
 ) -> dict[str, list[list[object]]]:
     """Failed, and what was raised, [value][seed]; a run that the engine refuses raises nothing."""
     found = [courses.course(variant, scenario.place(variant, v), guarded=variant is STABLE) for v in values]
@@ -110,7 +110,7 @@ def _drive_side(
 def undriven(config: StabilityConfig, courses: Courses, context: Context) -> Sound:
     """What both presets raise as they are, in the plain world."""
     sound = {}
-    for variant in (PAPER, STABLE):
+    for variant in context.each("undriven", (PAPER, STABLE)):
         stage = f"undriven/{variant.name}"
         if not context.done(stage):
             course = courses.course(variant, (PLAIN, dials_of(variant)), guarded=False)

@@ -174,7 +174,8 @@ def watch(
       warm: batches that are drawn first.
     """
     if not context.done(stage):
-        made = make_seconds(feed, config.batches, warm)
+        ahead = context.each(f"{stage}, ahead", range(warm))
+        made = make_seconds(feed, context.rounds(f"{stage}, timing batches", config.batches), ahead)
         lasts_s = step_s * stretch(config, made.cpu_s / step_s)
         steps = min(config.steps, max(2, round(config.most_s / lasts_s)))
         idle = idle_share(feed, lasts_s, steps, context, stage)

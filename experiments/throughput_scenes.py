@@ -115,8 +115,7 @@ def run(config: ThroughputConfig, context: Context) -> Findings:
     large = Rate(**_once(context, "large/0", lambda: _feed(config, context, config.large_contacts, config.large_px)))
     found = _once(context, "written/0", lambda: _written(config, context))
     written = Written(**found | {"rate": Rate(**found["rate"]), "kept": Kept(**found["kept"])})
-    context.say("timing stages")
-    stages = _stages(config)
+    stages = _stages(config, context)
     floor = _floor_table(config)
     context.say("looking at what force tells")
     paper = SceneConfig(
@@ -163,12 +162,19 @@ def _written(config: ThroughputConfig, context: Context) -> Written:
     with context.progress("writing", scenes.contact_count) as advance:
         rate, size = scene_rates.write_rate(scenes, whole, advance)
     shards = len(list(whole.glob("contacts-*")))
-    context.say(f"killing and resuming {config.kills} times")
-    kills = scene_kills.killed_and_resumed(
-        _arguments(scenes), killed, kills=config.kills, shards=shards, shard_s=rate.seconds / shards, seed=config.seed
-    )
-    kept = scene_kills.compare(whole, killed)
-    past = _past_limit(whole)
+    with context.progress("killing and going on", config.kills + 1) as advance:
+        kills = scene_kills.killed_and_resumed(
+            _arguments(scenes),
+            killed,
+            kills=config.kills,
+            shards=shards,
+            shard_s=rate.seconds / shards,
+            seed=config.seed,
+            advance=advance,
+        )
+    with context.progress("comparing", scenes.contact_count) as advance:
+        kept = scene_kills.compare(whole, killed, advance)
+    past = _past_limit(whole, context)
     shutil.rmtree(home)
     return Written(rate=rate, bytes=size, past_limit=past, kills=kills, kept=kept)
 
@@ -179,9 +185,10 @@ def _arguments(scenes: SceneConfig) -> list[str]:
     return [text for name in named for text in (f"--{name.replace('_', '-')}", str(getattr(scenes, name)))]
 
 
-def _past_limit(path: Path) -> int:
+def _past_limit(path: Path, context: Context) -> int:
     store = RecordStore(path)
-    flags = [s.flags for i in range(len(store)) for s in store.contact(i, fields=False).values()]
+    rows = context.each("reading flags", range(len(store)))
+    flags = [s.flags for i in rows for s in store.contact(i, fields=False).values()]
     return int((np.concatenate(flags) & np.uint32(Flag.STRAIN_LIMIT) > 0).sum())
 
 
@@ -266,10 +273,10 @@ def _picture(config: ThroughputConfig, feed: Rate, large: Rate, written: Written
     )
 
 
-def _stages(config: ThroughputConfig) -> Stages:
+def _stages(config: ThroughputConfig, context: Context) -> Stages:
     scenes = config.scenes(config.feed_contacts, config.image_px)
     stages = {}
-    for name in config.stage_sensors:
+    for name in context.each("timing stages", config.stage_sensors):
         cost = scene_stages.stage_costs(scenes, SENSORS.index(name), config.stage_objects)
         stages[name] = {
             "pressure": cost.normal,

@@ -52,6 +52,7 @@ from experiments.released.ways import written, zero_shot
 from experiments.reporting.findings import Requirement
 from experiments.reporting.results import Comparison, Estimate, Results
 from experiments.running.context import Context
+from experiments.running.progress import in_megabytes
 from experiments.running.runner import Experiment
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, SENSORS
@@ -167,7 +168,8 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
       WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released` and `prove_released`.
     """
     model = config.model
-    found = load_checkpoint(source, jnp.dtype(model.dtype))
+    with context.told("reading weights, MB") as tell:
+        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(tell))
     require_same(source, context)
     prove_released(assemble_released(model, found, SENSORS), touch_shapes(model, model.view_px, SENSORS))
     if config.encoder is not None:

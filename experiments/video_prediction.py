@@ -70,8 +70,8 @@ def run(config: Config, context: Context) -> Findings:
     films = {name: train(config, name, data, rows, context, start) for name in (TOUCH, SIGHT)}
     judge = make_judge(config, start, films[TOUCH])
     with context.timed("score"):
-        mean = mean_frames(data, rows[: config.mean_of])
-        scores = judged(films, mean, data, test, judge)
+        mean = mean_frames(data, rows[: config.mean_of], context)
+        scores = judged(films, mean, data, test, judge, context)
     strips = show(films, mean, data, test, config)
     return findings(config, data, scores, data.object_ids[test], strips)
 

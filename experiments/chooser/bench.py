@@ -6,7 +6,7 @@ to half of it, by a solution on a finer grid than any setting's, with more paddi
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -73,14 +73,14 @@ def stage_of(sensor: SensorModel) -> Stage:
     return Stage(gel=sensor.gel, body=BODY, window_mm=sensor.window_mm)
 
 
-def measure(batch: Batch, menu: tuple[Setting, ...], true: Array) -> Outcomes:
+def measure(batch: Batch, menu: Iterable[Setting], true: Array) -> Outcomes:
     """Errors and times of all settings."""
     everything = np.arange(len(batch.force_n))
     errors, ms = [], []
     for setting in menu:
         call = functools.partial(from_scratch, batch, setting, everything)
         errors.append(errors_of(call(), true))
-        ms.append(1e3 * np.median(interleaved({"": call}, ROUNDS)[""]) / len(everything))
+        ms.append(1e3 * np.median(interleaved({"": call}, range(ROUNDS))[""]) / len(everything))
     seen = chooser.look(1.0, batch.gaps, batch.force_n, batch.modulus_mpa, stage_of(batch.sensor)).survey
     surveys = {f.name: np.asarray(getattr(seen, f.name)) for f in dataclasses.fields(Survey)}
     return Outcomes(errors=np.stack(errors, 1), ms=np.array([ms]), family=batch.family, **surveys)

@@ -119,4 +119,4 @@ def _race(
     }
     for call in calls.values():
         call()
-    return {name: float(np.median(s)) for name, s in interleaved(calls, bench.ROUNDS).items()}
+    return {name: float(np.median(s)) for name, s in interleaved(calls, range(bench.ROUNDS)).items()}

@@ -6,12 +6,14 @@ half-space; where the contact is then wider by the tolerance, the flag should be
 """
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.reporting.findings import Column, Table
+from experiments.running.context import Context
 from sensors_io import layer
 from sensors_io.scenes import adhesion, contact, hertz, press
 from sensors_io.scenes.config import SceneConfig
@@ -42,9 +44,10 @@ class Threshold:
         return self.counts_n / self.flagged_n
 
 
-def thresholds(grid: int) -> list[Threshold]:
+def thresholds(grid: int, context: Context) -> list[Threshold]:
     """Every gel and radius, with the generator's work of adhesion and tolerance."""
-    return [_threshold(sensor, radius, grid) for sensor in MODELS for radius in RADII_MM]
+    spheres = itertools.product(MODELS, RADII_MM)
+    return [_threshold(sensor, radius, grid) for sensor, radius in context.each("adhesion", spheres)]
 
 
 def threshold_table(found: list[Threshold]) -> Table:

@@ -2,13 +2,14 @@
 
 import functools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.contact import oracles as contact_oracles
 from experiments.reporting.findings import Cell, Column, Table
+from experiments.running.context import Context
 from sensors_io import layer
 from sensors_io.scenes import contact
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
@@ -24,7 +25,7 @@ TIGHT = 2e-5  # float32 carries little more
 RADII_PX = (4, 6, 8, 12, 16, 20)
 
 
-def hertz(grid: int, radius_mm: float = 8.0, modulus_mpa: float = 0.4) -> dict[str, float]:
+def hertz(grid: int, context: Context, radius_mm: float = 8.0, modulus_mpa: float = 0.4) -> dict[str, float]:
     """How far the solver is from Hertz, for contact radii of 4 pixels and more: exponent, peak pressure.
 
     The apex lies on a pixel's centre.
@@ -34,7 +35,7 @@ def hertz(grid: int, radius_mm: float = 8.0, modulus_mpa: float = 0.4) -> dict[s
     gap = jnp.asarray((x[None] ** 2 + x[:, None] ** 2) / (2 * radius_mm), jnp.float32)
     kernel = jnp.asarray(half_space_spectrum(grid, spacing, modulus_mpa), jnp.float32)
     forces, depths, peaks = [], [], []
-    for pixels in (p for p in RADII_PX if p <= grid / 4):
+    for pixels in context.each("Hertz", (p for p in RADII_PX if p <= grid / 4)):
         force = 4 * modulus_mpa * (pixels * spacing) ** 3 / (3 * radius_mm)
         solved = contact.solve(gap, force, kernel, jnp.zeros_like(kernel), spacing, TIGHT)
         closed = Hertz(radius_mm=radius_mm, plane_modulus_mpa=modulus_mpa, force_n=force)
@@ -45,15 +46,20 @@ def hertz(grid: int, radius_mm: float = 8.0, modulus_mpa: float = 0.4) -> dict[s
     return {"exponent": abs(exponent - 1.5), "peak": float(np.abs(peaks).max())}
 
 
-def against_oracles(count: int, grid: int, seed: int) -> dict[str, float]:
+def against_oracles(scenes: Iterable[object], grid: int, seed: int) -> dict[str, float]:
     """Worst relative L₂ error of the pressure over rough spheres, by every oracle; the seeds of all are the same.
 
     The bodies are periodic here, as the published solvers take them.
+
+    Args:
+      scenes: a sphere is drawn for each item.
+      grid: its side.
+      seed: of the spheres.
     """
     spacing = SIDE_MM / grid
     rng = np.random.default_rng(seed)
     errors: dict[str, list[float]] = {}
-    for _ in range(count):
+    for _ in scenes:
         gap, force = rough_sphere(rng, grid), float(np.exp(rng.uniform(np.log(0.5), np.log(10))))
         for name, spectrum in _bodies(grid).items():
             ours, _ = _pressure(gap, force, spectrum, spacing, TIGHT)
@@ -62,16 +68,17 @@ def against_oracles(count: int, grid: int, seed: int) -> dict[str, float]:
     return {oracle: max(e) for oracle, e in errors.items()}
 
 
-def published(count: int, grid: int, seed: int) -> Table:
+def published(count: int, grid: int, seed: int, context: Context) -> Table:
     """Time and error of the pressure of every installed solver, and of the package's, on the same periodic bodies."""
     rng = np.random.default_rng(seed)
     scenes = [(rough_sphere(rng, grid), float(np.exp(rng.uniform(np.log(0.5), np.log(10))))) for _ in range(count)]
     rows: list[tuple[Cell, ...]] = []
     for body, spectrum in _bodies(grid).items():
         exact = [
-            solve_reference(gap, force, spectrum, SIDE_MM / grid, 1e-9, 20_000).pressure_mpa for gap, force in scenes
+            solve_reference(gap, force, spectrum, SIDE_MM / grid, 1e-9, 20_000).pressure_mpa
+            for gap, force in context.each(f"exact scenes, {body}", scenes)
         ]
-        for name, tolerance, solve in _solvers(body, spectrum, grid):
+        for name, tolerance, solve in context.each(f"solvers, {body}", _solvers(body, spectrum, grid)):
             solve(*scenes[0])  # compiles, plans its transforms
             found, seconds = zip(*(solve(gap, force) for gap, force in scenes), strict=True)
             errors = [np.linalg.norm(p - e) / np.linalg.norm(e) for p, e in zip(found, exact, strict=True)]

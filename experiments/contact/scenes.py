@@ -1,6 +1,8 @@
 """Random scenes for measuring contact solvers: gaps, forces, moduli, the spectra of one sensor, float64 solutions."""
 
 import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,14 @@ SHORTEST_WAVE_MM = 0.8
 REFERENCE_TOLERANCE = 1e-8
 
 
+class Scene(NamedTuple):
+    """Gap [N, N] mm, force N, modulus MPa of the object."""
+
+    gap_mm: np.ndarray
+    force_n: np.ndarray
+    modulus_mpa: np.ndarray
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scenes:
     """S scenes on one grid: gaps [S, N, N] mm, forces [S] N, moduli [S] MPa of the objects; float32."""
@@ -26,6 +36,9 @@ class Scenes:
 
     def __len__(self) -> int:
         return len(self.force_n)
+
+    def __iter__(self) -> Iterator[Scene]:
+        return map(Scene, self.gap_mm, self.force_n, self.modulus_mpa)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,10 +85,10 @@ def sample(sensor: SensorModel, count: int, grid: int, seed: int) -> Scenes:
     return Scenes(gap_mm=np.stack(gaps), force_n=np.array(forces, np.float32), modulus_mpa=np.array(moduli, np.float32))
 
 
-def exact(scenes: Scenes, bench: Bench) -> np.ndarray:
+def exact(scenes: Iterable[Scene], bench: Bench) -> np.ndarray:
     """Float64 displacement of the gel on the same grid, [S, N, N] mm."""
     found = []
-    for gap, force, modulus in zip(scenes.gap_mm, scenes.force_n, scenes.modulus_mpa, strict=True):
+    for gap, force, modulus in scenes:
         compliance = bench.gel + bench.body / float(modulus)
         solved = solve_reference(
             gap.astype(np.float64), float(force), compliance, bench.spacing_mm, REFERENCE_TOLERANCE, 20_000

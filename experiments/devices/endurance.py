@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from experiments.running.progress import Tell
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices.base import Identity
 from sensors_io.devices.intake import Counts, Intake
@@ -77,7 +78,14 @@ class Outcome:
 
 
 def endure(
-    source: Loop, seconds: float, faults: Faults, *, capacity: int, every: int = 1, traced: bool = False
+    source: Loop,
+    seconds: float,
+    faults: Faults,
+    *,
+    capacity: int,
+    every: int = 1,
+    traced: bool = False,
+    tell: Tell = lambda done_s, all_s: None,
 ) -> Outcome:
     """Replay for so long; the consumer reads `every`-th time only, so that a small ring overflows.
 
@@ -88,6 +96,7 @@ def endure(
       capacity: of the ring.
       every: samples between two visits of the consumer, which then reads half of the ring.
       traced: whether Python's memory is traced, which takes twice the time.
+      tell: told of the seconds of device time, at every tenth.
     """
     clock = JumpingClock()
     replay = Replay(source, seconds=seconds, faults=faults, clock=clock)
@@ -102,10 +111,12 @@ def endure(
         if visits % every == 0:
             for _ in range(min(intake.counts.waiting, max(1, capacity // 2))):
                 late.add(intake.next(0.0).host_time_ns)
-        memory.look(clock.now_ns() / NS_PER_S)
+        if memory.look(clock.now_ns() / NS_PER_S):
+            tell(round(clock.now_ns() / NS_PER_S), round(seconds))
     while intake.counts.waiting:
         intake.next(0.0)
     memory.look(seconds)
+    tell(round(seconds), round(seconds))
     return Outcome(
         truth=replay.truth,
         counts=intake.counts,
@@ -144,13 +155,15 @@ class _Memory:
         if traced:
             tracemalloc.start()
 
-    def look(self, now_s: float) -> None:
+    def look(self, now_s: float) -> bool:
+        """Whether it was time to look."""
         if now_s < self._next_s:
-            return
+            return False
         self._next_s += self._every_s
         self.seen_mb.append(resident_mb())
         if self._traced and len(self.seen_mb) == 2:
             self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
+        return True
 
     def growth_kb(self) -> float:
         if not self._traced:

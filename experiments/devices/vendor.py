@@ -5,7 +5,7 @@ import importlib.util
 import pathlib
 import struct
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -108,7 +108,7 @@ def message(path: pathlib.Path | None) -> list[bytes]:
     return [struct.pack("=IHH", 1, len(parts) - 1, k) + part for k, part in enumerate(parts)]
 
 
-def decode_ms(packets: list[bytes], rounds: int, repeats: int = 20) -> dict[str, np.ndarray]:
+def decode_ms(packets: list[bytes], rounds: Iterable[object], repeats: int = 20) -> dict[str, np.ndarray]:
     """Time of one message by every way, ms [rounds]: decoding alone, from the packets, as samples, by YAML."""
     whole = _joined(packets)
     decoder = tac3d_messages.Decoder()

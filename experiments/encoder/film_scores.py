@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments.policies.dataset import Dataset
 from experiments.policies.feeds import touch_batch
+from experiments.running.context import Context
 from touchr1_jax.bench.lpips import lpips
 from touchr1_jax.bench.ssim import ssim
 from touchr1_jax.models.predictor import layer_norm
@@ -107,19 +108,21 @@ class Judge:
         return jax.jit(lambda p, a, b, batch: jnp.abs(tokens(p, a, batch) - tokens(p, b, batch)).mean((-2, -1)))
 
 
-def mean_frames(data: Dataset, rows: np.ndarray) -> np.ndarray:
+def mean_frames(data: Dataset, rows: np.ndarray, context: Context) -> np.ndarray:
     """Mean frame of every sensor at every position of its clip, float32 [S, F, H, W, 3] in [0, 1]; 0 where none was."""
     total: Any = 0.0
     count: Any = 0.0
-    for clip in data.batches(rows, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
-        seen = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
-        total = total + np.where(seen, clip["frames"], 0).sum(0, dtype=np.float64)
-        count = count + seen.sum(0)
+    with context.progress("mean frames", len(rows)) as advance:
+        for clip in data.batches(rows, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
+            seen = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
+            total = total + np.where(seen, clip["frames"], 0).sum(0, dtype=np.float64)
+            count = count + seen.sum(0)
+            advance(len(seen))
     return (total / np.maximum(count, 1) / 255.0).astype(np.float32)
 
 
 def judged(
-    films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.ndarray, judge: Judge
+    films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.ndarray, judge: Judge, context: Context
 ) -> dict[str, Scores]:
     """Scores of every predictor, which all know the same skips, and of the baselines on some contacts.
 
@@ -129,15 +132,18 @@ def judged(
       data: the records.
       rows: contacts to score.
       judge: metrics.
+      context: shows how far it is.
     """
     skips = next(iter(films.values())).config.skips
     questions = every_question(data.clip.frames, skips)
     blocks: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in (*films, COPY, MEAN)}
-    for batch, count in batches(data, rows):
-        answers = [answer_all(films, mean, batch, t, k, skips) for t, k in questions]
-        for name, parts in blocks.items():
-            found = [_masked(judge.score(a[name], a[GOAL], batch), a[EXISTS]) for a in answers]
-            parts.append({m: np.stack([f[m] for f in found], -1)[:count] for m in found[0]})
+    with context.progress("scoring", len(rows)) as advance:
+        for batch, count in batches(data, rows):
+            answers = [answer_all(films, mean, batch, t, k, skips) for t, k in questions]
+            for name, parts in blocks.items():
+                found = [_masked(judge.score(a[name], a[GOAL], batch), a[EXISTS]) for a in answers]
+                parts.append({m: np.stack([f[m] for f in found], -1)[:count] for m in found[0]})
+            advance(count)
     asked = np.array([skips[k] for _, k in questions])
     return {
         name: Scores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=asked)

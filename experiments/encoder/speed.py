@@ -1,7 +1,7 @@
 """How fast an encoder reads prompts, how near the machine it comes, and where the rest of the time goes."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import flax.linen as nn
@@ -30,8 +30,10 @@ def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> Prog
     return by_contact(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
 
 
-def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Program]:
-    """Programs that each do one thing more than the one before, contact by contact, up to the whole encoder."""
+def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Callable[[], Program]]:
+    """How to compile programs that each do one thing more than the one before, contact by contact, up to the whole
+    encoder.
+    """
     e = networks.encoder
     shallow = dataclasses.replace(e, num_layers=0)
     few = {name: x for name, x in params.items() if not name.startswith("layer_")}
@@ -44,12 +46,14 @@ def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[s
 
     cut = lambda x, kept: cut_patches(x, e, kept).astype(jnp.float32) / 127.5
     return {
-        "cut the bytes": by_contact(lambda b: each(cut, b), batch),
-        "stem, energies, embedding": by_contact(
+        "cut the bytes": lambda: by_contact(lambda b: each(cut, b), batch),
+        "stem, energies, embedding": lambda: by_contact(
             lambda p, b: each(lambda x, kept: _Stem(e).apply({"params": p}, x, kept), b), stem, batch
         ),
-        "time, force, pooling": by_contact(lambda p, b: encode_each(shallow, p, read_frames(networks, b)), few, batch),
-        "transformer": forward(networks, params, batch),
+        "time, force, pooling": lambda: by_contact(
+            lambda p, b: encode_each(shallow, p, read_frames(networks, b)), few, batch
+        ),
+        "transformer": lambda: forward(networks, params, batch),
     }
 
 
@@ -93,7 +97,7 @@ def arithmetic(function: Callable[..., Any], *arguments: Any) -> float:
     return float(cost["flops"]) / 1e9
 
 
-def medians(programs: Mapping[str, Program], rounds: int) -> dict[str, float]:
+def medians(programs: Mapping[str, Program], rounds: Iterable[object]) -> dict[str, float]:
     """Median seconds of each, in interleaved rounds."""
     for program in programs.values():
         jax.block_until_ready(program.call())

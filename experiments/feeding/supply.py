@@ -1,7 +1,7 @@
 """What cores deliver to a step of training: seconds of a batch, and a device that stands still when it comes late."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -63,21 +63,22 @@ class _Ending:
         return np.array(self._value, dtype)
 
 
-def make_seconds(batches: Iterator[Any], count: int, ahead: int) -> Made:
-    """Mean over `count` batches, of the processor's clock: all threads together, and nobody else's load.
+def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterable[object]) -> Made:
+    """Mean over some batches, of the processor's clock: all threads together, and nobody else's load.
 
     Args:
       batches: endless.
-      count: of them that are timed.
-      ahead: batches that may have been made before the first is asked for; so many are drawn first.
+      rounds: a batch is timed for each item.
+      ahead: batches that may have been made before the first is asked for; one is drawn first for each item.
     """
-    for _ in range(ahead):
+    for _ in ahead:
+        next(batches)
+    spent = []
+    for _ in rounds:
+        began = time.process_time()
         batch = next(batches)
-    began = time.process_time()
-    for _ in range(count):
-        batch = next(batches)
-    spent = time.process_time() - began
-    return Made(spent / count, sum(np.asarray(x).nbytes for x in jax.tree.leaves(batch)))
+        spent.append(time.process_time() - began)
+    return Made(float(np.mean(spent)), sum(np.asarray(x).nbytes for x in jax.tree.leaves(batch)))
 
 
 def idle_share(batches: Batches, step_s: float, steps: int, context: Context, stage: str) -> float:

@@ -90,7 +90,7 @@ def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: i
     calls = {kind: (lambda read=read: depth_by(read, picture, presses.mm_per_px)) for kind, read in readers.items()}
     for call in calls.values():
         call()
-    ms = {kind: 1e3 * float(np.median(s)) for kind, s in interleaved(calls, rounds).items()}
+    ms = {kind: 1e3 * float(np.median(s)) for kind, s in interleaved(calls, range(rounds)).items()}
     figures = errors[PACKAGE].figures()
     return Panel(
         verdict=(
@@ -225,4 +225,4 @@ def frame_ms(made: Calibration, size: tuple[int, int], rounds: int) -> float:
     read = DepthReader(dataclasses.replace(made, background=background))
     picture = cv2.add(background, np.full_like(background, 3))
     read(picture)
-    return 1e3 * float(np.median(interleaved({"depth": lambda: read(picture)}, rounds)["depth"]))
+    return 1e3 * float(np.median(interleaved({"depth": lambda: read(picture)}, range(rounds))["depth"]))

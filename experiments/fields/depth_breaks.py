@@ -6,6 +6,7 @@ of `BROKEN_DEPTH` of the press's depth, root mean square over the contact.
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -14,6 +15,7 @@ from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import published_poisson, table_map
 from experiments.fields.depth_presses import GEL, WINDOW_MM, WINDOW_PX, fitted_optics, generated_presses
 from experiments.fields.motion_breaks import Outcome, Stress
+from experiments.running.context import Context
 from sensors_io.calibration.circles import find_circles
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.extract import Extractor
@@ -55,23 +57,25 @@ class _Press:
     drift: float = 0.0
 
 
-def attempt_depth(presses: int, seeds: int, seed: int) -> dict[str, dict[tuple[str, float], list[Outcome]]]:
+def attempt_depth(
+    presses: int, seeds: int, seed: int, context: Context
+) -> dict[str, dict[tuple[str, float], list[Outcome]]]:
     """Outcomes of every way to depth under every stress; `error_px` is relative.
 
     Args:
       presses: that the calibration is made with.
       seeds: presses under each level.
       seed: of the calibration's presses; places and noise follow it.
+      context: shows how far it is.
     """
     methods = _methods(presses, seed)
     outcomes: dict[str, dict[tuple[str, float], list[Outcome]]] = {}
-    for stress in DEPTH_STRESSES:
-        for level in stress.levels:
-            for i in range(seeds):
-                picture, truth, inside = _shown(_stressed(stress.name, level, seed + i), seed + 1 + i)
-                for name, read in methods.items():
-                    outcome = _outcome(*read(picture), truth, inside)
-                    outcomes.setdefault(name, {}).setdefault((stress.name, level), []).append(outcome)
+    every = [(stress.name, level) for stress in DEPTH_STRESSES for level in stress.levels]
+    for (stress, level), i in context.each("depth", itertools.product(every, range(seeds))):
+        picture, truth, inside = _shown(_stressed(stress, level, seed + i), seed + 1 + i)
+        for name, read in methods.items():
+            outcome = _outcome(*read(picture), truth, inside)
+            outcomes.setdefault(name, {}).setdefault((stress, level), []).append(outcome)
     return outcomes
 
 

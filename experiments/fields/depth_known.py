@@ -66,7 +66,7 @@ def poisson_panel(rounds: int) -> Panel:
     calls = {name: (lambda f=f: f(*slopes, PITCH_MM)) for name, f in INTEGRATORS.items()}
     for call in calls.values():
         call()
-    ms = {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, rounds).items()}
+    ms = {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, range(rounds)).items()}
     errors = {name: [scale_error(f, *surface) for surface in surfaces.values()] for name, f in INTEGRATORS.items()}
     worst = max(abs(scale) for scale, _ in errors["this, Neumann"])
     columns = [Column(name="integrator")]

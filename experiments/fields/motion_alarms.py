@@ -10,6 +10,7 @@ import numpy as np
 from experiments.fields.motion_frames import load, reduced
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Column, Table
+from experiments.running.context import Context
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import read_video
@@ -59,13 +60,13 @@ FOLDERS = (
 """No limit of the two flags was set with the flags on these pictures in view."""
 
 
-def panel(data_dir: pathlib.Path) -> Panel:
+def panel(data_dir: pathlib.Path, context: Context) -> Panel:
     """Counts of each flag by recording.
 
     Raises:
       FileNotFoundError: none of the recordings lies in the directory.
     """
-    counts = {folder.name: _counted(folder, data_dir) for folder in FOLDERS}
+    counts = {folder.name: _counted(folder, data_dir) for folder in context.each("flags", FOLDERS)}
     present = {name: count for name, count in counts.items() if count["frames"]}
     if not present:
         raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {[f.pattern for f in FOLDERS]}; correct it")

@@ -55,7 +55,7 @@ def spline_hertz(of: Subject, rounds: int) -> float:
     moved = of.motion(PEAK_PX, None).forward(of.points_px)
     call = functools.partial(densify, moved)
     call()
-    return 1 / float(np.median(interleaved({"": call}, max(rounds, 30))[""]))
+    return 1 / float(np.median(interleaved({"": call}, range(max(rounds, 30)))[""]))
 
 
 def _measure(of: Subject, seeds: Sequence[int | None], rounds: int) -> dict[str, tuple[float, float, float]]:
@@ -73,7 +73,7 @@ def _measure(of: Subject, seeds: Sequence[int | None], rounds: int) -> dict[str,
             wrong = np.linalg.norm(dense(picture)[rows, columns] - true, axis=-1)
             errors.setdefault(name, []).append(wrong.ravel())
     calls = {name: functools.partial(dense, picture) for name, dense in methods.items()}
-    seconds = interleaved(calls, rounds)
+    seconds = interleaved(calls, range(rounds))
     pooled = {name: np.concatenate(e) for name, e in errors.items()}
     return {
         name: (float(e.mean()), float(np.quantile(e, 0.95)), 1e3 * float(np.median(seconds[name])))

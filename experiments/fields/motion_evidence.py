@@ -10,6 +10,7 @@ import cv2
 from experiments.fields.motion_frames import load
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Column, Requirement, Table
+from experiments.running.context import Context
 from sensors_io.fields.evidence import Pattern, examine
 
 Crop = tuple[float, float, float, float]
@@ -50,9 +51,9 @@ FOLDERS = (
 """What the data directory may hold; the thresholds were set on a tenth of each."""
 
 
-def panel(data_dir: pathlib.Path, most: int) -> Panel:
+def panel(data_dir: pathlib.Path, most: int, context: Context) -> Panel:
     """Judge at most `most` pictures of every folder, evenly chosen."""
-    rows = [(folder, _judged(folder, data_dir, most)) for folder in FOLDERS]
+    rows = [(folder, _judged(folder, data_dir, most)) for folder in context.each("patterns", FOLDERS)]
     present = [(folder, judged) for folder, judged in rows if sum(judged.values())]
     if not present:
         raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {[f.pattern for f in FOLDERS]}; correct it")

@@ -80,7 +80,7 @@ def speeds(of: Subject, rounds: int) -> dict[str, float]:
         follow = make(rest, of.points_px, of.half_px)
         calls[name] = functools.partial(_both, follow, pictures)
         calls[name]()
-    seconds = interleaved(calls, rounds)
+    seconds = interleaved(calls, range(rounds))
     return {name: 1e3 / len(pictures) * float(np.median(s)) for name, s in seconds.items()}
 
 

@@ -218,7 +218,7 @@ def _milliseconds(sensor: SensorModel, slide: Slide, rounds: int) -> dict[str, f
     calls = {name: functools.partial(shear, slide, f) for name, shear in methods(sensor).items()}
     for call in calls.values():
         call()
-    return {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, rounds).items()}
+    return {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, range(rounds)).items()}
 
 
 def _mean(errors: Mapping[str, float]) -> float:

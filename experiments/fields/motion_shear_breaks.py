@@ -9,6 +9,7 @@ import numpy as np
 from experiments.fields.motion_breaks import Outcome, Stress
 from experiments.fields.motion_shear import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, pressing
 from experiments.fields.motion_slides import Slide, cached_slides, node_grid
+from experiments.running.context import Context
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.fields.helmholtz import decompose
 from sensors_io.fields.inversion import InverseConfig
@@ -32,16 +33,16 @@ _SENSOR = TAC3D
 _SENSOR_NOISE = InverseConfig(lateral_noise_mm=_SENSOR.lateral_noise_mm, depth_noise_mm=_SENSOR.depth_noise_mm)
 
 
-def attempt_shear(frames: int, seed: int) -> Outcomes:
+def attempt_shear(frames: int, seed: int, context: Context) -> Outcomes:
     """Outcomes of every reading of shear under every stress, on one slide; `error_px` is then relative."""
     (slide,) = cached_slides(_SENSOR, ("patterned",), ("slide_x",), frames, seed)
     outcomes: Outcomes = {}
-    for stress in SHEAR_STRESSES:
-        for level in stress.levels:
-            kind = stress.name.split(",")[0].split(" ")[0]
-            stressed, layer = _stressed(slide, kind, level, seed), _layer(kind, level)
-            for name, outcome in _outcomes(stressed, layer):
-                outcomes.setdefault(name, {}).setdefault((stress.name, level), []).append(outcome)
+    every = [(stress.name, level) for stress in SHEAR_STRESSES for level in stress.levels]
+    for stress, level in context.each("shear", every):
+        kind = stress.split(",")[0].split(" ")[0]
+        stressed, layer = _stressed(slide, kind, level, seed), _layer(kind, level)
+        for name, outcome in _outcomes(stressed, layer):
+            outcomes.setdefault(name, {}).setdefault((stress, level), []).append(outcome)
     return outcomes
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from experiments.running.context import Context
 from touchr1_jax.models.lm import LayerCache, attend_causally
 
 Flash = Literal["cudnn", "xla"]
@@ -67,19 +68,23 @@ def pairs(prompts: int, tokens: int, heads: int) -> float:
     return prompts * heads * tokens * (tokens + 1) / 2
 
 
-def errors(h: Heads, ways: dict[str, Attention]) -> dict[str, float]:
+def errors(h: Heads, ways: dict[str, Attention], context: Context) -> dict[str, float]:
     """Largest difference of the first prompt's results and gradients from float32, over the largest number in each.
 
     Args:
       h: what attends.
       ways: by name.
+      context: shows how far it is.
     """
     one = jax.tree.map(lambda x: x[:1], h)
     wide = jax.tree.map(lambda x: x.astype(jnp.float32), one)
     with jax.default_matmul_precision("highest"):
         exact = jax.jit(with_gradient(flash_attention("xla")))(wide)
-    found = {name: jax.jit(with_gradient(way))(one) for name, way in ways.items()}
-    return {name: max(jax.tree.leaves(jax.tree.map(_error, exact, f))) for name, f in found.items()}
+    found = {}
+    for name, way in context.each("comparing attention", ways.items()):
+        ours = jax.jit(with_gradient(way))(one)
+        found[name] = max(jax.tree.leaves(jax.tree.map(_error, exact, ours)))
+    return found
 
 
 def _error(exact: Array, found: Array) -> float:

@@ -1,13 +1,11 @@
 """Measurements of one GRPO iteration: in a process of its own, beside its variants, over many steps."""
 
-import concurrent.futures
 import dataclasses
-import multiprocessing
 import resource
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +13,8 @@ import numpy as np
 
 from experiments.grpo.job import Job, config_of
 from experiments.grpo.size import Size
+from experiments.running.context import Context
+from experiments.running.progress import Tell
 from experiments.running.timing import interleaved
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
@@ -28,8 +28,6 @@ MATRIX = 1024  # side of the matrices whose product is the yardstick of the mach
 SHORT = 1 / 8  # share of the words that end a completion where answers are to be short
 GIB, KIB, MIB = 2**30, 2**10, 2**20
 RESIDENT_EVERY = 100  # steps between two looks at the memory
-
-T = TypeVar("T")
 
 Option = Literal[
     "one micro-batch",
@@ -73,13 +71,6 @@ class Course:
     programs: int
 
 
-def in_own_process(work: Callable[..., T], *arguments: Any) -> T:
-    """The result of a function of a module, called in a fresh interpreter, whose peak memory is then the work's."""
-    fresh = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(1, mp_context=fresh) as pool:
-        return pool.submit(work, *arguments).result()
-
-
 def time_alone(size: Size, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> Alone:
     """Seconds of each iteration after the first two, of the first, peak memory of this process, matrix products.
 
@@ -97,7 +88,7 @@ def time_alone(size: Size, prefix: int, config: GRPOConfig, rounds: int, cache: 
     first_s = time.perf_counter() - began
     return_memory()
     jax.block_until_ready(job.step())
-    seconds = interleaved({"step": job.step}, rounds)["step"]
+    seconds = interleaved({"step": job.step}, range(rounds))["step"]
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB / GIB
     return Alone(
         seconds=tuple(seconds.tolist()),
@@ -113,13 +104,13 @@ def matrix_gflops(rounds: int = 10) -> float:
     a = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
     product = jax.jit(jnp.matmul)
     jax.block_until_ready(product(a, a))
-    return 2 * MATRIX**3 / interleaved({"product": lambda: product(a, a)}, rounds)["product"].min() / 1e9
+    return 2 * MATRIX**3 / interleaved({"product": lambda: product(a, a)}, range(rounds))["product"].min() / 1e9
 
 
 def options(
     size: Size, prefix: int, micro_prompts: int, buckets: tuple[int, ...], names: Sequence[Option]
-) -> dict[str, Job]:
-    """The engine as it is, and with one thing changed; short answers are ones that end."""
+) -> dict[str, Callable[[], Job]]:
+    """How to make the engine as it is, and with one thing changed; short answers are ones that end."""
     plain = config_of(size, micro_prompts)
     change = lambda **changes: lambda: Job(size, prefix, dataclasses.replace(plain, **changes))
     short = lambda config: lambda: Job(size, prefix, config, end_share=SHORT, learning_rate=0.0)
@@ -136,21 +127,34 @@ def options(
     }
     if not compiles_leanly():
         del makers["lean compilation"]
-    return {"this": Job(size, prefix, plain)} | {name: makers[name]() for name in names if name in makers}
+    return {"this": lambda: Job(size, prefix, plain)} | {name: makers[name] for name in names if name in makers}
 
 
-def repeated(size: Size, prefix: int, micro_prompts: int) -> dict[str, Job]:
-    """The engine as it is, and encoding the prefix for every rollout."""
+def repeated(size: Size, prefix: int, micro_prompts: int) -> dict[str, Callable[[], Job]]:
+    """How to make the engine as it is, and one that encodes the prefix for every rollout."""
     plain = config_of(size, micro_prompts)
-    return {"this": Job(size, prefix, plain), "repeated prefix": Job(size, prefix, plain, repeated=True)}
+    return {
+        "this": lambda: Job(size, prefix, plain),
+        "repeated prefix": lambda: Job(size, prefix, plain, repeated=True),
+    }
 
 
-def side_by_side(jobs: dict[str, Job], rounds: int) -> dict[str, float]:
-    """Median over rounds of each job's time over that of `this` in the same round."""
-    for job in jobs.values():
+def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, context: Context) -> dict[str, float]:
+    """Median over rounds of each job's time over that of `this` in the same round.
+
+    Args:
+      makers: how to make each job.
+      rounds: of timing.
+      what: of them differs.
+      context: shows how far it is.
+    """
+    jobs = {}
+    for name, make in context.each(f"compiling {what}", makers.items()):
+        jobs[name] = make()
         for _ in range(2):
-            jax.block_until_ready(job.step())
-    seconds = interleaved({name: job.step for name, job in jobs.items()}, rounds)
+            jax.block_until_ready(jobs[name].step())
+    calls = {name: job.step for name, job in jobs.items()}
+    seconds = interleaved(calls, context.rounds(f"timing {what}", rounds))
     return {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
 
 
@@ -161,10 +165,10 @@ def parser_seconds(size: Size, rounds: int = 20) -> float:
     shape = (size.prompts, size.group, size.length)
     tokens = jnp.asarray(np.random.default_rng(0).integers(0, tokenizer.vocab_size, shape), jnp.int32)
     jax.block_until_ready(parse(tokens))
-    return float(np.median(interleaved({"parse": lambda: parse(tokens)}, rounds)["parse"]))
+    return float(np.median(interleaved({"parse": lambda: parse(tokens)}, range(rounds))["parse"]))
 
 
-def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int) -> Course:
+def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int, tell: Tell) -> Course:
     """Steps whose answers end early and late, so that every bucket is taken; nothing is learned, so that they go on to.
 
     Args:
@@ -172,6 +176,7 @@ def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int) ->
       prefix: prompt tokens.
       buckets: lengths that an update may pay for.
       steps: how many.
+      tell: told of them whenever the memory is looked at.
     """
     job = Job(size, prefix, dataclasses.replace(config_of(size), buckets=buckets), end_share=SHORT, learning_rate=0.0)
     for _ in range(3):
@@ -185,6 +190,7 @@ def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int) ->
         if (t + 1) % RESIDENT_EVERY == 0:
             resident.append(resident_mb())
             lengths.append(float(metrics["length"]))
+            tell(t + 1, steps)
     return Course(
         seconds=seconds,
         resident_mb=np.array(resident),

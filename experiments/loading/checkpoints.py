@@ -1,6 +1,7 @@
 """Random checkpoints in the published layout, written shard by shard so that no more than one is ever in memory."""
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,14 +10,14 @@ import numpy as np
 
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.names import published, sources
-from touchr1_jax.models.qwen.safetensors import write_file
+from touchr1_jax.models.qwen.safetensors import Tell, write_file
 from touchr1_jax.models.qwen.weights import INDEX
 
 SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
 """Bits of a bfloat16 that are drawn, and the exponent that is not: ±2⁻⁷ … ±2⁻⁶, of a trained weight's size."""
 
 
-def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, seed: int) -> int:
+def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, seed: int, tell: Tell) -> int:
     """Write weights of a shape in bfloat16 and their index; returns their size in bytes.
 
     Args:
@@ -24,16 +25,22 @@ def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, see
       config: shape.
       shard_bytes: a shard is closed before it would exceed this, unless a single tensor does.
       seed: of the contents.
+      tell: told of the bytes after each tensor that is drawn or written, each of which counts for half of them.
     """
     rng = np.random.default_rng(seed)
     place: dict[str, str] = {}
-    size = 0
-    for i, shapes in enumerate(shards(config, shard_bytes)):
-        name = f"model-{i + 1:05}.safetensors"
-        tensors = {key: draw(rng, shape) for key, shape in shapes.items()}
-        write_file(directory / name, tensors)
+    cut = list(shards(config, shard_bytes))
+    size, every = 0, sum(2 * math.prod(shape) for shapes in cut for shape in shapes.values())
+    for i, shapes in enumerate(cut):
+        name, tensors, drawn = f"model-{i + 1:05}.safetensors", {}, 0
+        for key, shape in shapes.items():
+            tensors[key] = draw(rng, shape)
+            drawn += tensors[key].nbytes
+            tell(size + drawn // 2, every)
+        begun = size + drawn // 2
+        write_file(directory / name, tensors, lambda done, _, begun=begun: tell(begun + done // 2, every))
         place |= dict.fromkeys(tensors, name)
-        size += sum(x.nbytes for x in tensors.values())
+        size += drawn
     index = {"metadata": {"total_size": size}, "weight_map": place}
     (directory / INDEX).write_text(json.dumps(index), encoding="utf-8")
     return size

@@ -1,6 +1,5 @@
 """Where the data of an experiment comes from: generated scenes, imported recordings, or existing records."""
 
-import contextlib
 import dataclasses
 import hashlib
 import json
@@ -9,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments.running.context import Context
-from experiments.running.progress import Advance
+from experiments.running.progress import Tell
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
 from sensors_io.scenes.config import SceneConfig, config_hash
@@ -55,18 +54,7 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     return path
 
 
-def _make(context: Context, title: str, make: Callable[[Callable[[int, int], None]], object]) -> None:
-    """Run `make` under a progress bar that its first report opens."""
-    with contextlib.ExitStack() as stack, context.timed("data"):
-        bar: list[Advance] = []
-        seen = 0
-
-        def tell(done: int, total: int) -> None:
-            nonlocal seen
-            if not bar:
-                bar.append(stack.enter_context(context.progress(title, total, done)))
-            elif done > seen:
-                bar[0](done - seen)
-            seen = done
-
+def _make(context: Context, title: str, make: Callable[[Tell], object]) -> None:
+    """Run `make` under a progress bar."""
+    with context.timed("data"), context.told(title) as tell:
         context.team.once(lambda: make(tell))

@@ -6,6 +6,7 @@ from experiments.policies.answers import Evaluated, evaluate_policy
 from experiments.policies.stages import encode_contacts, untrained
 from experiments.policies.study import Trained
 from experiments.released.written import read_policy, write_policy
+from experiments.running.progress import in_megabytes
 
 
 def zero_shot(trained: Trained) -> Evaluated:
@@ -31,7 +32,9 @@ def written(source: Path, trained: Trained) -> Evaluated:
     """
     assembly, data, context = trained.assembly, trained.data, trained.context
     folder = folder_of(context.directory, trained.seed)
-    context.team.once(lambda: write_policy(folder, source, trained.params))
-    params = read_policy(folder, assembly.agent.cache_dtype)
+    with context.told("writing weights, MB") as tell:
+        context.team.once(lambda: write_policy(folder, source, trained.params, in_megabytes(tell)))
+    with context.told("reading weights, MB") as tell:
+        params = read_policy(folder, assembly.agent.cache_dtype, in_megabytes(tell))
     test = encode_contacts(assembly, params, data, data.parts["test"], context)
     return evaluate_policy(assembly, params, test, trained.label, alone=False)

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from experiments.running.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
 from experiments.running.distributed import ALONE, Devices, Team
-from experiments.running.progress import Advance, Loop, progress
+from experiments.running.progress import Advance, Loop, Tell, progress
 from experiments.running.stopping import Stopping
 from experiments.running.watcher import Watcher
 
@@ -138,13 +138,13 @@ class Context:
             self._log.rewind(stage, step)
 
     @contextlib.contextmanager
-    def progress(self, title: str, total: int, completed: int = 0) -> Iterator[Advance]:
-        """A progress bar for one loop; `completed` are the steps done before this session."""
+    def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
+        """A progress bar for one loop; `completed` are the steps done before this session, `still` as `rounds` says."""
         loop = Loop(title, total, completed)
         self._loops.append(loop)
         try:
             self._looping()
-            with progress(self.console, loop, self._looping) as advance:
+            with progress(self.console, loop, self._looping, still=still) as advance:
                 yield advance
         finally:
             self._loops.remove(loop)
@@ -157,6 +157,33 @@ class Context:
             for item in listed:
                 yield item
                 advance()
+
+    def rounds(self, title: str, number: int) -> Iterator[int]:
+        """Rounds of a timing, from 0, under a bar that is drawn between them alone and so takes no time of theirs."""
+        with self.progress(title, number, still=True) as advance:
+            for n in range(number):
+                yield n
+                advance()
+
+    @contextlib.contextmanager
+    def told(self, title: str) -> Iterator[Tell]:
+        """A progress bar for a loop that tells of itself how many steps are done and of how many, first or later.
+
+        The first word opens the bar; what is done by then does not count into the rate.
+        """
+        with contextlib.ExitStack() as stack:
+            bar: list[Advance] = []
+            seen = 0
+
+            def tell(done: int, total: int) -> None:
+                nonlocal seen
+                if not bar:
+                    bar.append(stack.enter_context(self.progress(title, total, done)))
+                elif done > seen:
+                    bar[0](done - seen)
+                seen = done
+
+            yield tell
 
     def require_logged(self, stage: str, steps: int) -> None:
         """Hold the log to a checkpoint: every step before it is there, so that no run ends with a part of its log.

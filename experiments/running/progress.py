@@ -30,6 +30,17 @@ class Advance(Protocol):
     def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
+Tell = Callable[[int, int], None]
+"""What a loop calls that knows how far it is: with the steps that are done, and all of them."""
+
+MB = 1_000_000
+
+
+def in_megabytes(tell: Tell) -> Tell:
+    """For a loop that tells bytes; those begun are counted, so that the last word is all of all."""
+    return lambda done, total: tell(-(-done // MB), -(-total // MB))
+
+
 class Loop:
     """How far a loop has come.
 
@@ -89,18 +100,22 @@ class RateColumn(ProgressColumn):
 
 
 @contextlib.contextmanager
-def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
+def progress(
+    console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, still: bool = False
+) -> Iterator[Advance]:
     """Show the progress of one loop.
 
     Args:
       console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
       loop: advanced by what this yields.
       after: called after each advance.
+      still: draw the bar with each advance only, not ten times a second, which would take time of what is timed.
     """
     if console.is_terminal:
-        with _bar(console) as bar:
+        with _bar(console, still) as bar:
             task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
-            yield _advance(loop, lambda: bar.update(task, completed=loop.completed, note=loop.note), after)
+            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=still)
+            yield _advance(loop, draw, after)
     else:
         plain = _Plain(console, loop)
         yield _advance(loop, plain.look, after)
@@ -117,7 +132,7 @@ def _advance(loop: Loop, *shows: Callable[[], None]) -> Advance:
     return advance
 
 
-def _bar(console: Console) -> Progress:
+def _bar(console: Console, still: bool) -> Progress:
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -128,6 +143,7 @@ def _bar(console: Console) -> Progress:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", style="dim", markup=False),
         console=console,
+        auto_refresh=not still,
     )
 
 

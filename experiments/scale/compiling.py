@@ -5,10 +5,8 @@ upper figure.  For `h200` XLA's GPU compiler gets a description of the machine, 
 plugin for CUDA but no GPU: what it reserves is what a step there takes.
 """
 
-import concurrent.futures
 import contextlib
 import importlib.util
-import multiprocessing
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -17,6 +15,7 @@ from typing import Literal, NamedTuple
 import jax
 from jax.experimental import topologies
 
+from experiments.running.apart import in_own_process
 from experiments.scale.paper import OPTIMIZER, Setup, Training, score_of
 from touchr1_jax.distributed.abstract import compile_grpo
 from touchr1_jax.distributed.memory import Compiled
@@ -74,10 +73,9 @@ def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Outc
     flags = {"cpu": f"--xla_force_host_platform_device_count={setup.mesh.devices}"}
     if compiler == "h200":  # Triton's products would be tuned on the device, and XLA's guesses without it can fail
         flags["h200"] = f"--xla_gpu_cuda_data_dir={toolkit()} --xla_gpu_enable_triton_gemm=false"
-    fresh = multiprocessing.get_context("spawn")
     environment = {"XLA_FLAGS": flags[compiler], "JAX_PLATFORMS": "cpu"}
-    with _environment(environment), concurrent.futures.ProcessPoolExecutor(1, mp_context=fresh) as pool:
-        return pool.submit(compile_here, training, setup, compiler).result()
+    with _environment(environment):
+        return in_own_process(compile_here, training, setup, compiler)
 
 
 def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Outcome:

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,16 @@ class Kept:
     differing: int
 
 
-def killed_and_resumed(arguments: list[str], out: Path, *, kills: int, shards: int, shard_s: float, seed: int) -> int:
+def killed_and_resumed(
+    arguments: list[str],
+    out: Path,
+    *,
+    kills: int,
+    shards: int,
+    shard_s: float,
+    seed: int,
+    advance: Callable[[], None] = lambda: None,
+) -> int:
     """Run `python -m sensors_io generate`, kill it with SIGKILL at random moments, let the last run end.
 
     A moment is a random shard, another each time, and a random part of the time in which it is written; the first shard
@@ -47,6 +56,7 @@ def killed_and_resumed(arguments: list[str], out: Path, *, kills: int, shards: i
       shards: that the finished set has.
       shard_s: seconds that an undisturbed writer takes for one.
       seed: of the moments.
+      advance: called after each kill, and after the last run.
 
     Returns:
       How often it was killed before its end.
@@ -68,15 +78,18 @@ def killed_and_resumed(arguments: list[str], out: Path, *, kills: int, shards: i
         finally:
             process.kill()
             killed += process.wait() == _SIGKILL
+        advance()
     subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+    advance()
     return killed
 
 
-def compare(whole: Path, killed: Path) -> Kept:
-    """Read every entry of both sets."""
+def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> Kept:
+    """Read every entry of both sets; `advance` is called before each."""
     left, right = RecordStore(whole), RecordStore(killed)
     records = damaged = differing = 0
     for i, key in enumerate(right.contacts):
+        advance()
         try:
             contact = right.contact(i)
         except CorruptRecordsError:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.reporting.checks import ResultsError, require
+from experiments.running.context import Context
 from sensors_io.calibration import circles
 from sensors_io.calibration.presses import BallPresses as Recorded
 from sensors_io.scenes import fitting, mini_optics, optics, photometric
@@ -76,11 +77,16 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
     )
 
 
-def fit(presses: BallPresses) -> Study:
+def fit(presses: BallPresses, context: Context) -> Study:
     """Fit to the even presses, align the odd ones."""
-    profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
-    train = np.arange(0, len(presses.pictures), 2)
-    fitted, touches = fitting.fit_jointly(presses, profiles, located(presses, train), train)
+    with context.progress("fitting", 3) as advance:
+        profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
+        advance(note="the ball is solved")
+        train = np.arange(0, len(presses.pictures), 2)
+        begun = located(presses, train)
+        advance(note="circles are found")
+        fitted, touches = fitting.fit_jointly(presses, profiles, begun, train)
+        advance()
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
     return Study(
         presses=presses,

@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from sensors_io.augment import AugmentConfig
 from sensors_io.codec import decode_sequence, encode_sequence
@@ -48,7 +49,7 @@ class FeedConfig:
     workers: tuple[int, ...] = (0, 1, 2)
 
 
-def stage_ms(config: FeedConfig, store: RecordStore, rounds: int) -> dict[str, float]:
+def stage_ms(config: FeedConfig, store: RecordStore, rounds: Iterable[object]) -> dict[str, float]:
     """Milliseconds of one core that each part of making one clip takes, by subtraction where parts are nested."""
     clip = clip_config(config)
     rows = range(min(config.contacts, len(store)))
@@ -81,7 +82,7 @@ def stage_ms(config: FeedConfig, store: RecordStore, rounds: int) -> dict[str, f
     }
 
 
-def feed_rates(config: FeedConfig, store: RecordStore, rounds: int) -> dict[tuple[int, str], float]:
+def feed_rates(config: FeedConfig, store: RecordStore, rounds: int, context: Context) -> dict[tuple[int, str], float]:
     """Clips a second by number of workers and by change, median over rounds.
 
     One feed after the other: the workers of one that waits would read ahead in the time of another.  What a feed read
@@ -90,8 +91,9 @@ def feed_rates(config: FeedConfig, store: RecordStore, rounds: int) -> dict[tupl
     rates = {}
     for workers, name in itertools.product(config.workers, _EXTREMES):
         feed, seconds = iter(_batches(config, store, workers, _EXTREMES[name])), []
+        title = f"timing the feed {name}, {workers} processes"
         with contextlib.closing(feed):
-            for _ in range(rounds):
+            for _ in context.rounds(title, rounds):
                 _draw(feed, _AHEAD + 2 * workers)
                 began = time.perf_counter()
                 _draw(feed, config.batches)
@@ -100,9 +102,10 @@ def feed_rates(config: FeedConfig, store: RecordStore, rounds: int) -> dict[tupl
     return rates
 
 
-def make_store(config: FeedConfig, directory: Path) -> RecordStore:
+def make_store(config: FeedConfig, directory: Path, context: Context) -> RecordStore:
     """The records, made first where they are not there."""
-    generate_records(config.scenes, directory)
+    with context.told("making records") as tell:
+        generate_records(config.scenes, directory, progress=tell)
     return RecordStore(directory)
 
 

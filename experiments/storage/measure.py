@@ -3,11 +3,12 @@
 import dataclasses
 import pathlib
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from experiments.storage.codecs import Clips, Codec, stored_bytes
 from sensors_io.deltas import FILTERS, choose_filter
@@ -24,19 +25,22 @@ class Measured:
     exact: bool
 
 
-def measure(codecs: Sequence[Codec], clips: Clips, rounds: int) -> tuple[list[Measured], dict[str, str]]:
+def measure(
+    codecs: Sequence[Codec], clips: Clips, rounds: int, context: Context
+) -> tuple[list[Measured], dict[str, str]]:
     """Every codec over the same clips, in turn within each round; and why a codec is missing, by name.
 
     Args:
       codecs: what to measure.
       clips: what they store.
       rounds: of timing; rates are medians.
+      context: shows how far it is.
     """
     frames = sum(map(len, clips))
     with tempfile.TemporaryDirectory() as root:
         folders = {codec.name: pathlib.Path(root) / str(n) for n, codec in enumerate(codecs)}
         present, exact, missing = [], {}, {}
-        for codec in codecs:
+        for codec in context.each("codecs", codecs):
             folders[codec.name].mkdir()
             try:
                 codec.store(clips, folders[codec.name])
@@ -49,7 +53,8 @@ def measure(codecs: Sequence[Codec], clips: Clips, rounds: int) -> tuple[list[Me
         for codec in present:
             calls[f"write {codec.name}"] = _bind(codec.store, clips, folders[codec.name])
             calls[f"read {codec.name}"] = _bind(codec.load, folders[codec.name])
-        seconds = {name: float(np.median(s)) for name, s in interleaved(calls, rounds).items()}
+        timed = interleaved(calls, context.rounds("timing codecs", rounds))
+        seconds = {name: float(np.median(s)) for name, s in timed.items()}
         rows = [
             Measured(
                 codec=codec,
@@ -74,7 +79,7 @@ def front(rows: Sequence[Measured]) -> list[Measured]:
     return kept
 
 
-def chosen_filters(clips: Clips) -> dict[str, int]:
+def chosen_filters(clips: Iterable[np.ndarray]) -> dict[str, int]:
     """How many clips want each filter."""
     names = [choose_filter(clip) for clip in clips]
     return {name: names.count(name) for name in FILTERS}

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.reporting.findings import Cell, Column, Table
+from experiments.running.context import Context
 from sensors_io.scenes import partial_slip, tangential
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.sensors import BODY, SensorModel
@@ -38,7 +39,7 @@ class Promise:
         return self.error <= self.promised
 
 
-def cattaneo_mindlin(grid: int) -> dict[str, float]:
+def cattaneo_mindlin(grid: int, context: Context) -> dict[str, float]:
     """How far the solver is from Cattaneo (1938) and Mindlin (1949): the worst over three forces, relative.
 
         δ = 3μF/(8Ga) [1 − (1 − Q/μF)^⅔],   c = a (1 − Q/μF)^⅓,   τ = μ [p_a(r) − (c/a) p_c(r)]
@@ -49,7 +50,7 @@ def cattaneo_mindlin(grid: int) -> dict[str, float]:
     radius, most, a = np.hypot(x[None], x[:, None]), FRICTION * SPHERE.force_n, SPHERE.contact_radius_mm
     still = jnp.zeros((grid, grid), jnp.complex64)
     off: dict[str, list[float]] = {"slide": [], "force": [], "traction": []}
-    for share in PULL_SHARES:
+    for share in context.each("Cattaneo and Mindlin", PULL_SHARES):
         slide = 3 * most / (8 * SHEAR_MODULUS_MPA * a) * (1 - (1 - share) ** (2 / 3))
         stick = a * (1 - share) ** (1 / 3)
         inner = SPHERE.peak_pressure_mpa * stick / a * np.sqrt(np.maximum(1 - (radius / stick) ** 2, 0))
@@ -63,7 +64,7 @@ def cattaneo_mindlin(grid: int) -> dict[str, float]:
     return {name: max(values) for name, values in off.items()}
 
 
-def lubkin(grid: int) -> float:
+def lubkin(grid: int, context: Context) -> float:
     """How far the torque of a twisted sphere is from Lubkin (1951): the worst over three twists, relative.
 
     A stack of twisted punches of radius t (Reissner & Sagoci 1944: torque 16/3 G t³ each) makes τ = μp outside the
@@ -72,7 +73,7 @@ def lubkin(grid: int) -> float:
     x, spacing, limit, compliance = _sphere(grid)
     axis, still = jnp.asarray(x, jnp.float32), jnp.zeros(2, jnp.float32)
     off = []
-    for ratio in STICK_RATIOS:
+    for ratio in context.each("Lubkin", STICK_RATIOS):
         twist, torque = _lubkin(ratio)
         solved = tangential.solve(limit, rigid_field(axis, still, twist, still), compliance, None, TIGHT)
         t = np.asarray(solved.traction_mpa, np.complex128)

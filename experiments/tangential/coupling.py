@@ -118,7 +118,7 @@ def _change(
         "with": lambda: [_frames(motion, bench, each) for motion, each in zip(motions, couplings, strict=True)],
     }
     without, coupled = (jax.device_get(call()) for call in calls.values())
-    seconds = interleaved(calls, _ROUNDS)
+    seconds = interleaved(calls, range(_ROUNDS))
     count = len(motions) * len(motions[0].pressure_mpa)
     ms = {key: 1e3 * float(np.median(s)) / count for key, s in seconds.items()}
     before, after = (np.stack([f.displacement_mm[:, :2] for f in found]) for found in (without, coupled))

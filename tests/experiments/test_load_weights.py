@@ -1,6 +1,7 @@
 """The measurement of reading weights, shrunken, and the random checkpoints that it reads."""
 
 import json
+import os
 
 import jax
 import jax.numpy as jnp
@@ -29,12 +30,21 @@ def test_experiment_runs_shrunken(tmp_path):
 
 
 def test_readers_read_the_same(tmp_path):
-    size = random_checkpoint(tmp_path, TINY, 50_000, seed=1)
+    told: list[tuple[int, int]] = []
+    size = random_checkpoint(tmp_path, TINY, 50_000, seed=1, tell=lambda *word: told.append(word))
+    assert told == sorted(told)
+    assert told[-1] == (size, size)
     assert len(list(tmp_path.glob("*.safetensors"))) > 3
-    ours, theirs = (sorted(map(digest, read(tmp_path, TINY))) for read in READERS.values())
+    ours, theirs = (sorted(map(digest, read(tmp_path, TINY, silent))) for read in READERS.values())
     assert ours == theirs
     assert json.loads((tmp_path / "model.safetensors.index.json").read_text())["metadata"]["total_size"] == size
-    assert size == sum(x.nbytes for x in READERS["streamed"](tmp_path, TINY)) == load_weights.weight_bytes("tiny")
+    assert (
+        size == sum(x.nbytes for x in READERS["streamed"](tmp_path, TINY, silent)) == load_weights.weight_bytes("tiny")
+    )
+
+
+def silent(done: int, total: int) -> None:
+    del done, total
 
 
 def digest(x: jax.Array) -> tuple[tuple[int, ...], bytes]:
@@ -42,8 +52,8 @@ def digest(x: jax.Array) -> tuple[tuple[int, ...], bytes]:
 
 
 def test_contents_are_small_numbers(tmp_path):
-    random_checkpoint(tmp_path, TINY, 10**9, seed=1)
-    for x in READERS["streamed"](tmp_path, TINY):
+    random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    for x in READERS["streamed"](tmp_path, TINY, silent):
         size = jnp.abs(x.astype(jnp.float32))
         assert float(size.min()) >= 2**-7
         assert float(size.max()) < 2**-6
@@ -54,9 +64,29 @@ def test_no_shard_is_larger_than_said_but_for_single_tensors():
         assert len(shard) == 1 or 2 * sum(int(np.prod(s)) for s in shard.values()) <= 20_000
 
 
-def test_a_reader_that_fails_is_said_to_have(tmp_path):
-    with pytest.raises(RuntimeError, match="ended with status 1 and no answer"):
-        measure("streamed", tmp_path, TINY)
+def test_a_reader_that_fails_says_why(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no weights; correct the directory"):
+        measure("streamed", tmp_path, TINY, silent)
+
+
+def end_at_once(*_: object) -> list[jax.Array]:
+    os._exit(9)
+
+
+def test_a_reader_that_is_stopped_is_said_to_be(tmp_path, monkeypatch):
+    monkeypatch.setitem(READERS, "stopped", end_at_once)
+    with pytest.raises(RuntimeError, match="ended without an answer: probably too little memory"):
+        measure("stopped", tmp_path, TINY, silent)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_bytes_are_told_from_the_process_that_reads(tmp_path, reader):
+    size = random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    told: list[tuple[int, int]] = []
+    measure(reader, tmp_path, TINY, lambda *word: told.append(word))
+    assert told == sorted(told)
+    assert told[-1] == (size, size)
+    assert len(told) > 3
 
 
 def test_sizes_must_have_shapes_and_room(tmp_path):
@@ -71,6 +101,6 @@ def test_sizes_must_have_shapes_and_room(tmp_path):
 def test_peak_memory_is_that_of_the_program_and_not_of_its_parent(tmp_path):
     """This process has imported more than the reader will, and has held what its child has not."""
     held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
-    random_checkpoint(tmp_path, TINY, 10**9, seed=1)
-    assert measure("streamed", tmp_path, TINY).before < peak_memory()
+    random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    assert measure("streamed", tmp_path, TINY, silent).before < peak_memory()
     assert peak_memory() >= held.nbytes

@@ -74,9 +74,9 @@ def test_the_report_holds_every_codec_on_every_kind_of_clips(results):
     assert lossless
 
 
-def test_kinds_that_are_not_there_are_left_out(recordings, tmp_path):
-    assert recorded_clips(tmp_path, 2, 4) == {}
-    found = recorded_clips(recordings, 2, 4)
+def test_kinds_that_are_not_there_are_left_out(recordings, tmp_path, context):
+    assert recorded_clips(tmp_path, 2, 4, context) == {}
+    found = recorded_clips(recordings, 2, 4, context)
     assert {kind: [clip.shape for clip in clips] for kind, clips in found.items()} == {
         IMPORTED: [(6, 120, 160, 3)] * 2,
         WHOLE: [(4, 24, 32, 3)] * 2,

@@ -9,6 +9,7 @@ import pytest
 
 from experiments.reporting.checks import ResultsError
 from experiments.running.artifacts import read_json
+from experiments.running.context import Context
 from experiments.running.runner import main
 from experiments.scenes import realism
 from experiments.scenes.shadows import shadow_gain
@@ -89,9 +90,9 @@ def test_the_report_shows_the_presses(directory: Path) -> None:
     assert (directory / "plots" / "presses.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_shadows_that_were_not_cast_explain_nothing(recordings: Path) -> None:
+def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: Context) -> None:
     presses = realism.read(recordings, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
-    study = realism.fit(presses)
+    study = realism.fit(presses, context)
     found = shadow_gain(presses, study.profiles, study.touches, study.fitted, study.held_out)
     assert found["explained"] < 0.05
     assert json.dumps(found)

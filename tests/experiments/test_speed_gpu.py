@@ -38,13 +38,13 @@ def test_sizes_that_do_not_fit_are_named(changes, message):
         GpuConfig(**changes)
 
 
-def test_both_ways_to_attend_are_one_in_float32_and_near_it_in_bfloat16():
+def test_both_ways_to_attend_are_one_in_float32_and_near_it_in_bfloat16(context):
     heads = draw_heads(2, 12, 4, 2, 8)
     ways = {"engine": engine_attention, "flash": flash_attention("xla")}
     wide = jax.tree.map(lambda x: x.astype(jnp.float32), heads)
     a, b = (jax.jit(with_gradient(way))(wide) for way in ways.values())
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
-    off = errors(heads, ways)
+    off = errors(heads, ways, context)
     assert all(0 < e < speed_gpu.OFF_FLOAT32 for e in off.values())
 
 

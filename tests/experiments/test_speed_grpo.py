@@ -12,8 +12,9 @@ from experiments.grpo.harness import PeerTimes
 from experiments.grpo.job import Job, config_of, init_decoder, make_agent, make_batch
 from experiments.grpo.peers import PeerFailed
 from experiments.grpo.size import Size
-from experiments.grpo.speed import Course, Option, in_own_process, many_steps, options, time_alone
+from experiments.grpo.speed import Course, Option, many_steps, options, time_alone
 from experiments.grpo.speed_tables import steadiness
+from experiments.running.apart import in_own_process
 from experiments.running.artifacts import read_json
 from experiments.running.runner import main
 
@@ -60,7 +61,7 @@ def test_the_second_process_reads_what_the_first_compiled(tmp_path):
 def jobs():
     """Every option, small, after one step each."""
     every = options(TINY, 16, 1, (4,), get_args(Option))
-    return {name: (job, jax.device_get(job.step())) for name, job in every.items()}
+    return {name: (job, jax.device_get(job.step())) for name, job in ((name, make()) for name, make in every.items())}
 
 
 @pytest.mark.slow
@@ -107,7 +108,9 @@ def test_seeds_share_a_program_and_nothing_else():
 @pytest.mark.slow
 def test_many_steps_take_every_length_in_one_program():
     size = dataclasses.replace(speed_grpo.SMOKE.steps_size, vocab_size=16, hidden_size=16)
-    course = many_steps(size, 16, (4, 8), 200)
+    told: list[tuple[int, int]] = []
+    course = many_steps(size, 16, (4, 8), 200, lambda *word: told.append(word))
+    assert told == [(100, 200), (200, 200)]
     assert course.seconds.shape == (200,)
     assert course.resident_mb.shape == (2,)
     assert course.programs == 1
@@ -129,7 +132,7 @@ def test_the_experiment_reports_every_prefix(tmp_path):
     small = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16,), words=256)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(speed_grpo, "EXPERIMENT", dataclasses.replace(speed_grpo.EXPERIMENT, config=small))
-        patch.setattr(speed_grpo, "in_own_process", lambda work, *arguments: work(*arguments))
+        patch.setattr(speed_grpo, "in_own_process", lambda work, *arguments, **tell: work(*arguments, **tell))
         assert main(["speed_grpo", "--runs-dir", str(tmp_path)]) == 0
     (directory,) = (p for p in (tmp_path / "speed_grpo").iterdir() if not p.is_symlink())
     results = read_json(directory / "results.json")

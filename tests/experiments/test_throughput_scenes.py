@@ -52,7 +52,7 @@ def cheap(monkeypatch):
 
 
 def test_the_experiment_runs_shrunken(cheap, tmp_path):
-    def killed(arguments, out, *, kills, shards, shard_s, seed):
+    def killed(arguments, out, *, kills, shards, shard_s, seed, advance):
         assert arguments[:4] == ["--objects", "4", "--sequences", "32"]
         assert shards == 1
         generate.generate_records(config.scenes(8, 32), out)

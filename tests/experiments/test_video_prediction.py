@@ -44,13 +44,13 @@ def test_both_predictors_stand_beside_the_baselines(directory):
     assert (directory / "plots" / "film_strip.png").stat().st_size > 1000
 
 
-def test_mean_frames_are_means_of_what_was_recorded(data):
+def test_mean_frames_are_means_of_what_was_recorded(data, context):
     rows = data.parts["sft"][:3]
     (clip,) = clip_batches(data.store, rows, data.clip, batch_size=3, seed=0, shuffle=False, repeat=False)
     seen = clip["frame_mask"][..., None, None, None]
     assert not seen.all()  # some frames were left out of their clips, as padding of zeros
     known = np.ma.masked_array(clip["frames"] / 255.0, ~np.broadcast_to(seen, clip["frames"].shape))
-    np.testing.assert_allclose(mean_frames(data, rows), known.mean(0).filled(0.0), atol=1e-6)
+    np.testing.assert_allclose(mean_frames(data, rows, context), known.mean(0).filled(0.0), atol=1e-6)
 
 
 def test_scores_leave_out_what_is_missing():

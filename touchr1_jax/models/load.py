@@ -6,11 +6,13 @@ says what it found, how long that took and how much memory; on files that do not
 status 1.
 """
 
+import contextlib
 import dataclasses
 import math
 import resource
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,9 +21,11 @@ import jax
 import jax.numpy as jnp
 import tyro
 from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from touchr1_jax.models.qwen.config import QwenConfig, read_config
 from touchr1_jax.models.qwen.pictures import PixelBudget, read_budget
+from touchr1_jax.models.qwen.safetensors import Tell
 from touchr1_jax.models.qwen.weights import load_params
 from touchr1_jax.text.chat import SEEN, SEEN_END, check_template
 from touchr1_jax.text.tokenizer import Tokenizer, from_file
@@ -44,31 +48,36 @@ class Checkpoint:
     budget: PixelBudget
 
 
-def load_checkpoint(directory: str | Path, dtype: jnp.dtype | type = jnp.bfloat16) -> Checkpoint:
+def load_checkpoint(
+    directory: str | Path,
+    dtype: jnp.dtype | type = jnp.bfloat16,
+    progress: Tell = lambda done_bytes, all_bytes: None,
+) -> Checkpoint:
     """Read a checkpoint; small files first, so that a wrong one is refused before the weights are read.
 
     Args:
       directory: `config.json`, `tokenizer.json`, `preprocessor_config.json`, a chat template, and the weights as
         `load_params` reads them.
       dtype: type of all parameters.
+      progress: told of the weights as `load_params` tells.
 
     Raises:
       FileNotFoundError: a file that is missing.
       WeightsError: one that does not fit.
     """
     try:
-        return _read(Path(directory), dtype)
+        return _read(Path(directory), dtype, progress)
     except ValueError as error:
         raise WeightsError(str(error)) from error
 
 
-def _read(directory: Path, dtype: jnp.dtype | type) -> Checkpoint:
+def _read(directory: Path, dtype: jnp.dtype | type, progress: Tell) -> Checkpoint:
     config = read_config(directory)
     tokenizer = from_file(directory / TOKENIZER_FILE, vocab_size=config.decoder.vocab_size)
     check_ids(tokenizer, config)
     check_template(directory)
     budget = read_budget(directory, config.vision)
-    params = load_params(directory, config, dtype)
+    params = load_params(directory, config, dtype, progress=progress)
     return Checkpoint(config=config, params=params, tokenizer=tokenizer, budget=budget)
 
 
@@ -92,17 +101,43 @@ def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:
             )
 
 
-def check_finite(params: Params) -> None:
+def check_finite(params: Params, progress: Tell = lambda done_bytes, all_bytes: None) -> None:
     """Refuse weights that are no numbers; a loader that reads every release need not look, the command does.
+
+    Args:
+      params: the weights.
+      progress: called after each.
 
     Raises:
       WeightsError: NaN or infinity.
     """
     whole = jax.jit(lambda x: jnp.isfinite(x).all())
-    broken = [name for name, x in flax.traverse_util.flatten_dict(params, sep="/").items() if not whole(x)]
+    every = flax.traverse_util.flatten_dict(params, sep="/")
+    done, size, broken = 0, sum(x.nbytes for x in every.values()), []
+    for name, x in every.items():
+        if not whole(x):
+            broken.append(name)
+        done += x.nbytes
+        progress(done, size)
     if broken:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         raise WeightsError(f"{broken[0]}{more} holds NaN or infinity: must be finite; fetch the weights again")
+
+
+@contextlib.contextmanager
+def _bar(title: str) -> Iterator[Tell]:
+    """Bytes, rate and time left on stderr; where that is no terminal, its last state alone."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -116,8 +151,10 @@ class Load:
         """Read, report, and return the exit status."""
         console, began = Console(soft_wrap=True, highlight=False), time.perf_counter()
         try:
-            found = load_checkpoint(self.directory, jnp.dtype(self.dtype))
-            check_finite(found.params)
+            with _bar("reading") as progress:
+                found = load_checkpoint(self.directory, jnp.dtype(self.dtype), progress)
+            with _bar("checking") as progress:
+                check_finite(found.params, progress)
         except (OSError, ValueError) as error:
             Console(stderr=True, soft_wrap=True).print(
                 f"{type(error).__name__}: {error}", markup=False, highlight=False

@@ -1,6 +1,7 @@
 """Logging, stages, timing and progress of a run."""
 
 import io
+import time
 
 import numpy as np
 import pytest
@@ -121,6 +122,40 @@ def test_progress_draws_a_bar_on_a_terminal():
         advance(2, "reward 0.5")
     assert "2/2" in console.file.getvalue()
     assert "reward 0.5" in console.file.getvalue()
+
+
+def test_rounds_are_drawn_between_them_alone(tmp_path):
+    """A bar that draws itself ten times a second would take time of what is timed."""
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    context = Context(tmp_path, tmp_path / "cache", console)
+    for _ in context.rounds("timing", 2):
+        before = console.file.getvalue()
+        time.sleep(0.3)
+        assert console.file.getvalue() == before
+    assert "2/2" in console.file.getvalue()
+    context.close()
+
+
+def test_a_loop_that_tells_of_itself_is_shown_from_its_first_word(context):
+    with context.told("contacts") as tell:
+        assert not context._loops
+        tell(4, 10)  # an earlier session's
+        (loop,) = context._loops
+        assert (loop.completed, loop.total, loop.rate) == (4, 10, 0.0)
+        tell(7, 10)
+        tell(7, 10)
+        assert loop.completed == 7
+        assert loop.rate > 0
+    assert not context._loops
+    assert "contacts: 7/10" in context.console.file.getvalue()
+
+
+def test_bytes_are_told_in_megabytes_and_end_at_all_of_them():
+    told: list[tuple[int, int]] = []
+    tell = progress.in_megabytes(lambda *word: told.append(word))
+    for done in (0, 1, 2_000_000, 2_500_000):
+        tell(done, 2_500_000)
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])

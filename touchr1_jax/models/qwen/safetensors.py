@@ -8,7 +8,7 @@ pages of a shard of several gigabytes count as long as it is open; here one tens
 import json
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +30,10 @@ MAX_HEADER = 100_000_000
 """Longest header, bytes; the format forbids more, and a file of another format would seem to ask for exabytes."""
 
 
+Tell = Callable[[int, int], None]
+"""Hears how many bytes are done, and of how many."""
+
+
 class Entry(NamedTuple):
     """Where a tensor lies: its type by the format's name, its shape, its bytes from `start` to `end` of the file."""
 
@@ -38,6 +42,11 @@ class Entry(NamedTuple):
     shape: tuple[int, ...]
     start: int
     end: int
+
+    @property
+    def size(self) -> int:
+        """Its bytes."""
+        return self.end - self.start
 
 
 def read_header(path: Path) -> dict[str, Entry]:
@@ -70,20 +79,28 @@ def read_tensor(entry: Entry) -> np.ndarray:
     """
     dtype = DTYPES[entry.dtype]
     with entry.path.open("rb") as file:
-        data = np.fromfile(file, dtype, (entry.end - entry.start) // dtype.itemsize, offset=entry.start)
-    if data.nbytes != entry.end - entry.start:
-        raise ValueError(f"{entry.path} ends inside a tensor, {data.nbytes} bytes of {entry.end - entry.start}")
+        data = np.fromfile(file, dtype, entry.size // dtype.itemsize, offset=entry.start)
+    if data.nbytes != entry.size:
+        raise ValueError(f"{entry.path} ends inside a tensor, {data.nbytes} bytes of {entry.size}")
     return data.reshape(entry.shape)
 
 
-def write_file(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
+def write_file(
+    path: Path, tensors: Mapping[str, np.ndarray], progress: Tell = lambda done_bytes, all_bytes: None
+) -> None:
     """Write tensors to a file, whole or not at all.
+
+    Args:
+      path: of the file.
+      tensors: by name.
+      progress: called after each tensor.
 
     Raises:
       ValueError: a tensor of a type that no weight has.
     """
     names = {dtype: name for name, dtype in DTYPES.items()}
-    header, end = {}, 0
+    header: dict[str, dict[str, Any]] = {}
+    end = 0
     for name, x in tensors.items():
         if x.dtype not in names:
             raise ValueError(f"{name} is {x.dtype}: must be one of {', '.join(map(str, names))}; cast it")
@@ -94,8 +111,9 @@ def write_file(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
         file.write(struct.pack("<Q", len(text)) + text)
-        for x in tensors.values():
+        for name, x in tensors.items():
             np.ascontiguousarray(x).tofile(file)
+            progress(header[name]["data_offsets"][1], end)
     os.replace(partial, path)
 
 
@@ -108,10 +126,9 @@ def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int
     entry = Entry(path, found["dtype"], tuple(found["shape"]), start, end)
     if entry.dtype in DTYPES:
         needed = DTYPES[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
-        if entry.end - entry.start != needed:
+        if entry.size != needed:
             raise ValueError(
-                f"{entry.path}: {name} has {entry.end - entry.start} bytes, its type and shape need {needed}; "
-                "fetch the file again"
+                f"{entry.path}: {name} has {entry.size} bytes, its type and shape need {needed}; fetch the file again"
             )
     if entry.end > size:
         raise ValueError(f"{entry.path} was cut off: {name} ends at byte {entry.end} of {size}; fetch it again")

@@ -28,7 +28,11 @@ SHOWN = 12
 
 
 def load_params(
-    directory: str | Path, config: QwenConfig, dtype: jnp.dtype | type = jnp.bfloat16, device: jax.Device | None = None
+    directory: str | Path,
+    config: QwenConfig,
+    dtype: jnp.dtype | type = jnp.bfloat16,
+    device: jax.Device | None = None,
+    progress: safetensors.Tell = lambda done_bytes, all_bytes: None,
 ) -> Params:
     """Parameters of `QwenVL` from the safetensors files of a directory.
 
@@ -40,6 +44,7 @@ def load_params(
       config: shapes that are expected.
       dtype: type of all parameters.
       device: where they are placed; JAX's default without one.
+      progress: called before the first tensor and after each with the bytes of the files that are read, and all.
 
     Raises:
       FileNotFoundError: no weights, or a shard that is missing.
@@ -58,7 +63,12 @@ def load_params(
         )
     place = functools.partial(_place, dtype=jnp.dtype(dtype), device=device)
     by_size = sorted(wanted.items(), key=lambda item: -math.prod(item[1].shape))
-    loaded = {path: place(entries[s.key], turned=s.turned) for path, s in by_size}
+    done, size, loaded = 0, sum(entry.size for entry in entries.values()), {}
+    progress(done, size)
+    for path, s in by_size:
+        loaded[path] = place(entries[s.key], turned=s.turned)
+        done += entries[s.key].size
+        progress(done, size)
     return flax.traverse_util.unflatten_dict(loaded)
 
 
@@ -94,8 +104,16 @@ def compare(entries: Mapping[str, safetensors.Entry], wanted: Mapping[str, tuple
     return missing + extra + shapes + types
 
 
-def save_params(path: Path, params: Params, config: QwenConfig) -> None:
+def save_params(
+    path: Path, params: Params, config: QwenConfig, progress: safetensors.Tell = lambda done_bytes, all_bytes: None
+) -> None:
     """Write parameters to one file with the published keys, in their own type.
+
+    Args:
+      path: of the file.
+      params: the tree of `QwenVL`.
+      config: its shapes.
+      progress: called after each tensor.
 
     Raises:
       ValueError: a tree that is not that of the config.
@@ -105,7 +123,8 @@ def save_params(path: Path, params: Params, config: QwenConfig) -> None:
     if flat.keys() != wanted.keys():
         differ = sorted("/".join(p) for p in flat.keys() ^ wanted.keys())
         raise ValueError(f"params and config differ in {', '.join(differ[:SHOWN])}; save with the config of the params")
-    safetensors.write_file(path, {published(s.key): names.write(np.asarray(flat[p]), s) for p, s in wanted.items()})
+    tensors = {published(s.key): names.write(np.asarray(flat[p]), s) for p, s in wanted.items()}
+    safetensors.write_file(path, tensors, progress)
 
 
 def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
