@@ -18,7 +18,7 @@ Baselines without touch stay near chance in comparisons.  A constant already has
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -78,10 +78,10 @@ def run(config: MainConfig, context: Context) -> Results:
     with context.timed("baselines"):
         said = {**study.answers, **study.further, **{n: [x] for n, x in without_training(study, context).items()}}
     with context.timed("score"):
-        asks = questions(study.data, config.quota)
+        asks = questions(study.data, config.quota, context)
         rows = {
             name: bench_row(asks, answered(study.data, asks, seeds), sight(study, asks, seeds))
-            for name, seeds in said.items()
+            for name, seeds in context.each("scoring", said.items())
         }
     trained = {name: rows[name] for name in (SFT, FULL)}
     pictures, reliability = level_report(study)
@@ -123,13 +123,18 @@ def without_training(study: Study, context: Context) -> dict[str, Evaluated]:
         fields = [field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
     pictures = [picture_features(data.store, rows) for rows in (train, test)]
     known = lambda seen: Known(seen=seen, label=data.label[train])
-    found = baselines(study)
+
+    def by_picture() -> Levels:
+        found = probed(known(pictures[0]), pictures[1], levels, study.config.probe)
+        return Levels(together=found.together, alone=_repeated(found, fields[1]))
+
+    ways: dict[str, Callable[[], Levels]] = {}
     if pictures[0].present.any():
-        by_picture = probed(known(pictures[0]), pictures[1], levels, study.config.probe)
-        found[PICTURE] = _answers(study, Levels(together=by_picture.together, alone=_repeated(by_picture, fields[1])))
+        ways[PICTURE] = by_picture
     if fields[0].present.any():
-        found[NEAREST] = _answers(study, nearest(known(fields[0]), fields[1], levels))
-    return found
+        ways[NEAREST] = lambda: nearest(known(fields[0]), fields[1], levels)
+    read = {name: _answers(study, make()) for name, make in context.each("baselines", ways.items())}
+    return baselines(study) | read
 
 
 def _answers(study: Study, levels: Levels) -> Evaluated:

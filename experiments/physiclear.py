@@ -133,15 +133,15 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findi
     spent = {stage: seconds for stage, seconds in context.timing().items() if stage.startswith((*MADE, "fold/"))}
     keep(config, videos, background, context)
     baselines = [Row(name=name, answer=said) for name, said in constants(videos.label, videos.objects, fold).items()]
-    probes = Row(name="probes alone", answer=cross_answers(config.learn, videos, background, fold))
+    probes = Row(name="probes alone", answer=cross_answers(config.learn, videos, background, fold, context))
     policy = Row(name="policy", answer=answer)
     main = intervals(answer, videos.label, videos.objects)
     elsewhere = deal_folds(videos.objects, videos.label, config.folds, config.ablation_seed)
-    curve = growth(config.learn, videos, background, elsewhere)
-    contributions = ablate_probes(config.learn, videos, background, elsewhere)
+    curve = growth(config.learn, videos, background, elsewhere, context)
+    contributions = ablate_probes(config.learn, videos, background, elsewhere, context)
     if config.ablations:
         contributions += ablate(config.learn, videos, background, elsewhere, config.ablation_seed, context)
-    limits = label_limits(config.learn, videos, background, elsewhere)
+    limits = label_limits(config.learn, videos, background, elsewhere, context)
     score = lambda title, rows, note="": score_table(title, rows, videos.label, videos.objects, note)
     return Findings(
         verdict=verdict(main, curve, videos, answer),
@@ -186,7 +186,7 @@ def keep(config: PhysiclearStudy, videos: Described, background: Background, con
     path = context.directory / POLICY
     if not path.exists():
         with context.timed("policy"):
-            learned, _ = learn(config.learn, videos, background, config.seed)
+            learned, _ = learn(config.learn, videos, background, config.seed, context)
         save(path, learned)
     if config.objects is None:
         write_bytes(kept(config, context), path.read_bytes())

@@ -67,7 +67,7 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     scored = score_study(study)
     asked = asked_questions(study)
     found = cases(asked, said(study))
-    asks = questions(study.data, config.quota)
+    asks = questions(study.data, config.quota, context)
     items = items_shown(
         asks,
         answered(study.data, asks, study.answers[FULL][:1])[0],

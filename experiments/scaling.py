@@ -132,7 +132,7 @@ HERE = (
 def one_size(config: ScalingConfig, name: str, context: Context) -> Sized:
     """Train and ask one size; the study itself, which keeps its clips in memory, is not kept."""
     study, timing = study_apart(dataclasses.replace(config.study, model=config.sizes[name]), name, context)
-    asks, scored = questions(study.data, config.quota), score_study(study)
+    asks, scored = questions(study.data, config.quota, context), score_study(study)
 
     def row(policy: str) -> dict[str, Estimate]:
         alone = {m: scored.estimates[policy][m] for m in ("acc", "parse_rate", "middle_rate", "reward")}

@@ -112,13 +112,13 @@ def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> 
     """Runs of a victim until all kills have struck; a stopped session of this experiment goes on behind the last."""
     stage = f"kill/{victim.name}"
     campaign = Campaign(context.directory / "victims" / victim.name, context.cache_dir / "programs", victim, config)
-    if not context.done(f"{stage}/{ALONE}"):
-        context.save_stage(f"{stage}/{ALONE}", campaign.left_alone()._asdict())
-    alone = Alone(**context.load_stage(f"{stage}/{ALONE}"))
     kills: list[Kill] = []
     differs: list[str] = []
     number = 0
     with context.progress(f"killing the {name}", config.kills, _struck_before(stage, context)) as advance:
+        if not context.done(f"{stage}/{ALONE}"):
+            context.save_stage(f"{stage}/{ALONE}", campaign.left_alone()._asdict())
+        alone = Alone(**context.load_stage(f"{stage}/{ALONE}"))
         while len(kills) < config.kills:
             here = f"{stage}/{number}"
             if not context.done(here):
@@ -159,20 +159,26 @@ def _damage(config: FaultsConfig, context: Context, scratch: Path) -> list[tuple
     if not context.done("damage"):
         (scratch / "unfinished").mkdir()
         (scratch / "damaged").mkdir()
-        unfinished_run(scratch / "unfinished")
-        found = strike(scratch / "unfinished", scratch / "damaged", config.damaged_files)
+        _unfinished(scratch / "unfinished", context)
+        found = strike(scratch / "unfinished", scratch / "damaged", context, config.damaged_files)
         struck = [(one.file, one.way, one.outcome, _first_error(one.said)) for one in found]
         context.save_stage("damage", struck)
     return [(file, way, outcome, said) for file, way, outcome, said in context.load_stage("damage")]
 
 
+def _unfinished(folder: Path, context: Context) -> None:
+    with context.progress("making a run to damage", 1, still=True) as advance:  # its output is caught
+        unfinished_run(folder)
+        advance()
+
+
 def _bad_inputs(config: FaultsConfig, context: Context, scratch: Path) -> list[tuple[str, str, int, str, str]]:
     """Kind, name, exit code, message and faults of every bad input."""
     if not context.done("inputs"):
-        unfinished_run(scratch / "inputs")
+        _unfinished(scratch / "inputs", context)
         tried = cases(scratch / "inputs")[: config.bad_inputs]
         rows = []
-        with context.progress("trying bad inputs", len(tried)) as advance:
+        with context.progress("trying bad inputs", len(tried), still=True) as advance:
             for i, case in enumerate(tried):
                 folder = scratch / f"case-{i}"
                 folder.mkdir()

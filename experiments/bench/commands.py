@@ -1,8 +1,10 @@
 """The commands of the bench over records and files."""
 
+import contextlib
 import dataclasses
+import itertools
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import tyro
 from rich.console import Console
@@ -15,6 +17,7 @@ from experiments.bench.filters import Filtered, sift
 from experiments.bench.generate import Source, ask_about, generate, read_source
 from experiments.bench.sheets import SheetError
 from experiments.running.artifacts import write_json
+from sensors_io.commands.console import progress_bar
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import read_items, write_items
 from touchr1_jax.bench.json_lines import read_lines, write_lines
@@ -35,7 +38,9 @@ class FromRecords:
 
     def source(self) -> Source:
         """The records, measured."""
-        return read_source(RecordStore(self.records))
+        store = RecordStore(self.records)
+        with _contacts(store, "test", "train") as tell:
+            return read_source(store, tell=tell)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -154,7 +159,9 @@ class Annotate:
             return 1
         decided = annotate.read_decisions(str(cells), a, b) if annotate.open_cells(a, b) else {}
         labels = annotate.adjudicate(a, b, decided)
-        contacts = [c for split in ("train", "val", "test", "unlabelled") for c in gather(store, split).contacts]
+        splits = ("train", "val", "test", "unlabelled")
+        with _contacts(store, *splits) as tell:
+            contacts = [c for split in splits for c in gather(store, split, tell).contacts]
         for doubt in annotate.doubts(labels, contacts):
             told = f"{doubt.object}: {doubt.attribute} {doubt.label} against {', '.join(doubt.sensors)}"
             OUT.print(f"look again at {told}")
@@ -178,7 +185,9 @@ class AuditSheet:
     def run(self) -> int:
         items, store = read_items(self.items), RecordStore(self.records)
         key = audit.sample(items, min(self.count, len(items)), self.seed)
-        audit.write_blank(str(self.out), items, key, gather(store, "test").by_touch())
+        with _contacts(store, "test") as tell:
+            contacts = gather(store, "test", tell).by_touch()
+        audit.write_blank(str(self.out), items, key, contacts)
         write_json(self.out.with_suffix(".key.json"), key)
         OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
         return 0
@@ -206,6 +215,14 @@ class Audit:
             for axis, kappa in audit.judges_agree(*judged).items():
                 OUT.print(f"{axis}: κ = {'undefined' if kappa is None else f'{kappa:.2f}'}")
         return 0
+
+
+@contextlib.contextmanager
+def _contacts(store: RecordStore, *splits: str) -> Iterator[Callable[[], None]]:
+    """A progress bar for contacts that are read; what it yields is called after each."""
+    total, done = sum(len(store.contacts_of_split(split)) for split in splits), itertools.count(1)
+    with progress_bar("contacts") as show:
+        yield lambda: show(next(done), total)
 
 
 def _publish(path: pathlib.Path, found: Filtered, source: Source) -> int:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from experiments.faults.evidence import differences, evidence
 from experiments.faults.inputs import counting_paths, cut, emptied, flipped, newest_checkpoints, run_directory
+from experiments.running.context import Context
 from experiments.running.runner import main
 
 WAYS: Mapping[str, Callable[[Path], None]] = {
@@ -35,28 +36,30 @@ class Damage:
     said: str
 
 
-def strike(unfinished: Path, scratch: Path, most: int | None = None) -> Iterator[Damage]:
+def strike(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
     """Damage a copy of the run, go on with it, and compare its end with the one that it would have had.
 
     Args:
       unfinished: a folder that `inputs.unfinished_run` filled.
       scratch: an empty folder.
+      context: shows how far it is.
       most: so many files at most; `None` takes all.
     """
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
     _go_on(whole)
     wanted = evidence(run_directory(whole))
-    for i, path in enumerate(_files(unfinished)[:most]):
-        for way, damage in WAYS.items():
-            if path.stat().st_size == 0 and way != "removed":
-                continue
+    files = enumerate(_files(unfinished)[:most])
+    every = [(i, path, way) for i, path in files for way in WAYS if path.stat().st_size or way == "removed"]
+    with context.progress("damaging files", len(every), still=True) as advance:  # what a run prints is caught
+        for i, path, way in every:
             folder = scratch / f"{i}-{way.replace(' ', '-')}"
             shutil.copytree(unfinished, folder, symlinks=True)
-            damage(folder / path.relative_to(unfinished))
+            WAYS[way](folder / path.relative_to(unfinished))
             code, said = _go_on(folder)
             yield Damage(file=_kind(path), way=way, outcome=_outcome(folder, code, said, wanted), said=said)
             shutil.rmtree(folder)
+            advance()
 
 
 def _go_on(folder: Path) -> tuple[int, str]:

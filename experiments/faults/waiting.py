@@ -45,7 +45,7 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
     data = open_study_data(study, context)
     assembly = assemble(study.model, data.clip.sensors)
-    evidence = gather_evidence(data, probe_features(data, context), study.probe)
+    evidence = gather_evidence(data, probe_features(data, context), study.probe, context)
     sft = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
     params = run_sft(assembly, data, evidence, sft, context, seed=0, stage=STAGES[0])
     features = encode_contacts(assembly, params, data, data.parts["grpo"], context)

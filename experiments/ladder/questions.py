@@ -16,6 +16,7 @@ from experiments.bench.draw import Quota, draw
 from experiments.bench.facts import gather
 from experiments.policies.answers import Evaluated
 from experiments.policies.dataset import Dataset
+from experiments.running.context import Context
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import Ask, Touch
@@ -61,9 +62,11 @@ class Answerer:
         return float(level) + (float(read.mean()) / SCALE if len(read) else 0.0)
 
 
-def questions(data: Dataset, quota: Quota) -> tuple[Ask, ...]:
+def questions(data: Dataset, quota: Quota, context: Context) -> tuple[Ask, ...]:
     """The bench's questions about the test contacts."""
-    return draw(gather(data.store, "test").contacts, data.clip.sensors, quota, seed=0)
+    with context.progress("measuring contacts", len(data.store.contacts_of_split("test"))) as advance:
+        contacts = gather(data.store, "test", advance).contacts
+    return draw(contacts, data.clip.sensors, quota, seed=0)
 
 
 def answered(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:

@@ -41,7 +41,7 @@ def untrained(trained: Trained) -> Evaluated:
     """The policy as it is before SFT."""
     params = stages.untrained(trained.assembly, trained.data, trained.seed)
     test = encode_contacts(trained.assembly, params, trained.data, trained.data.parts["test"], trained.context)
-    return evaluate_policy(trained.assembly, params, test, trained.label)
+    return evaluate_policy(trained.assembly, params, test, trained.label, trained.context)
 
 
 def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> Evaluated:
@@ -55,7 +55,7 @@ def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> 
     asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
     stage = f"grpo/no_sft/{trained.seed}"
     tuned = run_grpo(assembly, arm, asked, params, trained.context, seed=trained.seed, stage=stage)
-    return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label)
+    return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)
 
 
 def by_encoder(strange: bool, trained: Trained) -> Evaluated:
@@ -112,4 +112,4 @@ def _controlled(control: str, trained: Trained) -> Evaluated:
         "swapped": lambda: swap_objects(trained.test, objects, trained.seed),
     }
     changed = jax.device_get(change[control]())
-    return evaluate_policy(trained.assembly, trained.params, changed, trained.label, alone=False)
+    return evaluate_policy(trained.assembly, trained.params, changed, trained.label, trained.context, alone=False)

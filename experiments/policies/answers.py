@@ -14,6 +14,7 @@ from jaxtyping import Float
 from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.feeds import each, labelled, question_batch
 from experiments.running.artifacts import write_bytes
+from experiments.running.context import Context
 from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
@@ -50,21 +51,27 @@ class Evaluated:
 
 
 def evaluate_policy(
-    assembly: Assembly, params: Params, features: Features, label: np.ndarray, *, alone: bool = True
+    assembly: Assembly,
+    params: Params,
+    features: Features,
+    label: np.ndarray,
+    context: Context,
+    *,
+    alone: bool = True,
 ) -> Evaluated:
     """Ask every labelled question about every contact, with all streams and, unless `alone` is off, with each alone."""
     contact, attribute = labelled(label)
     present = np.asarray(features.stream_mask)[contact]
-    ask = answer_program(assembly)
-    said = _ask(ask, assembly, params, features, label, contact, attribute, present)
     s = present.shape[1]
-    single = None
+    shown = [present]
     if alone and present.any() and s > 1:
-        each_alone = [
-            _ask(ask, assembly, params, features, label, contact, attribute, present & (np.arange(s) == i))
-            for i in range(s)
+        shown += [present & (np.arange(s) == i) for i in range(s)]
+    ask = answer_program(assembly)
+    with context.progress("asking", len(shown) * len(contact)) as advance:
+        said, *each_alone = [
+            _ask(ask, assembly, params, features, label, contact, attribute, streams, advance) for streams in shown
         ]
-        single = np.stack([x.parsed.conclude for x in each_alone], 1)
+    single = np.stack([x.parsed.conclude for x in each_alone], 1) if each_alone else None
     return Evaluated(
         contact=contact,
         attribute=attribute,
@@ -82,12 +89,13 @@ def answer_program(assembly: Assembly) -> Any:
     return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
 
 
-def _ask(ask, assembly, params, features, label, contact, attribute, streams):
+def _ask(ask, assembly, params, features, label, contact, attribute, streams, advance):
     """Greedy answers to all questions, in blocks of one size so that the program is compiled once."""
     decoder, blocks = {"decoder": params["decoder"]}, []
     for rows, real in each(len(contact), EVAL_BATCH):
         batch = question_batch(assembly, features, label, contact[rows], attribute[rows], streams[rows])
         blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(decoder, batch)))
+        advance(real)
     return jax.tree.map(lambda *x: np.concatenate(x), *blocks)
 
 

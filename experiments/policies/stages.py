@@ -6,6 +6,7 @@ run goes on from its last checkpoint.
 
 import dataclasses
 import functools
+import itertools
 import math
 from typing import Any
 
@@ -129,7 +130,9 @@ def _features(data: Dataset, rows: np.ndarray, context: Context) -> dict[str, np
     return {name: np.concatenate(part) for name, part in parts.items()}
 
 
-def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float[np.ndarray, "contact S A K"]:
+def gather_evidence(
+    data: Dataset, probed: Probed, config: ProbeConfig, context: Context
+) -> Float[np.ndarray, "contact S A K"]:
     """Out-of-fold log-probabilities of each sensor's probe for the SFT contacts.
 
     Levels that an attribute lacks have −inf.  A stream that was not recorded says nothing, 0 for every level, and so
@@ -137,15 +140,13 @@ def gather_evidence(data: Dataset, probed: Probed, config: ProbeConfig) -> Float
     """
     rows = data.parts["sft"]
     out = np.full((len(data.store), len(data.clip.sensors), len(ATTRIBUTES), max(LEVELS.values())), -np.inf, np.float32)
-    for a, name in enumerate(ATTRIBUTES):
-        out[:, :, a, : LEVELS[name]] = 0.0
-        for s in range(len(data.clip.sensors)):
-            felt = rows[probed.present[rows, s] & (data.label[rows, a] >= 0)]
-            label, groups = data.label[felt, a], data.object_ids[felt]
-            if len(np.unique(groups)) >= config.folds:
-                out[felt, s, a, : LEVELS[name]] = cross_fit(
-                    probed.streams[felt, s], label, groups, LEVELS[name], config
-                )
+    every = itertools.product(enumerate(ATTRIBUTES), range(len(data.clip.sensors)))
+    for (a, name), s in context.each("evidence", every):
+        out[:, s, a, : LEVELS[name]] = 0.0
+        felt = rows[probed.present[rows, s] & (data.label[rows, a] >= 0)]
+        label, groups = data.label[felt, a], data.object_ids[felt]
+        if len(np.unique(groups)) >= config.folds:
+            out[felt, s, a, : LEVELS[name]] = cross_fit(probed.streams[felt, s], label, groups, LEVELS[name], config)
     return out
 
 

@@ -176,7 +176,7 @@ def train_study(
         for arm in arms
     }
     probed = probe_features(data, context)
-    evidence = gather_evidence(data, probed, config.probe)
+    evidence = gather_evidence(data, probed, config.probe, context)
     prior = data.prior()
     make = functools.partial(make_arm, assembly, prior=prior, loop=config.grpo_loop, lora=config.grpo_lora)
     made = {arm: make(weights, config=configs[arm]) for arm, weights in arms.items()}
@@ -254,17 +254,17 @@ class _Seed:
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(assembly.agent, params, data, seed=seed, probe=config.noise_contacts)
         asked = Asked(features=train, label=self._grpo_label(), noise=noise)
-        self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test")))
+        self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test"), context))
         self._ask_further(SFT, params, test, noise)
         for arm in self.arms:
             tuned = self._grpo(arm, params, asked)
-            self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test")))
+            self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test"), context))
             self._ask_further(arm, tuned, test, noise)
 
     def _blind(self) -> Evaluated:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
         features = encode_contacts(self.assembly, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return evaluate_policy(self.assembly, params, features, self._label("test"))
+        return evaluate_policy(self.assembly, params, features, self._label("test"), self.context)
 
     def _sft(self, sft: SFTConfig, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
         make = shared_sft if self.start.share else run_sft

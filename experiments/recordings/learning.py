@@ -31,6 +31,7 @@ from experiments.recordings.training import (
 )
 from experiments.recordings.validation import object_weights
 from experiments.running.artifacts import jsonable, write_bytes
+from experiments.running.context import Context
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
 
@@ -99,7 +100,7 @@ class Said:
 
 
 def learn(
-    config: LearnConfig, training: Described, background: Background, seed: int
+    config: LearnConfig, training: Described, background: Background, seed: int, context: Context
 ) -> tuple[Learned, dict[str, np.ndarray]]:
     """Train every member on labelled videos.
 
@@ -108,6 +109,7 @@ def learn(
       training: videos, all of known levels.
       background: what else is known.
       seed: of members and folds; member m has 1000 · seed + m, but what it reads with is the same for all seeds.
+      context: shows how far it is.
 
     Returns:
       The policy, and its loss and rewards by step, [members, steps].
@@ -118,7 +120,7 @@ def learn(
     felt = _Felt(training, background, training, config)
     families = len(config.evidence.families) if config.read_evidence else 0
     trained, losses, rewards = [], [], []
-    for member in range(config.members):
+    for member in context.each("members", range(config.members)):
         own = 1000 * seed + member
         x, percept = felt.inputs(own)
         params = _reader(config.shape, config.reading, families, config.components, 1000 + member)

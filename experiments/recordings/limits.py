@@ -11,6 +11,7 @@ from experiments.recordings.evidence import standardise
 from experiments.recordings.learning import Background, LearnConfig, evidence_alone
 from experiments.recordings.policy import LEVELS
 from experiments.recordings.validation import Row, intervals
+from experiments.running.context import Context
 from touchr1_jax.bench.statistics import Interval
 
 SHARES = (0.25, 0.5, 0.75, 1.0)
@@ -18,11 +19,16 @@ SHARES = (0.25, 0.5, 0.75, 1.0)
 
 
 def cross_answers(
-    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray, share: float = 1.0
+    config: LearnConfig,
+    videos: Described,
+    background: Background,
+    fold: np.ndarray,
+    context: Context,
+    share: float = 1.0,
 ) -> Int[np.ndarray, "n A"]:
     """Answers of the probes alone, each fold read by probes on a share of the objects of the other folds."""
     answer = np.zeros_like(videos.label)
-    for k in np.unique(fold):
+    for k in context.each("probes", np.unique(fold)):
         names = np.unique(videos.objects[fold != k])
         kept = np.random.default_rng(0).permutation(names)[: max(1, round(share * len(names)))]
         training = videos.rows(np.flatnonzero(np.isin(videos.objects, kept)))
@@ -31,15 +37,15 @@ def cross_answers(
 
 
 def growth(
-    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray
+    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray, context: Context
 ) -> dict[int, dict[str, Interval]]:
     """Scores of the probes by the number of objects that they learn from."""
     objects = np.mean([len(np.unique(videos.objects[fold != k])) for k in np.unique(fold)])
     return {
         round(share * objects): intervals(
-            cross_answers(config, videos, background, fold, share), videos.label, videos.objects
+            cross_answers(config, videos, background, fold, context, share), videos.label, videos.objects
         )
-        for share in SHARES
+        for share in context.each("shares of the objects", SHARES)
     }
 
 
@@ -73,7 +79,9 @@ def vote(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> Int[np.ndarray,
     return voted
 
 
-def label_limits(config: LearnConfig, videos: Described, background: Background, fold: np.ndarray) -> list[Row]:
+def label_limits(
+    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray, context: Context
+) -> list[Row]:
     """Answers that bound what can be told.
 
     - *vote*: the answers of the probes, those of an object's videos pooled.  What is wrong then is no matter of trials.
@@ -84,10 +92,10 @@ def label_limits(config: LearnConfig, videos: Described, background: Background,
       often objects that feel alike, by this description, were judged differently.
     """
     known = np.zeros_like(videos.label)
-    for i in range(len(videos.names)):
+    for i in context.each("touched before", range(len(videos.names))):
         rest = videos.rows(np.flatnonzero(np.arange(len(videos.names)) != i))
         known[i] = evidence_alone(config, rest, background, videos.rows(np.array([i])))
-    answer = cross_answers(config, videos, background, fold)
+    answer = cross_answers(config, videos, background, fold, context)
     return [
         Row(name="probes", answer=answer),
         Row(name="probes, vote over all videos of an object", answer=vote(answer, videos.objects)),

@@ -30,7 +30,7 @@ def cross_validate(
             held, name = np.flatnonzero(fold == k), f"{stage}/{k}"
             if not context.done(name):
                 with context.timed(name):
-                    learned, course = learn(config, videos.rows(np.flatnonzero(fold != k)), background, seed)
+                    learned, course = learn(config, videos.rows(np.flatnonzero(fold != k)), background, seed, context)
                 for step, loss in enumerate(course["loss"].mean(0)):
                     context.log(name, step, loss=float(loss))
                 context.save_stage(name, say(learned, videos.rows(held)).conclude.tolist())
@@ -55,11 +55,13 @@ def ablate(
     return rows
 
 
-def ablate_probes(config: LearnConfig, videos: Described, background: Background, fold: np.ndarray) -> list[Row]:
+def ablate_probes(
+    config: LearnConfig, videos: Described, background: Background, fold: np.ndarray, context: Context
+) -> list[Row]:
     """Answers of the probes alone and of variants of them."""
     return [
-        Row(name=name, answer=cross_answers(learning, videos, known, fold))
-        for name, (learning, known) in probes(config, background).items()
+        Row(name=name, answer=cross_answers(learning, videos, known, fold, context))
+        for name, (learning, known) in context.each("variants of the probes", probes(config, background).items())
     ]
 
 

@@ -15,7 +15,7 @@ def zero_shot(trained: Trained) -> Evaluated:
     assembly, data = trained.assembly, trained.data
     params = untrained(assembly, data, trained.seed)
     test = encode_contacts(assembly, params, data, data.parts["test"], trained.context, blind=True)
-    return evaluate_policy(assembly, params, test, trained.label)
+    return evaluate_policy(assembly, params, test, trained.label, trained.context)
 
 
 def folder_of(run: Path, seed: int) -> Path:
@@ -37,4 +37,4 @@ def written(source: Path, trained: Trained) -> Evaluated:
     with context.told("reading weights, MB") as tell:
         params = read_policy(folder, assembly.agent.cache_dtype, in_megabytes(tell))
     test = encode_contacts(assembly, params, data, data.parts["test"], context)
-    return evaluate_policy(assembly, params, test, trained.label, alone=False)
+    return evaluate_policy(assembly, params, test, trained.label, context, alone=False)

@@ -64,12 +64,12 @@ def test_a_difference_a_wrong_end_and_an_answer_that_lacks_something_are_not_met
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_damaged_checkpoint_ends_the_same_or_names_what_is_wrong(tmp_path):
+def test_a_damaged_checkpoint_ends_the_same_or_names_what_is_wrong(tmp_path, context):
     unfinished, scratch = tmp_path / "unfinished", tmp_path / "scratch"
     for folder in (unfinished, scratch):
         folder.mkdir()
     unfinished_run(unfinished)
-    outcomes = [one.outcome for one in strike(unfinished, scratch, most=3)]
+    outcomes = [one.outcome for one in strike(unfinished, scratch, context, most=3)]
     assert outcomes
     assert WRONG not in outcomes
 

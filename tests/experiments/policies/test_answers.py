@@ -73,12 +73,11 @@ def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(a
     np.testing.assert_allclose(mute["exact"], np.where(material, -0.06 / 0.7, -0.06), atol=1e-6)
 
 
-@pytest.fixture(scope="module")
-def ask(assembly, params):
+@pytest.fixture
+def ask(assembly, params, context, monkeypatch):
     """Evaluate some contacts in blocks of eight questions, two contacts each."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(answers, "EVAL_BATCH", 8)
-        yield lambda features, label: evaluate_policy(assembly, params, features, label)
+    monkeypatch.setattr(answers, "EVAL_BATCH", 8)
+    return lambda features, label: evaluate_policy(assembly, params, features, label, context)
 
 
 LABEL = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, 1, 1, 4]], np.int32)
@@ -113,13 +112,13 @@ def felt_sum(decoder, batch):
     return Answers(tokens=batch.ids, parsed=parsed)
 
 
-def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(assembly, monkeypatch):
+def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(assembly, context, monkeypatch):
     monkeypatch.setattr(answers, "answer_program", lambda assembly: felt_sum)
     present = np.array([[True] * 4, [True, False, True, False]])
     features = dataclasses.replace(tiny.features(2), stream_mask=present)
     label = LABEL[:2].copy()
     label[0, 1] = -1
-    said = evaluate_policy(assembly, {"decoder": {}}, features, label)
+    said = evaluate_policy(assembly, {"decoder": {}}, features, label, context)
     assert list(zip(said.contact, said.attribute, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
     assert np.array_equal(said.tokens, assembly.layout.ids[said.attribute])
     assert np.array_equal(said.streams, present[said.contact])
@@ -127,12 +126,13 @@ def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(assemb
     assert np.array_equal(said.label.max(1), label[said.contact, said.attribute])
     assert said.parsed.conclude[:, 0].tolist() == [15] * 3 + [5] * 4
     assert said.alone[:, :, 0].tolist() == [[1, 2, 4, 8]] * 3 + [[1, 0, 4, 0]] * 4
+    assert "asking: 35/35" in context.console.file.getvalue()  # seven questions, by all streams and each of four
 
 
-def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(assembly, monkeypatch):
+def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(assembly, context, monkeypatch):
     monkeypatch.setattr(answers, "answer_program", lambda assembly: felt_sum)
     features = dataclasses.replace(tiny.features(1), stream_mask=np.zeros((1, 4), bool))
-    assert evaluate_policy(assembly, {"decoder": {}}, features, LABEL[:1]).alone is None
+    assert evaluate_policy(assembly, {"decoder": {}}, features, LABEL[:1], context).alone is None
 
 
 def test_the_answers_are_what_the_metrics_read(said):

@@ -26,8 +26,8 @@ def probed(data):
     return Probed(streams=streams, present=present, force=np.zeros((n, 1), np.float32))
 
 
-def test_evidence_of_what_was_felt_is_a_distribution_and_of_the_rest_nothing(data, probed):
-    evidence = gather_evidence(data, probed, PROBE)
+def test_evidence_of_what_was_felt_is_a_distribution_and_of_the_rest_nothing(data, probed, context):
+    evidence = gather_evidence(data, probed, PROBE, context)
     sft = np.isin(np.arange(len(data.store)), data.parts["sft"])
     for a, levels in enumerate(LEVELS.values()):
         assert (evidence[:, :, a, levels:] == -np.inf).all()
@@ -41,9 +41,9 @@ def test_evidence_of_what_was_felt_is_a_distribution_and_of_the_rest_nothing(dat
         assert (evidence[:, 2, a, :levels] == 0).all()  # one object cannot be held out
 
 
-def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed):
+def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed, context):
     label = np.where(np.arange(4) == 0, -1, data.label)
-    evidence = gather_evidence(dataclasses.replace(data, label=label), probed, PROBE)
+    evidence = gather_evidence(dataclasses.replace(data, label=label), probed, PROBE, context)
     assert (evidence[:, :, 0, :3] == 0).all()
     assert (evidence[data.parts["sft"][1:], 0, 1, :3] != 0).all()
 

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from experiments.recordings.descriptions import Described
 from experiments.recordings.descriptors import families
@@ -21,6 +22,7 @@ from experiments.recordings.training import (
     reading_lesson,
     reinforce,
 )
+from experiments.running.context import Context
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig
@@ -60,9 +62,12 @@ def worlds(objects=12, videos=2, seed=0):
 
 
 @pytest.fixture(scope="module")
-def trained():
+def trained(tmp_path_factory):
     videos, background = worlds()
-    learned, course = learn(CONFIG, videos, background, 0)
+    home = tmp_path_factory.mktemp("run")
+    context = Context(home, home / "cache", Console(quiet=True))
+    learned, course = learn(CONFIG, videos, background, 0, context)
+    context.close()
     return videos, learned, course
 
 
