@@ -91,7 +91,7 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
             random_checkpoint(directory, SHAPES[size], config.shard_bytes, config.seed, in_megabytes(tell))
         readings = {}
         for name in (OURS, PLAIN) if size in config.compare else (OURS,):
-            with context.told(f"reading {size}, {name}, MB") as tell:
+            with context.told(f"reading {size}, {name}, MB", still=True) as tell:
                 in_megabytes(tell)(0, weight_bytes(size))
                 readings[name] = measure(name, directory, SHAPES[size], in_megabytes(tell))
     finally:

@@ -106,13 +106,13 @@ def _batch(name: str, sensor: int, index: int, config: ChooserConfig) -> Batch:
 def _outcomes(name: str, batches: int, config: ChooserConfig, menu: tuple[Setting, ...], context: Context) -> Outcomes:
     """Measured batches of every gel, each a stage."""
     parts = []
-    for i, sensor in context.each(name, itertools.product(range(batches), range(config.sensors))):
+    for i, sensor in context.each(name, itertools.product(range(batches), range(config.sensors)), still=True):
         stage = f"{name}/{MODELS[sensor].name}/{i}"
         if not context.done(stage):
             with context.timed(stage):
                 batch = _batch(name, sensor, i, config)
                 true = bench.reference(batch, config.reference)
-                context.save_stage(stage, bench.measure(batch, context.each(stage, menu), true).to_json())
+                context.save_stage(stage, bench.measure(batch, context.each(stage, menu, still=True), true).to_json())
             context.say(f"{stage}: {config.batch} scenes under {len(menu)} settings")
         parts.append(context.load_stage(stage))
     return bench.join(parts)
@@ -124,14 +124,14 @@ def _trials(
     """The chooser on the tested batches, each a stage; one trial for every error asked for."""
     parts = []
     batches = itertools.product(range(config.tested_batches), range(config.sensors))
-    for k, (i, sensor) in context.each("trials", enumerate(batches)):
+    for k, (i, sensor) in context.each("trials", enumerate(batches), still=True):
         stage = f"trial/{MODELS[sensor].name}/{i}"
         if not context.done(stage):
             with context.timed(stage):
                 batch = _batch("unseen", sensor, i, config)
                 errors = tested.errors[k * config.batch : (k + 1) * config.batch]
                 true = bench.reference(batch, config.reference)
-                shown = context.each(stage, config.asked)
+                shown = context.each(stage, config.asked, still=True)
                 made = [trial.try_out(batch, menu, errors, cost, a, true) for a in shown]
                 context.save_stage(stage, [t.to_json() for t in made])
             context.say(f"{stage}: {config.batch} scenes at {len(config.asked)} errors asked for")

@@ -128,7 +128,7 @@ def learn(config: Config, variant: Variant, data: Dataset, context: Context, nam
         clip = clip_of(variant.config, data.clip)
         both = np.concatenate([data.parts["val"], data.parts["test"]])
         unseen = dataclasses.replace(watched(data, "test", config.touch), store=store, clip=clip, read_rows=both)
-        found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen)
+        found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen, context)
         context.save_stage(answers, found)
     right = np.array(context.load_stage(answers))
     context.say(f"{variant.name}: {100 * right.mean():.1f} %")

@@ -180,7 +180,7 @@ def make_gels(config: TangentialConfig, context: Context) -> tuple[Gel, ...]:
 def measure(gels: Sequence[Gel], config: TangentialConfig, context: Context) -> dict[str, dict[str, Row]]:
     """Time and errors of every method of every task: task → name → row."""
     every, tasks = methods(), {}
-    with context.progress("solving", len(every)) as advance:
+    with context.progress("solving", len(every), still=True) as advance:
         for task, tiers in every.items():
             true = _exact(task, gels)
             calls = {m.name: _call(task, m, gels) for m in tiers}
@@ -198,7 +198,7 @@ def couple(config: TangentialConfig, context: Context) -> list[Change]:
     """What coupling changes on every gel with markers."""
     marked = [s for s in tangential_scenes.sensors(config.sensors) if s.marker_depth_mm is not None]
     found: list[Change] = []
-    with context.progress("coupling", len(marked)) as advance:
+    with context.progress("coupling", len(marked), still=True) as advance:
         for sensor in marked:
             found += tangential_coupling.measure(sensor, config.grid, config.frames, config.coupled_bodies, config.seed)
             advance(1)

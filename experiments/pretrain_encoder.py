@@ -64,9 +64,9 @@ def run(config: Config, context: Context) -> Findings:
     with context.timed("assess"):
         test = watched(data, "test", config.touch)
         networks = config.pretrain.dynamics(len(data.clip.sensors))
-        after = assess(networks, state, test)
+        after = assess(networks, state, test, context)
         start = untrained(config.pretrain, data.store, rows, clip_of(config.pretrain, data.clip), SEED)
-        before = assess(networks, start, test)
+        before = assess(networks, start, test, context)
     return findings(config, context, data, before, after)
 
 

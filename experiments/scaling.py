@@ -95,7 +95,7 @@ class Sized:
 
 def run(config: ScalingConfig, context: Context) -> Results:
     """Train every size, ask, time, fit lines."""
-    sized = {name: one_size(config, name, context) for name in config.sizes}
+    sized = {name: one_size(config, name, context) for name in context.each("sizes", config.sizes)}
     costs = timed(sized, config.rounds, context)
     rows: Rows = {title: {name: s.rows[policy] for name, s in sized.items()} for policy, title in POLICIES.items()}
     found = growths(rows, costs, LOOKED_AT) if config.study.seeds > 1 else ()

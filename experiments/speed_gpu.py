@@ -95,7 +95,8 @@ def without_policy(config: GpuConfig, heads: Heads) -> dict[str, Callable[[], Pi
 
 def measured(title: str, pieces: Mapping[str, Callable[[], Piece]], rounds: int, context: Context) -> dict[str, Timed]:
     """The times of some pieces."""
-    return {name: measure(name, make, rounds, context) for name, make in context.each(title, pieces.items())}
+    shown = context.each(title, pieces.items(), still=True)
+    return {name: measure(name, make, rounds, context) for name, make in shown}
 
 
 def measure(name: str, make: Callable[[], Piece], rounds: int, context: Context) -> Timed:

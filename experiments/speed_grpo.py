@@ -117,7 +117,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
         step = dataclasses.replace(config_of(config.size, config.micro_prompts), lean_compilation=True)
         lean = {
             prefix: in_own_process(time_alone, config.size, prefix, step, 1, Path(folder))
-            for prefix in context.each("lean compilation", (lean_at,) if compiles_leanly() else ())
+            for prefix in context.each("lean compilation", (lean_at,) if compiles_leanly() else (), still=True)
         }
         words = many_words(config, Path(folder), context)
     makers = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
@@ -129,7 +129,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
         twice[prefix] = side_by_side(makers, max(2, config.rounds // 2), f"prefix {prefix}", context)
         context.say(f"prefix {prefix}: {said(twice[prefix])}")
     short = min(config.prefixes)
-    with context.told("steps") as tell:
+    with context.told("steps", still=True) as tell:
         tell(0, config.steps)
         course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps, tell=tell)
     peers, failed = measure_peers(config, context)
@@ -157,7 +157,7 @@ def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[di
     """Each prefix in a process that compiles, and in one that reads what the first compiled."""
     first, alone = {}, {}
     step = config_of(config.size, config.micro_prompts)
-    for prefix in context.each("prefixes", config.prefixes):
+    for prefix in context.each("prefixes", config.prefixes, still=True):
         first[prefix] = in_own_process(time_alone, config.size, prefix, step, 1, cache)
         alone[prefix] = in_own_process(time_alone, config.size, prefix, step, config.rounds, cache)
         a, b = alone[prefix], first[prefix]
@@ -174,7 +174,7 @@ def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, 
     whole = dataclasses.replace(blocks, max_logits=size.group * size.length * size.vocab_size)
     found = {}
     ways = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
-    for name, step in context.each("many words", ways.items()):
+    for name, step in context.each("many words", ways.items(), still=True):
         found[name] = in_own_process(time_alone, size, min(config.prefixes), step, 2, cache)
         context.say(f"{config.words} words, {name}: {median(found[name].seconds):.2f} s, {found[name].peak_gb:.2f} GB")
     return found
@@ -198,7 +198,7 @@ def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[s
         context.say(f"not measured, for want of an interpreter that has them: {', '.join(sorted(absent))}")
     found: dict[tuple[str, int], PeerTimes] = {}
     failed: list[str] = []
-    for prefix, peer in context.each("other engines", itertools.product(config.prefixes, peers)):
+    for prefix, peer in context.each("other engines", itertools.product(config.prefixes, peers), still=True):
         job = PeerJob(prefix=prefix, rounds=max(1, config.peer_tokens // prefix), size=config.size)
         try:
             times = found[peer.name, prefix] = peer.measure(job)

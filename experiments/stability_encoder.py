@@ -128,8 +128,8 @@ def run(config: Config, context: Context) -> Findings:
     data = open_touch(config.touch, config.frames, config.touch.scenes.image_px, context)
     if len(data.parts["val"]) < 2:
         raise DataError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
-    contacts, label, train = load(data, config)
-    watched = batch_of(data, config, data.parts["val"])
+    contacts, label, train = load(data, config, context)
+    watched = batch_of(data, config, data.parts["val"], context)
     encoder = dataclasses.replace(config.encoder, sensors=config.sensors)
     networks = DynamicsConfig(encoder=encoder, predictor=config.predictor)
     runner = make_runner(
@@ -150,19 +150,24 @@ def run(config: Config, context: Context) -> Findings:
     return findings(config, outcomes)
 
 
-def load(data: Dataset, config: Config) -> tuple[TouchBatch, np.ndarray, np.ndarray]:
+def load(data: Dataset, config: Config, context: Context) -> tuple[TouchBatch, np.ndarray, np.ndarray]:
     """All contacts of training and test objects, their ordinal labels, and which are for training."""
     fit, read = training_rows(data), data.parts["test"]
     rows = np.concatenate([fit, read])
     label = data.label[rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
-    return batch_of(data, config, rows), label, np.arange(len(rows)) < len(fit)
+    return batch_of(data, config, rows, context), label, np.arange(len(rows)) < len(fit)
 
 
-def batch_of(data: Dataset, config: Config, rows: np.ndarray) -> TouchBatch:
+def batch_of(data: Dataset, config: Config, rows: np.ndarray, context: Context) -> TouchBatch:
     """Some contacts as one batch."""
     clip = dataclasses.replace(data.clip, sensors=data.clip.sensors[: config.sensors], view_px=1)
     clips = clip_batches(data.store, rows, clip, batch_size=64, seed=0, shuffle=False, repeat=False)
-    return in_memory([touch_batch(c) for c in clips])
+    found = []
+    with context.progress("reading clips", len(rows)) as advance:
+        for one in clips:
+            found.append(touch_batch(one))
+            advance(len(one["contact"]))
+    return in_memory(found)
 
 
 def drive(

@@ -276,7 +276,7 @@ def _picture(config: ThroughputConfig, feed: Rate, large: Rate, written: Written
 def _stages(config: ThroughputConfig, context: Context) -> Stages:
     scenes = config.scenes(config.feed_contacts, config.image_px)
     stages = {}
-    for name in context.each("timing stages", config.stage_sensors):
+    for name in context.each("timing stages", config.stage_sensors, still=True):
         cost = scene_stages.stage_costs(scenes, SENSORS.index(name), config.stage_objects)
         stages[name] = {
             "pressure": cost.normal,

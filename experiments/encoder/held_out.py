@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.policies.feeds import touch_batch
+from experiments.running.context import Context
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax import masked
@@ -107,11 +108,13 @@ class Assessment:
         }
 
 
-def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched) -> Assessment:
+def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched, context: Context) -> Assessment:
     """Measure; all streams that are there are shown."""
     rows = np.concatenate([watched.fit_rows, watched.read_rows])
     look = _look(networks)
-    seen = encode_rows(lambda batch: look(state.params, state.target, batch), watched.store, rows, watched.clip)
+    seen = encode_rows(
+        lambda batch: look(state.params, state.target, batch), watched.store, rows, watched.clip, context
+    )
     fitted = watched.fitted
     goal, exists = seen["goal"], seen["exists"]
     both = (exists[:, :, 1:] & exists[:, :, :-1])[..., None, None]
@@ -130,7 +133,7 @@ def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched) -> 
     )
 
 
-def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: Watched) -> np.ndarray:
+def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: Watched, context: Context) -> np.ndarray:
     """Whether the probes on an encoder alone are right, bool [read, 3]."""
 
     def encode(batch: TouchBatch) -> dict[str, Any]:
@@ -139,20 +142,25 @@ def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: Watched) -
         return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
 
     rows = np.concatenate([watched.fit_rows, watched.read_rows])
-    seen = encode_rows(jax.jit(encode), watched.store, rows, watched.clip)
+    seen = encode_rows(jax.jit(encode), watched.store, rows, watched.clip, context)
     features = np.asarray(contact_features(seen["latent"], seen["exists"]))
     return probe_right(features, watched.ordinal_labels(), watched.fitted, watched.probe)
 
 
 def encode_rows(
-    encode: Callable[[TouchBatch], dict[str, Any]], store: Contacts, rows: np.ndarray, clip: ClipConfig
+    encode: Callable[[TouchBatch], dict[str, Any]],
+    store: Contacts,
+    rows: np.ndarray,
+    clip: ClipConfig,
+    context: Context,
 ) -> dict[str, np.ndarray]:
     """Results of all rows on the host, in their order; every call has the same number of contacts."""
     padded = rows[np.minimum(np.arange(-(-len(rows) // BATCH) * BATCH), len(rows) - 1)]
-    parts = [
-        jax.device_get(encode(touch_batch(element)))
-        for element in clip_batches(store, padded, clip, batch_size=BATCH, seed=0, shuffle=False, repeat=False)
-    ]
+    parts = []
+    with context.progress("encoding", len(padded)) as advance:
+        for element in clip_batches(store, padded, clip, batch_size=BATCH, seed=0, shuffle=False, repeat=False):
+            parts.append(jax.device_get(encode(touch_batch(element))))
+            advance(BATCH)
     return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
 
 

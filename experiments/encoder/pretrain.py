@@ -185,7 +185,7 @@ def _measure(
     """Log what the encoder knows after so many steps, and the alarms since the step measured before; once for a run."""
     if watched is None or context.done(f"{stage}/at{step}"):
         return
-    found = assess(networks, state, watched).summary()
+    found = assess(networks, state, watched, context).summary()
     if step:  # a random encoder is what the probes are held against, and has no lead over itself
         start = context.load_stage(f"{stage}/at0")
         found |= {"probe_lead": found["probe"] - start["probe"], "kept": found["told_apart"] / start["told_apart"]}

@@ -181,7 +181,7 @@ def train_study(
     make = functools.partial(make_arm, assembly, prior=prior, loop=config.grpo_loop, lora=config.grpo_lora)
     made = {arm: make(weights, config=configs[arm]) for arm, weights in arms.items()}
     answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
-    for seed in range(config.seeds):
+    for seed in context.each("seeds", range(config.seeds)):
         one = _Seed(config, start, evidence, made, ways, context, seed)
         for name, said in one.answers().items():
             answers[name].append(said)

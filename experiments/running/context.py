@@ -139,7 +139,14 @@ class Context:
 
     @contextlib.contextmanager
     def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
-        """A progress bar for one loop; `completed` are the steps done before this session, `still` as `rounds` says."""
+        """A progress bar for one loop.
+
+        Args:
+          title: what is going on.
+          total: steps of the whole loop.
+          completed: steps done before this session.
+          still: draw the bar with each step only, so that it takes no time of what is timed within one.
+        """
         loop = Loop(title, total, completed)
         self._loops.append(loop)
         try:
@@ -150,23 +157,20 @@ class Context:
             self._loops.remove(loop)
         self._looping()
 
-    def each(self, title: str, items: Iterable[T]) -> Iterator[T]:
+    def each(self, title: str, items: Iterable[T], *, still: bool = False) -> Iterator[T]:
         """The items one after the other, under a progress bar; an item counts once the next is asked for."""
         listed = tuple(items)
-        with self.progress(title, len(listed)) as advance:
+        with self.progress(title, len(listed), still=still) as advance:
             for item in listed:
                 yield item
                 advance()
 
     def rounds(self, title: str, number: int) -> Iterator[int]:
         """Rounds of a timing, from 0, under a bar that is drawn between them alone and so takes no time of theirs."""
-        with self.progress(title, number, still=True) as advance:
-            for n in range(number):
-                yield n
-                advance()
+        return self.each(title, range(number), still=True)
 
     @contextlib.contextmanager
-    def told(self, title: str) -> Iterator[Tell]:
+    def told(self, title: str, *, still: bool = False) -> Iterator[Tell]:
         """A progress bar for a loop that tells of itself how many steps are done and of how many, first or later.
 
         The first word opens the bar; what is done by then does not count into the rate.
@@ -178,7 +182,7 @@ class Context:
             def tell(done: int, total: int) -> None:
                 nonlocal seen
                 if not bar:
-                    bar.append(stack.enter_context(self.progress(title, total, done)))
+                    bar.append(stack.enter_context(self.progress(title, total, done, still=still)))
                 elif done > seen:
                     bar[0](done - seen)
                 seen = done
