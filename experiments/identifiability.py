@@ -113,7 +113,7 @@ def run(config: IdentifiabilityConfig, context: Context) -> Findings:
         at_own_noise = [(tier, (1.0,)) for tier in tiers]
         pressed = press(config.presses, [(config.exact, config.noise), *at_own_noise], config.batch, advance)
     with context.timed("motions"):
-        moved = {motion: _move(config, motion, context) for motion in MOTIONS}
+        moved = {motion: _move(config, motion, context) for motion in context.each("motions", MOTIONS)}
     with context.timed("probes"):
         studied = _ask(config, pressed, moved, context)
     return findings(config, studied)

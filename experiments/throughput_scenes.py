@@ -117,12 +117,13 @@ def run(config: ThroughputConfig, context: Context) -> Findings:
     written = Written(**found | {"rate": Rate(**found["rate"]), "kept": Kept(**found["kept"])})
     stages = _stages(config, context)
     floor = _floor_table(config)
-    context.say("looking at what force tells")
     paper = SceneConfig(
         objects=config.leak_objects,
         sequences=len(SENSORS) * round(config.leak_objects * PAPER_SEQUENCES / len(SENSORS) / PAPER_OBJECTS),
     )
-    leaks = scene_protocol.leaks(paper)
+    with context.progress("planning the paper's set", 1) as advance:
+        leaks = scene_protocol.leaks(paper)
+        advance()
     return Findings(
         verdict=_verdict(feed, large, written),
         requirements=_requirements(feed, large, written, leaks),

@@ -79,13 +79,15 @@ class Recordings:
 
 def run(config: VTVConfig, context: Context) -> Findings:
     """Make the recordings, probe, ask."""
-    rows = one_each(LiveScenes(config.scenes))
+    with context.progress("planning", 1) as advance:
+        rows = one_each(LiveScenes(config.scenes))
+        advance()
     with context.timed("recordings"), context.progress("recordings", sum(map(len, rows.values()))) as advance:
         made = together([feel(config.scenes, name, config.moments, advance, rows[name]) for name in MOTIONS])
     tasks = draw_tasks(made.label, config.questions, seed=0)
     with context.timed("probes"):
         told = answers(made, config.probe, context)
-    scores = {name: vtv.score(tasks, log_probs) for name, log_probs in told.items()}
+    scores = {name: vtv.score(tasks, log_probs) for name, log_probs in context.each("scoring", told.items())}
     scored = {name: vtv.averaged(score, made.objects) for name, score in scores.items()}
     counts = {task: len(score.values) for task, score in scores[FUSED].items()}
     return Findings(
