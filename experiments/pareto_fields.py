@@ -79,7 +79,7 @@ class FieldsConfig:
 def run(config: FieldsConfig, context: Context) -> Findings:
     """Measure field by field, gather."""
     panels: list[Panel] = []
-    for name, make in context.each("panels", panels_of(config).items()):
+    for name, make in context.each("panels", panels_of(config, context).items()):
         context.say(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
             panels += make()
@@ -92,27 +92,29 @@ def run(config: FieldsConfig, context: Context) -> Findings:
     )
 
 
-def panels_of(config: FieldsConfig) -> dict[str, Callable[[], list[Panel]]]:
+def panels_of(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[Panel]]]:
     """What is measured, in the order of the report: name → how to make its panels."""
     root = config.data_dir
     makes: dict[str, Callable[[], list[Panel]]] = {
-        "integrators": lambda: [depth_known.poisson_panel(config.rounds)],
-        "generated balls": lambda: generated_panels(config),
+        "integrators": lambda: [depth_known.poisson_panel(context.rounds("timing integrators", config.rounds))],
+        "generated balls": lambda: generated_panels(config, context),
     }
     if root is not None:
         makes |= {
-            "real balls": lambda: real_balls(config, root),
-            "known depth": lambda: [depth_known.known_panel(root, config.seed)],
+            "real balls": lambda: real_balls(config, root, context),
+            "known depth": lambda: [depth_known.known_panel(root, config.seed, context)],
             "failed contact": lambda: [depth_contact.contact_panel(root, config.seed)],
         }
-    return makes | (motion_panels(config) if config.motion else {})
+    return makes | (motion_panels(config, context) if config.motion else {})
 
 
-def generated_panels(config: FieldsConfig) -> list[Panel]:
+def generated_panels(config: FieldsConfig, context: Context) -> list[Panel]:
     """Balls of other diameters on generated pictures, and the speed."""
-    made, balls = other_balls(config, depth_presses.fitted_optics, "generated, supposed optics")
+    made, balls = other_balls(config, depth_presses.fitted_optics, "generated, supposed optics", context)
     strange = (
-        [other_balls(config, depth_presses.near_lamps, "generated, near lamps")[1]] if config.strange_lamps else []
+        [other_balls(config, depth_presses.near_lamps, "generated, near lamps", context)[1]]
+        if config.strange_lamps
+        else []
     )
     return [balls, *strange, speed_panel(config, made, "generated balls")]
 
@@ -126,7 +128,9 @@ def speed_panel(config: FieldsConfig, made: Calibration, source: str) -> Panel:
     return Panel(verdict=(f"{sentence}{source}.",), requirements=(speed,))
 
 
-def other_balls(config: FieldsConfig, optics: depth_presses.Optics, source: str) -> tuple[Calibration, Panel]:
+def other_balls(
+    config: FieldsConfig, optics: depth_presses.Optics, source: str, context: Context
+) -> tuple[Calibration, Panel]:
     """A calibration with one generated ball, and its errors on others."""
     made = depth_balls.calibrated(
         depth_presses.generated_presses(6.31, config.generated_presses, config.seed, optics), config.seed
@@ -137,15 +141,15 @@ def other_balls(config: FieldsConfig, optics: depth_presses.Optics, source: str)
         )
         for diameter in depth_balls.OTHER_BALLS_MM
     }
-    return made, depth_balls.other_ball_panel(made, others, source)
+    return made, depth_balls.other_ball_panel(made, others, source, context)
 
 
-def real_balls(config: FieldsConfig, root: pathlib.Path) -> list[Panel]:
+def real_balls(config: FieldsConfig, root: pathlib.Path, context: Context) -> list[Panel]:
     """Recorded presses of the calibration's ball, and of another where there are any."""
     gelslam = depth_data.gelslam(root)
     made = depth_balls.calibrated(gelslam, config.seed)
     panels = [
-        depth_balls.real_panel(gelslam, "gelslam", config.folds, config.rounds, config.seed),
+        depth_balls.real_panel(gelslam, "gelslam", config.folds, config.rounds, config.seed, context),
         speed_panel(config, made, "gelslam"),
     ]
     other = root / "gelslam" / "9.500mm"
@@ -153,24 +157,24 @@ def real_balls(config: FieldsConfig, root: pathlib.Path) -> list[Panel]:
         bigger = dataclasses.replace(
             gelslam, pictures=read_pictures([other], "gelsight_mini").frames, radius_mm=9.5 / 2
         )
-        panels.append(depth_balls.other_ball_panel(made, {"9.5 mm": bigger}, "gelslam"))
+        panels.append(depth_balls.other_ball_panel(made, {"9.5 mm": bigger}, "gelslam", context))
     return panels
 
 
-def motion_panels(config: FieldsConfig) -> dict[str, Callable[[], list[Panel]]]:
+def motion_panels(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[Panel]]]:
     """Markers and their drift, dense fields, shear and force, and what tells a marker gel from a bare one."""
     root, rests = config.data_dir, motion_frames.gels(config.data_dir)
     subjects = [motion_subjects.subject(rest) for rest in rests]
     real = [s for s in subjects if s.rest.real] or subjects[:1]
     makes: dict[str, Callable[[], list[Panel]]] = {
-        "markers": lambda: [motion_markers.panel(config.markers, subjects)],
+        "markers": lambda: [motion_markers.panel(config.markers, subjects, context)],
         "drift": lambda: [motion_drift.panel(config.drift, real)],
-        "dense fields": lambda: [motion_dense.panel(config.dense_motions, config.rounds, rests)],
-        "shear": lambda: [motion_shear.panel(config.shear, root)],
+        "dense fields": lambda: [motion_dense.panel(config.dense_motions, config.rounds, rests, context)],
+        "shear": lambda: [motion_shear.panel(config.shear, root, context)],
         "wrong layers": lambda: [motion_layers.panel(config.shear)],
     }
     if root is not None:
-        makes["patterns"] = lambda: [motion_evidence.panel(root, config.judged)]
+        makes["patterns"] = lambda: [motion_evidence.panel(root, config.judged, context)]
     return makes
 
 

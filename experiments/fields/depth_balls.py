@@ -10,6 +10,7 @@ from experiments.fields.depth_methods import MAPS, Slopes
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
 from experiments.reporting.pareto import speed_against_error
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.fit import fit_map
@@ -50,10 +51,10 @@ class Fold:
     rest_index: np.ndarray
 
 
-def folds_of(presses: BallPresses, folds: int, seed: int) -> list[Fold]:
+def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> list[Fold]:
     """Circles of each fold's training presses, and those of the rest by the optics of the training presses alone."""
     order, found = np.random.default_rng(seed).permutation(len(presses)), []
-    for k in range(folds):
+    for k in context.each("finding circles", range(folds)):
         out = order[k::folds]
         train, rest = presses.chosen(np.setdiff1d(order, out)), presses.chosen(out)
         circles = find_circles(train)
@@ -81,16 +82,21 @@ def depth_by(read: Slopes, picture: np.ndarray, mm_per_px: float) -> np.ndarray:
     return depth - zero_level(depth, np.hypot(slope_x, slope_y), mm_per_px, ZeroConfig())
 
 
-def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: int) -> Panel:
+def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context) -> Panel:
     """All maps on the presses of one real sensor: table, chart of speed against error, requirements."""
-    parts = folds_of(presses, folds, seed)
-    errors = {kind: held_out(parts, make, seed) for kind, make in MAPS.items()}
-    readers = {kind: make(parts[0].train, parts[0].train_touches, seed) for kind, make in MAPS.items()}
+    parts = folds_of(presses, folds, seed, context)
+    errors = {kind: held_out(parts, make, seed) for kind, make in context.each("maps", MAPS.items())}
+    readers = {
+        kind: make(parts[0].train, parts[0].train_touches, seed)
+        for kind, make in context.each("maps to time", MAPS.items())
+    }
     picture = presses.pictures[0]
     calls = {kind: (lambda read=read: depth_by(read, picture, presses.mm_per_px)) for kind, read in readers.items()}
     for call in calls.values():
         call()
-    ms = {kind: 1e3 * float(np.median(s)) for kind, s in interleaved(calls, range(rounds)).items()}
+    ms = {
+        kind: 1e3 * float(np.median(s)) for kind, s in interleaved(calls, context.rounds("timing maps", rounds)).items()
+    }
     figures = errors[PACKAGE].figures()
     return Panel(
         verdict=(
@@ -169,11 +175,11 @@ def map_picture(errors: dict[str, BallErrors], ms: dict[str, float], name: str) 
     )
 
 
-def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: str) -> Panel:
+def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: str, context: Context) -> Panel:
     """A calibration made with one ball, scored on balls of other diameters."""
     rows: list[tuple[Cell, ...]] = []
     requirements: list[Requirement] = []
-    for name, presses in others.items():
+    for name, presses in context.each("balls", others.items()):
         circles = find_circles(presses)
         figures = score_presses(made, presses, circles.touches.stacked()).figures()
         requirements += ball_requirements(figures, f"{name}, {source}", OTHER_MICROMETRES, OTHER_RADIUS)

@@ -1,7 +1,7 @@
 """The depth panel, part two: integrators on analytic slopes, presses at known depth."""
 
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import one_sided_dirichlet, published_poisson
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Cell, Column, Requirement, Table
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.poisson import dirichlet, neumann
@@ -59,14 +60,14 @@ def scale_error(
     return 100 * (scale - 1), 1e3 * float(np.sqrt(np.mean((depth - truth)[deep] ** 2)))
 
 
-def poisson_panel(rounds: int) -> Panel:
+def poisson_panel(rounds: Iterable[object]) -> Panel:
     """Every integrator on every analytic surface, and its time."""
     surfaces = analytic()
     slopes = [a.astype(np.float32) for a in surfaces["ball, centre"][1:]]
     calls = {name: (lambda f=f: f(*slopes, PITCH_MM)) for name, f in INTEGRATORS.items()}
     for call in calls.values():
         call()
-    ms = {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, range(rounds)).items()}
+    ms = {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, rounds).items()}
     errors = {name: [scale_error(f, *surface) for surface in surfaces.values()] for name, f in INTEGRATORS.items()}
     worst = max(abs(scale) for scale, _ in errors["this, Neumann"])
     columns = [Column(name="integrator")]
@@ -98,12 +99,12 @@ def poisson_panel(rounds: int) -> Panel:
     )
 
 
-def known_panel(root: pathlib.Path, seed: int) -> Panel:
+def known_panel(root: pathlib.Path, seed: int, context: Context) -> Panel:
     """Presses at known depth under a calibration made with the ball presses of the same sensor."""
     presses = depth_data.sim2real(root)
     read = SlopeReader(calibrated(presses, seed).colours, presses.background)
     found: dict[str, dict[str, list[tuple[float, float]]]] = {"Neumann": {}, "Dirichlet": {}}
-    for (shape, depth_mm), picture in depth_data.known_depths(root).items():
+    for (shape, depth_mm), picture in context.each("presses", depth_data.known_depths(root).items()):
         slope_x, slope_y = read(picture)
         truth, mask = depth_data.known_truth(shape, depth_mm, presses.shape)
         for name, integrate in (("Neumann", neumann), ("Dirichlet", dirichlet)):

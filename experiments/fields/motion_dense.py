@@ -13,6 +13,7 @@ from experiments.fields.motion_truth import Film
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Column, Picture, Requirement, Table
 from experiments.reporting.pareto import Point, speed_against_error
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
@@ -24,11 +25,11 @@ Dense = Callable[[np.ndarray], np.ndarray]
 """From a picture, RGB, to its displacement field in pixels, [H, W, 2]."""
 
 
-def panel(motions: int, rounds: int, rests: Sequence[Rest]) -> Panel:
+def panel(motions: int, rounds: int, rests: Sequence[Rest], context: Context) -> Panel:
     """Errors and speeds of dense fields on every gel, and the speed of the spline alone."""
     seeds: list[int | None] = [None, *range(FIRST_SEED, FIRST_SEED + motions)]
     subjects = [subject(rest) for rest in rests]
-    measured = {s.rest.name: _measure(s, seeds, rounds) for s in subjects}
+    measured = {s.rest.name: _measure(s, seeds, rounds) for s in context.each("gels", subjects)}
     chosen = [s for s in subjects if s.rest.real] or subjects
     errors = [measured[s.rest.name][MAIN][0] / s.unit for s in chosen]
     hertz = spline_hertz(subjects[0], rounds)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from experiments.fields.motion_truth import REST_PICTURES, Film
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
 from experiments.reporting.pareto import Point, speed_against_error
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 
 MAIN, ALONE = "this", "this, affine alone"
@@ -32,13 +33,13 @@ class MarkerConfig:
                 raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
 
 
-def panel(config: MarkerConfig, subjects: Sequence[Subject]) -> Panel:
+def panel(config: MarkerConfig, subjects: Sequence[Subject], context: Context) -> Panel:
     """Errors and speeds of every method on every gel; a jump."""
     seeds = [None, *range(FIRST_SEED, FIRST_SEED + config.motions)]
-    by_gel = {s.rest.name: errors_of(s, PEAK_PX, seeds) for s in subjects}
+    by_gel = {s.rest.name: errors_of(s, PEAK_PX, seeds) for s in context.each("following", subjects)}
     errors = {name: {gel: by[name] for gel, by in by_gel.items()} for name in FOLLOWERS}
-    milliseconds = {s.rest.name: speeds(s, config.rounds) for s in subjects}
-    jumps = {s.rest.name: jump(s, seeds) for s in subjects}
+    milliseconds = {s.rest.name: speeds(s, context.rounds(f"timing on {s.rest.name}", config.rounds)) for s in subjects}
+    jumps = {s.rest.name: jump(s, seeds) for s in context.each("jumping", subjects)}
     return Panel(
         verdict=_verdict(errors, milliseconds, subjects),
         requirements=_requirements(errors, jumps, subjects),
@@ -70,7 +71,7 @@ def errors_of(of: Subject, peak_px: float, seeds: Sequence[int | None]) -> dict[
     return {name: np.concatenate(errors) for name, errors in found.items()}
 
 
-def speeds(of: Subject, rounds: int) -> dict[str, float]:
+def speeds(of: Subject, rounds: Iterable[object]) -> dict[str, float]:
     """Milliseconds a frame of every method on a picture under motion, median over rounds."""
     film = Film(of.rest.picture, NOISE_GREY, 1)
     rest, motion = grey(film.at_rest()), of.motion(PEAK_PX / 2, None)
@@ -80,7 +81,7 @@ def speeds(of: Subject, rounds: int) -> dict[str, float]:
         follow = make(rest, of.points_px, of.half_px)
         calls[name] = functools.partial(_both, follow, pictures)
         calls[name]()
-    seconds = interleaved(calls, range(rounds))
+    seconds = interleaved(calls, rounds)
     return {name: 1e3 / len(pictures) * float(np.median(s)) for name, s in seconds.items()}
 
 

@@ -11,6 +11,7 @@ from experiments.fields.motion_slides import NODES, Slide, cached_slides, node_g
 from experiments.fields.panel import Panel
 from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
 from experiments.reporting.pareto import Point, speed_against_error
+from experiments.running.context import Context
 from experiments.running.timing import interleaved
 from sensors_io.clock import NS_PER_S
 from sensors_io.fields import total_force
@@ -45,11 +46,13 @@ class ShearConfig:
     rounds: int = 9
 
 
-def panel(config: ShearConfig, data_dir: pathlib.Path | None) -> Panel:
+def panel(config: ShearConfig, data_dir: pathlib.Path | None, context: Context) -> Panel:
     """Shear of every method on every sensor with markers; total force by inversion and by regression."""
-    slides = {s.name: cached_slides(s, config.kinds, config.motions, config.frames, FIRST_SEED) for s in SENSORS}
-    errors = {s.name: shear_errors(s, slides[s.name], config.stride) for s in SENSORS}
-    forces = {s.name: force_errors(s, slides[s.name], config.stride) for s in SENSORS}
+    slides, errors, forces = {}, {}, {}
+    for s in context.each("sensors", SENSORS):
+        slides[s.name] = cached_slides(s, config.kinds, config.motions, config.frames, FIRST_SEED)
+        errors[s.name] = shear_errors(s, slides[s.name], config.stride)
+        forces[s.name] = force_errors(s, slides[s.name], config.stride)
     milliseconds = _milliseconds(TAC3D, slides[TAC3D.name][0], config.rounds)
     regressions = regression_rows(slides) + (recorded_rows(data_dir) if data_dir is not None else [])
     return Panel(

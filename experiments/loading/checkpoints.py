@@ -37,13 +37,16 @@ def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, see
             tensors[key] = draw(rng, shape)
             drawn += tensors[key].nbytes
             tell(size + drawn // 2, every)
-        begun = size + drawn // 2
-        write_file(directory / name, tensors, lambda done, _, begun=begun: tell(begun + done // 2, every))
+        write_file(directory / name, tensors, _after(size + drawn // 2, every, tell))
         place |= dict.fromkeys(tensors, name)
         size += drawn
     index = {"metadata": {"total_size": size}, "weight_map": place}
     (directory / INDEX).write_text(json.dumps(index), encoding="utf-8")
     return size
+
+
+def _after(begun: int, every: int, tell: Tell) -> Tell:
+    return lambda done, _: tell(begun + done // 2, every)
 
 
 def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int, ...]]]:

@@ -145,13 +145,13 @@ class Context:
           title: what is going on.
           total: steps of the whole loop.
           completed: steps done before this session.
-          still: draw the bar with each step only, so that it takes no time of what is timed within one.
+          still: draw the bar with each step only, and so all bars within, so that they take no time of what is timed.
         """
-        loop = Loop(title, total, completed)
+        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self._loops))
         self._loops.append(loop)
         try:
             self._looping()
-            with progress(self.console, loop, self._looping, still=still) as advance:
+            with progress(self.console, loop, self._looping) as advance:
                 yield advance
         finally:
             self._loops.remove(loop)

@@ -48,10 +48,11 @@ class Loop:
       title: what is going on.
       total: steps of the whole loop.
       completed: steps that an earlier session did; they do not count into the rate.
+      still: whether it is drawn with each step only, not ten times a second, which would take time of what is timed.
     """
 
-    def __init__(self, title: str, total: int, completed: int = 0) -> None:
-        self.title, self.total, self.completed, self.note = title, total, completed, ""
+    def __init__(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> None:
+        self.title, self.total, self.completed, self.still, self.note = title, total, completed, still, ""
         self._began = self._first_call = (completed, time.monotonic())
 
     def advance(self, steps: int, note: str = "") -> None:
@@ -100,21 +101,18 @@ class RateColumn(ProgressColumn):
 
 
 @contextlib.contextmanager
-def progress(
-    console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, still: bool = False
-) -> Iterator[Advance]:
+def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
     """Show the progress of one loop.
 
     Args:
       console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
       loop: advanced by what this yields.
       after: called after each advance.
-      still: draw the bar with each advance only, not ten times a second, which would take time of what is timed.
     """
     if console.is_terminal:
-        with _bar(console, still) as bar:
+        with _bar(console, loop.still) as bar:
             task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
-            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=still)
+            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
             yield _advance(loop, draw, after)
     else:
         plain = _Plain(console, loop)

@@ -136,6 +136,18 @@ def test_rounds_are_drawn_between_them_alone(tmp_path):
     context.close()
 
 
+def test_bars_within_a_still_one_are_drawn_with_their_steps_alone(tmp_path):
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    context = Context(tmp_path, tmp_path / "cache", console)
+    for _ in context.each("pieces", "a", still=True):
+        for step in context.each("programs", range(2)):
+            before = console.file.getvalue()
+            assert f"{step}/2" in before
+            time.sleep(0.3)
+            assert console.file.getvalue() == before
+    context.close()
+
+
 def test_a_loop_that_tells_of_itself_is_shown_from_its_first_word(context):
     with context.told("contacts") as tell:
         assert not context._loops
