@@ -79,14 +79,13 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
 
 def fit(presses: BallPresses, context: Context) -> Study:
     """Fit to the even presses, align the odd ones."""
-    with context.progress("fitting", 3) as advance:
+    with context.progress("fitting", 2 + fitting.ROUNDS + 1) as advance:
         profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
         advance(note="the ball is solved")
         train = np.arange(0, len(presses.pictures), 2)
         begun = located(presses, train)
         advance(note="circles are found")
-        fitted, touches = fitting.fit_jointly(presses, profiles, begun, train)
-        advance()
+        fitted, touches = fitting.fit_jointly(presses, profiles, begun, train, lambda done, total: advance())
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
     return Study(
         presses=presses,

@@ -9,6 +9,7 @@ and the gel's edge are ignored.
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
@@ -150,7 +151,11 @@ def align(presses: BallPresses, profiles: Profiles, touches: np.ndarray, optics:
 
 
 def fit_jointly(
-    presses: BallPresses, profiles: Profiles, begun: np.ndarray, train: np.ndarray
+    presses: BallPresses,
+    profiles: Profiles,
+    begun: np.ndarray,
+    train: np.ndarray,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[PhotometricOptics, np.ndarray]:
     """Optics from the presses `train` alone, and touches of all: the others are only aligned to finished optics.
 
@@ -159,14 +164,18 @@ def fit_jointly(
       profiles: of their ball.
       begun: about where the touches are (x, y, contact radius), mm, [P, 3].
       train: indices of the presses that are fitted.
+      progress: called with the number of rounds done and of all, the last of which aligns all presses.
     """
     touches = np.column_stack([begun[:, :2], np.clip(begun[:, 2], *CONTACT_MM)])
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
     optics = fit(chosen, profiles, touches[train])
-    for _ in range(ROUNDS):
+    for n in range(ROUNDS):
         touches[train] = align(chosen, profiles, touches[train], optics)
         optics = fit(chosen, profiles, touches[train])
-    return optics, align(presses, profiles, touches, optics)
+        progress(n + 1, ROUNDS + 1)
+    touches = align(presses, profiles, touches, optics)
+    progress(ROUNDS + 1, ROUNDS + 1)
+    return optics, touches
 
 
 def change(
