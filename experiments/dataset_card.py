@@ -57,15 +57,16 @@ def run(config: CardConfig, context: Context) -> Findings:
     with context.timed("measure"), context.progress("measuring contacts", _contacts(store)) as advance:
         source = read_source(store, tell=advance)
     with context.timed("generate"):
-        found = generate(source, config.quota, config.seed)
-    again = generate(source, config.quota, config.seed)
+        found, again = (
+            generate(source, config.quota, config.seed) for _ in context.each("making the bench twice", range(2))
+        )
     checks = card.checks(found.kept, source.bench, source.train)
     card.require(checks)
     write_items(context.directory / "items.jsonl", found.kept)
     with context.timed("faults"):
         step = max(1, len(found.kept) // config.faulty)
         sound = found.kept[::step]
-        caught = faults.caught(sound, source.bench.by_touch())
+        caught = faults.caught(context.each("planted faults", sound), source.bench.by_touch())
     return _findings(
         config, source, found, checks, {rule: n / len(sound) for rule, n in caught.items()}, again == found
     )

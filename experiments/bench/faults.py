@@ -32,7 +32,7 @@ def planted(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, Candidat
     return {rule: faults[rule]() for rule in RULES}
 
 
-def caught(items: Sequence[Item], contacts: Mapping[Touch, Contact]) -> dict[str, int]:
+def caught(items: Iterable[Item], contacts: Mapping[Touch, Contact]) -> dict[str, int]:
     """How many of the planted faults each rule catches; all would be `len(items)`."""
     counts = dict.fromkeys(RULES, 0)
     for item in items:
