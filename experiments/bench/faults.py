@@ -1,7 +1,7 @@
 """Faults of each kind, planted in sound items to judge the rules by: each must be caught under its own name."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from experiments.bench.facts import Contact
 from experiments.bench.filters import MARGIN, RULES, Candidate, broken_rule
@@ -33,7 +33,7 @@ def planted(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, Candidat
 
 
 def caught(items: Iterable[Item], contacts: Mapping[Touch, Contact]) -> dict[str, int]:
-    """How many of the planted faults each rule catches; all would be `len(items)`."""
+    """How many of the planted faults each rule catches; all would be the number of items."""
     counts = dict.fromkeys(RULES, 0)
     for item in items:
         for rule, candidate in planted(item, contacts).items():
