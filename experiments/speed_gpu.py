@@ -48,7 +48,9 @@ GB = 1e9
 def run(config: GpuConfig, context: Context) -> Findings:
     """Time every piece, then compare attention and memory with what they must be."""
     device = accelerator(anywhere=config.anywhere)
-    heads = draw_heads(config.prompts, config.tokens, config.heads, config.kv_heads, config.head_dim)
+    with context.progress("drawing what attends", 1) as advance:
+        heads = draw_heads(config.prompts, config.tokens, config.heads, config.kv_heads, config.head_dim)
+        advance()
     timed = measured("pieces", without_policy(config, heads), config.rounds, context)
     off = errors(heads, ways(config), context)
     del heads
