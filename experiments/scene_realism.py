@@ -74,7 +74,7 @@ def run(config: RealismConfig, context: Context) -> Findings:
     for name, way in context.each("candidates", realism.candidates(study).items()):
         rendered[name] = realism.render(study, way, config.seed)
         rows[name] = compare(real, rendered[name], study, config.judge)
-    shadows = shadow_gain(study.presses, study.profiles, study.touches, study.fitted, study.held_out)
+    shadows = shadow_gain(study.presses, study.profiles, study.touches, study.fitted, study.held_out, context)
     drift = float(np.sqrt(np.mean((realism.clean(study, study.fitted) - realism.clean(study, photometric.MINI)) ** 2)))
     return Findings(
         verdict=verdict(rows, shadows),

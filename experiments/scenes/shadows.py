@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from experiments.running.context import Context
 from sensors_io.scenes import fitting
 from sensors_io.scenes.fitting import BallPresses, Profiles
 from sensors_io.scenes.photometric import PhotometricOptics
@@ -13,7 +14,12 @@ REACH_MM = np.linspace(0.25, 4.0, 12)
 
 
 def shadow_gain(
-    presses: BallPresses, profiles: Profiles, touches: np.ndarray, optics: PhotometricOptics, held_out: np.ndarray
+    presses: BallPresses,
+    profiles: Profiles,
+    touches: np.ndarray,
+    optics: PhotometricOptics,
+    held_out: np.ndarray,
+    context: Context,
 ) -> dict[str, float]:
     """Regress what is left on shadow depths from eight sides and three elevations, and ask the held-out presses.
 
@@ -28,7 +34,8 @@ def shadow_gain(
     """
     size = DIRECTIONS * len(ELEVATIONS_DEG)
     normal, right, asked = np.zeros((size, size)), np.zeros((size, 3)), []
-    for i, (touch, picture) in enumerate(zip(touches, presses.pictures, strict=True)):
+    seen = enumerate(zip(touches, presses.pictures, strict=True))
+    for i, (touch, picture) in context.each("shadows", seen):
         rows, left = _shadows(presses, profiles, touch), _residual(presses, profiles, touch, picture, optics)
         if i in held_out:
             asked.append((rows, left))

@@ -93,7 +93,7 @@ def test_the_report_shows_the_presses(directory: Path) -> None:
 def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: Context) -> None:
     presses = realism.read(recordings, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
     study = realism.fit(presses, context)
-    found = shadow_gain(presses, study.profiles, study.touches, study.fitted, study.held_out)
+    found = shadow_gain(presses, study.profiles, study.touches, study.fitted, study.held_out, context)
     assert found["explained"] < 0.05
     assert json.dumps(found)
 
