@@ -18,10 +18,10 @@ from pathlib import Path
 
 import jax
 
-from experiments.loading.charts import memory_bars
 from experiments.loading.checkpoints import random_checkpoint
 from experiments.loading.readers import Reading, measure
 from experiments.loading.shapes import SHAPES
+from experiments.reporting.bars import bars
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.progress import in_megabytes
@@ -75,7 +75,12 @@ def run(config: LoadWeightsConfig, context: Context) -> Findings:
                 name="memory",
                 title="Memory of a reading",
                 caption=f"The dotted line is the bound, {BOUND} times the weights in bfloat16.",
-                content=memory_bars(ratios, BOUND),
+                content=bars(
+                    {f"{size}, {name}": ratio for size, by in ratios.items() for name, ratio in by.items()},
+                    "largest resident size of the process, in weights",
+                    written="{:.2f}",
+                    bounds=(BOUND,),
+                ),
             ),
         ),
         settings={"physical memory": f"{physical_memory() / 1e9:.0f} GB", "shard": f"{config.shard_bytes / 1e9:g} GB"},

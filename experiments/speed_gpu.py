@@ -25,8 +25,9 @@ from experiments.gpu.attention import Heads, draw_heads, errors
 from experiments.gpu.config import GpuConfig
 from experiments.gpu.device import Sheet, accelerator, sheet_of
 from experiments.gpu.pieces import Learning, Piece, attention, product, tactile_encoder, vision_tower, ways
-from experiments.gpu.tables import Timed, share_bars, time_table
+from experiments.gpu.tables import Timed, time_table
 from experiments.grpo.size import Size
+from experiments.reporting.bars import bars
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
@@ -75,7 +76,9 @@ def run(config: GpuConfig, context: Context) -> Findings:
                 name="share",
                 title="Share of the peak",
                 caption="Operations that no program can avoid, over the time that they took and the device's peak.",
-                content=share_bars(timed, peak),
+                content=bars(
+                    {n: 100 * t.share(peak) for n, t in timed.items()}, "share of the peak, %", written="{:.1f}"
+                ),
             ),
         ),
         settings={"device": device.device_kind, "platform": device.platform, "jax": jax.__version__},

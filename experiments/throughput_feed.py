@@ -25,7 +25,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import jax
 import numpy as np
 
-from experiments.feeding.charts import cores_needed
 from experiments.feeding.demand import grpo_seconds, sft_seconds
 from experiments.feeding.scales import Scale, answers, clip_bytes, memory_share, questions
 from experiments.feeding.supply import Made, idle_share, make_seconds
@@ -34,6 +33,7 @@ from experiments.policies.assembly import assemble
 from experiments.policies.feeds import Feed
 from experiments.policies.study import SMOKE as TINY_STUDY
 from experiments.policies.study import open_study_data
+from experiments.reporting.bars import bars
 from experiments.reporting.findings import Column, Findings, Picture, Requirement, Table
 from experiments.running.context import Context
 from experiments.running.runner import Experiment
@@ -119,8 +119,8 @@ def run(config: FeedingConfig, context: Context) -> Findings:
             Picture(
                 name="cores",
                 title="Cores that a device needs for its batches",
-                caption="Processor time of a batch over the predicted time of a step; the line is what it has.",
-                content=cores_needed({one.name: one.cores for one in fed}, config.cores),
+                caption="Processor time of a batch over the predicted time of a step; the dotted line is what it has.",
+                content=bars({one.name: one.cores for one in fed}, "cores", bounds=(config.cores,), logarithmic=True),
             ),
         ),
         settings={"cores here": cores_here(), "cores beside a device": config.cores},

@@ -1,14 +1,10 @@
-"""Times on an accelerator as tables and bars."""
+"""Times on an accelerator as a table."""
 
 import statistics
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
-
 from experiments.gpu.device import Sheet
-from experiments.reporting.charts import LOOK, PALETTE, svg
 from experiments.reporting.findings import Cell, Column, Table
 
 
@@ -70,19 +66,3 @@ def time_table(timed: Mapping[str, Timed], sheet: Sheet | None, peak_flops: floa
         rows=tuple(rows),
         note=f"The peak is that of {peak}: {peak_flops / 1e12:.4g} TFLOP/s.",
     )
-
-
-def share_bars(timed: Mapping[str, Timed], peak_flops: float) -> bytes:
-    """Share of the peak of every piece."""
-    names = list(timed)
-    shares = [100 * timed[name].share(peak_flops) for name in names]
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(7.2, 0.9 + 0.34 * len(names)), layout="constrained")
-        axes = figure.subplots()
-        axes.barh(names, shares, color=PALETTE[0], height=0.6)
-        for y, share in enumerate(shares):
-            axes.annotate(f"{share:.1f}", (share, y), (3, 0), textcoords="offset points", va="center", fontsize=8)
-        axes.set(xlabel="share of the peak, %", xlim=(0, 1.12 * max(shares)))
-        axes.invert_yaxis()
-        axes.grid(axis="y", visible=False)
-        return svg(figure)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from experiments.reporting.checks import require
@@ -107,14 +107,26 @@ class Findings:
         Args:
           description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
         """
-        git = description["git"]
-        requirements = [r.to_json() for r in self.requirements]
-        return {
-            "experiment": description["experiment"],
-            "scale": description["scale"],
-            "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
-            "requirements": jsonable(requirements, where="requirements"),
-            **{name: jsonable(getattr(self, name), where=name) for name in ("verdict", "tables", "settings")},
-            **{name: jsonable(getattr(self, name), where=name) for name in ("timing", "data")},
-            "config": description["config"],
-        }
+        shown = {name: getattr(self, name) for name in ("verdict", "tables", "settings", "timing", "data")}
+        return outcome_json(description, self.requirements, shown)
+
+
+def outcome_json(
+    description: Mapping[str, Any], requirements: Sequence[Requirement], shown: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What `results.json` holds of any experiment: which run it was, its requirements, what it shows, its config.
+
+    Args:
+      description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
+      requirements: figures with bounds.
+      shown: name → anything that JSON can hold.
+    """
+    git = description["git"]
+    return {
+        "experiment": description["experiment"],
+        "scale": description["scale"],
+        "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
+        "requirements": jsonable([r.to_json() for r in requirements], where="requirements"),
+        **{name: jsonable(value, where=name) for name, value in shown.items()},
+        "config": description["config"],
+    }

@@ -8,8 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from experiments.reporting.checks import require
-from experiments.reporting.findings import Picture, Requirement, Table
-from experiments.running.artifacts import jsonable
+from experiments.reporting.findings import Picture, Requirement, Table, outcome_json
 from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")
@@ -157,17 +156,8 @@ class Results:
         Args:
           description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
         """
-        shown = ("arms", "baselines", "comparisons", "verdict", "tables", "settings", "timing", "data")
-        git = description["git"]
-        requirements = [r.to_json() for r in self.requirements]
-        return {
-            "experiment": description["experiment"],
-            "scale": description["scale"],
-            "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
-            "requirements": jsonable(requirements, where="requirements"),
-            **{name: jsonable(getattr(self, name), where=name) for name in shown},
-            "config": description["config"],
-        }
+        names = ("arms", "baselines", "comparisons", "verdict", "tables", "settings", "timing", "data")
+        return outcome_json(description, self.requirements, {name: getattr(self, name) for name in names})
 
     def _check_comparison(self, field: str, comparison: Comparison) -> None:
         _check_metric(f"{field}.metric", comparison.metric)

@@ -16,20 +16,33 @@ from touchr1_jax.models.linear import Dense
 MASKED = -1e9
 """Score of a forbidden key or token: finite, so that 0 · MASKED is 0 and no NaN arises from differences."""
 
+MOST_LAYERS = 1000
+"""Ten times as many as large models have; each is traced by itself, so that more would seem to hang."""
+
 
 class SizeError(ValueError):
     """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
 
 
-def check_sizes(config: Any, *fields: str, least: int = 1) -> None:
-    """Refuse a config with a size below the least.
+def check_sizes(config: Any, *fields: str) -> None:
+    """Refuse a config with a size below one.
 
     Raises:
       SizeError: naming the field.
     """
     for field in fields:
-        if getattr(config, field) < least:
-            raise SizeError(f"{field} is {getattr(config, field)}: must be at least {least}; raise it")
+        if getattr(config, field) < 1:
+            raise SizeError(f"{field} is {getattr(config, field)}: must be at least 1; raise it")
+
+
+def check_layers(config: Any, least: int) -> None:
+    """Refuse a depth below the least, or one that no machine could trace.
+
+    Raises:
+      SizeError: naming `num_layers`.
+    """
+    if not least <= config.num_layers <= MOST_LAYERS:
+        raise SizeError(f"num_layers is {config.num_layers}: must lie in {least} … {MOST_LAYERS}; change it")
 
 
 def check_heads(width: int, heads: int) -> None:

@@ -24,6 +24,7 @@ from touchr1_jax.models.layers import (
     Rotation,
     SizeError,
     attend,
+    check_layers,
     check_sizes,
     mrope,
     rotate,
@@ -48,7 +49,8 @@ class DecoderConfig:
     tie_embedding: bool = True
 
     def __post_init__(self) -> None:
-        check_sizes(self, "hidden_size", "num_layers", "num_heads", "num_kv_heads", "head_dim", "intermediate_size")
+        check_sizes(self, "hidden_size", "num_heads", "num_kv_heads", "head_dim", "intermediate_size")
+        check_layers(self, least=1)
         if self.num_heads % self.num_kv_heads:
             raise SizeError(
                 f"num_heads is {self.num_heads}: must be a multiple of num_kv_heads {self.num_kv_heads}; change either"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from touchr1_jax.models.layers import MASKED, RMSNorm, check_heads, check_sizes
+from touchr1_jax.models.layers import MASKED, RMSNorm, check_heads, check_layers, check_sizes
 from touchr1_jax.models.salience import busiest_patches, patch_change, rest_mean
 
 
@@ -53,7 +53,7 @@ class TactileViTConfig:
     def __post_init__(self) -> None:
         check_sizes(self, "width", "num_heads", "mlp_ratio", "stem_px", "stem_width", "patch_cells")
         check_sizes(self, "frames_per_step", "tokens_per_step")
-        check_sizes(self, "num_layers", least=0)
+        check_layers(self, least=0)
         check_heads(self.width, self.num_heads)
 
 

@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, UInt8
 
-from touchr1_jax.models.layers import RMSNorm, SizeError, check_heads, check_sizes
+from touchr1_jax.models.layers import RMSNorm, SizeError, check_heads, check_layers, check_sizes
 from touchr1_jax.models.tactile_vit import EncoderLayer
 
 
@@ -27,7 +27,7 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         check_sizes(self, "image_px", "patch_px", "width", "num_heads", "mlp_ratio")
-        check_sizes(self, "num_layers", least=0)
+        check_layers(self, least=0)
         check_heads(self.width, self.num_heads)
         if self.image_px % (2 * self.patch_px):
             raise SizeError(
