@@ -59,9 +59,9 @@ class LoadWeightsConfig:
 
 def run(config: LoadWeightsConfig, context: Context) -> Findings:
     """Write, read, compare, one size after the other."""
-    for size in config.sizes:
+    for size in context.each("looking for room", config.sizes):
         check_room(size, config.scratch, copies=2 if size in config.compare else 1)
-    readings = {size: read_size(size, config, context) for size in config.sizes}
+    readings = {size: read_size(size, config, context) for size in context.each("sizes", config.sizes, still=True)}
     ratios = {size: {name: r.peak / r.held for name, r in by.items()} for size, by in readings.items()}
     return Findings(
         verdict=verdict(readings),

@@ -85,7 +85,7 @@ def run(config: StorageConfig, context: Context) -> Findings:
         verdict=verdict(rows, best, need, stages, rates),
         requirements=requirements(rows, best),
         tables=(*(_table(kind, r) for kind, r in rows.items()), _filters(filters), _stages(stages), _rates(rates)),
-        pictures=tuple(_picture(n, kind, r, need) for n, (kind, r) in enumerate(rows.items())),
+        pictures=tuple(_picture(n, *row, need) for n, row in context.each("drawing", enumerate(rows.items()))),
         settings={
             "rule": f"reads {need:,.0f} frames/s: {config.training_fps:,.0f} on {config.core_share:.0%} of a core",
             "not available here": "; ".join(missing.values()) or "nothing",
