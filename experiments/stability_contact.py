@@ -161,7 +161,9 @@ def ordinary_scenes(config: StabilityConfig, context: Context) -> dict[str, floa
         return _solve(gap, force, gel, body / modulus, bench.spacing_mm, bench.thickness_mm)
 
     inputs = tuple(map(jnp.asarray, (scenes.gap_mm, scenes.force_n, scenes.modulus_mpa)))
-    found = jax.device_get(jax.jit(lambda s: jax.lax.map(solve, s))(inputs))
+    with context.progress("solving ordinary scenes", 1) as advance:
+        found = jax.device_get(jax.jit(lambda s: jax.lax.map(solve, s))(inputs))
+        advance()
     error = displacement_error(found.displacement_mm, true)
     flagged = ~np.asarray(found.validity.all)
     good = true.max((1, 2)) / bench.thickness_mm <= STRAIN_LIMIT
