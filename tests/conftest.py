@@ -11,7 +11,7 @@ import jax
 import jaxtyping
 import pytest
 
-from experiments.running.quick import compiled_quickly
+from experiments.running.quick import FLAGS, compiled_quickly
 from tests.typecheck import functions
 
 jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions.__name__}")
@@ -29,6 +29,12 @@ WORTH_KEEPING_S = 0.2
 MOST_BYTES = 16 * 2**30
 """Never reached; without a limit JAX takes no lock, and a worker could read what another has half written."""
 
+LEAN = (
+    "--xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,while-loop-constant-sinking"
+)
+"""Flags of XLA: one piece of code for the one core of a worker, and no search for what its few rounds might share."""
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep compiled programs for the length of the session, for its files and workers to share, and compile quickly.
@@ -37,6 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
     matrices keep to one thread: each has a core, and threads that wait for that of another take eight times as long.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if LEAN not in os.environ.get(FLAGS, ""):  # else this is a worker, with the environment of its session
+        os.environ[FLAGS] = f"{os.environ.get(FLAGS, '')} {LEAN}".strip()
     quick = contextlib.ExitStack()
     quick.enter_context(compiled_quickly())
     config.add_cleanup(quick.close)
