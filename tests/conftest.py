@@ -8,13 +8,12 @@ from collections.abc import Iterator
 
 import hypothesis
 import jax
-import jaxtyping
 import pytest
 
 from experiments.running.quick import FLAGS, compiled_quickly
-from tests.typecheck import functions
+from tests.typecheck import install
 
-jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions.__name__}")
+install("touchr1_jax")
 
 # both judge by the clock, which a shared machine falsifies
 hypothesis.settings.register_profile("shared", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
@@ -34,6 +33,9 @@ LEAN = (
     "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,while-loop-constant-sinking"
 )
 """Flags of XLA: one piece of code for the one core of a worker, and no search for what its few rounds might share."""
+
+MADE_BETWEEN_WALKS = 20_000
+"""Objects; at Python's 700 the collector walks the traces of a file a dozen times and finds little."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -59,9 +61,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector the modules and tests, which live to the end: it would walk them a thousand times."""
+    """Spare the garbage collector what lives long: modules and tests, to the end; traces, to the end of their file."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(MADE_BETWEEN_WALKS)
 
 
 @pytest.fixture(scope="module", autouse=True)
