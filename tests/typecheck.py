@@ -7,15 +7,19 @@ import jaxtyping
 from beartype import beartype
 from jaxtyping import AbstractArray
 
-_whole = jaxtyping.jaxtyped
-
 
 def install(package: str) -> None:
     """Check the functions of a package that annotate shapes from its first import on, and leave the others as they are.
 
     The hook would wrap these too, and bind the arguments of each of their calls to check nothing.
     """
-    jaxtyping.jaxtyped = _where_shapes_are
+    whole = jaxtyping.jaxtyped
+
+    def where_shapes_are(*, typechecker: Callable) -> Callable:
+        spared = lambda fn: fn.__module__.split(".")[0] == package and not _wanted(fn)
+        return lambda fn: fn if spared(fn) else whole(fn, typechecker=typechecker)
+
+    jaxtyping.jaxtyped = where_shapes_are
     jaxtyping.install_import_hook(package, f"{functions.__module__}.{functions.__name__}")
 
 
@@ -25,11 +29,6 @@ def functions(fn: Callable) -> Callable:
     Not the fields of pytrees: JAX fills those with specs, and the feeds with NumPy arrays.
     """
     return beartype(fn) if _wanted(fn) else fn
-
-
-def _where_shapes_are(*, typechecker: Callable) -> Callable:
-    """In place of `jaxtyping.jaxtyped`, which the hook has every function and class decorated with."""
-    return lambda fn: _whole(fn, typechecker=typechecker) if _wanted(fn) else fn
 
 
 def _wanted(fn: Any) -> bool:
