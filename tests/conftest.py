@@ -8,13 +8,12 @@ from collections.abc import Iterator
 
 import hypothesis
 import jax
-import jaxtyping
 import pytest
 
-from experiments.running.quick import compiled_quickly
-from tests.typecheck import functions
+from experiments.running.quick import FLAGS, compiled_quickly
+from tests.typecheck import install
 
-jaxtyping.install_import_hook("touchr1_jax", f"{functions.__module__}.{functions.__name__}")
+install("touchr1_jax")
 
 # both judge by the clock, which a shared machine falsifies
 hypothesis.settings.register_profile("shared", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
@@ -29,6 +28,15 @@ WORTH_KEEPING_S = 0.2
 MOST_BYTES = 16 * 2**30
 """Never reached; without a limit JAX takes no lock, and a worker could read what another has half written."""
 
+LEAN = (
+    "--xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,while-loop-constant-sinking"
+)
+"""Flags of XLA: one piece of code for the one core of a worker, and no search for what its few rounds might share."""
+
+MADE_BETWEEN_WALKS = 20_000
+"""Objects; at Python's 700 the collector walks the traces of a file a dozen times and finds little."""
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep compiled programs for the length of the session, for its files and workers to share, and compile quickly.
@@ -37,6 +45,8 @@ def pytest_configure(config: pytest.Config) -> None:
     matrices keep to one thread: each has a core, and threads that wait for that of another take eight times as long.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if LEAN not in os.environ.get(FLAGS, ""):  # else this is a worker, with the environment of its session
+        os.environ[FLAGS] = f"{os.environ.get(FLAGS, '')} {LEAN}".strip()
     quick = contextlib.ExitStack()
     quick.enter_context(compiled_quickly())
     config.add_cleanup(quick.close)
@@ -51,9 +61,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector the modules and tests, which live to the end: it would walk them a thousand times."""
+    """Spare the garbage collector what lives long: modules and tests, to the end; traces, to the end of their file."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(MADE_BETWEEN_WALKS)
 
 
 @pytest.fixture(scope="module", autouse=True)

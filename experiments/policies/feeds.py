@@ -27,6 +27,9 @@ from touchr1_jax.training.packing import PackedRows, Packing, existing_tokens, p
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.types import TouchBatch
 
+ONE_AT_A_TIME = grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)
+"""How to read an order of rows: left to itself Grain shuffles 500 batches ahead, seconds of a core at every start."""
+
 
 class Feed:
     """A Grain iterator with a count; subclasses turn its elements into batches."""
@@ -199,7 +202,7 @@ class QuestionFeed(Feed):
     ) -> None:
         contact, attribute = labelled(label)
         order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
-        super().__init__(order.to_iter_dataset(), seed)
+        super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
         self._assembly, self._features, self._label = assembly, features, label
         self._contact, self._attribute, self._full_share = contact, attribute, full_share
         self._own = np.arange(batch_size) if own is None else own

@@ -1,6 +1,7 @@
 """What the stages are fed: right answers, random questions, exact resumption."""
 
 import json
+import threading
 
 import jax
 import numpy as np
@@ -298,3 +299,11 @@ def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
     assert [(rows.tolist(), real) for rows, real in each(2, 4)] == [([0, 1, 1, 1], 2)]
     assert [real for _, real in each(6, 3)] == [3, 3]
     assert list(each(0, 3)) == []
+
+
+def test_the_order_of_questions_is_not_made_ahead(questions):
+    """Grain's threads would shuffle 500 batches beside the training that they are for."""
+    before = threading.active_count()
+    feed = questions()
+    next(feed)
+    assert threading.active_count() == before

@@ -18,6 +18,9 @@ from sensors_io.scenes.sensors import BODY, TAC3D
 WINDOW_MM, GEL = TAC3D.window_mm, TAC3D.gel
 STAGE = chooser.Stage(gel=GEL, body=BODY, window_mm=WINDOW_MM)
 
+surveyed = jax.jit(survey, static_argnums=(4, 5))  # as the chooser calls it; each operation alone compiles for long
+log_error = jax.jit(chooser_law.log_error, static_argnums=2)
+
 
 def _ball(grid: int, radius_mm: float = 8.0) -> jnp.ndarray:
     x = (np.arange(grid) + 0.5) * WINDOW_MM / grid - WINDOW_MM / 2
@@ -48,7 +51,7 @@ def _survey(gap, force_n: float = 2.0):
     found = contact.solve(gap(LOOK.grid), force_n, soft, 0 * soft, WINDOW_MM / LOOK.grid, LOOK.tolerance)
     gaps = tuple(gap(n) for n in chooser.LOOK_GRIDS)
     one = jnp.float32(1.0)
-    return survey(found.pressure_mpa, found.displacement_mm, gaps, one, WINDOW_MM, GEL.thickness_mm)
+    return surveyed(found.pressure_mpa, found.displacement_mm, gaps, one, WINDOW_MM, GEL.thickness_mm)
 
 
 # The menu ------------------------------------------------------------------------------------------------------------
@@ -71,7 +74,7 @@ def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
 def test_errors_add_in_quadrature() -> None:
     """By hand: with all coefficients 0 each of the three parts is e⁰ = 1."""
     law = jax.tree.map(np.zeros_like, LAW)
-    found = chooser_law.log_error(_survey(_ball), law, MENU)
+    found = log_error(_survey(_ball), law, MENU)
     np.testing.assert_allclose(found, np.full(len(MENU), np.log(3) / 2), rtol=1e-6)
 
 
@@ -85,25 +88,25 @@ def test_each_part_follows_its_formula() -> None:
     )
     by_grid = dataclasses.replace(silent, grid=0 * first, rate=-first, bend=0.5 * first)
     x = np.log(np.array([s.grid for s in menu]) / 48)
-    np.testing.assert_allclose(chooser_law.log_error(seen, by_grid, menu), -x + x**2 / 2, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(log_error(seen, by_grid, menu), -x + x**2 / 2, rtol=1e-4, atol=1e-6)
     by_stop = dataclasses.replace(silent, stop=np.append(0 * first, [0, 1.0]))
     tolerances = np.log([s.tolerance for s in menu])
-    np.testing.assert_allclose(chooser_law.log_error(seen, by_stop, menu), tolerances, rtol=1e-4)
+    np.testing.assert_allclose(log_error(seen, by_stop, menu), tolerances, rtol=1e-4)
     by_wrap = dataclasses.replace(silent, wrap=np.array([0.0, 1.0, 0.0, 0.0, 0.0]))
     clearance = [(WINDOW_MM * s.padded / s.grid - 2 * float(seen.radius_mm)) / GEL.thickness_mm for s in menu]
-    np.testing.assert_allclose(chooser_law.log_error(seen, by_wrap, menu), clearance, rtol=1e-4)
+    np.testing.assert_allclose(log_error(seen, by_wrap, menu), clearance, rtol=1e-4)
 
 
 def test_many_surveys_have_the_errors_of_each() -> None:
     each = [_survey(gap) for gap in (_ball, _bumps)]
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-    found = chooser_law.log_error(both, LAW, MENU)
+    found = log_error(both, LAW, MENU)
     for row, seen in zip(found, each, strict=True):
-        np.testing.assert_allclose(row, chooser_law.log_error(seen, LAW, MENU), rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(row, log_error(seen, LAW, MENU), rtol=1e-5, atol=1e-5)
 
 
 def test_finer_grids_promise_less_error_where_the_contact_is_rough() -> None:
-    expected = {s: float(e) for s, e in zip(MENU, chooser_law.log_error(_survey(_bumps), LAW, MENU), strict=True)}
+    expected = {s: float(e) for s, e in zip(MENU, log_error(_survey(_bumps), LAW, MENU), strict=True)}
     tight = [expected[s] for s in sorted(MENU, key=lambda s: s.grid) if s.tolerance == 3e-3 and s.padded == 2 * s.grid]
     assert tight == sorted(tight, reverse=True)
 
@@ -129,7 +132,7 @@ def test_a_survey_by_hand() -> None:
     """A square punch of 4 × 4 of 8 pixels under a flat gap: no detail, 32 edges of 16 pixels, an extent of a half."""
     pressure = jnp.zeros((8, 8)).at[2:6, 2:6].set(1.0)
     flat = tuple(jnp.zeros((n, n)) for n in (8, 16, 32))
-    seen = survey(pressure, pressure, flat, jnp.float32(0.5), 8.0, 2.0)
+    seen = surveyed(pressure, pressure, flat, jnp.float32(0.5), 8.0, 2.0)
     told = dict(zip(FEATURES, np.asarray(seen.features), strict=True))
     least = np.log(1e-3)
     assert told["1"] == 1
