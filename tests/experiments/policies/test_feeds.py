@@ -303,7 +303,7 @@ def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
 
 def test_the_order_of_questions_is_not_made_ahead(questions):
     """Grain's threads would shuffle 500 batches beside the training that they are for."""
-    before = threading.active_count()
+    before = set(threading.enumerate())
     feed = questions()
     next(feed)
-    assert threading.active_count() == before
+    assert set(threading.enumerate()) <= before  # those of other feeds may end meanwhile
