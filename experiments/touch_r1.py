@@ -19,7 +19,8 @@ than 0.8 %: answers parse where they are greedy, and GRPO samples noise.  `--sca
 checkpoint to write answers, without touch or pictures, and trains on it what a user without weights can watch learning.
 
 Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
-Several devices: `--distributed --mesh.fsdp N` as in every study; each process reads the whole weights first.
+Several devices: `--distributed --mesh.fsdp N` as in every study, with `--grpo.micro-prompts` a multiple of N; each
+process reads the whole weights first.
 
 Cost: not measured, for neither such weights nor such a machine were at hand; sized for the 3B or 7B on one H200, of
 which GRPO holds 28 or 52 GB by the count that every run makes ahead.  `--scale smoke` under two minutes.
@@ -50,7 +51,7 @@ from experiments.policies.stages import SFTConfig
 from experiments.policies.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
 from experiments.policies.training import TrainingConfig, open_data, starting_model
 from experiments.released.kept import kept_shares, kept_table, least_kept
-from experiments.released.memory import counted, memory_table
+from experiments.released.memory import counted, memory_table, shape_of
 from experiments.released.policy import ReleasedAssembly, ReleasedModel, assemble_released, instruction, prove_released
 from experiments.released.teaching import TeachingConfig, teach
 from experiments.released.tiny import SMALLEST, write_tiny
@@ -184,12 +185,14 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     """The policy and its data; weights and sizes are looked at before data are made.
 
     Raises:
-      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released` and `prove_released`.
+      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `shape_of`.
     """
     model = config.model
     found = load_checkpoint(source, jnp.dtype(model.dtype))
     require_same(source, context)
-    prove_released(assemble_released(model, found, SENSORS), touch_shapes(model, model.view_px, SENSORS))
+    ahead = assemble_released(model, found, SENSORS)
+    prove_released(ahead, touch_shapes(model, model.view_px, SENSORS))
+    shape_of(config, ahead, context.devices.shape)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)
