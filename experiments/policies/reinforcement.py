@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from experiments.policies.assembly import Assembly, Weights
 from experiments.policies.feeds import QuestionFeed
-from experiments.policies.stages import fresh_adapters
+from experiments.policies.stages import fresh_adapters, merge_noted
 from experiments.policies.watching import watched_log
 from experiments.running.context import Context
 from experiments.running.loops import run_loop
 from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.lora import LoraConfig, adapt, merge
+from touchr1_jax.models.lora import LoraConfig, adapt
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import LEAN, Fixed, GRPOState, make_grpo_step, start_state
@@ -108,7 +108,7 @@ def run_grpo(
     step, state, batches = context.devices.spread(step, state, feed, config.drawn, *shared)
     end = run_loop(step, state, batches, arm.loop, context, stage, make_log=watched_log)
     found = context.devices.whole(end.params)
-    return {**params, **(found if lora is None else merge(decoder, found.adapters, lora))}
+    return {**params, **(found if lora is None else merge_noted(decoder, found.adapters, lora, context, stage))}
 
 
 @functools.cache

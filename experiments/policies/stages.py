@@ -27,7 +27,7 @@ from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.chunked import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
-from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge
+from touchr1_jax.models.lora import Adapters, LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
 from touchr1_jax.models.policy import Features
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig
@@ -35,6 +35,9 @@ from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
+
+KEPT = "kept"
+"""Stages whose results say how much of a stage's adapters is in the merged weights (see `lora.kept_share`)."""
 
 ENCODE_BATCH = 8
 """Contacts that are encoded at once: eight stay in cache, sixteen take twice the time each."""
@@ -198,7 +201,9 @@ def run_sft(
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
     step, state, batches = context.devices.spread(step, state, feed, config.batch_size, *([frozen] if frozen else []))
     found = context.devices.whole(run_loop(step, state, batches, loop, context, stage).params)
-    return found if config.lora is None else {**merge(frozen, found.adapters, config.lora), **found.towers}
+    if config.lora is None:
+        return found
+    return {**merge_noted(frozen, found.adapters, config.lora, context, stage), **found.towers}
 
 
 def untrained(assembly: Assembly, data: Dataset, seed: int) -> Params:
@@ -211,6 +216,13 @@ def fresh_adapters(frozen: Params, towers: Params, lora: LoraConfig, seed: int) 
     """What is trained where some towers stand still: their adapters, and the other towers."""
     adapters = init_adapters(jax.random.fold_in(jax.random.key(seed), 1), frozen, lora)
     return Trainable(adapters=adapters, towers=towers)
+
+
+def merge_noted(base: Params, adapters: Adapters, lora: LoraConfig, context: Context, stage: str) -> Params:
+    """The base with a stage's adapters in it; what its type kept of them is noted as the result of `KEPT`/stage."""
+    merged = merge(base, adapters, lora)
+    context.save_stage(f"{KEPT}/{stage}", kept_share(base, merged, adapters, lora))
+    return merged
 
 
 @functools.cache

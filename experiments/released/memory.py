@@ -11,6 +11,7 @@ from experiments.reporting.findings import Column, Table
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.training.optimizer import falling_adamw
 
 GB = 1e9
@@ -31,17 +32,11 @@ def counted(config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, m
       mesh: devices along its axes.
 
     Raises:
-      ValueError: prompts that the mesh cannot share.
+      SizeError: as `shape_of`.
     """
     released, layout, streams = assembly.checkpoint.config, assembly.layout, len(assembly.language.sensors)
     touch, view = layout.touch.size // streams, len(layout.view)
-    data_axis, fsdp, tensor = mesh
-    shape = GRPOShape(
-        decoder=released.decoder,
-        grpo=config.grpo,
-        mesh=MeshConfig(data=data_axis, fsdp=fsdp, tensor=tensor),
-        prompt_tokens=layout.ids.shape[1],
-    )
+    shape = shape_of(config, assembly, mesh)
     text = layout.ids.shape[1] - streams * touch - view
     prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
     step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.grpo_lora)
@@ -49,6 +44,24 @@ def counted(config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, m
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
     of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)
     return {STEP: counted_peak(lines), WEIGHTS: _bytes(assembly), CONTACTS: contacts * of_contact}
+
+
+def shape_of(config: TrainingConfig, assembly: ReleasedAssembly, mesh: tuple[int, ...]) -> GRPOShape:
+    """What the memory of a GRPO step depends on; needs no data.
+
+    Raises:
+      SizeError: prompts or heads that the mesh cannot share.
+    """
+    data, fsdp, tensor = mesh
+    try:
+        return GRPOShape(
+            decoder=assembly.checkpoint.config.decoder,
+            grpo=config.grpo,
+            mesh=MeshConfig(data=data, fsdp=fsdp, tensor=tensor),
+            prompt_tokens=assembly.layout.ids.shape[1],
+        )
+    except ValueError as error:
+        raise SizeError(f"GRPO cannot be shared by the devices of the mesh: {error}") from error
 
 
 def _bytes(assembly: ReleasedAssembly) -> int:

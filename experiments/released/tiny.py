@@ -31,8 +31,23 @@ VOCABULARY = 640
 
 ROWS = 704
 
+SMALLEST = DecoderConfig(
+    vocab_size=ROWS,
+    hidden_size=64,
+    num_layers=1,
+    num_heads=4,
+    num_kv_heads=2,
+    head_dim=16,
+    intermediate_size=96,
+    mrope_section=(2, 3, 3),
+    rope_theta=1e6,
+)
+"""0.1 million parameters with a vision tower."""
 
-def write_tiny(directory: Path, language: Language, system: str = SYSTEM, seed: int = 0) -> None:
+
+def write_tiny(
+    directory: Path, language: Language, system: str = SYSTEM, seed: int = 0, decoder: DecoderConfig = SMALLEST
+) -> None:
     """Write config, tokenizer, template, picture settings and weights in bfloat16.
 
     Args:
@@ -40,11 +55,12 @@ def write_tiny(directory: Path, language: Language, system: str = SYSTEM, seed: 
       language: the tokenizer is trained on its answers, so that they are short.
       system: text that the tokenizer is trained on too.
       seed: of the weights.
+      decoder: shape of the decoder; its vocabulary is `ROWS`.
     """
     directory.mkdir(parents=True, exist_ok=True)
     library = trained_tokenizer(language, system)
     library.save(str(directory / TOKENIZER_FILE))
-    config = tiny_config(library)
+    config = tiny_config(library, decoder)
     (directory / CONFIG_FILE).write_text(json.dumps(published_config(config)), encoding="utf-8")
     vision = config.vision
     pictures = {
@@ -75,23 +91,13 @@ def trained_tokenizer(language: Language, system: str) -> tokenizers.Tokenizer:
     return library
 
 
-def tiny_config(library: tokenizers.Tokenizer) -> QwenConfig:
-    """0.1 million parameters; the ids are the tokenizer's."""
+def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST) -> QwenConfig:
+    """A decoder with the smallest vision tower beside it; the ids are the tokenizer's."""
     ids = library.get_vocab(with_added_tokens=True)
     return QwenConfig(
-        decoder=DecoderConfig(
-            vocab_size=ROWS,
-            hidden_size=64,
-            num_layers=1,
-            num_heads=4,
-            num_kv_heads=2,
-            head_dim=16,
-            intermediate_size=96,
-            mrope_section=(2, 3, 3),
-            rope_theta=1e6,
-        ),
+        decoder=decoder,
         vision=QwenVisionConfig(
-            out_size=64,
+            out_size=decoder.hidden_size,
             depth=1,
             hidden_size=32,
             num_heads=2,

@@ -9,12 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.policies.stages import SFTConfig
+from experiments.policies.stages import KEPT, SFTConfig
+from experiments.policies.study import BLIND, SFT
+from experiments.released.kept import kept_shares, least_kept
+from experiments.reporting.results import Estimate
 from experiments.running.artifacts import read_json
 from experiments.running.context import Context
 from experiments.running.loops import STEPPING, WAITING
 from experiments.running.runner import main
-from experiments.touch_r1 import ARM, DEFAULT, SMOKE, WRITTEN, ZERO, require_same
+from experiments.touch_r1 import ARM, DEFAULT, DRAWN, SMALL, SMOKE, TAUGHT, WRITTEN, ZERO, require_same, verdict
 from tests.experiments.shrunk import only_run
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.load import Load, WeightsError
@@ -64,7 +67,30 @@ def test_a_folder_that_is_none_is_named_before_data_are_made(tmp_path, capsys):
 def test_only_a_trial_makes_weights_of_its_own():
     assert not DEFAULT.tiny
     assert SMOKE.tiny
-    assert SMOKE.weights is DEFAULT.weights is None
+    assert SMALL.tiny
+    assert SMOKE.weights is SMALL.weights is DEFAULT.weights is None
+
+
+@pytest.mark.parametrize(("config", "first"), [(SMOKE, DRAWN), (SMALL, TAUGHT)])
+def test_a_verdict_says_what_its_figures_are_of(config, first):
+    half = Estimate(mean=50.0, ci95=(40.0, 60.0), per_seed=(50.0,))
+    rows = {name: {"acc": half} for name in (ZERO, SFT, ARM, BLIND, "constant")}
+    assert verdict(config, rows, None)[0] == first
+    assert DRAWN not in (said := verdict(dataclasses.replace(config, weights=Path("released")), rows, None))
+    assert TAUGHT not in said
+
+
+def test_what_merging_keeps_is_the_least_of_all_seeds(context):
+    shares = {"sft": (0.97, 0.95), f"grpo/{ARM}": (0.4, 0.99), "blind": (1.0, 1.0)}
+    for stage, of_seeds in shares.items():
+        for seed, share in enumerate(of_seeds):
+            context.save_stage(f"{KEPT}/{stage}/{seed}", share)
+    found = kept_shares(ARM, 2, context)
+    assert found == {SFT: 0.95, ARM: 0.4, BLIND: 1.0}
+    least = least_kept(found)
+    assert least.measured == 0.4
+    assert not least.met
+    assert least_kept({SFT: 0.95}).met
 
 
 def test_a_run_goes_on_with_the_weights_that_it_began_with(tmp_path, context):
@@ -99,10 +125,11 @@ def test_the_smoke_run_trains_scores_and_writes(whole):
     assert {"acc", "omae", "csc", "mat_acc", "parse_rate", "reward"} <= set(results["arms"][ARM])
     assert "csc" not in results["baselines"][ZERO]
     assert "drawn weights of a tiny model" in results["verdict"][0]
-    (same,) = results["requirements"]
+    same, kept = results["requirements"]
     assert same["measured"] == 0
+    assert -0.1 < kept["measured"] < 1.1
     titles = [table["title"] for table in results["tables"]]
-    assert {"What touch is worth", "Memory, counted from shapes"} <= set(titles)
+    assert {"What touch is worth", "What merging keeps of the adapters", "Memory, counted from shapes"} <= set(titles)
     stages = ("sft/0", f"grpo/{ARM}/0", "blind/0")
     assert {f"{what}/{stage}" for what in (STEPPING, WAITING) for stage in stages} <= set(results["timing"])
     assert results["settings"]["weights"] == "tiny, bfloat16"

@@ -117,6 +117,26 @@ def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
     return flax.traverse_util.unflatten_dict(flat)
 
 
+def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraConfig) -> float:
+    """How much of the adapters' change Δ is in merged weights, ⟨W' − W, Δ⟩ / ⟨Δ, Δ⟩ over all layers.
+
+    1 where nothing is lost; near 0 where the weights' type is too coarse: a weight that the change moves by less than
+    half the distance to its neighbour in that type stays where it is.  No change at all is kept whole.
+
+    Args:
+      base, adapters, config: as `merge` took them.
+      merged: what it gave.
+    """
+    before, after, by_path = (flax.traverse_util.flatten_dict(tree) for tree in (base, merged, adapters))
+    along, whole = 0.0, 0.0
+    for path, adapter in by_path.items():
+        w, v = (tree[(*path, "kernel")].astype(jnp.float32) for tree in (before, after))
+        change = config.scale * adapter.a @ adapter.b
+        along += float(jnp.vdot(v - w, change))
+        whole += float(jnp.vdot(change, change))
+    return along / whole if whole else 1.0
+
+
 class Trainable(struct.PyTreeNode):
     """What an adapted agent trains: adapters, and towers that are trained in full, such as the tactile encoder's.
 

@@ -10,7 +10,9 @@ import pytest
 from experiments.policies.assembly import touch_shapes
 from experiments.policies.feeds import AnswerFeed
 from experiments.policies.stages import SFTConfig, run_sft
+from experiments.released.memory import shape_of
 from experiments.released.policy import assemble_released, instruction, longest_answer, plain_answers, prove_released
+from experiments.touch_r1 import SMOKE
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
 from tests.experiments.released.conftest import MODEL
@@ -47,6 +49,19 @@ def test_sizes_that_contradict_each_other_are_named_before_there_is_data(checkpo
     model = dataclasses.replace(MODEL, tactile=tactile, frames=3)
     with pytest.raises(SizeError, match="no policy can be built of these sizes"):
         prove_released(assemble_released(model, checkpoint, SENSORS), touch_shapes(model, model.view_px, SENSORS))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "message"),
+    [
+        ((1, 2, 1), r"micro_prompts is 1: must be a multiple of data · fsdp = 2"),
+        ((1, 1, 4), r"num_kv_heads is 2: must be a multiple of mesh tensor = 4"),
+    ],
+)
+def test_a_mesh_that_cannot_share_the_work_is_named_before_there_is_data(policy, mesh, message):
+    assert shape_of(SMOKE, policy, (1, 1, 2)).mesh.tensor == 2
+    with pytest.raises(SizeError, match=f"GRPO cannot be shared by the devices of the mesh: {message}"):
+        shape_of(SMOKE, policy, mesh)
 
 
 def test_the_released_towers_are_taken_as_they_are(policy, streamed, checkpoint):

@@ -11,7 +11,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.layers import GatedMLP
 from touchr1_jax.models.lm import Decoder
-from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapted, init_adapters, merge
+from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapted, init_adapters, kept_share, merge
 
 LORA = LoraConfig(rank=3, alpha=6.0)
 MLP = LoraConfig(rank=3, layers=("gate", "up", "down"))
@@ -152,3 +152,20 @@ def test_half_precision_base_stays_so(base):
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), {"decoder": base["decoder"]})
     merged = merge(half, init_adapters(jax.random.key(0), half, LORA), LORA)
     jax.tree.map(np.testing.assert_array_equal, merged, half)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "change", "kept"),
+    [
+        (jnp.float32, 2**-9, 1.0),
+        (jnp.bfloat16, 2**-7, 1.0),  # the neighbour of 1 in bfloat16 is 1 + 2⁻⁷
+        (jnp.bfloat16, 2**-9, 0.0),  # a quarter of the way there: rounded back
+        (jnp.bfloat16, 3 * 2**-9, 4 / 3),  # three quarters: rounded on
+        (jnp.bfloat16, 0.0, 1.0),
+    ],
+)
+def test_what_a_coarse_type_keeps_of_a_change_by_hand(dtype, change, kept):
+    base = {"decoder": {"q_proj": {"kernel": jnp.ones((1, 1), dtype)}}}
+    adapters = {"decoder": {"q_proj": Adapter(a=jnp.array([[change]]), b=jnp.array([[1.0]]))}}
+    lora = LoraConfig(rank=1, alpha=1.0)
+    assert kept_share(base, merge(base, adapters, lora), adapters, lora) == pytest.approx(kept)
