@@ -56,6 +56,7 @@ from experiments.policies.training import TrainingConfig, open_data, starting_mo
 from experiments.released.kept import kept_shares, kept_table, least_kept
 from experiments.released.memory import counted, memory_table, shape_of
 from experiments.released.policy import ReleasedAssembly, ReleasedModel, assemble_released, instruction, prove_released
+from experiments.released.same import require_same
 from experiments.released.teaching import TeachingConfig, teach
 from experiments.released.tiny import SMALLEST, write_tiny
 from experiments.released.ways import written, zero_shot
@@ -230,23 +231,6 @@ def make_tiny(made: Path, config: TouchR1Config, context: Context) -> None:
     """Write the tiny checkpoint of a trial, and teach it to write where that is wanted."""
     write_tiny(made, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE), decoder=config.tiny_decoder)
     teach(made, config.teaching, context)
-
-
-def require_same(source: Path, context: Context) -> None:
-    """Hold the weights of a run that goes on to those that it began with, by the names and sizes of their files.
-
-    Raises:
-      WeightsError: they are others.
-    """
-    sizes = {path.name: path.stat().st_size for path in sorted(source.iterdir()) if path.is_file()}
-    if not context.done("weights"):
-        context.save_stage("weights", sizes)
-    began = context.load_stage("weights")
-    changed = sorted(name for name in {*began, *sizes} if began.get(name) != sizes.get(name))
-    if changed:
-        raise WeightsError(
-            f"{source} is not what this run began with: {', '.join(changed)} changed; put it back, or say --fresh"
-        )
 
 
 def estimates(seeds: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> dict[str, Estimate]:
