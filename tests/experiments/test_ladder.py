@@ -29,10 +29,12 @@ def test_every_baseline_stands_in_the_main_table(tmp_path, cache_dir):
     assert set(results["baselines"]) == {*main_table.TOUCHLESS, "encoder_probe", "nearest_fields"}
     for row in {**results["arms"], **results["baselines"]}.values():
         assert {"h_acc", "omae", "l2_em", "csc"} <= set(row)  # a single pair has no interval
-    beside, tiers, differs = results["tables"]
+    beside, pooled, reliability, tiers, differs = results["tables"]
     assert [row[0] for row in beside["rows"]][-1] == "Touch-R1-7B (paper)"
     assert beside["rows"][-1][1:5] == [76.8, 68.4, 65.1, 74.6]
     assert [row[2] for row in tiers["rows"]] == [8, 3, 2, 8]
+    assert [row[0] for row in pooled["rows"]][:2] == ["sft", "full"]
+    assert {row[0].split(":")[0] for row in reliability["rows"]} == {"sft", "full"}
     assert len(differs["rows"]) > 3
     assert results["requirements"][0]["met"]
     page = (directory / "report.html").read_text(encoding="utf-8")
@@ -44,11 +46,13 @@ def test_every_rung_stands_beside_the_papers(tmp_path, cache_dir):
     directory = run(ablation_cumulative, STUDY, tmp_path, cache_dir)
     results = read_json(directory / "results.json")
     assert list(results["arms"]) == [r.name for r in LADDER[1:]]
-    rungs, changes, attributes, _ = results["tables"]
+    rungs, changes, attributes, pooled, reliability, _ = results["tables"]
     assert [row[0] for row in rungs["rows"]] == [r.name for r in LADDER] == [row[0] for row in attributes["rows"]]
     assert rungs["rows"][3][3] == 0.31
     assert len(changes["rows"]) == 3 * (len(LADDER) - 1)
     assert {row[7] for row in changes["rows"]} <= {"reproduced", "opposite", "undecided", "not in the paper"}
+    assert [row[0] for row in pooled["rows"]] == list(results["arms"])
+    assert len(reliability["rows"]) == 9 * len(results["arms"])
     assert len(results["requirements"]) == 3
     assert "changes.svg" in [path.name for path in (directory / "plots").iterdir()]
 
