@@ -32,7 +32,7 @@ test-slow: setup  ## pass the tests that take minutes
 	$(BIN)/python -m pytest -q -m slow $(ARGS)
 
 test-matrix:  ## pass the tests on each of PYTHONS, in an environment of its own
-	@for python in $(PYTHONS); do command -v $$python > /dev/null || { echo "$$python is not on the PATH: install it, or name others, as in make test-matrix PYTHONS=\"python3.11 python3.13\""; exit 1; }; done
+	@for python in $(PYTHONS); do $$python -c '' 2> /dev/null || { echo "$$python cannot be run: install it, or name others, as in make test-matrix PYTHONS=\"python3.11 python3.13\""; exit 1; }; done
 	for python in $(PYTHONS); do $(MAKE) test PYTHON=$$python VENV=.venv-$$python || exit 1; done
 
 lint: setup  ## check style, imports and types
