@@ -12,11 +12,11 @@ what the sensors send a dozen times over: see `stability_devices`.
 """
 
 import collections
-import contextlib
 import dataclasses
 import json
 import os
 import pathlib
+import select
 import selectors
 import subprocess
 import time
@@ -36,6 +36,7 @@ _LARGEST_HEADER = 1 << 16  # bytes: a few names and shapes
 _LARGEST_PAYLOAD = 1 << 28  # bytes: 256 MB, ten times the largest camera frame
 _KINDS = "biuf"  # of arrays: booleans, integers, floats; never Python objects
 _LAST_WORDS = 4096  # bytes of the server's standard error that are kept for a message
+_LAST_WORDS_S = 0.5  # that they may come after the end of its answers; its children may live on and hold the pipe
 _PIPE_BYTES = 1 << 20  # the most that Linux gives without privileges: a picture of 640 × 480
 _RELEASE_S = 3.0  # for the SDK to let its sensor go
 _OURS = ("PYTHONPATH", "PYTHONHOME")  # would make the vendor's Python import what belongs to this one
@@ -232,11 +233,14 @@ class Bridge:
         return process.stdout, process.stderr
 
     def _hear_rest(self) -> None:
-        """What a server that has ended said last, which may lie unread."""
+        """What a server that has ended says last, which may lie unread or still be on its way."""
         _, errors = self._pipes()
-        with contextlib.suppress(BlockingIOError):  # its children may live on and hold the pipe
-            while data := os.read(errors.fileno(), _LAST_WORDS):
-                self._words.append(data)
+        deadline = time.monotonic() + _LAST_WORDS_S
+        while select.select([errors], [], [], max(0.0, deadline - time.monotonic()))[0]:
+            data = os.read(errors.fileno(), _LAST_WORDS)
+            if not data:
+                return
+            self._words.append(data)
 
     def _last_words(self) -> str:
         words = b"".join(self._words).decode(errors="replace").strip()

@@ -203,6 +203,14 @@ def test_a_python_without_the_sdk_is_named(vendors):
         pass
 
 
+def test_last_words_that_come_after_the_end_of_answers_are_heard(tmp_path):
+    late = tmp_path / "python"
+    late.write_text("#!/bin/sh\nexec 1>&-\nsleep .2\necho no such sensor >&2\n")
+    late.chmod(0o755)
+    with pytest.raises(DeviceNotFoundError, match="has ended; it said: no such sensor"):
+        bridge.BridgeConfig(python=late).open().__enter__()
+
+
 READER = """
 import sys, time
 from sensors_io.devices.bridge import BridgeConfig
