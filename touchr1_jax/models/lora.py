@@ -112,7 +112,7 @@ def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
         raise ValueError(f"adapters {strangers[:3]} belong to no layer of the base; merge them into their own")
     for path, adapter in by_path.items():
         kernel = flat[(*path, "kernel")]
-        change = config.scale * adapter.a @ adapter.b
+        change = _change(adapter, config)
         flat[(*path, "kernel")] = (kernel.astype(jnp.float32) + change).astype(kernel.dtype)
     return flax.traverse_util.unflatten_dict(flat)
 
@@ -131,10 +131,15 @@ def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraCon
     along, whole = 0.0, 0.0
     for path, adapter in by_path.items():
         w, v = (tree[(*path, "kernel")].astype(jnp.float32) for tree in (before, after))
-        change = config.scale * adapter.a @ adapter.b
+        change = _change(adapter, config)
         along += float(jnp.vdot(v - w, change))
         whole += float(jnp.vdot(change, change))
     return along / whole if whole else 1.0
+
+
+def _change(adapter: Adapter, config: LoraConfig) -> Array:
+    """What an adapter adds to its kernel, (α/r) A B, in float32."""
+    return config.scale * adapter.a @ adapter.b
 
 
 class Trainable(struct.PyTreeNode):
