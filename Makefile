@@ -45,7 +45,7 @@ format: setup  ## rewrite the sources in the house format
 	$(BIN)/ruff format .
 
 picture: setup  ## draw the architecture from the imports
-	$(BIN)/python -m experiments.reporting.architecture
+	$(BIN)/python -m experiments.core.architecture
 
 clean:  ## remove the environments and caches, keep data/ and runs/
 	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

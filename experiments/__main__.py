@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 
-from experiments.running.commands import answer, complain
+from experiments.core.commands import answer, complain
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -33,7 +33,7 @@ def main() -> None:
     try:
         status = answer(arguments, "experiments")
         if status is None:
-            from experiments.running.runner import run  # JAX and charts, which only runs need
+            from experiments.core.runner import run  # JAX and charts, which only runs need
 
             status = run(arguments)
     except KeyboardInterrupt:  # a run that has begun hears it by itself

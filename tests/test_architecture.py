@@ -55,23 +55,19 @@ SENSORS_LAYERS = (
 """The same; members of one layer do not know each other."""
 
 EXPERIMENTS_LAYERS = (
-    {"running", "reporting"},
-    {"storage"},
-    {"devices"},
-    {"policies", "contact", "scenes"},
-    {"chooser", "tangential", "identify"},
-    {"grpo"},
+    {"core"},
+    {"study"},
+    {"mechanics"},
+    {"scenes"},
     {"fields"},
-    {"loading", "released"},
-    {"scale"},
-    {"gpu", "feeding"},
     {"encoder"},
     {"recordings"},
     {"bench"},
-    {"ladder"},
+    {"paper"},
+    {"engine"},
     {"faults"},
 )
-"""The same; an experiment itself is one file beside them, which nobody imports."""
+"""The same for the families of experiments."""
 
 REWARDS_MAY_IMPORT = {
     "touchr1_jax.types",
@@ -257,8 +253,8 @@ def test_an_unknown_global_name_would_be_seen():
 
 def test_a_forbidden_import_would_be_seen():
     """Also one inside a function, and one by its parent package."""
-    hidden = "def f():\n    from sensors_io import schema\n    import experiments.running.runs\n"
-    assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.running.runs"}
+    hidden = "def f():\n    from sensors_io import schema\n    import experiments.core.runs\n"
+    assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.core.runs"}
     assert starts("sensors_io.schema", {"sensors_io"})
     assert not starts("sensors_io_extra", {"sensors_io"})
     with pytest.raises(AssertionError, match="relative import"):

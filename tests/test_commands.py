@@ -12,9 +12,9 @@ import pytest
 import tyro
 
 from experiments.bench.__main__ import Command as Bench
-from experiments.running.catalogue import find
-from experiments.running.commands import COMMANDS, Command
-from experiments.running.runner import parse
+from experiments.core.catalogue import find
+from experiments.core.commands import COMMANDS, Command
+from experiments.core.runner import parse
 from sensors_io.__main__ import read as sensors_command
 from touchr1_jax.models.load import Load
 from touchr1_jax.rewards.__main__ import Command as Rewards
@@ -63,7 +63,7 @@ def read(module: str, arguments: str) -> None:
         if words[0] not in ("-h", "--help"):
             sensors_command(words)
     elif module == "experiments" and words[0] in EXPERIMENTS:
-        parse(importlib.import_module(f"experiments.{words[0]}").EXPERIMENT, words[1:], "")
+        parse(importlib.import_module(EXPERIMENTS[words[0]].module).EXPERIMENT, words[1:], "")
     elif module == "experiments" and words[0] not in {"NAME", *WRITTEN_BY_TUTORIAL}:
         assert words[0] in COMMANDS, f"there is no experiment {words[0]!r}"
         tyro.cli(Command, args=words, config=(tyro.conf.OmitArgPrefixes,))

@@ -84,8 +84,8 @@ def test_every_command_answers(installed, tmp_path, arguments, printed):
     "arguments",
     [
         ("experiments", "new", "brevity", "--reward"),
-        ("experiments.reporting.architecture",),
-        ("experiments.reporting.recorded", "fill"),
+        ("experiments.core.architecture",),
+        ("experiments.core.recorded", "fill"),
     ],
     ids=" ".join,
 )

@@ -1,1 +1,1 @@
-"""The bench of questions about touch: made from records, filtered, annotated, audited, carded."""
+"""Questions about touch: make, check and score them."""

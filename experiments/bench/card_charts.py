@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.bench.card import Share
-from experiments.reporting.charts import LOOK, PALETTE, SHARED, svg
+from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
 
 def answer_shares(rows: Sequence[Share]) -> bytes:

@@ -10,13 +10,14 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.bench import adapter, annotate, audit, card, examine
+from experiments.bench import adapter, annotate, audit, card
+from experiments.bench import scoring as examine
 from experiments.bench.draw import Quota
 from experiments.bench.facts import gather
 from experiments.bench.filters import Filtered, sift
 from experiments.bench.generate import Source, ask_about, generate, read_source
 from experiments.bench.sheets import SheetError
-from experiments.running.artifacts import write_json
+from experiments.core.artifacts import write_json
 from sensors_io.commands.console import progress_bar
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import read_items, write_items

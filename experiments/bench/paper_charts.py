@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from experiments.bench import paper_numbers as paper
 from experiments.bench.paper_arithmetic import columns_as_scores, error_and_distance, impossible_distances
-from experiments.reporting.charts import LOOK, PALETTE, SHARED, svg
+from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
 
 def distance_against_error() -> bytes:

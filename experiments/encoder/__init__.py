@@ -1,1 +1,1 @@
-"""Stage 1: pretraining of the tactile encoder, what it learned, how fast it runs, frames that it lets one predict."""
+"""Pretraining of the tactile encoder, measured."""

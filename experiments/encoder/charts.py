@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
-from experiments.reporting.names import Named, name_points
+from experiments.core.charts import LOOK, MARKERS, PALETTE, svg
+from experiments.core.names import Named, name_points
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.probes import BOUNDS
 

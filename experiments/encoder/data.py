@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.core.context import Context
 from experiments.encoder.held_out import Watched
-from experiments.policies.dataset import Dataset, open_dataset
-from experiments.policies.sources import Source, SourceConfig, prepare_records
-from experiments.running.context import Context
+from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.sources import Source, SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig

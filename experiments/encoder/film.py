@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.loops import run_loop
 from experiments.encoder.pretrain import ClipFeed
-from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import touch_batch
-from experiments.policies.pretrained import PretrainedEncoder
-from experiments.running.context import Context
-from experiments.running.loops import run_loop
+from experiments.study.dataset import Dataset
+from experiments.study.feeds import touch_batch
+from experiments.study.pretrained import PretrainedEncoder
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.video import VideoConfig, VideoState, make_video_step, start_video

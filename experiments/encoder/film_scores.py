@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import touch_batch
-from experiments.running.context import Context
+from experiments.core.context import Context
+from experiments.study.dataset import Dataset
+from experiments.study.feeds import touch_batch
 from touchr1_jax.bench.lpips import lpips
 from touchr1_jax.bench.ssim import ssim
 from touchr1_jax.models.predictor import layer_norm

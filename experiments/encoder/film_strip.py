@@ -8,7 +8,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.reporting.charts import LOOK
+from experiments.core.charts import LOOK
 
 SIDE_IN, DPI = 1.5, 150
 

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.policies.feeds import touch_batch
-from experiments.running.context import Context
+from experiments.core.context import Context
+from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax import masked

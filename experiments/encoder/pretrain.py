@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from experiments.core.context import Context
+from experiments.core.loops import run_loop
 from experiments.encoder.held_out import Watched, assess
-from experiments.policies.feeds import Feed, host_touch, touch_batch
-from experiments.policies.pretrained import PretrainedEncoder
-from experiments.running.context import Context
-from experiments.running.loops import run_loop
+from experiments.study.feeds import Feed, host_touch, touch_batch
+from experiments.study.pretrained import PretrainedEncoder
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from touchr1_jax.models.predictor import PredictorConfig

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.running.timing import interleaved
+from experiments.core.timing import interleaved
 from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, kept_patches, patch_tokens
 from touchr1_jax.training.dynamics import DynamicsConfig, encode_each, read_frames
 from touchr1_jax.types import Params, TouchBatch

@@ -1,1 +1,1 @@
-"""Faults: what strikes a run, two small runs for it to strike, and what is left of them."""
+"""Kills, damaged files, failing devices and bad input."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
+from experiments.core import runs
 from experiments.faults.cases import Case, Kind
 from experiments.faults.inputs import (
     counting_paths,
@@ -22,7 +23,6 @@ from experiments.faults.inputs import (
     write_pictures,
     write_records,
 )
-from experiments.running import runs
 from touchr1_jax.training.checkpoint import Checkpoints
 
 FULL_BYTES = 6_000

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments.bench import __main__ as bench
-from experiments.running import runner
+from experiments.core import runner
 from sensors_io import __main__ as sensors_io
 from touchr1_jax.rewards import __main__ as rewards
 

@@ -6,8 +6,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.core.charts import LOOK, PALETTE, svg
 from experiments.faults.watched import PHASES, Kill
-from experiments.reporting.charts import LOOK, PALETTE, svg
 
 BINS = 20
 """Of the share of a run that was done."""

@@ -17,10 +17,10 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from experiments.reporting.findings import Findings
-from experiments.running.context import Context
-from experiments.running.loops import run_loop
-from experiments.running.runner import Experiment
+from experiments.core.context import Context
+from experiments.core.findings import Findings
+from experiments.core.loops import run_loop
+from experiments.core.runner import Experiment
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import falling_adamw
 

@@ -7,10 +7,10 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from experiments.core.context import Context
+from experiments.core.runner import main
 from experiments.faults.evidence import differences, evidence
 from experiments.faults.inputs import counting_paths, cut, emptied, flipped, newest_checkpoints, run_directory
-from experiments.running.context import Context
-from experiments.running.runner import main
 
 WAYS: Mapping[str, Callable[[Path], None]] = {
     "a byte flipped": flipped,

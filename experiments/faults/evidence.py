@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from experiments.running.artifacts import read_json
+from experiments.core.artifacts import read_json
 
 
 def evidence(directory: Path) -> dict[str, str]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from experiments.running.runner import main
+from experiments.core.runner import main
 from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard, Sequence
 

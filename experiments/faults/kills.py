@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from experiments.core import runs
 from experiments.faults.evidence import evidence
 from experiments.faults.watched import START, Kill, Session, Victim, look, only
-from experiments.running import runs
 
 ALONE = "alone"
 """Name of the run that is not killed."""

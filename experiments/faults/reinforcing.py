@@ -17,18 +17,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
+from experiments.core.findings import Findings
+from experiments.core.loops import run_loop
+from experiments.core.runner import Experiment
 from experiments.faults.victim import ARM, MODEL
-from experiments.policies.arrays import flat, nested
-from experiments.policies.assembly import Assembly, assemble, touch_shapes
-from experiments.policies.feeds import QuestionFeed
-from experiments.policies.reinforcement import grpo_program
-from experiments.policies.scores import PUBLISHED
-from experiments.policies.watching import watched_log
-from experiments.reporting.findings import Findings
-from experiments.running.artifacts import write_bytes
-from experiments.running.context import Context
-from experiments.running.loops import run_loop
-from experiments.running.runner import Experiment
+from experiments.study.arrays import flat, nested
+from experiments.study.assembly import Assembly, assemble, touch_shapes
+from experiments.study.feeds import QuestionFeed
+from experiments.study.reinforcement import grpo_program
+from experiments.study.scores import PUBLISHED
+from experiments.study.watching import watched_log
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import uniform_prior

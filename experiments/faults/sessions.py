@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jax
 
-from experiments.running.runner import main
+from experiments.core.runner import main
 
 PACKAGE = "experiments.faults"
 

@@ -9,13 +9,13 @@ written.
 
 import dataclasses
 
-from experiments.policies.assembly import ModelConfig
-from experiments.policies.scores import PUBLISHED
-from experiments.policies.stages import SFTConfig
-from experiments.policies.study import StudyConfig, run_study
-from experiments.reporting.findings import Findings
-from experiments.running.context import Context
-from experiments.running.runner import Experiment
+from experiments.core.context import Context
+from experiments.core.findings import Findings
+from experiments.core.runner import Experiment
+from experiments.study.assembly import ModelConfig
+from experiments.study.scores import PUBLISHED
+from experiments.study.stages import SFTConfig
+from experiments.study.study import StudyConfig, run_study
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig

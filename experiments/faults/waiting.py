@@ -3,20 +3,20 @@
 import dataclasses
 from collections.abc import Mapping
 
+from experiments.core.context import Context
+from experiments.core.loops import STEPPING, WAITING
 from experiments.encoder.pretrain import PretrainConfig, pretrain
-from experiments.policies.assembly import assemble
-from experiments.policies.reinforcement import Asked, make_arm, run_grpo
-from experiments.policies.scores import PUBLISHED
-from experiments.policies.stages import (
+from experiments.study.assembly import assemble
+from experiments.study.reinforcement import Asked, make_arm, run_grpo
+from experiments.study.scores import PUBLISHED
+from experiments.study.stages import (
     encode_contacts,
     gather_evidence,
     noise_bank,
     probe_features,
     run_sft,
 )
-from experiments.policies.study import StudyConfig, open_study_data
-from experiments.running.context import Context
-from experiments.running.loops import STEPPING, WAITING
+from experiments.study.study import StudyConfig, open_study_data
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.training.loop import LoopConfig
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from experiments.core import runs
 from experiments.faults.sessions import start
-from experiments.running import runs
 
 POLL_S = 0.005
 """How often a session's files are looked at; a step takes longer."""

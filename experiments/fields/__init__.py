@@ -1,1 +1,1 @@
-"""Of the field experiments: known motion on real pictures, generated slides, methods, peers, charts."""
+"""Depth, motion and force fields, measured on known and real data."""

@@ -6,12 +6,12 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Cell, Column, Picture, Requirement, Table
+from experiments.core.pareto import speed_against_error
+from experiments.core.timing import interleaved
 from experiments.fields.depth_methods import MAPS, Slopes
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
-from experiments.reporting.pareto import speed_against_error
-from experiments.running.context import Context
-from experiments.running.timing import interleaved
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.fit import fit_map
 from sensors_io.calibration.presses import BallPresses, Touches

@@ -11,11 +11,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from experiments.core.context import Context
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import published_poisson, table_map
 from experiments.fields.depth_presses import GEL, WINDOW_MM, WINDOW_PX, fitted_optics, generated_presses
 from experiments.fields.motion_breaks import Outcome, Stress
-from experiments.running.context import Context
 from sensors_io.calibration.circles import find_circles
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.extract import Extractor

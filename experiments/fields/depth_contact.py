@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from experiments.core.findings import Cell, Column, Requirement, Table
 from experiments.fields import depth_data
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Requirement, Table
 from sensors_io import quality
 from sensors_io.fields.contact import ContactConfig, changed_contacts, steepest_change
 from sensors_io.fields.depth import DepthReader

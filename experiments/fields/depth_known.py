@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.timing import interleaved
 from experiments.fields import depth_data
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import one_sided_dirichlet, published_poisson
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Requirement, Table
-from experiments.running.context import Context
-from experiments.running.timing import interleaved
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Column, Table
 from experiments.fields.motion_frames import load, reduced
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Column, Table
-from experiments.running.context import Context
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import read_video

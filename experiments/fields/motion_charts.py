@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.reporting.charts import LOOK, PALETTE, SHARED, svg
+from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
 _COLUMNS = 4
 _INCHES = (2.75, 2.45)  # of a panel

@@ -6,15 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 import cv2
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Column, Picture, Requirement, Table
+from experiments.core.pareto import Point, speed_against_error
+from experiments.core.timing import interleaved
 from experiments.fields.motion_frames import Rest
 from experiments.fields.motion_peers import farneback_flow
 from experiments.fields.motion_subjects import FIRST_SEED, NOISE_GREY, PEAK_PX, Subject, grey, subject
 from experiments.fields.motion_truth import Film
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Column, Picture, Requirement, Table
-from experiments.reporting.pareto import Point, speed_against_error
-from experiments.running.context import Context
-from experiments.running.timing import interleaved
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
 

@@ -15,12 +15,12 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.core.charts import LOOK, PALETTE, svg
+from experiments.core.findings import Cell, Column, Picture, Requirement, Table
 from experiments.fields.motion_peers import FOLLOWERS
 from experiments.fields.motion_subjects import NOISE_GREY, PEAK_PX, Subject, grey
 from experiments.fields.motion_truth import REST_PICTURES, Film
 from experiments.fields.panel import Panel
-from experiments.reporting.charts import LOOK, PALETTE, svg
-from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
 
 METHODS = ("this", "this, affine alone", "this, LK alone", "LK frame to frame")
 MAIN, ALONE, PEER = METHODS[0], METHODS[1], METHODS[-1]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import cv2
 
+from experiments.core.context import Context
+from experiments.core.findings import Column, Requirement, Table
 from experiments.fields.motion_frames import load
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Column, Requirement, Table
-from experiments.running.context import Context
 from sensors_io.fields.evidence import Pattern, examine
 
 Crop = tuple[float, float, float, float]

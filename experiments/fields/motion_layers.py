@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from experiments.core.findings import Cell, Column, Requirement, Table
 from experiments.fields.motion_shear import BASELINE, MAIN, ShearConfig, methods, pressing, reader, shear_errors
 from experiments.fields.motion_slides import Slide, make_slides
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Requirement, Table
 from sensors_io.scenes.sensors import TAC3D, SensorModel
 
 LAYERS = ((1.0, 0.48), (1.0, 0.45), (0.7, 0.48), (0.7, 0.45), (1.3, 0.48), (1.3, 0.45))

@@ -6,14 +6,14 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Cell, Column, Picture, Requirement, Table
+from experiments.core.pareto import Point, speed_against_error
+from experiments.core.timing import interleaved
 from experiments.fields.motion_peers import FOLLOWERS
 from experiments.fields.motion_subjects import FIRST_SEED, JUMP_PX, NOISE_GREY, PEAK_PX, Subject, grey
 from experiments.fields.motion_truth import REST_PICTURES, Film
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
-from experiments.reporting.pareto import Point, speed_against_error
-from experiments.running.context import Context
-from experiments.running.timing import interleaved
 
 MAIN, ALONE = "this", "this, affine alone"
 LOST_PX = 1.0

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.findings import Cell, Column, Picture, Requirement, Table
+from experiments.core.pareto import Point, speed_against_error
+from experiments.core.timing import interleaved
 from experiments.fields.motion_slides import NODES, Slide, cached_slides, node_grid
 from experiments.fields.panel import Panel
-from experiments.reporting.findings import Cell, Column, Picture, Requirement, Table
-from experiments.reporting.pareto import Point, speed_against_error
-from experiments.running.context import Context
-from experiments.running.timing import interleaved
 from sensors_io.clock import NS_PER_S
 from sensors_io.fields import total_force
 from sensors_io.fields.compliance import total_force as total_traction

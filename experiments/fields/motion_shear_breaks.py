@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from experiments.core.context import Context
 from experiments.fields.motion_breaks import Outcome, Stress
 from experiments.fields.motion_shear import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, pressing
 from experiments.fields.motion_slides import Slide, cached_slides, node_grid
-from experiments.running.context import Context
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.fields.helmholtz import decompose
 from sensors_io.fields.inversion import InverseConfig

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.tangential import scenes
+from experiments.mechanics import tangential_scenes as scenes
 from sensors_io.fields.inversion import NodeGrid
 from sensors_io.scenes import drag
 from sensors_io.scenes.sensors import SensorModel
@@ -62,7 +62,7 @@ def make_slides(
 
     Args:
       sensor: a model with markers.
-      kinds: of `experiments.tangential.scenes.KINDS`.
+      kinds: of `experiments.mechanics.tangential_scenes.KINDS`.
       motions: names of the protocol's.
       frames: of a sequence.
       seed: of objects and noise.

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from experiments.reporting.findings import Picture, Requirement, Table
+from experiments.core.findings import Picture, Requirement, Table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

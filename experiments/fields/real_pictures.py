@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import ndimage
 
-from experiments.reporting.charts import LOOK
+from experiments.core.charts import LOOK
 
 _DPI = 110
 _FLAGS = 42  # letters of a line of flags

@@ -1,1 +1,1 @@
-"""A policy for real recordings: videos to touches, their fixed description, encoder and decoder, cross-validation."""
+"""Policies on real recordings."""

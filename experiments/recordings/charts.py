@@ -6,9 +6,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from experiments.core.charts import LOOK, MARKERS, PALETTE, svg
+from experiments.core.levels import draw_confusion
 from experiments.recordings.policy import LANGUAGE
-from experiments.reporting.charts import LOOK, MARKERS, PALETTE, svg
-from experiments.reporting.levels import draw_confusion
 from touchr1_jax.bench.statistics import Interval
 
 

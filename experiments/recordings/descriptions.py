@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
 from experiments.recordings.descriptors import describe, families
 from experiments.recordings.policy import LANGUAGE
 from experiments.recordings.touches import read_touch
-from experiments.running.artifacts import write_bytes
-from experiments.running.context import Context
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError

@@ -15,6 +15,8 @@ import numpy as np
 from flax import traverse_util
 from jaxtyping import Float, Int
 
+from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.context import Context
 from experiments.recordings.descriptions import Described
 from experiments.recordings.evidence import EvidenceConfig, cross_probe, probe, standardise
 from experiments.recordings.policy import COMBINATIONS, LEVELS, PolicyShape, assemble_policy, choose, utility
@@ -30,8 +32,6 @@ from experiments.recordings.training import (
     tune,
 )
 from experiments.recordings.validation import object_weights
-from experiments.running.artifacts import jsonable, write_bytes
-from experiments.running.context import Context
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
 

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Int
 
+from experiments.core.context import Context
 from experiments.recordings.descriptions import Described
 from experiments.recordings.evidence import standardise
 from experiments.recordings.learning import Background, LearnConfig, evidence_alone
 from experiments.recordings.policy import LEVELS
 from experiments.recordings.validation import Row, intervals
-from experiments.running.context import Context
 from touchr1_jax.bench.statistics import Interval
 
 SHARES = (0.25, 0.5, 0.75, 1.0)

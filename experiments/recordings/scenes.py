@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from experiments.policies.sources import SourceConfig, prepare_records
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
 from experiments.recordings.descriptors import describe, families
 from experiments.recordings.evidence import EvidenceConfig, kernel_ridge, standardise
 from experiments.recordings.touches import touch_of_scene
-from experiments.running.artifacts import write_bytes
-from experiments.running.context import Context
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from experiments.core.context import Context
 from experiments.recordings.descriptions import Described
 from experiments.recordings.descriptors import families
 from experiments.recordings.learning import Background, LearnConfig, learn, say
@@ -11,7 +12,6 @@ from experiments.recordings.limits import cross_answers
 from experiments.recordings.scenes import Scenes
 from experiments.recordings.training import ReinforceConfig, TuneConfig
 from experiments.recordings.validation import Row
-from experiments.running.context import Context
 
 
 def cross_validate(

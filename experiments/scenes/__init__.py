@@ -1,1 +1,1 @@
-"""Of the experiments on generated scenes: rates, sheets, realism."""
+"""Generated scenes and the storage of records."""

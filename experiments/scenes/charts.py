@@ -6,7 +6,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.reporting.charts import LOOK, PALETTE, SHARED, svg
+from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
 Rate = tuple[str, float, float]
 """Name, records a second, records a second that are required."""

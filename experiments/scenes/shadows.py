@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.running.context import Context
+from experiments.core.context import Context
 from sensors_io.scenes import fitting
 from sensors_io.scenes.fitting import BallPresses, Profiles
 from sensors_io.scenes.photometric import PhotometricOptics

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from experiments.reporting.charts import LOOK, SHARED, svg
+from experiments.core.charts import LOOK, SHARED, svg
 
 CELL_INCH = 1.25
 DPI = 150

@@ -5,9 +5,9 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments.policies.assembly import assemble
-from experiments.policies.dataset import open_dataset
-from experiments.running.context import Context
+from experiments.core.context import Context
+from experiments.study.assembly import assemble
+from experiments.study.dataset import open_dataset
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import config_hash

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from experiments.running.runner import main
+from experiments.core.runner import main
 
 
 def run_shrunk(module: ModuleType, config: Any, home: Path, *arguments: str) -> Path:

@@ -6,11 +6,11 @@ import jax
 import numpy as np
 
 from experiments.faults.victim import MODEL, SCENES
-from experiments.policies.assembly import Assembly
-from experiments.policies.dataset import Dataset
-from experiments.policies.feeds import touch_batch
-from experiments.policies.stages import SFTConfig
-from experiments.policies.study import StudyConfig
+from experiments.study.assembly import Assembly
+from experiments.study.dataset import Dataset
+from experiments.study.feeds import touch_batch
+from experiments.study.stages import SFTConfig
+from experiments.study.study import StudyConfig
 from sensors_io.pipeline import clip_batches
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.policy import Features

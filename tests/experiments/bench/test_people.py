@@ -8,7 +8,7 @@ import pytest
 from experiments.bench import annotate, audit
 from experiments.bench.__main__ import main
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
-from experiments.running.artifacts import read_json, write_json
+from experiments.core.artifacts import read_json, write_json
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import write_items
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain as module
 from experiments.encoder.data import TouchConfig, watched
 from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain, starting_from, untrained
 from experiments.encoder.variants import STUDIED, FieldsOnly, variants
-from experiments.running.context import Context, read_metrics
 from sensors_io.pipeline import make_clip
 from tests.experiments import tiny
 from touchr1_jax.models.predictor import PredictorConfig

@@ -12,11 +12,11 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.policies.estimates import compare_over_objects, compare_over_seeds, estimate
-from experiments.reporting.results import Results, RolloutExample
-from experiments.running.artifacts import read_json, write_json
-from experiments.running.context import Context
-from experiments.running.runner import Experiment
+from experiments.core.artifacts import read_json, write_json
+from experiments.core.context import Context
+from experiments.core.results import Results, RolloutExample
+from experiments.core.runner import Experiment
+from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from touchr1_jax.bench.metrics import Answers, Scores, evaluate
 
 ATTRIBUTES = ("hardness", "roughness", "protrusion")

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import pytest
 
+from experiments.core.artifacts import write_json
 from experiments.faults.evidence import evidence
-from experiments.running.artifacts import write_json
 
 
 @pytest.fixture

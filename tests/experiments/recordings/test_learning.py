@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.core.context import Context
 from experiments.recordings.descriptions import Described
 from experiments.recordings.descriptors import families
 from experiments.recordings.evidence import EvidenceConfig
@@ -22,7 +23,6 @@ from experiments.recordings.training import (
     reading_lesson,
     reinforce,
 )
-from experiments.running.context import Context
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import pytest
 
-from experiments.policies.scores import PUBLISHED as REPORTED
+from experiments.study.scores import PUBLISHED as REPORTED
 from touchr1_jax.rewards import Reward, make_rewards, uniform_prior
 from touchr1_jax.rewards import __main__ as explanation
 from touchr1_jax.rewards.__main__ import PUBLISHED, main

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from experiments.released import tiny
+from experiments.paper import tiny_checkpoint as tiny
 
 DATA = Path(__file__).resolve().parents[3] / "data" / "qwen"
 TEMPLATE, GOLDEN = tiny.TEMPLATE, DATA / "chats.json"

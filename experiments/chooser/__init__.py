@@ -1,1 +1,0 @@
-"""Of the chooser's trial: the bench, the fit, charts."""

@@ -1,1 +1,0 @@
-"""Of the contact experiments: scenes, methods, oracles, failures, charts."""

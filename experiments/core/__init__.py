@@ -1,0 +1,1 @@
+"""The runner and the reports of every experiment."""

@@ -1,0 +1,316 @@
+"""What a run offers the experiment: where to write, how to log, and which of its stages are already done.
+
+A *stage* is a piece of work that is done once and remembered, named `PHASE/SEED` or `PHASE/ARM/SEED`, for example
+`sft/0` and `grpo/ordinal/0`; the report takes phases, arms and seeds of the curves from these names.
+"""
+
+import contextlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
+from experiments.core.distributed import ALONE, Devices, Team
+from experiments.core.progress import Advance, Loop, Tell, progress
+from experiments.core.stopping import Stopping
+from experiments.core.watcher import Watcher
+
+T = TypeVar("T")
+
+_STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
+
+
+class MetricLog:
+    """`metrics.jsonl`: one line per logged step, the same file whether or not the run was ever interrupted.
+
+    Lines hold no clock, so that an interrupted and an uninterrupted run can be compared byte for byte.
+
+    Args:
+      path: of the file.
+      watchers: told of every line.
+    """
+
+    def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
+        self._path, self._watchers = path, watchers
+        self._seen: set[str] = set()
+        lines = _whole_lines(path)
+        write_text(path, "".join(lines))  # drops a line that a crash tore
+        self._file = path.open("a", encoding="utf-8")
+
+    def rewind(self, stage: str, step: int) -> None:
+        """Drop the lines of a stage at or past a step: they are about to be computed again."""
+        self._seen.add(stage)
+        lines = _whole_lines(self._path)
+        kept = [line for line in lines if _before(_row(line, self._path), stage, step)]
+        if len(kept) < len(lines):
+            self._file.close()
+            write_text(self._path, "".join(kept))
+            self._file = self._path.open("a", encoding="utf-8")
+        for watcher in self._watchers:
+            watcher.rewound(stage, step)
+
+    def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
+        """Add one line and hand it to the operating system.
+
+        Raises:
+          ValueError: a scalar is not finite, or takes the name of a field.
+        """
+        taken = {"stage", "step"} & set(scalars)
+        if taken:
+            raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
+        if stage not in self._seen:
+            self.rewind(stage, step)
+        values = jsonable(scalars, where=f"{stage} step {step}")
+        self._file.write(json.dumps({"stage": stage, "step": step, **values}) + "\n")
+        self._file.flush()
+        for watcher in self._watchers:
+            watcher.logged(stage, step, values)
+
+    def close(self) -> None:
+        """Flush the file to the disk and close it."""
+        if not self._file.closed:  # a signal may have struck inside `rewind`
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+
+
+class Context:
+    """The hands of a run.
+
+    Args:
+      directory: `runs/NAME/STAMP`.
+      cache_dir: data shared between runs; whatever is stored there must be named by the hash of what made it.
+      console: where people read along.
+      watchers: told of every logged line and of every loop.
+      stopping: hears the signals that ask the run to stop; one of its own hears none.
+      team: the processes of the run, of which the first alone writes.
+      devices: where training steps run.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        cache_dir: Path,
+        console: Console,
+        watchers: Sequence[Watcher] = (),
+        stopping: Stopping | None = None,
+        team: Team = ALONE,
+        devices: Devices | None = None,
+    ) -> None:
+        self.directory = directory
+        self.cache_dir = cache_dir
+        self.console = console
+        self.stopping = stopping or Stopping()
+        self.team = team
+        self.devices = devices or Devices()
+        self._opened = time.monotonic()
+        self._watchers = watchers
+        self._loops: list[Loop] = []
+        self._log = MetricLog(directory / "metrics.jsonl", watchers) if team.leads else None
+
+    def say(self, text: str) -> None:
+        """Print one line to the reader."""
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def log(self, stage: str, step: int, **scalars: Any) -> None:
+        """Append `{"stage", "step", **scalars}` to `metrics.jsonl`; the steps of a stage must not decrease.
+
+        The first line of a stage in this session drops the lines of that stage at or past its step, which an
+        interrupted session left behind.  Waits for the scalars if they are still being computed.
+
+        Raises:
+          ValueError: a scalar is not finite: the run diverged, or a mean was taken over nothing.
+        """
+        _checked(stage)
+        if self._log is not None:
+            self._log.append(stage, step, scalars)
+
+    def rewind(self, stage: str, step: int) -> None:
+        """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
+        _checked(stage)
+        if self._log is not None:
+            self._log.rewind(stage, step)
+
+    @contextlib.contextmanager
+    def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
+        """A progress bar for one loop.
+
+        Args:
+          title: what is going on.
+          total: steps of the whole loop.
+          completed: steps done before this session.
+          still: draw the bar with each step only, and so all bars within, so that they take no time of what is timed.
+        """
+        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self._loops))
+        self._loops.append(loop)
+        try:
+            self._looping()
+            with progress(self.console, loop, self._looping) as advance:
+                yield advance
+        finally:
+            self._loops.remove(loop)
+        self._looping()
+
+    def each(self, title: str, items: Iterable[T], *, still: bool = False) -> Iterator[T]:
+        """The items one after the other, under a progress bar; an item counts once the next is asked for."""
+        listed = tuple(items)
+        with self.progress(title, len(listed), still=still) as advance:
+            for item in listed:
+                yield item
+                advance()
+
+    def rounds(self, title: str, number: int) -> Iterator[int]:
+        """Rounds of a timing, from 0, under a bar that is drawn between them alone and so takes no time of theirs."""
+        return self.each(title, range(number), still=True)
+
+    @contextlib.contextmanager
+    def told(self, title: str, *, still: bool = False) -> Iterator[Tell]:
+        """A progress bar for a loop that tells of itself how many steps are done and of how many, first or later.
+
+        The first word opens the bar; what is done by then does not count into the rate.
+        """
+        with contextlib.ExitStack() as stack:
+            bar: list[Advance] = []
+            seen = 0
+
+            def tell(done: int, total: int) -> None:
+                nonlocal seen
+                if not bar:
+                    bar.append(stack.enter_context(self.progress(title, total, done, still=still)))
+                elif done > seen:
+                    bar[0](done - seen)
+                seen = done
+
+            yield tell
+
+    def require_logged(self, stage: str, steps: int) -> None:
+        """Hold the log to a checkpoint: every step before it is there, so that no run ends with a part of its log.
+
+        Raises:
+          DamagedFileError: a line is missing.
+        """
+        if steps == 0 or not self.team.leads:
+            return
+        seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
+        missing = sorted(set(range(steps)) - seen)
+        if missing:
+            how = f"of stage {stage} {len(missing)} of {steps} steps are missing, the first is {missing[0]}"
+            raise _damaged(self.directory / "metrics.jsonl", how)
+
+    def _looping(self) -> None:
+        for watcher in self._watchers:
+            watcher.looping(self._loops)
+
+    def checkpoint_dir(self, stage: str) -> Path:
+        """The directory of a stage's checkpoints, created."""
+        path = (self.directory / "checkpoints" / _checked(stage)).absolute()
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UnwrittenError(f"{path} cannot be made ({error}): move away what is in its place") from error
+        return path
+
+    def done(self, stage: str) -> bool:
+        """Whether the stage has a saved result."""
+        return self._stage_file(stage).exists()
+
+    def save_stage(self, stage: str, result: Any) -> None:
+        """Publish the result of a finished stage as JSON; from now on the stage is done."""
+        self.team.once(lambda: write_json(self._stage_file(stage), result))
+
+    def load_stage(self, stage: str) -> Any:
+        """The saved result of a finished stage, in JSON's types.
+
+        Raises:
+          FileNotFoundError: the stage is not done.
+        """
+        path = self._stage_file(stage)
+        if not path.exists():
+            raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")
+        return read_json(path)
+
+    @contextlib.contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Add the wall time of the block to the stage's, in `timing`, over interruptions too."""
+        _checked(stage)
+        start = time.monotonic()
+        try:
+            yield
+        finally:
+            self.add_time(stage, time.monotonic() - start)
+
+    def add_time(self, name: str, seconds: float) -> None:
+        """Add to the wall time that is kept under a name, in `timing`, over interruptions too."""
+        if self.team.leads:
+            kept = self.timing()
+            write_json(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
+
+    def timing(self) -> dict[str, float]:
+        """Wall seconds of every timed stage so far."""
+        return read_json(self._timing_file) if self._timing_file.exists() else {}
+
+    @property
+    def elapsed_s(self) -> float:
+        """Wall seconds of the run so far, those before interruptions too."""
+        return self.timing().get("total", 0.0) + time.monotonic() - self._opened
+
+    def close(self) -> None:
+        """Close the log; the runner calls this."""
+        if self._log is not None:
+            self._log.close()
+        for watcher in self._watchers:
+            watcher.closed()
+
+    @property
+    def _timing_file(self) -> Path:
+        return self.directory / "timing.json"
+
+    def _stage_file(self, stage: str) -> Path:
+        path = self.directory / "stages" / _checked(stage)
+        return path.with_name(path.name + ".json")
+
+
+def read_metrics(directory: Path) -> list[dict[str, Any]]:
+    """The logged lines of a run, in order."""
+    path = directory / "metrics.jsonl"
+    return [_row(line, path) for line in _whole_lines(path)]
+
+
+def _whole_lines(path: Path) -> list[str]:
+    if not path.exists():
+        return []
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    except UnicodeDecodeError as error:
+        raise _damaged(path, str(error)) from error
+    return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
+
+
+def _row(line: str, path: Path) -> dict[str, Any]:
+    try:
+        row: dict[str, Any] = json.loads(line)
+    except ValueError as error:
+        raise _damaged(path, f"{error} in {line[:80]!r}") from error
+    return row
+
+
+def _damaged(path: Path, how: str) -> DamagedFileError:
+    return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start the run anew with --fresh")
+
+
+def _before(row: dict[str, Any], stage: str, step: int) -> bool:
+    return row["stage"] != stage or row["step"] < step
+
+
+def _checked(stage: str) -> str:
+    if _STAGE.fullmatch(stage) is None:
+        raise ValueError(
+            f"stage is {stage!r}: must be words of letters, digits, '_', '.' or '-' joined by '/'; for example 'sft/0'"
+        )
+    return stage

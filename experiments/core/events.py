@@ -1,0 +1,70 @@
+"""TensorBoard's event files beside `metrics.jsonl`, a folder for every stage.
+
+python -m experiments NAME --tensorboard
+tensorboard --logdir runs/NAME/latest/events
+"""
+
+import importlib
+import importlib.util
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from experiments.core.watcher import Watcher
+
+PACKAGE = "tensorboardX"
+
+HINT = (
+    f"--tensorboard needs the package {PACKAGE}, which is not installed: "
+    "pip install 'touchr1-jax[tensorboard]', or leave the flag out"
+)
+
+FLUSH_S = 10
+"""Seconds after which a line is on the disk at the latest."""
+
+
+def installed() -> bool:
+    """Whether event files can be written."""
+    return importlib.util.find_spec(PACKAGE) is not None
+
+
+class Events(Watcher):
+    """Writes every number of every logged line.
+
+    A stage that goes on gets one more file, whose first event tells TensorBoard to drop what the last session wrote at
+    or past its step.  Events carry the time, which `metrics.jsonl` does not.
+
+    Args:
+      folder: a folder for each stage is made in it.
+
+    Raises:
+      ModuleNotFoundError: tensorboardX is not installed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._make = importlib.import_module(PACKAGE).SummaryWriter
+        self._writers: dict[str, Any] = {}
+
+    def rewound(self, stage: str, step: int) -> None:
+        """Begin a file of the stage."""
+        if stage in self._writers:
+            self._writers[stage].close()
+        self._writers[stage] = self._make(
+            str(self._folder / stage),
+            purge_step=step,
+            flush_secs=FLUSH_S,
+            filename_suffix=f".{time.time_ns()}",  # two files of one second would be one
+        )
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """Write the numbers among the scalars."""
+        for name, value in scalars.items():
+            if isinstance(value, int | float):
+                self._writers[stage].add_scalar(name, value, step)
+
+    def closed(self) -> None:
+        """Write what is left and close the files."""
+        for writer in self._writers.values():
+            writer.close()

@@ -1,0 +1,195 @@
+"""What an experiment hands back: estimates per arm and metric, comparisons, and the material of the report."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from experiments.core.checks import require
+from experiments.core.findings import Picture, Requirement, Table, outcome_json
+from touchr1_jax.bench.scoring import REPORTED
+
+SETTINGS = ("preset", "lr_scale")
+"""Settings without which no report can be read."""
+
+Slot = tuple[int, int, str]
+"""Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One metric of one arm: its mean over seeds, a 95 % interval and the value of every seed."""
+
+    mean: float
+    ci95: tuple[float, float]
+    per_seed: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """`arm` minus `against` on one metric, paired.
+
+    `over` says what the interval generalises to: other training `seeds` (Student t on paired per-seed differences) or
+    other `objects` (clustered bootstrap of paired answers).  `p_value` is that of the sign-flip test over seeds,
+    `improvement` the probability of improvement; both `None` where `over` is `objects`.
+    """
+
+    metric: str
+    arm: str
+    against: str
+    difference: float
+    ci95: tuple[float, float]
+    over: Literal["seeds", "objects"]
+    n: int
+    p_value: float | None = None
+    improvement: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trace:
+    """A text and its parsed pieces, in order and disjoint.
+
+    Raises:
+      ResultsError: pieces that overlap, are out of order or end past the text.
+    """
+
+    text: str
+    slots: tuple[Slot, ...]
+
+    def __post_init__(self) -> None:
+        end = 0
+        for slot in self.slots:
+            ok = end <= slot[0] <= slot[1] <= len(self.text)
+            require(ok, "slots", slot, f"must follow {end} and end by {len(self.text)}", "sort and separate them")
+            end = slot[1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RolloutExample:
+    """One answer to look at, with the touch behind it.
+
+    Args:
+      arm, object_id: who answered, about what.
+      question, label, trace: text.
+      slots: the parsed pieces of the trace, in order and disjoint.
+      reward: the value of each term; `total` their weighted sum.
+      frames: sensor → uint8 [F, H, W, 3], RGB.
+      force_n: sensor → float [F, 3].
+      view: uint8 [H, W, 3] RGB picture of the object, or `None`.
+      fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
+      instead: what stood in the place of the touch → what was then said.
+      group: heading under which it stands with its neighbours of the same one; none by default.
+    """
+
+    arm: str
+    object_id: str
+    question: str
+    label: str
+    trace: str
+    slots: tuple[Slot, ...]
+    reward: Mapping[str, float]
+    total: float
+    frames: Mapping[str, np.ndarray]
+    force_n: Mapping[str, np.ndarray]
+    view: np.ndarray | None = None
+    fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
+    group: str = ""
+
+    def __post_init__(self) -> None:
+        Trace(text=self.trace, slots=self.slots)
+        for sensor, frames in self.frames.items():
+            ok = frames.dtype == np.uint8 and frames.ndim == 4 and frames.shape[-1] == 3
+            got = f"{frames.dtype}{list(frames.shape)}"
+            require(ok, f"frames[{sensor}]", got, "must be uint8 [F, H, W, 3]", "convert them to RGB")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Results:
+    """The outcome of an experiment, checked when it is made.
+
+    Args:
+      arms, baselines: name → metric → estimate; all arms have the same seeds, baselines may differ.
+      settings: what a reader must know first; `preset` and `lr_scale` at least.
+      verdict: sentences that answer the experiment's question from the figures.
+      requirements: figures with bounds.
+      tables, pictures: what there is to say beyond estimates and comparisons, in the order of the report.
+      data, timing: sizes of the data, seconds; anything that JSON can hold.
+      curves: phase → names of the logged scalars to draw; a phase not named is drawn whole.
+      examples: a few rollouts; they go into the report, not into `results.json`.
+
+    Raises:
+      ResultsError: an unknown metric, a number that is not finite, an interval out of order, unequal numbers of seeds.
+    """
+
+    arms: Mapping[str, Mapping[str, Estimate]]
+    baselines: Mapping[str, Mapping[str, Estimate]]
+    settings: Mapping[str, Any]
+    comparisons: tuple[Comparison, ...] = ()
+    verdict: tuple[str, ...] = ()
+    requirements: tuple[Requirement, ...] = ()
+    tables: tuple[Table, ...] = ()
+    data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    timing: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    pictures: tuple[Picture, ...] = ()
+    curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    examples: tuple[RolloutExample, ...] = ()
+
+    def __post_init__(self) -> None:
+        require(bool(self.arms), "arms", dict(self.arms), "must hold one arm at least", "add the arms")
+        missing = [name for name in SETTINGS if name not in self.settings]
+        require(not missing, "settings", dict(self.settings), f"must hold {', '.join(missing)}", "add them")
+        both = sorted(set(self.arms) & set(self.baselines))
+        require(not both, "baselines", both, "must not take the names of arms", "rename them")
+        for name, row in {**self.arms, **self.baselines}.items():
+            _check_row(name, row)
+        seeds = {arm: len(next(iter(row.values())).per_seed) for arm, row in self.arms.items()}
+        require(len(set(seeds.values())) == 1, "arms", seeds, "must all have the same seeds", "run the missing ones")
+        for i, comparison in enumerate(self.comparisons):
+            self._check_comparison(f"comparisons[{i}]", comparison)
+
+    def to_json(self, description: Mapping[str, Any]) -> dict[str, Any]:
+        """The content of `results.json`.
+
+        Args:
+          description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
+        """
+        names = ("arms", "baselines", "comparisons", "verdict", "tables", "settings", "timing", "data")
+        return outcome_json(description, self.requirements, {name: getattr(self, name) for name in names})
+
+    def _check_comparison(self, field: str, comparison: Comparison) -> None:
+        _check_metric(f"{field}.metric", comparison.metric)
+        known = {**self.arms, **self.baselines}
+        for side in (comparison.arm, comparison.against):
+            require(side in known, field, side, f"must be one of {', '.join(known)}", "name an arm or baseline")
+        _check_interval(field, comparison.difference, comparison.ci95)
+        for name in ("p_value", "improvement"):
+            share = getattr(comparison, name)
+            ok = share is None or 0 <= share <= 1
+            require(ok, f"{field}.{name}", share, "must lie in [0, 1]", "correct it")
+
+
+def _check_row(name: str, row: Mapping[str, Estimate]) -> None:
+    require(bool(row), name, dict(row), "must hold one metric at least", "add the metrics")
+    for metric, value in row.items():
+        _check_metric(name, metric)
+        _check_interval(f"{name}.{metric}", value.mean, value.ci95)
+        finite = all(math.isfinite(x) for x in value.per_seed)
+        require(finite, f"{name}.{metric}.per_seed", value.per_seed, "must be finite", "leave the metric out")
+    counts = {metric: len(value.per_seed) for metric, value in row.items()}
+    ok = len(set(counts.values())) == 1 and min(counts.values()) > 0
+    require(ok, f"{name}.per_seed", counts, "must have the same length, ≥ 1, for every metric", "add the missing seeds")
+
+
+def _check_metric(field: str, metric: str) -> None:
+    require(
+        metric in REPORTED, field, metric, f"must be one of {', '.join(REPORTED)}", "rename it or add it to METRICS"
+    )
+
+
+def _check_interval(field: str, mean: float, ci95: tuple[float, float]) -> None:
+    finite = all(math.isfinite(x) for x in (mean, *ci95))
+    require(finite, field, (mean, ci95), "must be finite", "leave an undefined metric out")
+    require(ci95[0] <= ci95[1], f"{field}.ci95", ci95, "must be (low, high)", "swap its ends")

@@ -1,0 +1,297 @@
+"""Find an experiment, resolve its configuration, run or continue it, write its report.
+
+    python -m experiments NAME [--scale smoke|default] [--fresh] [--tensorboard] [--distributed] [overrides]
+    python -m experiments list | new | compare
+
+An experiment is a module of this package.  It opens with a docstring, whose first line is the question, followed by the
+command, the cost and the expected result, and it defines `EXPERIMENT`.
+"""
+
+import contextlib
+import dataclasses
+import importlib
+import itertools
+import shlex
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import tyro
+from rich.console import Console
+
+from experiments.core import events, runs
+from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_json
+from experiments.core.catalogue import find
+from experiments.core.commands import PROG, answer, complain, say
+from experiments.core.context import Context
+from experiments.core.distributed import Launch, NoTeam, Team, devices_of, joined
+from experiments.core.findings import Findings
+from experiments.core.history import seconds_of_last
+from experiments.core.live import LivePage
+from experiments.core.machine import Machine, MachineError, require_machine
+from experiments.core.quick import compiled_quickly
+from experiments.core.report import write_report
+from experiments.core.report_findings import write_findings
+from experiments.core.results import Results
+from experiments.core.stopping import Stopped, Stopping
+from experiments.core.watcher import Watcher
+from sensors_io.errors import UserError
+from touchr1_jax.models.layers import SizeError
+from touchr1_jax.models.load import WeightsError
+from touchr1_jax.rewards import RewardError
+from touchr1_jax.training.checkpoint import CheckpointError
+from touchr1_jax.training.compilation import compilations_kept
+from touchr1_jax.training.loop import NonFiniteGradientError
+
+EVENTS = "events"
+"""Folder of a run that holds its TensorBoard events."""
+
+EVENTS_HELP = f"Write TensorBoard events beside metrics.jsonl: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
+
+COMPILED = "compiled"
+"""Folder of the cache that holds compiled programs, so that a run like an earlier one compiles next to nothing."""
+
+KNOWN_ERRORS = (
+    runs.RunInUse,
+    UserError,
+    CheckpointError,
+    NonFiniteGradientError,
+    DamagedFileError,
+    NoTeam,
+    MachineError,
+    RewardError,
+    SizeError,
+    WeightsError,
+    OSError,
+)
+"""Whose message says all that a user needs; others come with their traceback."""
+
+C = TypeVar("C")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment(Generic[C]):
+    """A question, and the code that answers it.
+
+    Args:
+      name: the name of its module.
+      config: the default configuration, a frozen keyword-only dataclass.
+      run: computes results (trained arms) or findings (measurements); it must skip the stages that `Context.done` names
+        and continue from checkpoints.
+      scales: further configurations by name, `smoke` for one that takes under two minutes.
+      curves: of each phase the scalars to draw while it runs; of a phase that is not named, the first few.
+      needs: of each scale what it asks of the machine; one that is not named runs on any.
+      quick: scales whose programs run so few times that they are compiled quickly (`core/quick.py`).
+      spreads: whether its training runs on the devices of all processes; others know one device.
+    """
+
+    name: str
+    config: C
+    run: Callable[[C, Context], Results | Findings]
+    scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
+    curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    needs: Mapping[str, Machine] = dataclasses.field(default_factory=dict)
+    quick: tuple[str, ...] = ()
+    spreads: bool = False
+
+    def __post_init__(self) -> None:
+        if "default" in self.scales:
+            raise ValueError(f"scales of {self.name} holds 'default': that name means `config`; rename the scale")
+        for scale, config in self.configs().items():
+            if not dataclasses.is_dataclass(config) or type(config) is not type(self.config):
+                raise ValueError(
+                    f"scale {scale!r} of {self.name} is {config!r}: every scale must be an instance of one dataclass; "
+                    "make it with dataclasses.replace from the default"
+                )
+
+        for field, named in (("needs", self.needs), ("quick", self.quick)):
+            unknown = sorted(set(named) - set(self.configs()))
+            if unknown:
+                raise ValueError(f"{field} of {self.name} names {unknown}: must be scales; rename or drop them")
+
+    def configs(self) -> dict[str, C]:
+        """Every scale's configuration."""
+        return {"default": self.config, **self.scales}
+
+
+def main(arguments: Sequence[str] | None = None, package: str = "experiments") -> int:
+    """The command line; returns the exit code.
+
+    Args:
+      arguments: those after the program's name, by default the process's.
+      package: the package to find experiments in.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    status = answer(arguments, package)
+    return run(arguments, package) if status is None else status
+
+
+def run(arguments: Sequence[str], package: str = "experiments") -> int:
+    """Run or continue the experiment that the first argument names; returns the exit code."""
+    name, *rest = arguments
+    module = importlib.import_module(find(package)[name].module)
+    if module.EXPERIMENT.name != name:
+        raise ValueError(
+            f"{module.__name__} names its experiment {module.EXPERIMENT.name!r}: must be {name!r}; rename it"
+        )
+    try:
+        command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
+        jsonable(command.config, where="config")
+    except ValueError as error:  # a configuration refuses its own values, or one is not finite
+        complain(f"{type(error).__name__}: {error}")
+        return 2
+    with compiled_quickly() if command.scale in module.EXPERIMENT.quick else contextlib.nullcontext():
+        return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
+
+
+def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:
+    """Resolve the command line: `.scale`, `.fresh`, `.tensorboard`, two directories and the overridden `.config`.
+
+    The scale is picked out first, since it chooses the defaults that everything else overrides.
+
+    Raises:
+      SystemExit: code 2 after an answer to a typo, 0 after help.
+    """
+    configs = experiment.configs()
+    command = dataclasses.make_dataclass(
+        "Command",
+        [
+            ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Whose defaults to start from.")]),
+            ("fresh", Annotated[bool, tyro.conf.arg(help="Start anew beside an unfinished run.")]),
+            ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)]),
+            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Where runs are kept.")]),
+            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Where data and compiled programs are kept.")]),
+            ("launch", Annotated[Launch, tyro.conf.arg(name="")]),
+            ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")]),
+        ],
+        kw_only=True,
+        frozen=True,
+    )
+    scale = _scale(arguments, configs)
+    default = command(
+        scale=scale,
+        fresh=False,
+        tensorboard=False,
+        runs_dir=Path("runs"),
+        cache_dir=Path("data"),
+        launch=Launch(),
+        config=configs[scale],
+    )
+    prog = f"{PROG} {experiment.name}"
+    return tyro.cli(command, args=arguments, default=default, prog=prog, description=about)
+
+
+def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
+    """Run or continue an experiment; returns the exit code, 128 + n after signal n."""
+    if command.tensorboard and not events.installed():
+        complain(events.HINT)
+        return 2
+    if not experiment.spreads and command.launch != Launch():
+        complain(f"{experiment.name} knows one process and one device; leave --distributed and --mesh out")
+        return 2
+    stopping = Stopping()
+    directory = None
+    try:
+        team = joined(command.launch)
+        require_machine(command.scale, experiment.needs.get(command.scale))
+        chosen, resumed = team.agreed(lambda: _directory(experiment, command, typed))
+        directory = Path(chosen)
+        with stopping.listening(), _held(directory, team), compilations_kept(command.cache_dir / COMPILED):
+            if team.leads:
+                runs.point_latest(directory)
+                _announce(directory, resumed)
+                _run(experiment, command, directory, about, stopping, team)
+            else:
+                _follow(experiment, command, directory, stopping, team)
+    except KNOWN_ERRORS as error:
+        complain(f"{type(error).__name__}: {error}")
+        if directory is not None:
+            say(f"Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
+        return 1
+    except Stopped as stopped:
+        say(f"\nStopped by {stopped}. Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
+        return 128 + stopped.number
+    return 0
+
+
+def _held(directory: Path, team: Team) -> contextlib.AbstractContextManager[None]:
+    """The run's lock, which the process that writes holds for all."""
+    return runs.locked(directory) if team.leads else contextlib.nullcontext()
+
+
+def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[str, bool]:
+    """The run's directory, and whether it is an unfinished one that goes on."""
+    config = jsonable(command.config, where="config")
+    home = command.runs_dir / experiment.name
+    unfinished = None if command.fresh else runs.newest_unfinished(home, config)
+    if unfinished is not None:
+        return str(unfinished), True
+    return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
+
+
+def _follow(experiment: Experiment[Any], command: Any, directory: Path, stopping: Stopping, team: Team) -> None:
+    """Compute with the process that writes."""
+    devices = devices_of(command.launch)
+    context = Context(directory, command.cache_dir, Console(quiet=True), (), stopping, team, devices)
+    with contextlib.closing(context):
+        experiment.run(command.config, context)
+
+
+def _run(
+    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, team: Team
+) -> None:
+    """Compute and publish; whatever ends a run before that is what its page says last."""
+    description = read_json(directory / "config.json")
+    page = LivePage(
+        directory,
+        about=about,
+        description=description,
+        curves=experiment.curves,
+        usual_s=seconds_of_last(directory.parent, description["config"]),
+    )
+    try:
+        watchers: list[Watcher] = [page]
+        if command.tensorboard:
+            watchers.append(events.Events(directory / EVENTS))
+        devices = devices_of(command.launch)
+        context = Context(directory, command.cache_dir, Console(), watchers, stopping, team, devices)
+        with contextlib.closing(context), context.timed("total"):
+            results = experiment.run(command.config, context)
+        _publish(results, context, description, about)
+    except BaseException as error:
+        page.end(error)
+        raise
+
+
+def _publish(results: Results | Findings, context: Context, description: Mapping[str, Any], about: str) -> None:
+    """Write the report and, last, `results.json`, which marks the run as finished."""
+    results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
+    if isinstance(results, Findings):
+        report = write_findings(context.directory, results, about=about, description=description)
+    else:
+        report = write_report(context.directory, results, about=about, description=description)
+    write_json(context.directory / "results.json", results.to_json(description))
+    context.say(f"report: {report}")
+    for sentence in results.verdict:
+        context.say(sentence)
+
+
+def _announce(directory: Path, resumed: bool) -> None:
+    """Say which of the two happens, where to watch, and whether the code changed meanwhile."""
+    say(f"continuing {directory} (--fresh starts anew)" if resumed else f"new run {directory}")
+    say(f"to watch: {directory / 'report.html'}")
+    began, now = read_json(directory / "config.json")["git"], dataclasses.asdict(runs.revision())
+    if resumed and began != now:
+        say(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
+
+
+def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:
+    """The scale that the arguments name; `default` where they name none or an unknown one, which tyro then answers."""
+    named = "default"
+    for flag, value in itertools.pairwise([*arguments, ""]):
+        if flag == "--scale":
+            named = value
+        elif flag.startswith("--scale="):
+            named = flag.removeprefix("--scale=")
+    return named if named in configs else "default"

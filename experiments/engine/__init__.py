@@ -1,0 +1,1 @@
+"""Speed, stability and scale of GRPO and of its data feeds."""

@@ -1,0 +1,69 @@
+"""The batches of a study at one of its scales, as its first device gets them."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.study.assembly import Assembly
+from experiments.study.dataset import Dataset
+from experiments.study.feeds import AnswerFeed, QuestionFeed
+from experiments.study.stages import encode_program
+from experiments.study.study import StudyConfig
+from touchr1_jax.models.policy import Features
+from touchr1_jax.types import TouchBatch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scale:
+    """A study, its devices, and how many contacts its feed is tried on."""
+
+    study: StudyConfig
+    devices: int
+    contacts: int
+
+    def __post_init__(self) -> None:
+        for name, size in (("sft.batch_size", self.study.sft.batch_size), ("grpo.drawn", self.study.grpo.drawn)):
+            if size % self.devices:
+                raise ValueError(f"devices is {self.devices}: must divide {name} = {size}; change either")
+
+
+def clip_bytes(touch: TouchBatch) -> int:
+    """Bytes of each clip of a batch."""
+    return sum(x.nbytes for x in jax.tree.leaves(touch)) // len(touch.stream_mask)
+
+
+def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
+    """Share of the study's clips that its memory holds."""
+    scenes = study.scenes
+    contacts = scenes.objects * scenes.sites if scenes.sequences is None else scenes.sequences // len(data.clip.sensors)
+    return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes(touch)))
+
+
+def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
+    """Batches of SFT, those rows that the first device reads; the evidence is equal for all levels."""
+    config = scale.study.sft
+    shape = (len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels))
+    return AnswerFeed(
+        assembly,
+        data,
+        np.zeros(shape, np.float32),
+        batch_size=config.batch_size,
+        questions=config.questions,
+        seed=0,
+        augment=config.augment,
+        own=np.arange(config.batch_size // scale.devices),
+    )
+
+
+def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: Scale) -> QuestionFeed:
+    """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
+    params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
+    one = jax.eval_shape(encode_program(assembly.agent, False), params, touch)
+    n = len(data.store)
+    zeros: Features = jax.tree.map(lambda x: np.zeros((n, *x.shape[1:]), x.dtype), one)
+    there: Any = np.ones(zeros.stream_mask.shape, bool)
+    features = dataclasses.replace(zeros, stream_mask=there)
+    drawn = scale.study.grpo.drawn
+    return QuestionFeed(assembly, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))

@@ -1,0 +1,215 @@
+"""The job that GRPO engines are timed on: the same decoder, prompts, completions and update for all of them.
+
+8 prompts × 8 rollouts × 64 new tokens, no end token among them; a decoder of the Qwen2 shape with 1.05 million
+parameters (4 layers, width 128, 4 heads over 2 key heads of 32, MLP 512, vocabulary 512, tied embedding) in float32;
+one on-policy update by AdamW with β = .04 to a reference.  The reward of a completion is its share of low token ids.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from experiments.engine.size import BETA, LEARNING_RATE, Size
+from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.scoring import ScoreFn, make_host_score
+from touchr1_jax.types import Params, Parsed, Target
+
+VIEW, TOUCH = 4, 8
+"""Prompt tokens that are embeddings of a view and of the touch of the one sensor; the others are text."""
+
+
+class Job:
+    """One iteration as a call: `step()` samples, scores and updates, and returns the metrics.
+
+    Args:
+      size: the decoder and the numbers of prompts, rollouts and tokens.
+      prefix: prompt tokens.
+      config: the step.
+      repeated: encode the prefix for every rollout: as many prompts of one rollout each.
+      host: compute the reward in Python.
+      end_share: share of the vocabulary that ends a completion, so that a fresh policy's have 1/share tokens on
+        average; 0 lets none end.
+      learning_rate: AdamW's; 0 keeps the policy as it is.
+      seed: of the prompts and of the sampling.
+    """
+
+    def __init__(
+        self,
+        size: Size,
+        prefix: int,
+        config: GRPOConfig,
+        *,
+        repeated: bool = False,
+        host: bool = False,
+        end_share: float = 0.0,
+        learning_rate: float = LEARNING_RATE,
+        seed: int = 0,
+    ) -> None:
+        if repeated:
+            config = dataclasses.replace(
+                config,
+                prompts=size.prompts * size.group,
+                group=1,
+                micro_prompts=config.micro_prompts * size.group,
+            )
+        self.agent, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
+        self.batch = make_batch(size, prefix, config.drawn, seed)
+        params = init_decoder(self.agent, self.batch)
+        self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
+        self._state = start_state(params, optimizer, jax.random.key(seed), config)
+
+    def step(self) -> dict[str, jax.Array]:
+        """One iteration; the state moves on."""
+        self._state, metrics = self._step(self._state, self.batch, self.fixed)
+        return metrics
+
+    @property
+    def state(self) -> GRPOState:
+        """The state after the last iteration."""
+        return self._state
+
+    @property
+    def compilations(self) -> int:
+        """How many programs the steps so far took."""
+        return self._step._cache_size()
+
+    def lowered(self) -> jax.stages.Lowered:
+        """The step as it is handed to the compiler."""
+        return self._step.lower(self._state, self.batch, self.fixed)
+
+
+@functools.cache
+def engine(
+    size: Size, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
+) -> tuple[Agent, optax.GradientTransformation, Any]:
+    """Policy, optimizer and compiled step, made once for all seeds."""
+    agent = make_agent(size, prefix, end_share)
+    score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
+    optimizer = optax.adamw(learning_rate)
+    return agent, optimizer, make_grpo_step(agent, score, optimizer, config)
+
+
+def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
+    """The step that the job asks for: plain GRPO with a reference, nothing else."""
+    return GRPOConfig(
+        prompts=size.prompts,
+        group=size.group,
+        length=size.length,
+        micro_prompts=micro_prompts,
+        algorithm=Paper(beta=BETA, gamma=0.0),
+        inverse_draws=True,
+    )
+
+
+def decoder_config(size: Size) -> DecoderConfig:
+    """The decoder of a size; three eighths of the rotary frequencies each for row and column, the rest for time."""
+    names = {f.name for f in dataclasses.fields(DecoderConfig)}
+    half = size.head_dim // 2
+    sections = (half - 2 * (3 * half // 8), 3 * half // 8, 3 * half // 8)
+    shape = {name: value for name, value in dataclasses.asdict(size).items() if name in names}
+    return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
+
+
+def make_agent(size: Size, prefix: int, end_share: float = 0.0) -> Agent:
+    """A policy of the given decoder whose prompts have `prefix` tokens; the highest ids end a completion."""
+    policy = Policy(
+        PolicyConfig(
+            tactile=TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1),
+            vision=VisionConfig(),
+            decoder=decoder_config(size),
+        )
+    )
+    slots = Slots(touch=np.arange(VIEW, VIEW + TOUCH)[None], view=np.arange(VIEW), stream_text=np.full(prefix, -1))
+    banned = np.zeros(size.vocab_size, bool)
+    out_of_reach = (size.vocab_size,)
+    ends = tuple(range(size.vocab_size - round(end_share * size.vocab_size), size.vocab_size)) or out_of_reach
+    return Agent(policy=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
+
+
+def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
+    """Random prompts."""
+    rng = np.random.default_rng(seed)
+    normal = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)
+    target = Target(
+        asked=jnp.ones((prompts, 1), bool),
+        label=jnp.zeros((prompts, 1), jnp.int32),
+        levels=jnp.full((prompts, 1), 3),
+        ordinal=jnp.ones((prompts, 1), bool),
+        streams=jnp.ones((prompts, 1), bool),
+    )
+    features = Features(
+        touch=normal(prompts, 1, TOUCH, size.hidden_size),
+        touch_time=jnp.tile(jnp.arange(TOUCH) // 2, (prompts, 1, 1)),
+        stream_mask=jnp.ones((prompts, 1), bool),
+        view=normal(prompts, VIEW, size.hidden_size),
+        view_mask=jnp.ones(prompts, bool),
+    )
+    ids = jnp.asarray(rng.integers(0, size.vocab_size, (prompts, prefix)), jnp.int32)
+    return GRPOBatch(features=features, ids=ids, mask=jnp.ones((prompts, prefix), bool), target=target)
+
+
+def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
+    """N(0, .02²) weights and unit scales, drawn in NumPy: compiling an initialisation would count as the job's memory.
+
+    The shapes come from tracing one forward pass.
+    """
+    one = jax.tree.map(lambda x: x[0], batch)
+
+    def forward(module: Policy) -> jax.Array:
+        first, prefix = module.prefill_state(one.features, one.ids, one.mask, agent.slots)
+        return module.logits(module.completion_states(one.ids, first, prefix), jnp.asarray(agent.banned))
+
+    shapes = jax.eval_shape(lambda: agent.policy.init(jax.random.key(0), method=forward))["params"]
+    rng = np.random.default_rng(0)
+
+    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+        kind = path[-1].key
+        value = np.ones(leaf.shape) if kind == "scale" else rng.normal(0, 0.02, leaf.shape) * (kind != "bias")
+        return jnp.asarray(value, leaf.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def low_ids(vocab_size: int) -> ScoreFn:
+    """Share of token ids in the lower half of the vocabulary."""
+
+    def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+        del target
+        return jnp.mean(tokens < vocab_size // 2), {}, nothing_said(tokens)
+
+    return score
+
+
+def low_ids_on_host(vocab_size: int) -> ScoreFn:
+    """The same as a Python function, to see what leaving the device costs."""
+
+    def reward(tokens: np.ndarray, parsed: Parsed, target: Target) -> dict[str, float]:
+        del parsed, target
+        return {"low": float(np.mean(tokens < vocab_size // 2))}
+
+    return make_host_score(nothing_said, reward, ("low",))
+
+
+def nothing_said(tokens: jax.Array) -> Parsed:
+    """What a text without any tags says."""
+    nothing = jnp.full(1, -1)
+    return Parsed(
+        perceive=nothing[None],
+        compare=nothing,
+        conclude=nothing,
+        formatted=jnp.array(False),
+        truncated=jnp.array(True),
+        length=jnp.int32(tokens.shape[0]),
+    )

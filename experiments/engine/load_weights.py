@@ -1,0 +1,172 @@
+"""How much memory does it take to read a released checkpoint?
+
+    python -m experiments load_weights [--scale smoke] [--sizes 3B 7B] [--scratch DIR]
+
+Writes a checkpoint of a released shape with random contents in bfloat16, reads it in a process of its own, and holds
+the largest resident size of that process against the size of the weights; beside it the plain way, all tensors first,
+for the sizes in `compare`.  The 7B shape takes 17 GB of disk and of memory and some minutes; where there is less the
+run says so before it begins.  Expected: at most 1.2 times the weights from 0.5B to 7B; twice by the plain way.
+"""
+
+import dataclasses
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+
+from experiments.core.bars import bars
+from experiments.core.context import Context
+from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.progress import in_megabytes
+from experiments.core.runner import Experiment
+from experiments.engine.load_checkpoints import random_checkpoint
+from experiments.engine.load_readers import Reading, measure
+from experiments.engine.load_shapes import SHAPES
+from touchr1_jax.models.qwen.model import abstract_params
+
+BOUND = 1.2
+OURS, PLAIN = "streamed", "whole first"
+
+Measured = Mapping[str, Mapping[str, Reading]]
+"""Size → reader → reading."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoadWeightsConfig:
+    """Sizes to read, those to read the plain way too, largest shard, and where the checkpoints are written for a while.
+
+    Raises:
+      ValueError: a size that has no shape, or one that is compared and not read.
+    """
+
+    sizes: tuple[str, ...] = ("1.5B", "3B", "7B")
+    compare: tuple[str, ...] = ("1.5B",)
+    shard_bytes: int = 2_000_000_000
+    scratch: Path = Path(tempfile.gettempdir())
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        unknown = [size for size in self.sizes if size not in SHAPES]
+        if unknown or not set(self.compare) <= set(self.sizes):
+            raise ValueError(
+                f"sizes are {self.sizes}, compare {self.compare}: must be of {', '.join(SHAPES)}, and compare of sizes"
+            )
+
+
+def run(config: LoadWeightsConfig, context: Context) -> Findings:
+    """Write, read, compare, one size after the other."""
+    for size in context.each("looking for room", config.sizes):
+        check_room(size, config.scratch, copies=2 if size in config.compare else 1)
+    readings = {size: read_size(size, config, context) for size in context.each("sizes", config.sizes, still=True)}
+    ratios = {size: {name: r.peak / r.held for name, r in by.items()} for size, by in readings.items()}
+    return Findings(
+        verdict=verdict(readings),
+        requirements=tuple(
+            Requirement(name=f"{size}: peak over weights", measured=by[OURS], bound=BOUND, better="lower")
+            for size, by in ratios.items()
+        ),
+        tables=(table(readings),),
+        pictures=(
+            Picture(
+                name="memory",
+                title="Memory of a reading",
+                caption=f"The dotted line is the bound, {BOUND} times the weights in bfloat16.",
+                content=bars(
+                    {f"{size}, {name}": ratio for size, by in ratios.items() for name, ratio in by.items()},
+                    "largest resident size of the process, in weights",
+                    written="{:.2f}",
+                    bounds=(BOUND,),
+                ),
+            ),
+        ),
+        settings={"physical memory": f"{physical_memory() / 1e9:.0f} GB", "shard": f"{config.shard_bytes / 1e9:g} GB"},
+    )
+
+
+def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[str, Reading]:
+    """Write one checkpoint, read it by every reader, and remove it."""
+    directory = Path(tempfile.mkdtemp(prefix=f"weights-{size}-", dir=config.scratch))
+    try:
+        context.say(f"{size}: writing {weight_bytes(size) / 1e9:.1f} GB to {directory}")
+        with context.told(f"writing {size}, MB") as tell:
+            random_checkpoint(directory, SHAPES[size], config.shard_bytes, config.seed, in_megabytes(tell))
+        readings = {}
+        for name in (OURS, PLAIN) if size in config.compare else (OURS,):
+            with context.told(f"reading {size}, {name}, MB", still=True) as tell:
+                in_megabytes(tell)(0, weight_bytes(size))
+                readings[name] = measure(name, directory, SHAPES[size], in_megabytes(tell))
+    finally:
+        shutil.rmtree(directory)
+    for name, r in readings.items():
+        context.say(f"{size}, {name}: {r.peak / r.held:.3f} × {r.held / 1e9:.2f} GB in {r.seconds:.1f} s")
+    return readings
+
+
+def check_room(size: str, scratch: Path, copies: int) -> None:
+    """Refuse a size that this machine cannot hold.
+
+    Raises:
+      ValueError: too little disk or memory.
+    """
+    need = weight_bytes(size)
+    disk, memory = shutil.disk_usage(scratch).free, physical_memory()
+    if need > disk or BOUND * copies * need > memory:
+        raise ValueError(
+            f"size {size} takes {need / 1e9:.1f} GB of disk and {BOUND * copies * need / 1e9:.1f} GB of memory; there "
+            f"are {disk / 1e9:.1f} GB free in {scratch} and {memory / 1e9:.1f} GB: give --sizes that fit, or --scratch"
+        )
+
+
+def weight_bytes(size: str) -> int:
+    """Bytes of a size's weights in bfloat16."""
+    return 2 * sum(math.prod(x.shape) for x in jax.tree.leaves(abstract_params(SHAPES[size])))
+
+
+def physical_memory() -> int:
+    """Memory of this machine, bytes."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def verdict(readings: Measured) -> tuple[str, ...]:
+    """The answer in sentences."""
+    largest, by = max(readings.items(), key=lambda item: item[1][OURS].held)
+    ours = by[OURS]
+    said = [
+        f"Reading the {largest} shape, {ours.held / 1e9:.2f} GB, takes a process of {ours.peak / 1e9:.2f} GB at most, "
+        f"{ours.peak / ours.held:.3f} times the weights, and {ours.seconds:.0f} s."
+    ]
+    for size, other in readings.items():
+        if PLAIN in other:
+            said.append(f"All tensors first, the {size} shape takes {other[PLAIN].peak / other[PLAIN].held:.2f} times.")
+    return tuple(said)
+
+
+def table(readings: Measured) -> Table:
+    """Every reading."""
+    return Table(
+        title="Readings, each in a process of its own",
+        columns=(
+            Column(name="size and reader"),
+            Column(name="weights", unit="GB", format=".2f"),
+            Column(name="peak", unit="GB", format=".2f", meaning="largest resident size of the process"),
+            Column(name="peak over weights", format=".3f"),
+            Column(name="process before", unit="GB", format=".2f", meaning="with the runtime, without weights"),
+            Column(name="time", unit="s", format=".1f"),
+        ),
+        rows=tuple(
+            (f"{size}, {name}", r.held / 1e9, r.peak / 1e9, r.peak / r.held, r.before / 1e9, r.seconds)
+            for size, by in readings.items()
+            for name, r in by.items()
+        ),
+        note="The files were just written: they may come from the page cache, which the peak does not count.",
+    )
+
+
+DEFAULT = LoadWeightsConfig()
+SMOKE = LoadWeightsConfig(sizes=("0.5B",), compare=())
+
+EXPERIMENT = Experiment(name="load_weights", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -1,1 +1,0 @@
-"""What accelerators ask of the cores beside them, and what those deliver."""

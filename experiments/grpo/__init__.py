@@ -1,1 +1,0 @@
-"""Measuring the GRPO engine: benches, failure scenarios, ablations."""

@@ -1,1 +1,0 @@
-"""Of `identifiability`: touches drawn, probes, studies, tables."""

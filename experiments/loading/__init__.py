@@ -1,1 +1,0 @@
-"""Checkpoints of released shapes with random contents, and processes of their own that read them."""

@@ -1,0 +1,259 @@
+"""What can be told from touch, and what does a cheaper contact cost?
+
+    python -m experiments identifiability [--scale smoke]
+
+Generated objects are pressed once, 0.3 to 5 N in four frames, by all four sensors.  A linear probe on fixed features of
+a sensor's pictures, fields and force is asked for hardness, roughness and protrusion of objects that it never felt, at
+several multiples of the sensors' noise; beside it stand probes that know the true shape alone, or the measured force
+alone.  What such a probe tells is a lower bound of what can be told.  Then the probe is trained at other tiers of the
+contact ladder, on the same presses with the same noise, and asked about the exact ones.  A slide and a press that is
+released, from the protocol, are asked for friction and elasticity, which a press cannot tell.  Intervals are over
+objects.
+
+Cost: about seven minutes on two cores (`smoke` two minutes on one).
+
+Expected: touch tells hardness far above the lines of shape and force, which stay near guessing; roughness is told by
+the camera of the GelSight Mini alone; protrusion by all sensors, short of what its shape tells.  The generator's grid
+of 64² costs a probe less than a point, 24² several, a bed of springs ten.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from collections.abc import Sequence as Seq
+
+import numpy as np
+
+from experiments.core.context import Context
+from experiments.core.findings import Findings, Requirement
+from experiments.core.runner import Experiment
+from experiments.mechanics import identify_motions, identify_tables
+from experiments.mechanics.identify_figures import Figures, Studied, figures
+from experiments.mechanics.identify_motions import MOTIONS, Moved
+from experiments.mechanics.identify_presses import Pressed, press
+from experiments.mechanics.identify_studies import (
+    DYNAMIC,
+    FORCE,
+    FUSED,
+    SHAPE,
+    STATIC,
+    by_motion,
+    from_tiers,
+    over_noise,
+    without_touch,
+)
+from experiments.mechanics.identify_tables import CHANCE, MAY_LOSE
+from experiments.mechanics.identify_touch import Tier
+from sensors_io.live import LiveScenes
+from sensors_io.scenes.config import SceneConfig, require
+from sensors_io.scenes.validity import STRAIN_LIMIT
+from sensors_io.schema import SENSORS
+from touchr1_jax.training.evidence import ProbeConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class IdentifiabilityConfig:
+    """What to generate, at which tiers and noise, and how to ask.
+
+    Args:
+      presses: objects that are pressed, without `sequences`; the tiers replace its grid and tolerance.
+      grids: sides of the contact grids to train at, at the generator's tolerance.
+      coarsest_used: the coarsest grid that training data come from; of coarser ones nothing is required.
+      usual_grid: the one that is also solved loosely, and by springs.
+      loose_tolerance: of the loosest tier.
+      exact_grid, exact_tolerance: of what stands for the exact solution.
+      noise: multiples of the sensors' noise, 1 among them.
+      motions: the protocol that slides and held presses are taken from.
+      moments: frames of a motion that are looked at.
+      probe: folds and fit.
+      batch: presses in one call of a compiled program.
+    """
+
+    presses: SceneConfig = SceneConfig(objects=600, sites=1, frames=4, min_force_n=0.3, max_force_n=5.0)
+    grids: tuple[int, ...] = (24, 32, 48, 64, 96)
+    coarsest_used: int = 64
+    usual_grid: int = 64
+    loose_tolerance: float = 1e-2
+    exact_grid: int = 128
+    exact_tolerance: float = 1e-4
+    noise: tuple[float, ...] = (0.0, 1.0, 2.0, 4.0)
+    motions: SceneConfig = SceneConfig(objects=300, sequences=4 * 2100, frames=24, image_px=56, contact_grid=32)
+    moments: int = 8
+    probe: ProbeConfig = ProbeConfig()
+    batch: int = 50
+
+    def __post_init__(self) -> None:
+        require(1.0 in self.noise, "noise", self.noise, "must hold 1.0, the sensors' own")
+        require(self.presses.sequences is None, "presses.sequences", self.presses.sequences, "must be None")
+        require(self.motions.sequences is not None, "motions.sequences", None, "must be a number: the protocol's")
+        require(self.exact_grid > max(self.grids), "exact_grid", self.exact_grid, "must be finer than all of grids")
+
+    @property
+    def exact(self) -> Tier:
+        """What stands for the exact solution."""
+        return Tier(name=f"exact, {self.exact_grid}²", grid=self.exact_grid, tolerance=self.exact_tolerance)
+
+    @property
+    def solved(self) -> tuple[Tier, ...]:
+        """Tiers that solve the contact."""
+        usual = self.usual_grid
+        loose = Tier(name=f"{usual}², {self.loose_tolerance:g}", grid=usual, tolerance=self.loose_tolerance)
+        return (*(Tier(name=f"{n}²", grid=n) for n in self.grids), loose)
+
+    @property
+    def springs(self) -> Tier:
+        """The negative control."""
+        return Tier(name=f"springs, {self.usual_grid}²", grid=self.usual_grid, springs=True)
+
+
+def run(config: IdentifiabilityConfig, context: Context) -> Findings:
+    """Press, move, ask."""
+    tiers = (*config.solved, config.springs)
+    with context.timed("presses"), context.progress("presses", len(SENSORS) * (1 + len(tiers))) as advance:
+        at_own_noise = [(tier, (1.0,)) for tier in tiers]
+        pressed = press(config.presses, [(config.exact, config.noise), *at_own_noise], config.batch, advance)
+    with context.timed("motions"):
+        moved = {motion: _move(config, motion, context) for motion in context.each("motions", MOTIONS)}
+    with context.timed("probes"):
+        studied = _ask(config, pressed, moved, context)
+    return findings(config, studied)
+
+
+def _move(config: IdentifiabilityConfig, motion: str, context: Context) -> Moved:
+    count = len(identify_motions.rows_of(LiveScenes(config.motions), motion))
+    with context.progress(motion, count) as advance:
+        return identify_motions.feel(config.motions, motion, config.moments, advance)
+
+
+def _ask(config: IdentifiabilityConfig, pressed: Pressed, moved: dict[str, Moved], context: Context) -> Studied:
+    """Every probe."""
+    tiers, own = (*config.solved, config.springs), config.noise.index(1.0)
+    held = [np.asarray(pressed.felt[config.exact.name, order].features)[:, own] for order in range(len(SENSORS))]
+    dynamic: dict[str, tuple[Seq[np.ndarray], Pressed | Moved]] = {"press": (held, pressed)}
+    dynamic |= {motion: (m.touch, m) for motion, m in moved.items()}
+    per_sensor = len(STATIC) * (len(config.noise) + len(tiers)) + len(DYNAMIC) * len(dynamic)
+    blind = 2 * (len(STATIC) + len(DYNAMIC) * len(dynamic))
+    with context.progress("probes", len(SENSORS) * per_sensor + blind) as advance:
+        return Studied(
+            noise=config.noise,
+            exact=config.exact.name,
+            solved=tuple(tier.name for tier in config.solved),
+            springs=config.springs.name,
+            touch=over_noise(pressed, config.exact, len(config.noise), config.probe, advance),
+            blind=without_touch(pressed, STATIC, config.probe, advance),
+            tiers=from_tiers(pressed, tiers, config.exact, own, config.probe, advance),
+            motion={name: by_motion(touch, m, config.probe, advance) for name, (touch, m) in dynamic.items()},
+            still={name: without_touch(m, DYNAMIC, config.probe, advance) for name, (_, m) in dynamic.items()},
+            pressed=pressed,
+            moved=moved,
+        )
+
+
+def findings(config: IdentifiabilityConfig, studied: Studied) -> Findings:
+    """Everything that is reported."""
+    made, scenes = figures(studied), config.presses
+    strain = studied.pressed.felt[studied.exact, 0].strain
+    return Findings(
+        verdict=verdict(config, studied, made),
+        requirements=requirements(config, studied, made),
+        tables=(
+            identify_tables.touch_table(studied, made),
+            identify_tables.blind_table(studied, made),
+            identify_tables.tier_table(studied, made),
+            identify_tables.motion_table(studied, made),
+        ),
+        pictures=(identify_tables.noise_picture(studied, made), identify_tables.tier_picture(made)),
+        settings={
+            "presses": f"{len(studied.pressed.objects)} objects, {scenes.frame_count} frames of {scenes.min_force_n:g} "
+            f"to {scenes.max_force_n:g} N, pictures of {scenes.image_px} px",
+            "frames past the strain limit": f"{100 * float(np.mean(strain > STRAIN_LIMIT)):.1f} % on {SENSORS[0]}, "
+            "kept: leaving them out would tell hardness",
+            "motions": ", ".join(f"{len(m.objects)} × {name}" for name, m in studied.moved.items()),
+        },
+        data={
+            "frames not converged": {
+                f"{tier}, {SENSORS[order]}": int(np.sum(~felt.converged))
+                for (tier, order), felt in studied.pressed.felt.items()
+                if tier != studied.springs
+            }
+        },
+    )
+
+
+def requirements(config: IdentifiabilityConfig, studied: Studied, made: Figures) -> tuple[Requirement, ...]:
+    """Every tier in use against what it may lose, by its worst property.
+
+    Springs, whose pressure is known to be wrong, must lose more than that beyond doubt, or the comparison is blind.
+    """
+    kept = []
+    for tier in (t.name for t in config.solved if t.grid >= config.coarsest_used):
+        name = max(STATIC, key=lambda name: made.lost[tier, name].mean)
+        worst = made.lost[tier, name]
+        kept.append(
+            Requirement(
+                name=f"trained at {tier}, asked about exact records: lost at worst",
+                measured=worst.mean,
+                bound=MAY_LOSE,
+                better="lower",
+                unit="points",
+                note=f"{name}, mean over sensors, 95 % from {worst.low:.1f} to {worst.high:.1f}",
+            )
+        )
+    control = made.lost[studied.springs, STATIC[0]]
+    kept.append(
+        Requirement(
+            name=f"control: {STATIC[0]} lost by {studied.springs}, at least",
+            measured=control.low,
+            bound=MAY_LOSE,
+            better="higher",
+            unit="points",
+            note=f"lower end of the 95 % interval about {control.mean:.1f}",
+        )
+    )
+    return tuple(kept)
+
+
+def verdict(config: IdentifiabilityConfig, studied: Studied, made: Figures) -> tuple[str, ...]:
+    """The answer in sentences."""
+    own, last, hardness = studied.own, len(studied.noise) - 1, STATIC[0]
+    fused = {name: made.told[name, FUSED, own].mean for name in STATIC}
+    fall = {
+        name: float(np.mean([made.told[name, s, own].mean - made.told[name, s, last].mean for s in SENSORS]))
+        for name in STATIC
+    }
+    used = [t.name for t in config.solved if t.grid >= config.coarsest_used]
+    tier, name = max(((t, n) for t in used for n in STATIC), key=lambda key: made.lost[key].mean)
+    return (
+        f"All four sensors together tell of unseen objects {_listed(fused, '%')}. For {hardness}, true shape alone "
+        f"gives {made.blind[hardness, SHAPE].mean:.0f} %, force alone {made.blind[hardness, FORCE].mean:.0f} %, "
+        f"guessing {CHANCE:.0f} %.",
+        f"Noise ×{studied.noise[last]:g} instead of ×1 costs a sensor {_listed(fall, 'points')}.",
+        "Trained at a tier in use and asked about exact records, a probe loses at most "
+        f"{made.lost[tier, name].mean:.1f} points ({name}, {tier}); trained on springs, "
+        f"{made.lost[studied.springs, hardness].mean:.0f} of {hardness}.",
+        f"Touch without force tells friction {made.moved['friction', 'slide_x'].mean:.0f} % from a slide and "
+        f"{made.moved['friction', 'press'].mean:.0f} % from a press, elasticity "
+        f"{made.moved['elasticity', 'hold'].mean:.0f} % from a press that is released and "
+        f"{made.moved['elasticity', 'press'].mean:.0f} % from one that is not.",
+    )
+
+
+def _listed(named: Mapping[str, float], unit: str) -> str:
+    return ", ".join(f"{name} {value:.0f} {unit}" for name, value in named.items())
+
+
+DEFAULT = IdentifiabilityConfig()
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    presses=dataclasses.replace(DEFAULT.presses, objects=40, image_px=56),
+    grids=(24,),
+    coarsest_used=24,
+    usual_grid=24,
+    exact_grid=48,
+    noise=(1.0, 4.0),
+    motions=SceneConfig(objects=12, sequences=4 * 84, frames=20, image_px=28, contact_grid=24),
+    moments=6,
+    probe=ProbeConfig(iterations=20),
+    batch=20,
+)
+
+EXPERIMENT = Experiment(name="identifiability", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -1,0 +1,295 @@
+"""Ways to find the traction of a contact with friction: the package's tiers, and what they are measured against.
+
+A solver maps one contact, the spectra of its gel and a number (tolerance or iterations) to the traction [N, N], MPa,
+x + iy; one of sequences maps a motion likewise to tractions [F, N, N] and to the displacement that the markers show.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from experiments.mechanics.tangential_scenes import Bench, Case, Motion
+from sensors_io.scenes import contact, drag, partial_slip, tangential
+from sensors_io.scenes.traction import Compliance, displacement, in_series, rigid_field, shear_displacement
+
+Solver = Callable[[Case, Bench, Array], Any]
+SequenceSolver = Callable[[Motion, Bench, Array], tuple[Array, Any]]
+FrameSolver = Callable[[Array, Array, Compliance, Array], tuple[Array, Any]]
+"""μp, target, compliance and the traction before → the traction, and what else is to be kept."""
+
+MOST_ITERATIONS = 400
+EXACT_TOLERANCE, EXACT_ITERATIONS = 1e-8, 4000
+_TINY = 1e-30
+_SHORTEST = 1e-12  # MPa; below it a traction has no direction
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """A solver at one setting; `kind` groups the chart, `label` is its mark there."""
+
+    kind: str
+    label: str = ""
+    solve: Callable[[Any, Bench, Array], Any]
+    setting: float | int = 0.0
+
+    @property
+    def name(self) -> str:
+        """Name in the tables."""
+        return f"{self.kind} {self.label}".strip()
+
+
+@functools.partial(jax.jit, static_argnames="solve")
+def every(solve: Solver, cases: Case, bench: Bench, setting: Array) -> Any:
+    """What a solver finds of S contacts, one after the other, so that each stops on its own."""
+    return jax.lax.map(lambda case: solve(case, bench, setting), cases)
+
+
+@functools.partial(jax.jit, static_argnames="solve")
+def sequence(solve: SequenceSolver, motion: Motion, bench: Bench, setting: Array) -> tuple[Array, Any]:
+    """Tractions [F, N, N] of a sequence, and what its markers show."""
+    return solve(motion, bench, setting)
+
+
+def exact(task: str, cases: Case, bench: Bench) -> np.ndarray:
+    """Tractions [S, N, N] of a task of `TASKS` in float64, whose duality gap of 1e-8 proves them, whatever found them.
+
+    Raises:
+      RuntimeError: a gap that stays wider.
+    """
+    with jax.enable_x64(True):
+        found = every(_SOLVED[task], _double(cases), _double(bench), jnp.asarray(EXACT_TOLERANCE))
+        return _proven(found.traction_mpa, found.residual)
+
+
+def exact_sequence(motion: Motion, bench: Bench) -> np.ndarray:
+    """The same of all frames of a sequence."""
+    with jax.enable_x64(True):
+        found, (_, gap) = sequence(_tight_frames, _double(motion), _double(bench), jnp.asarray(EXACT_TOLERANCE))
+        return _proven(found, gap)
+
+
+@jax.jit
+def marker_motion(tractions: Array, bench: Bench) -> Array:
+    """Displacement along the gel at the depth of its markers by tractions [S, N, N], mm."""
+    return jax.lax.map(lambda each: shear_displacement(each, bench.markers.shear), tractions)
+
+
+def spg_pull(case: Case, bench: Bench, tolerance: Array) -> Array:
+    """A prescribed force by the package's solver."""
+    return _solved_pull(case, bench, tolerance).traction_mpa
+
+
+def spg_slide(case: Case, bench: Bench, tolerance: Array) -> Array:
+    """A prescribed slide by the package's solver."""
+    return _solved_slide(case, bench, tolerance).traction_mpa
+
+
+def spg_twist(case: Case, bench: Bench, tolerance: Array) -> Array:
+    """A prescribed twist by the package's solver."""
+    return _solved_twist(case, bench, tolerance).traction_mpa
+
+
+def superposed_pull(case: Case, bench: Bench, tolerance: Array) -> Array:
+    """Ciavarella and Jäger's superposition, the smaller contact solved to a tolerance."""
+    force = case.ramp_n[-1] * (1 - case.pull_share)
+    body = bench.normal_body / case.modulus_mpa
+    stuck = contact.solve(case.gap_mm, force, bench.normal_gel, body, bench.spacing_mm, tolerance).pressure_mpa
+    return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
+
+
+def ramp_pull(case: Case, bench: Bench, _: Array) -> Array:
+    """The same, the smaller contact read off the press that went before."""
+    stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, case.ramp_n[-1] * (1 - case.pull_share))
+    return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
+
+
+def ramp_slide(case: Case, bench: Bench, _: Array) -> Array:
+    """The same for a prescribed slide, whose force the press tells."""
+    slides = partial_slip.core_slide(case.ramp_mpa, _series(case, bench), case.direction)
+    left = partial_slip.stuck_force(case.ramp_n, slides, case.ramp_n[-1], case.friction, case.slide_mm)
+    stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, left)
+    return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
+
+
+def scaled_pull(case: Case, bench: Bench, _: Array) -> Array:
+    """Traction in proportion to the pressure."""
+    return case.pull_share * case.limit_mpa * case.direction
+
+
+def full_slip(case: Case, bench: Bench, _: Array) -> Array:
+    """A slide that slips everywhere: μp."""
+    return case.limit_mpa * case.direction
+
+
+def full_twist(case: Case, bench: Bench, _: Array) -> Array:
+    """A twist that slips everywhere."""
+    target = _twist(case, bench)
+    return case.limit_mpa * target / jnp.maximum(jnp.abs(target), _TINY)
+
+
+def plain_slide(case: Case, bench: Bench, iterations: Array) -> Array:
+    """A prescribed slide by the plain solver."""
+    return plain_spg(case.limit_mpa, _slide(case, bench), _series(case, bench), iterations)
+
+
+def plain_twist(case: Case, bench: Bench, iterations: Array) -> Array:
+    """A prescribed twist by the plain solver."""
+    return plain_spg(case.limit_mpa, _twist(case, bench), _series(case, bench), iterations)
+
+
+def plain_spg(limit: Array, target: Array, compliance: Compliance, iterations: Array) -> Array:
+    """Spectral projected gradients by real components, from 0, a fixed number of iterations, without safeguards."""
+    tensor, points = _tensor(compliance), compliance.even.shape[-1]
+    first_step = 1 / tensor[0, 0, 0, tensor.shape[-1] // 8]
+    goal = jnp.stack([target.real, target.imag])
+    inside = limit > 0
+
+    def nearest(t: Array) -> Array:
+        return t * jnp.minimum(1, limit / jnp.maximum(jnp.hypot(t[0], t[1]), _SHORTEST))
+
+    def slope(t: Array) -> Array:
+        spectrum = jnp.fft.rfft2(t, s=(points, points))
+        moved = jnp.fft.irfft2(tensor[0] * spectrum[0] + tensor[1] * spectrum[1], s=(points, points))
+        return moved[:, : t.shape[1], : t.shape[2]] - goal
+
+    def iterate(i: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        t, g, new = state
+        after = slope(new)
+        s, y = new - t, jnp.where(inside, after - g, 0)
+        curvature = jnp.sum(s * y)
+        long = jnp.sum(s * s) / jnp.maximum(curvature, _TINY)
+        short = curvature / jnp.maximum(jnp.sum(y * y), _TINY)
+        step = jnp.where(curvature > 0, jnp.where(i % 2 == 0, long, short), first_step)
+        return new, after, nearest(new - step * after)
+
+    still = jnp.zeros_like(goal)
+    start = slope(still)
+    x, y = jax.lax.fori_loop(0, iterations, iterate, (still, start, nearest(-first_step * start)))[2]
+    return jax.lax.complex(x, y)
+
+
+def spg_frames(motion: Motion, bench: Bench, tolerance: Array) -> tuple[Array, Any]:
+    """A sequence as the generator makes it."""
+    bodies = drag.Bodies(compliance=_series(motion, bench), coupling=None, response=bench.markers)
+
+    def go_on(history: drag.History, frame: tuple[Array, drag.Step]) -> tuple[drag.History, tuple[Array, Array]]:
+        pressure, step = frame
+        history, seen = drag.advance(
+            history, pressure, motion.friction, step, bodies, bench.x_mm, tolerance, MOST_ITERATIONS
+        )
+        return history, (seen.traction_mpa, seen.displacement_mm)
+
+    start = drag.at_rest(bench.x_mm.shape[0])
+    found: tuple[Array, Array] = jax.lax.scan(go_on, start, (motion.pressure_mpa, motion.step))[1]
+    return found
+
+
+def plain_frames(motion: Motion, bench: Bench, iterations: Array) -> tuple[Array, Any]:
+    """A sequence by the plain solver, which begins every frame anew."""
+    return _frames(motion, bench, lambda limit, target, c, _: (plain_spg(limit, target, c, iterations), None))
+
+
+def full_slip_frames(motion: Motion, bench: Bench, _: Array) -> tuple[Array, Any]:
+    """A sequence that slips everywhere against the motion of each frame."""
+
+    def one(frame: tuple[Array, drag.Step]) -> tuple[Array, Any]:
+        pressure, step = frame
+        moved = rigid_field(bench.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
+        found = motion.friction * pressure * moved / jnp.maximum(jnp.abs(moved), _TINY)
+        return found, displacement(pressure, found, bench.markers)
+
+    tractions: tuple[Array, Any] = jax.lax.map(one, (motion.pressure_mpa, motion.step))
+    return tractions
+
+
+def _tight_frames(motion: Motion, bench: Bench, tolerance: Array) -> tuple[Array, Any]:
+    def solve(limit: Array, target: Array, compliance: Compliance, before: Array) -> tuple[Array, Array]:
+        solved = tangential.solve(limit, target, compliance, before, tolerance, EXACT_ITERATIONS)
+        return solved.traction_mpa, solved.residual
+
+    return _frames(motion, bench, solve)
+
+
+def _frames(motion: Motion, bench: Bench, solve: FrameSolver) -> tuple[Array, Any]:
+    """What sticks carries its displacement on: every frame's target is what was carried and the motion since."""
+    compliance = _series(motion, bench)
+
+    def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.Step]) -> tuple[tuple[Array, Array], Any]:
+        (before, carried), (pressure, step) = state, frame
+        target = carried + rigid_field(bench.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
+        found, more = solve(motion.friction * pressure, target, compliance, before)
+        seen = displacement(pressure, found, bench.markers)
+        return (found, shear_displacement(found, compliance)), (found, (seen, more))
+
+    rest = jax.lax.complex(*[jnp.zeros_like(motion.pressure_mpa[0])] * 2)
+    found: tuple[Array, Any] = jax.lax.scan(go_on, (rest, rest), (motion.pressure_mpa, motion.step))[1]
+    return found
+
+
+def _solved_pull(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
+    pull = case.pull_share * case.direction * jnp.sum(case.limit_mpa) * bench.spacing_mm**2
+    force, still = jnp.stack([pull.real, pull.imag]), jnp.zeros_like(case.limit_mpa * case.direction)
+    compliance, cap = _series(case, bench), _cap(tolerance)
+    return tangential.solve_force(case.limit_mpa, force, still, compliance, bench.spacing_mm, tolerance, cap)
+
+
+def _solved_slide(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
+    target, compliance = _slide(case, bench), _series(case, bench)
+    return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
+
+
+def _solved_twist(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
+    target, compliance = _twist(case, bench), _series(case, bench)
+    return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
+
+
+def _cap(tolerance: Array) -> Array:
+    """More iterations for the tolerance of the reference."""
+    return jnp.where(tolerance <= EXACT_TOLERANCE, EXACT_ITERATIONS, MOST_ITERATIONS)
+
+
+def _series(of: Case | Motion, bench: Bench) -> Compliance:
+    return in_series(bench.gel, bench.body, 1.0, of.modulus_mpa)
+
+
+def _slide(case: Case, bench: Bench) -> Array:
+    return jnp.broadcast_to(case.slide_mm * case.direction, case.gap_mm.shape)
+
+
+def _twist(case: Case, bench: Bench) -> Array:
+    still = jnp.zeros_like(bench.x_mm, shape=(2,))
+    return rigid_field(bench.x_mm, still, case.twist_rad, still)
+
+
+def _tensor(compliance: Compliance) -> Array:
+    """The compliance of real components on a half plane, [2, 2, M, K]."""
+    half = compliance.even.shape[-1] // 2 + 1
+    even, odd = compliance.even[:, :half], compliance.odd[:, :half]
+    return jnp.stack([jnp.stack([even + odd.real, odd.imag]), jnp.stack([odd.imag, even - odd.real])])
+
+
+def _double(tree: Any) -> Any:
+    """The same numbers in double precision."""
+    wide = {np.dtype(np.float32): np.float64, np.dtype(np.complex64): np.complex128}
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), wide[np.asarray(leaf).dtype]), tree)
+
+
+def _proven(tractions: Array, gap: Array) -> np.ndarray:
+    worst = float(jnp.max(gap))
+    if not worst < EXACT_TOLERANCE:
+        raise RuntimeError(
+            f"duality gap of the float64 reference is {worst:.1e}: must be < {EXACT_TOLERANCE:.0e}; "
+            "raise EXACT_ITERATIONS"
+        )
+    return np.asarray(tractions)
+
+
+_SOLVED = {"force": _solved_pull, "slide": _solved_slide, "twist": _solved_twist}
+TASKS = tuple(_SOLVED)
+"""What is prescribed."""

@@ -1,0 +1,1 @@
+"""The paper's tables, ladders and ablations, and released weights."""

@@ -1,0 +1,28 @@
+"""Does the cross-sensor consistency reward make answers more consistent, or only the slots that it reads?
+
+    make experiment EXP=ablation_consistency [ARGS="--scale smoke"]
+
+Arms of GRPO from one SFT checkpoint per seed and the same questions, with the published ordinal and format rewards:
+without the consistency term, with the published one, and with the one that counts only where the answer is right.
+
+Cost: about 25 minutes on two cores with five seeds; `--scale smoke` under two.
+
+Expected: the published term can be met by writing one level into every slot (`echo_share` rises, and with it the
+agreement of slots), and it drives the middle level out, since sensors disagree most about middle objects; the gated
+term should raise consistency of conclusions (`csc`) without either.
+"""
+
+from experiments.study.ablation import Ablation, ablation_experiment
+from experiments.study.scores import PUBLISHED
+
+ABLATION = Ablation(
+    arms={
+        "none": {"accuracy": 0.9, "format": 0.1},
+        "published": PUBLISHED,
+        "gated": {"accuracy": 0.6, "consistency_gated": 0.3, "format": 0.1},
+    },
+    pairs=(("published", "none"), ("gated", "none"), ("gated", "published")),
+    curves=("reward", "accuracy", "middle_rate", "echo_share", "mode_share", "entropy", "parse_rate"),
+)
+
+EXPERIMENT = ablation_experiment("ablation_consistency", ABLATION)

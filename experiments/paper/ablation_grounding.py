@@ -1,0 +1,34 @@
+"""Does the tactile grounding term make answers depend on touch, and at which strength does it stop helping?
+
+    make experiment EXP=ablation_grounding [ARGS="--scale smoke"]
+
+Arms of GRPO from one SFT checkpoint per seed, the published reward, the same questions: no grounding, the published
+term at γ = .01, four times that with gradient through both branches, and the bounded form (masked branch held fixed,
+1 nat a token at most) at the same .04.
+
+Cost: about 35 minutes on two cores with five seeds; `--scale smoke` under two.
+
+Expected: PAPO (arXiv 2507.06448), where the term comes from, reports that .04 collapses; so `strong` should show a
+growing `grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
+"""
+
+from experiments.study.ablation import Ablation, ablation_experiment
+from experiments.study.scores import PUBLISHED
+from touchr1_jax.rl.config import Paper
+
+STRONG = 0.04
+"""The γ at which PAPO collapses without a cap."""
+
+ABLATION = Ablation(
+    arms=dict.fromkeys(("none", "paper", "strong", "strong_bounded"), PUBLISHED),
+    algorithms={
+        "none": Paper(gamma=0.0),
+        "paper": Paper(),
+        "strong": Paper(gamma=STRONG),
+        "strong_bounded": Paper(gamma=STRONG, grounding_stop_masked=True, grounding_cap_nat=1.0),
+    },
+    pairs=(("paper", "none"), ("strong", "none"), ("strong_bounded", "strong")),
+    curves=("reward", "accuracy", "grounding", "grounding_peak", "entropy", "kl", "parse_rate"),
+)
+
+EXPERIMENT = ablation_experiment("ablation_grounding", ABLATION)

@@ -1,0 +1,31 @@
+"""Does paying for answers that controls without touch do not reach make the policy use touch?
+
+    make experiment EXP=ablation_tactile_use [ARGS="--scale smoke"]
+
+Arms of GRPO from one SFT checkpoint per seed, the published reward, the same questions: no such reward, the abstract's
+literal bonus, added to the reward before normalisation, and the recommended one, added to the advantage after it.  Each
+question is also sampled with the touch dropped, with noise, and with another object's touch.
+
+Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
+
+Expected: where a group has rewards of two values, right and wrong, the literal bonus cancels by σ
+(`bonus_cancelled_share` against `bonus_telling_share`), the recommended one does not; the curves `touch_score` and
+`control_*` should part further under `recommended` than under `none`.
+"""
+
+from experiments.study.ablation import Ablation, ablation_experiment
+from experiments.study.scores import PUBLISHED
+from touchr1_jax.rl.config import Paper, TactileUse
+
+ABLATION = Ablation(
+    arms=dict.fromkeys(("none", "literal", "recommended"), PUBLISHED),
+    algorithms={
+        "none": Paper(),
+        "literal": Paper(tactile_use=TactileUse.LITERAL),
+        "recommended": Paper(tactile_use=TactileUse.RECOMMENDED, tactile_margin=0.13),
+    },
+    pairs=(("literal", "none"), ("recommended", "none"), ("recommended", "literal")),
+    curves=("reward", "accuracy", "touch_score", "control_drop", "control_noise", "control_order", "entropy"),
+)
+
+EXPERIMENT = ablation_experiment("ablation_tactile_use", ABLATION)

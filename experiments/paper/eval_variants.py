@@ -1,0 +1,115 @@
+"""Further ways to ask the policies of a study: under the controls of touch, before any training, without SFT, and
+through a linear probe on what the encoder makes of touch."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.paper.baselines import Known, probed
+from experiments.paper.features import Seen, other_objects
+from experiments.study import stages
+from experiments.study.answers import Evaluated, evaluate_policy
+from experiments.study.assembly import Weights
+from experiments.study.baselines import level_answers
+from experiments.study.reinforcement import Asked, make_arm, run_grpo
+from experiments.study.stages import encode_contacts, noise_bank
+from experiments.study.study import Trained, Way
+from touchr1_jax.bench.grounding import CONTROLS
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rl.config import AnyAlgorithm
+from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
+
+
+def under_controls(policy: str) -> dict[str, Way]:
+    """A policy asked without its touch, and with something else in its place: "POLICY under CONTROL" → way."""
+    return {
+        control_name(policy, control): Way(of=policy, ask=functools.partial(_controlled, control))
+        for control in CONTROLS
+    }
+
+
+def control_name(policy: str, control: str) -> str:
+    """Name of the answers of a policy under a control."""
+    return f"{policy}-under-{control}"
+
+
+def untrained(trained: Trained) -> Evaluated:
+    """The policy as it is before SFT."""
+    params = stages.untrained(trained.assembly, trained.data, trained.seed)
+    test = encode_contacts(trained.assembly, params, trained.data, trained.data.parts["test"], trained.context)
+    return evaluate_policy(trained.assembly, params, test, trained.label, trained.context)
+
+
+def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> Evaluated:
+    """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
+    assembly, data, config = trained.assembly, trained.data, trained.config
+    params = stages.untrained(assembly, data, trained.seed)
+    encode = functools.partial(encode_contacts, assembly, params, data, context=trained.context)
+    grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
+    arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
+    noise = noise_bank(assembly.agent, params, data, seed=trained.seed)
+    asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
+    stage = f"grpo/no_sft/{trained.seed}"
+    tuned = run_grpo(assembly, arm, asked, params, trained.context, seed=trained.seed, stage=stage)
+    return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)
+
+
+def by_encoder(strange: bool, trained: Trained) -> Evaluated:
+    """Levels by a probe on the encoded touch, its mean over the tokens of each stream.
+
+    Args:
+      strange: every contact, training ones too, has the touch of another object.
+      trained: whose encoder it is.
+    """
+    data = trained.data
+    rows = np.concatenate([data.parts["sft"], data.parts["grpo"]])
+    known = pooled(encode_contacts(trained.assembly, trained.params, data, rows, trained.context))
+    asked = pooled(trained.test)
+    if strange:
+        known = known.strangers(data.object_ids[rows], trained.seed)
+        asked = asked.strangers(data.object_ids[data.parts["test"]], trained.seed)
+    known_as = Known(seen=known, label=data.label[rows])
+    levels = probed(known_as, asked, trained.assembly.levels, trained.config.probe)
+    return level_answers(trained.assembly, trained.said, levels.together, levels.alone)
+
+
+def pooled(features: Features) -> Seen:
+    """Mean over the tokens of each stream."""
+    there = (np.asarray(features.touch_time) >= 0) & np.asarray(features.stream_mask)[..., None]
+    total = (np.asarray(features.touch) * there[..., None]).sum(-2)
+    x = total / np.maximum(there.sum(-1), 1)[..., None]
+    return Seen(x=x.astype(np.float32), present=there.any(-1))
+
+
+def swap_objects(features: Features, objects: np.ndarray, seed: int) -> Features:
+    """Every contact with the touch of a contact of another object; streams that only one of the two has are dropped.
+
+    Args:
+      features: those of n contacts.
+      objects: [n], the object of each.
+      seed: of the draw.
+    """
+    other = other_objects(objects, seed)
+    return dataclasses.replace(
+        features,
+        touch=features.touch[other],
+        touch_time=features.touch_time[other],
+        stream_mask=features.stream_mask & features.stream_mask[other],
+    )
+
+
+def _controlled(control: str, trained: Trained) -> Evaluated:
+    test, key = jax.tree.map(jnp.asarray, trained.test), jax.random.key(trained.seed)
+    objects = trained.data.object_ids[trained.data.parts["test"]]
+    change: Mapping[str, Callable[[], Features]] = {
+        "drop": lambda: drop_touch(test).features,
+        "shuffle": lambda: shuffle_touch(test, key).features,
+        "noise": lambda: noise_touch(test, trained.noise, key).features,
+        "swapped": lambda: swap_objects(trained.test, objects, trained.seed),
+    }
+    changed = jax.device_get(change[control]())
+    return evaluate_policy(trained.assembly, trained.params, changed, trained.label, trained.context, alone=False)

@@ -1,0 +1,134 @@
+"""The scales of the bench's studies, in one place: two cores, `smoke`, one accelerator, the paper's sizes.
+
+    SCALES = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}, refused on a machine that lacks what `NEEDS` says
+
+`gpu` is sized for one accelerator of 80 GB and an hour or two of training a seed.  `paper` has the sizes that Touch-R1
+(arXiv 2605.27154) names: 1,000 objects and 14,700 sequences by four sensors, 8 frames of 448², a decoder of
+Qwen2.5-VL 7B's shape, groups of 8, 240,000 questions for SFT and 120,000 for GRPO, three seeds where the paper has one.
+
+Departures of `paper`: towers and decoder start from drawn parameters, since a study loads no released weights, and so
+learning rates are ten times the paper's; answers have the fixed form of `touchr1_jax.text` and 20 tokens; batch sizes
+are ours, the paper gives none.  Neither scale has been run: no machine of that kind was at hand.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+from experiments.bench import paper_numbers as paper
+from experiments.bench.draw import Quota
+from experiments.core.machine import Machine
+from experiments.study.assembly import ModelConfig
+from experiments.study.stages import SFTConfig
+from experiments.study.study import SMOKE, StudyConfig
+from sensors_io.scenes.config import SceneConfig
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.qwen.config import RELEASED
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.training.optimizer import OptimizerConfig
+
+BENCH = StudyConfig(sft=SFTConfig(steps=1350), blind=SFTConfig(steps=1350, micro_contacts=16))
+"""The default: three times the SFT of `ablation_ordinal`, which still gained on validation objects when it stopped;
+what several studies share may cost more than a main job."""
+
+SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
+"""Questions of the bench at `smoke`; every other scale asks all 4,800."""
+
+NEEDS: Mapping[str, Machine] = {
+    "gpu": Machine(accelerators=1, memory_gib=70.0),
+    "paper": Machine(accelerators=16, memory_gib=130.0),
+}
+"""An H100 or H200; sixteen H200, on which `scale_paper` counts 47 to 53 GB of a step on each."""
+
+
+def _sft(steps: int, contacts: int, lr_scale: float) -> SFTConfig:
+    """SFT by whole batches: micro-batches are for a processor's cache."""
+    optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale)
+    return SFTConfig(steps=steps, batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
+
+
+def _grpo(prompts: int, micro_prompts: int, lr_scale: float) -> GRPOConfig:
+    return dataclasses.replace(
+        GRPOConfig.paper(),
+        prompts=prompts,
+        micro_prompts=micro_prompts,
+        lr_scale=lr_scale,
+        bfloat16=True,
+        remat=True,
+    )
+
+
+GPU_MODEL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=384, num_layers=8, num_heads=6, mlp_ratio=4),
+    vision=VisionConfig(image_px=224, width=384, num_layers=6, num_heads=6, mlp_ratio=4),
+    decoder=DecoderConfig(
+        vocab_size=0,
+        hidden_size=768,
+        num_layers=12,
+        num_heads=12,
+        num_kv_heads=4,
+        head_dim=64,
+        intermediate_size=3072,
+        mrope_section=(8, 12, 12),
+    ),
+    frames=8,
+    image_px=224,
+)
+"""135 million parameters."""
+
+
+def _resized(width: int, layers: int) -> ModelConfig:
+    """`GPU_MODEL` with other widths and depths of the tactile encoder and the decoder; heads keep their size."""
+    decoder, tactile = GPU_MODEL.decoder, GPU_MODEL.tactile
+    return dataclasses.replace(
+        GPU_MODEL,
+        tactile=dataclasses.replace(tactile, width=width // 2, num_heads=width // 128, num_layers=layers),
+        decoder=dataclasses.replace(
+            decoder,
+            hidden_size=width,
+            num_heads=width // decoder.head_dim,
+            intermediate_size=4 * width,
+            num_layers=layers,
+        ),
+    )
+
+
+GPU_SMALL, GPU_LARGE = _resized(512, 10), _resized(1024, 16)
+"""Less and more than `GPU_MODEL`, about as 3 and 14 billion are to 7."""
+
+GPU = StudyConfig(
+    scenes=SceneConfig(objects=10_000, sites=1, image_px=224, view_px=224),
+    clip_memory_gib=40.0,
+    read_threads=12,
+    model=GPU_MODEL,
+    sft=_sft(4_000, 64, 30.0),
+    blind=_sft(4_000, 64, 30.0),
+    grpo=_grpo(64, 32, 50.0),
+    grpo_steps=2_000,
+)
+
+PAPER_MODEL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=1280, num_layers=32, num_heads=16, mlp_ratio=4),
+    vision=VisionConfig(image_px=448, width=1280, num_layers=32, num_heads=16, mlp_ratio=4),
+    decoder=dataclasses.replace(RELEASED["7B"], vocab_size=0),
+    frames=int(paper.HYPERPARAMETERS["frames of a sequence"]),
+    image_px=int(paper.HYPERPARAMETERS["picture side"]),
+)
+
+PAPER_CONTACTS, PAPER_PROMPTS = 128, 128
+"""Contacts of a batch of SFT, with two questions each, and prompts of a step of GRPO: ours."""
+
+PAPER = StudyConfig(
+    seeds=3,
+    scenes=SceneConfig(objects=paper.OBJECTS, sequences=paper.SEQUENCES, image_px=448, view_px=448),
+    clip_memory_gib=0.0,
+    read_threads=12,
+    model=PAPER_MODEL,
+    sft=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),
+    blind=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),
+    grpo=_grpo(PAPER_PROMPTS, 16, 10.0),
+    grpo_steps=paper.RL_QA // PAPER_PROMPTS,
+)
+
+SCALES: Mapping[str, StudyConfig] = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}

@@ -1,0 +1,145 @@
+"""A policy on released weights: what it feels, how it is asked, and where its parameters come from."""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.study.assembly import Assembly, TouchConfig, language_of
+from touchr1_jax.models.layers import SizeError, check_sizes
+from touchr1_jax.models.load import Checkpoint
+from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_agent, qwen_policy
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.text.chat_layout import build_chat_layout
+from touchr1_jax.text.language import Language
+from touchr1_jax.text.parser import compile_parser
+from touchr1_jax.text.template import answer_text
+from touchr1_jax.text.tokenizer import Tokenizer
+from touchr1_jax.types import Params, TouchBatch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReleasedModel(TouchConfig):
+    """What is felt and seen beside released towers, and in which type these are held."""
+
+    tactile: TactileViTConfig = TactileViTConfig(
+        sensors=0, width=384, num_layers=8, num_heads=6, mlp_ratio=4, tokens_per_step=4
+    )
+    frames: int = 8
+    image_px: int = 224
+    completion_tokens: int = 96
+    view_px: int = 224
+    """Rows and columns of the object's picture; the released vision tower makes a token of 28² pixels."""
+    dtype: Literal["bfloat16", "float32"] = "bfloat16"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_sizes(self, "view_px")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ReleasedAssembly(Assembly):
+    """An assembly whose vision tower and decoder are a checkpoint's."""
+
+    checkpoint: Checkpoint
+
+    @property
+    def frozen(self) -> tuple[str, ...]:
+        """The released towers."""
+        return ("vision", "decoder")
+
+    def init(self, seed: int, batch: TouchBatch) -> Params:
+        """The released towers as they are, and beside them a fresh tactile encoder."""
+        agent, layout = self.agent, self.layout
+        key = jax.random.key(seed)
+        prompt = layout.ids[0], layout.mask[0], agent.slots
+        return init_on_pretrained(agent.policy, key, batch, *prompt, self.checkpoint.params)
+
+
+def instruction(language: Language) -> str:
+    """What the system says: the form of an answer and the words for every level, such as
+
+    Answer about the touch as <perceive> SENSOR LEVEL … </perceive> <compare> LEVEL </compare> …
+    """
+    perceive, compare, conclude = language.tags
+    levels = "; ".join(f"{a.name}: {', '.join(level[0] for level in a.levels)}" for a in language.attributes)
+    return (
+        f"Answer about the touch as <{perceive}> SENSOR LEVEL ... </{perceive}> <{compare}> LEVEL </{compare}> "
+        f"<{conclude}> LEVEL </{conclude}>. Levels are {levels}."
+    )
+
+
+def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[str, ...]) -> ReleasedAssembly:
+    """Put a checkpoint, prompts in its chat template and a tactile encoder together for a set of sensors.
+
+    Raises:
+      SizeError: completions that are too short for an answer.
+      ValueError: a sensor that the language does not know.
+    """
+    language = language_of(sensors)
+    need = longest_answer(language, found.tokenizer)
+    if model.completion_tokens < need:
+        raise SizeError(
+            f"model.completion_tokens is {model.completion_tokens}: the longest answer takes {need} tokens of this "
+            "tokenizer; raise it, and grpo.length with it"
+        )
+    tactile = dataclasses.replace(model.tactile, sensors=len(sensors))
+    policy = qwen_policy(found.config, tactile, (model.view_px, model.view_px), found.budget)
+    view = policy.config.vision
+    assert isinstance(view, QwenViewConfig)
+    layout = build_chat_layout(
+        found.tokenizer,
+        language,
+        tactile_tokens=model.stream_tokens,
+        view_tokens=view.tokens,
+        system=instruction(language),
+    )
+    return ReleasedAssembly(
+        model=model,
+        language=language,
+        tokenizer=found.tokenizer,
+        layout=layout,
+        agent=qwen_agent(policy, layout, found.tokenizer, jnp.dtype(model.dtype)),
+        parser=compile_parser(language, found.tokenizer),
+        checkpoint=found,
+    )
+
+
+def prove_released(assembly: ReleasedAssembly, batch: TouchBatch) -> None:
+    """Build the parameters in shapes alone, so that sizes which contradict each other show before data are made.
+
+    Args:
+      assembly: the policy.
+      batch: shapes of a batch.
+
+    Raises:
+      SizeError: they do.
+    """
+    try:
+        jax.eval_shape(functools.partial(assembly.init, 0), batch)
+    except (ValueError, TypeError) as error:
+        raise SizeError(f"no policy can be built of these sizes: {error}") from error
+
+
+def longest_answer(language: Language, tokenizer: Tokenizer) -> int:
+    """Tokens of the longest answer to a question for one attribute, with the one that ends it."""
+    return max(len(tokenizer.encode(text)) + 1 for text in plain_answers(language))
+
+
+def plain_answers(language: Language) -> Iterator[str]:
+    """For each level of each attribute the answer that gives it in every slot, felt by all sensors."""
+    sensors, attributes = len(language.sensors), len(language.attributes)
+    for a, attribute in enumerate(language.attributes):
+        for level in range(len(attribute.levels)):
+            yield answer_text(
+                language,
+                asked=np.arange(attributes) == a,
+                streams=np.ones(sensors, bool),
+                perceive=np.full((sensors, attributes), level),
+                compare=np.full(attributes, level),
+                conclude=np.full(attributes, level),
+            )

@@ -1,0 +1,366 @@
+"""What does the paper's training make of released Qwen2.5-VL weights, and what is touch worth to the policy?
+
+    make experiment EXP=touch_r1 ARGS="--weights DIR"
+    make experiment EXP=touch_r1 ARGS="--weights DIR --data records --data-dir RECORDS"
+    make experiment EXP=touch_r1 ARGS="--scale small|smoke"
+
+DIR holds a released Qwen2.5-VL: config, tokenizer, chat template, picture settings and safetensors (see
+`python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own stands beside its towers, which stand still: SFT
+trains the encoder and adapters in the decoder on verified answers, GRPO with the published rewards and the
+counterfactual KL trains new adapters over that, and each stage merges its own.  Scored on unseen objects beside the
+model as it was released, which sees the picture and no touch, the same training without touch, and constants; asked
+again under each control of touch.  The policy is written to `weights/SEED` of the run, readable by whatever reads the
+release, with its tactile encoder beside it, and asked from there: what is scored is what was written, adapters rounded
+into weights of the released type, which keeps less of a change the smaller it is; how much is in the report.
+
+`--scale smoke` makes a tiny checkpoint of the released format itself where none is given: it tries the code, and its
+figures say nothing.  Over its drawn embeddings, which stand still, no decoder can give a right token a chance of more
+than 0.8 %: answers parse where they are greedy, and GRPO samples noise.  `--scale small` first teaches such a
+checkpoint to write answers, without touch or pictures, and trains on it what a user without weights can watch learning.
+
+Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
+Several devices: `--distributed --mesh.fsdp N` as in every study, with `--grpo.micro-prompts` a multiple of N; each
+process reads the whole weights first.
+
+Cost: not measured, for neither such weights nor such a machine were at hand; sized for the 3B or 7B on one H200, of
+which GRPO holds 28 or 52 GB by the count that every run makes ahead.  `--scale smoke` under two minutes; `--scale
+small` 24 of one core, of which scenes and teaching take 4 each.
+
+Expected: the released model without touch near the constant, and much above it after SFT; from GRPO what the paper's
+ladder has (`ablation_cumulative`), of which small policies show only a part.  At `small` the loss of SFT stands still
+for 500 steps before it falls; of ordinal questions about unseen objects 60 % are then answered right, 61 % after GRPO,
+26 % by the checkpoint that writes and never felt, 36 % after the same training without touch, 34 % by a constant.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.core.context import Context
+from experiments.core.findings import Requirement
+from experiments.core.progress import in_megabytes
+from experiments.core.results import Comparison, Estimate, Results
+from experiments.core.runner import Experiment
+from experiments.paper.conflict_metrics import Use, asked_of, touch_use
+from experiments.paper.conflict_tables import use_table
+from experiments.paper.eval_variants import control_name, under_controls
+from experiments.paper.outcome import CURVES
+from experiments.paper.released_gain import kept_shares, kept_table, least_kept
+from experiments.paper.released_memory import counted, memory_table, shape_of
+from experiments.paper.released_policy import (
+    ReleasedAssembly,
+    ReleasedModel,
+    assemble_released,
+    instruction,
+    prove_released,
+)
+from experiments.paper.released_resume import require_same
+from experiments.paper.released_teaching import TeachingConfig, teach
+from experiments.paper.released_variants import written, zero_shot
+from experiments.paper.tiny_checkpoint import SMALLEST, write_tiny
+from experiments.study.assembly import prove_rewards, touch_shapes
+from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.study.examples import rollout_examples
+from experiments.study.levels import level_report
+from experiments.study.pretrained import load_encoder
+from experiments.study.scores import PUBLISHED, score, score_study, study_settings
+from experiments.study.stages import SFTConfig
+from experiments.study.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
+from experiments.study.training import TrainingConfig, open_data, starting_model
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import ATTRIBUTES, SENSORS
+from touchr1_jax.bench.grounding import CONTROLS
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.load import WeightsError, load_checkpoint
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.optimizer import OptimizerConfig
+
+ARM, ZERO, WRITTEN = "touch_r1", "zero_shot", "written"
+
+DRAWN = "These are drawn weights of a tiny model: the code was tried, and no figure here says anything."
+
+TAUGHT = (
+    "These are weights of a tiny model that was taught to write answers, without touch or pictures, before anything "
+    "else: the figures say that this training learns to feel, and nothing about a released model."
+)
+
+COMPARED = ("acc", "omae", "csc", "mat_acc")
+
+GRPO = dataclasses.replace(
+    GRPOConfig.paper(), prompts=16, micro_prompts=2, length=96, lr_scale=10.0, bfloat16=True, remat=True
+)
+"""At ten times the paper's learning rate, which is for whole weights."""
+
+
+def adapted_sft(
+    steps: int, *, micro_contacts: int, batch_size: int = 32, lora_rank: int = 16, lr_scale: float = 10.0
+) -> SFTConfig:
+    """SFT by adapters, by default at ten times the paper's learning rate, which is for whole weights."""
+    return SFTConfig(
+        steps=steps,
+        batch_size=batch_size,
+        micro_contacts=micro_contacts,
+        lora_rank=lora_rank,
+        remat=True,
+        optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale),
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchR1Config(TrainingConfig):
+    """The weights, and how they are trained; the defaults are for one H200.
+
+    Raises:
+      ValueError: nothing to train, or two precisions.
+    """
+
+    weights: Path | None = None
+    """Folder of a released Qwen2.5-VL."""
+    tiny: bool = False
+    """Make a tiny checkpoint of that format where no weights are given, to try the code."""
+    tiny_decoder: DecoderConfig = SMALLEST
+    """Shape of its decoder."""
+    teaching: TeachingConfig = TeachingConfig()
+    """How it is taught to write before anything else."""
+    seeds: int = 1
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1, image_px=224, view_px=224)
+    clip_memory_gib: float = 8.0
+    read_threads: int = 8
+    noise_contacts: int = 16
+    model: ReleasedModel = ReleasedModel()
+    sft: SFTConfig = adapted_sft(1_500, micro_contacts=4)
+    blind: SFTConfig = adapted_sft(1_500, micro_contacts=16)
+    grpo: GRPOConfig = GRPO
+    grpo_steps: int = 1_000
+    grpo_lora_rank: int = 16
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for field, rank in {
+            "sft.lora_rank": self.sft.lora_rank,
+            "blind.lora_rank": self.blind.lora_rank,
+            "grpo_lora_rank": self.grpo_lora_rank,
+        }.items():
+            if not rank:
+                raise ValueError(f"{field} is 0: must be at least 1, released towers stand still; raise it")
+        if self.grpo.bfloat16 != (self.model.dtype == "bfloat16"):
+            raise ValueError(
+                f"grpo.bfloat16 is {self.grpo.bfloat16}: must be {not self.grpo.bfloat16} for weights in "
+                f"{self.model.dtype}; set both alike"
+            )
+
+
+def run(config: TouchR1Config, context: Context) -> Results:
+    """Load, train, score, write."""
+    arms = {ARM: PUBLISHED}
+    prove_rewards(arms)
+    source = released_folder(config, context)
+    ways = {
+        ZERO: Way(of=SFT, ask=zero_shot),
+        WRITTEN: Way(of=ARM, ask=functools.partial(written, source)),
+        **under_controls(ARM),
+    }
+    check_ways(ways, arms)
+    assembly, start = begin(config, source, context)
+    memory = counted(config, assembly, start.data, context.devices.shape)
+    context.say(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
+    study = train_study(config, start, arms, context, ways=ways)
+    scored = score_study(study)
+    zero = [score(study, said) for said in study.further[ZERO]]
+    baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
+    pictures, tables = level_report(study)
+    use, kept = touch_worth(study), kept_shares(ARM, config.seeds, context)
+    return Results(
+        arms=scored.arms,
+        baselines=baselines,
+        settings=settings(config, source),
+        comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
+        verdict=verdict(config, {**scored.arms, **baselines}, use),
+        requirements=(differing(study), least_kept(kept)),
+        tables=(use_table({(ARM, "all"): use}), kept_table(kept), memory_table(memory), *tables),
+        pictures=pictures,
+        data=study.data.summary(),
+        curves=CURVES,
+        examples=rollout_examples(study, ARM, PUBLISHED, {c: study.further[control_name(ARM, c)][0] for c in CONTROLS}),
+    )
+
+
+def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[ReleasedAssembly, Start]:
+    """The policy and its data; weights and sizes are looked at before data are made.
+
+    Raises:
+      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `shape_of`.
+    """
+    model = config.model
+    with context.told("reading weights, MB") as tell:
+        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(tell))
+    require_same(source, context)
+    ahead = assemble_released(model, found, SENSORS)
+    prove_released(ahead, touch_shapes(model, model.view_px, SENSORS))
+    shape_of(config, ahead, context.devices.shape)
+    if config.encoder is not None:
+        load_encoder(config.encoder)  # what is no encoder is named before data are made
+    data = open_data(config, model.view_px, context)
+    model, tactile = starting_model(model, config.encoder, data.clip.sensors)
+    assembly = assemble_released(model, found, data.clip.sensors)
+    return assembly, Start(data=data, assembly=assembly, tactile=tactile)
+
+
+def released_folder(config: TouchR1Config, context: Context) -> Path:
+    """The weights to begin from, made where a trial has none.
+
+    Raises:
+      WeightsError: there are none.
+    """
+    if config.weights is not None:
+        return config.weights
+    if not config.tiny:
+        raise WeightsError(
+            "weights is None: must be the folder of a released Qwen2.5-VL (config, tokenizer, chat template, picture "
+            "settings, safetensors); say --weights DIR, or --scale smoke to try the code on a tiny one"
+        )
+    made = context.directory / "tiny"
+    if not context.done("tiny"):
+        context.team.once(lambda: make_tiny(made, config, context))
+        context.save_stage("tiny", {})
+    return made
+
+
+def make_tiny(made: Path, config: TouchR1Config, context: Context) -> None:
+    """Write the tiny checkpoint of a trial, and teach it to write where that is wanted."""
+    write_tiny(made, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE), decoder=config.tiny_decoder)
+    teach(made, config.teaching, context)
+
+
+def estimates(seeds: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> dict[str, Estimate]:
+    """Those of answers that were got in another way."""
+    return {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
+
+
+def settings(config: TouchR1Config, source: Path) -> dict[str, str | float]:
+    """Those of a study, the weights and the adapters."""
+    return {
+        **study_settings(config),
+        "weights": f"{source.name}, {config.model.dtype}",
+        "adapters": f"rank {config.sft.lora_rank} in SFT, {config.grpo_lora_rank} in GRPO",
+    }
+
+
+def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.ndarray, seeds: int) -> list[Comparison]:
+    """Each step of training and what it is held against, over objects, and over seeds where there are two."""
+    found = []
+    for a, b in ((ARM, SFT), (SFT, ZERO), (SFT, BLIND), (SFT, "constant")):
+        for metric in COMPARED:
+            if metric not in rows[a][0] or metric not in rows[b][0]:
+                continue
+            ours, theirs = ([seed[metric] for seed in rows[name]] for name in (a, b))
+            theirs = theirs * (len(ours) // len(theirs))
+            found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
+            if seeds > 1:
+                found.append(compare_over_seeds(metric, a, b, estimate(ours, objects), estimate(theirs, objects)))
+    return found
+
+
+def touch_worth(study: Study) -> Use | None:
+    """What the policy's answers lose under each control; `None` with fewer than two objects."""
+    test = study.data.parts["test"]
+    said = study.answers[ARM][0]
+    asked = asked_of(said, study.data.object_ids[test], study.data.visual_lies[test], ATTRIBUTES)
+    mask = asked.label >= 0
+    if len(np.unique(asked.objects[mask & asked.ordinal])) < 2:
+        return None
+    controls = {c: study.further[control_name(ARM, c)] for c in CONTROLS}
+    return touch_use(asked, study.answers[ARM], controls, study.assembly.ordered[asked.attribute], mask)
+
+
+def differing(study: Study) -> Requirement:
+    """Answers that the written folder gives and the trained policy does not."""
+    pairs = zip(study.answers[ARM], study.further[WRITTEN], strict=True)
+    count = sum(int((a.tokens != b.tokens).any(-1).sum()) for a, b in pairs)
+    name, note = "answers of the written weights that differ", f"of {len(study.answers[ARM][0].tokens)} a seed"
+    return Requirement(name=name, measured=count, bound=0, better="lower", note=note)
+
+
+def verdict(config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], use: Use | None) -> tuple[str, ...]:
+    """How often each stage is right, and what touch is worth."""
+    acc = lambda name: rows[name]["acc"].mean
+    said = [
+        f"Of ordinal questions about unseen objects the model answers {acc(ZERO):.1f} % right as it was released and "
+        f"without touch, {acc(SFT):.1f} % after SFT, {acc(ARM):.1f} % after GRPO; trained without touch "
+        f"{acc(BLIND):.1f} %, a constant {acc('constant'):.1f} %."
+    ]
+    if use is not None:
+        gain = use.least.gain
+        said.append(
+            f"Touch is worth {gain.mean:.1f} points [{gain.low:.1f}, {gain.high:.1f}] at least, over "
+            f"{use.least.control}."
+        )
+    if config.weights is None:
+        said.insert(0, TAUGHT if config.teaching.steps else DRAWN)
+    return tuple(said)
+
+
+DEFAULT = TouchR1Config()
+
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    tiny=True,
+    scenes=SceneConfig(objects=30, sites=1, image_px=56, view_px=32),
+    read_threads=2,
+    clip_memory_gib=0.0,
+    model=ReleasedModel(
+        tactile=TactileViTConfig(sensors=0, width=32, num_layers=1, num_heads=2, stem_width=4),
+        frames=4,
+        image_px=56,
+        completion_tokens=48,
+        view_px=32,
+    ),
+    sft=adapted_sft(8, batch_size=4, micro_contacts=2, lora_rank=4),
+    blind=adapted_sft(8, batch_size=4, micro_contacts=4, lora_rank=4),
+    grpo=dataclasses.replace(GRPO, prompts=2, group=4, micro_prompts=1, length=48),
+    grpo_steps=4,
+    grpo_lora_rank=4,
+)
+
+SMALL = dataclasses.replace(
+    DEFAULT,
+    tiny=True,
+    tiny_decoder=dataclasses.replace(
+        SMALLEST,
+        hidden_size=96,
+        num_layers=2,
+        num_heads=3,
+        num_kv_heads=1,
+        head_dim=32,
+        intermediate_size=192,
+        mrope_section=(4, 6, 6),
+    ),
+    teaching=TeachingConfig(steps=500),
+    scenes=SceneConfig(objects=900, sites=1),
+    read_threads=1,
+    clip_memory_gib=1.5,
+    model=ReleasedModel(tactile=TactileViTConfig(sensors=0), frames=4, image_px=112, completion_tokens=36, view_px=32),
+    sft=adapted_sft(1_000, batch_size=16, micro_contacts=2, lr_scale=100.0),
+    blind=adapted_sft(1_000, batch_size=16, micro_contacts=16, lr_scale=100.0),
+    grpo=dataclasses.replace(GRPO, prompts=8, micro_prompts=4, length=36, lr_scale=200.0),
+    grpo_steps=150,
+)
+"""Decoder and encoder of the size of the studies' policies; SFT's rate and length were chosen on validation objects,
+those of GRPO are not tuned."""
+
+EXPERIMENT = Experiment(
+    name="touch_r1",
+    config=DEFAULT,
+    scales={"smoke": SMOKE, "small": SMALL},
+    run=run,
+    curves=CURVES,
+    quick=("smoke",),
+    spreads=True,
+)

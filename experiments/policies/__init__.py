@@ -1,1 +1,0 @@
-"""Training and scoring of policies: data, feeds, stages, baselines, one study."""

@@ -1,1 +1,0 @@
-"""Released Qwen2.5-VL weights as the policy of a study: loaded, trained by adapters, written back."""

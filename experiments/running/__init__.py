@@ -1,1 +1,0 @@
-"""Running an experiment: the command line, its runs on disk, progress."""

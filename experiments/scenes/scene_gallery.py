@@ -1,0 +1,249 @@
+"""What do generated objects and touches look like?
+
+    python -m experiments scene_gallery
+
+Draws sheets of pictures: views of objects by material, honest and lying; presses over force by every sensor; every
+exploratory motion over time; objects that vary over their surface; and the ranges of the five properties by material,
+with a table of what the material alone tells of each.
+
+Cost: under two minutes on two cores.
+
+Expected: the pictures are to be looked at; a material alone tells a level right in half of the objects.
+"""
+
+import dataclasses
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.core.charts import PALETTE
+from experiments.core.context import Context
+from experiments.core.findings import Cell, Column, Findings, Picture, Table
+from experiments.core.runner import Experiment
+from experiments.scenes.sheets import depth_picture, field_picture, picture_rows, strips
+from sensors_io.scenes import appearance, objects, properties, surface
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.protocol import contact_key, make_contact
+from sensors_io.schema import MATERIALS, SENSORS, Sequence
+
+VIEW_PX = 96
+UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity": "share", "friction": ""}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GalleryConfig:
+    """What to draw.
+
+    Args:
+      views: objects per material, the last two of which lie.
+      presses: objects that are pressed.
+      columns: frames per row of a touch.
+      varied: objects of two parts, and as many graded ones.
+      image_px: side of the sensors' pictures.
+      protocol: small enough to be planned at once, with every motion in it.
+      seed: of all objects.
+    """
+
+    views: int = 9
+    presses: int = 3
+    columns: int = 8
+    varied: int = 4
+    image_px: int = 112
+    protocol: SceneConfig = SceneConfig(objects=12, sequences=4 * 48, frames=24, contact_grid=48)
+    seed: int = 0
+
+
+def run(config: GalleryConfig, context: Context) -> Findings:
+    """Draw all sheets."""
+    sheets = {
+        "views": lambda: [views(config)],
+        "presses": lambda: presses(config),
+        "motions": lambda: [motions(config)],
+        "varied": lambda: [varied(config)],
+        "properties": lambda: [ranges()],
+    }
+    pictures: list[Picture] = []
+    with context.progress("drawing", len(sheets)) as advance:
+        for name, draw in sheets.items():
+            with context.timed(name):
+                pictures += draw()
+            advance(1)
+    return Findings(
+        verdict=(f"{len(pictures)} sheets, drawn from seed {config.seed}.",),
+        tables=(odds(),),
+        pictures=tuple(pictures),
+        settings={"sensors": ", ".join(SENSORS), "picture": f"{config.image_px} px"},
+    )
+
+
+def views(config: GalleryConfig) -> Picture:
+    """RGB views of objects by true material; the two last columns lie."""
+    rows = {}
+    for material, name in enumerate(MATERIALS):
+        rng = np.random.default_rng([config.seed, material])
+        lies = rng.choice(objects.lie_materials(material), 2)
+        shown = [material] * (config.views - 2) + [int(other) for other in lies]
+        rows[name] = [appearance.view(look, VIEW_PX, rng)[0] for look in shown]
+    return Picture(
+        name="views",
+        title="Views by material",
+        caption="One row per material. The two objects on the right lie: they look like another material.",
+        content=picture_rows(rows, ["honest"] * (config.views - 2) + ["lie"] * 2, cell_inch=0.95),
+        kind="png",
+    )
+
+
+def presses(config: GalleryConfig) -> list[Picture]:
+    """One sheet per object: every sensor over force."""
+    scenes = SceneConfig(
+        objects=config.presses,
+        sites=1,
+        frames=config.columns,
+        image_px=config.image_px,
+        max_force_n=10.0,
+        seed=config.seed,
+    )
+    return [_press_sheet(make_contact(scenes, index), index) for index in range(config.presses)]
+
+
+def motions(config: GalleryConfig) -> Picture:
+    """The first contact of every motion of the protocol, over time, by the marker sensors' fields and one picture."""
+    scenes = dataclasses.replace(config.protocol, image_px=config.image_px, seed=config.seed)
+    first: dict[str, int] = {}
+    for index in range(scenes.contact_count):
+        first.setdefault(contact_key(scenes, index).motion, index)
+    rows = {}
+    for motion, index in sorted(first.items()):
+        by_sensor = {s.sensor: s for s in make_contact(scenes, index)}
+        rows[f"{motion}\ngelsight_mini"] = _frames(by_sensor["gelsight_mini"], config.columns, amplify=True)
+        rows[f"{motion}\ntac3d"] = _frames(by_sensor["tac3d"], config.columns)
+    return Picture(
+        name="motions",
+        title="Motions over time",
+        caption="Each motion by two sensors, from left to right in time: change of the Mini's picture, three times, "
+        "and depth and marker displacement of the Tac3D.",
+        content=picture_rows(rows, cell_inch=0.95),
+        kind="png",
+    )
+
+
+def varied(config: GalleryConfig) -> Picture:
+    """Height maps of objects that change over their surface, with the level of hardness where a press would land."""
+    x = jnp.linspace(-12, 12, 320)
+    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
+    rows = {}
+    for kind, shares in (("two parts", (1.0, 0.0)), ("graded", (0.0, 1.0))):
+        cells = []
+        for i in range(config.varied):
+            solid = objects.sample(np.random.default_rng([config.seed, 7, i]), 0.0, 0.8, *shares)
+            skin = surface.make_skin(solid, np.zeros(2), 0.0)
+            picture = depth_picture(-np.asarray(surface.gap(skin, pose, x)))
+            cells.append(_mark_levels(picture, solid))
+        rows[kind] = cells
+    return Picture(
+        name="varied",
+        title="Objects that vary over their surface",
+        caption="Relief and roughness of 24 mm, bodies flattened; the letters are the hardness (s, m, h) where a press "
+        "would land.",
+        content=picture_rows(rows, cell_inch=1.9),
+        kind="png",
+    )
+
+
+def ranges() -> Picture:
+    """Where 90 % of the objects of each material lie, for every property, with the thresholds of the levels."""
+    panels = {}
+    for name, prop in {**properties.PROPERTIES, **properties.DYNAMIC}.items():
+        spans = {
+            material: tuple(prop.value(mean + prop.spread * z) for z in (-1.645, 0.0, 1.645))
+            for material, mean in zip(MATERIALS, prop.means, strict=True)
+        }
+        panels[f"{name} ({UNITS[name]})" if UNITS[name] else name] = (spans, prop.thresholds)
+    return Picture(
+        name="properties",
+        title="Properties by material",
+        caption="From the 5th to the 95th percentile, dot at the median; lines are the thresholds between the levels. "
+        "Every material reaches every level.",
+        content=strips(panels, PALETTE[0]),
+    )
+
+
+def odds() -> Table:
+    """How often each level comes of a material: what an honest picture tells at best."""
+    every = {**properties.PROPERTIES, **properties.DYNAMIC}
+    chances = {name: 100 * properties.level_odds(prop) for name, prop in every.items()}
+    rows: list[tuple[Cell, ...]] = []
+    for i, material in enumerate(MATERIALS):
+        rows.append((material, *(" · ".join(f"{share:.0f}" for share in found[i]) for found in chances.values())))
+    rows.append(("right by the likeliest level", *(f"{found.max(1).mean():.0f}" for found in chances.values())))
+    return Table(
+        title="Levels by material",
+        columns=(Column(name="material"), *(Column(name=name, unit="%", meaning="levels 0 · 1 · 2") for name in every)),
+        rows=tuple(rows),
+        note="Materials are drawn evenly.  Pictures lie about three objects in ten, so that they tell less.",
+    )
+
+
+def _press_sheet(sequences: list[Sequence], index: int) -> Picture:
+    forces = sequences[0].target_force_n
+    assert forces is not None
+    rows = {s.sensor: _frames(s, len(forces)) for s in sequences}
+    change = {"its change × 3": _frames(sequences[0], len(forces), amplify=True)}
+    dense = {"its fields": _fields(sequences[-1], np.arange(len(forces)))}  # no eye follows its pattern
+    rows = {SENSORS[0]: rows.pop(SENSORS[0])} | change | rows | dense
+    return Picture(
+        name=f"press-{index}",
+        title=f"Object {index} pressed",
+        caption="The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers, as of "
+        "the dense pattern below; dark dots are nodes that were not read.",
+        content=picture_rows(rows, [f"{force:.1f} N" for force in forces]),
+        kind="png",
+    )
+
+
+def _frames(sequence: Sequence, columns: int, amplify: bool = False) -> list[np.ndarray]:
+    """Pictures spread over a sequence, or three times their change since the first; fields where there is no camera."""
+    at = np.linspace(0, len(sequence) - 1, min(columns, len(sequence))).astype(int)
+    if sequence.frames is not None:
+        frames = sequence.frames[at]
+        change = 128 + 3 * (frames.astype(np.float32) - frames[0])
+        return list(np.clip(change, 0, 255).astype(np.uint8) if amplify else frames)
+    return _fields(sequence, at)
+
+
+def _fields(sequence: Sequence, at: np.ndarray) -> list[np.ndarray]:
+    """Depth and displacement of some frames."""
+    assert sequence.depth_mm is not None
+    assert sequence.deformation_mm is not None
+    top = float(sequence.depth_mm.max())
+    return [field_picture(sequence.depth_mm[i], sequence.deformation_mm[i], top) for i in at]
+
+
+def _mark_levels(picture: np.ndarray, solid: objects.Solid) -> np.ndarray:
+    """Writes the level of hardness at nine sites into the picture of 24 mm."""
+    marked = picture.copy()
+    size = picture.shape[0] / 160
+    rim, stroke = max(2, round(4 * size)), max(1, round(size))
+    for x in (-8, 0, 8):
+        for y in (-8, 0, 8):
+            level = solid.at(np.array([x, y])).levels()["hardness"]
+            across, down = ((v / 24 + 0.5) * picture.shape[0] for v in (x, y))
+            at = (round(across - 5 * size), round(down + 5 * size))
+            for colour, width in (((0, 0, 0), rim), ((255, 255, 255), stroke)):  # readable on any relief
+                cv2.putText(marked, "smh"[level], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5 * size, colour, width, cv2.LINE_AA)
+    return marked
+
+
+DEFAULT = GalleryConfig()
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    views=4,
+    presses=1,
+    columns=4,
+    varied=1,
+    image_px=56,
+    protocol=SceneConfig(objects=4, sequences=4 * 24, frames=20, contact_grid=32),
+)
+
+EXPERIMENT = Experiment(name="scene_gallery", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

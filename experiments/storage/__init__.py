@@ -1,1 +1,0 @@
-"""What `pareto_storage` is made of: codecs, the clips that they store, the feed that reads them, charts."""

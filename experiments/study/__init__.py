@@ -1,0 +1,1 @@
+"""Train and score the arms of a study."""

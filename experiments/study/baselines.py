@@ -1,0 +1,85 @@
+"""Answers that need no policy: constants, and a probe that sees the measured forces alone."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.study.answers import Evaluated
+from experiments.study.assembly import Assembly
+from experiments.study.stages import force_only
+from experiments.study.study import SFT, Study
+from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.types import Parsed
+
+ORDINAL = tuple(a for a in ATTRIBUTES if LEVELS[a] == 3)
+
+
+def baselines(study: Study) -> dict[str, Evaluated]:
+    """Answers of every baseline to the questions that the policies were asked."""
+    train = study.data.label[np.concatenate([study.data.parts["sft"], study.data.parts["grpo"]])]
+    n = len(study.test_label)
+    constants = {
+        "constant": study.prior.argmax(-1),
+        "constant_joint": joint_mode(train),
+        "constant_middle": np.array([(LEVELS[a] - 1) // 2 for a in ATTRIBUTES]),
+    }
+    answers = {name: constant_answers(study, np.tile(level, (n, 1))) for name, level in constants.items()}
+    if study.data.has_force:
+        levels = force_only(study.data, study.probed, study.data.parts["test"], study.config.probe)
+        answers["force_only"] = constant_answers(study, levels)
+    return answers
+
+
+def joint_mode(label: np.ndarray) -> np.ndarray:
+    """The most frequent combination of ordinal levels in training, with its most frequent material, int [A]."""
+    ordinal = [ATTRIBUTES.index(a) for a in ORDINAL]
+    known = label[(label[:, ordinal] >= 0).all(1)]
+    combinations = itertools.product(*(range(LEVELS[a]) for a in ORDINAL))
+    mode = max(combinations, key=lambda c: int((known[:, ordinal] == c).all(1).sum()))
+    same = known[(known[:, ordinal] == mode).all(1)]
+    material = ATTRIBUTES.index("material")
+    out = np.zeros(len(ATTRIBUTES), int)
+    out[ordinal] = mode
+    out[material] = np.bincount(same[:, material] + 1, minlength=2)[1:].argmax()  # unknown, −1, does not vote
+    return out
+
+
+def constant_answers(study: Study, level: np.ndarray) -> Evaluated:
+    """Well-formatted answers that give contact i the levels `level[i]` [contact, A] in every slot."""
+    return level_answers(study.assembly, study.answers[SFT][0], level)
+
+
+def level_answers(
+    assembly: Assembly, asked: Evaluated, level: np.ndarray, alone: np.ndarray | None = None
+) -> Evaluated:
+    """Well-formatted answers with given levels to the questions that a policy was asked.
+
+    Args:
+      assembly: of the study.
+      asked: answers of any policy; its questions and labels are taken.
+      level: int [contact, A], what `compare` and `conclude` say.
+      alone: int [contact, S, A], what each sensor says in `perceive` and by itself; `level` where it is `None`.
+    """
+    wanted = assembly.layout.asked[asked.attribute]
+    said = np.where(wanted, level[asked.contact], -1).astype(np.int32)
+    n, sensors = asked.streams.shape
+    single = np.repeat(level[:, None], sensors, 1) if alone is None else alone
+    single = np.where(wanted[:, None], single[asked.contact], -1).astype(np.int32)
+    perceive = np.where(asked.streams[:, :, None], single, -1)
+    return Evaluated(
+        contact=asked.contact,
+        attribute=asked.attribute,
+        streams=asked.streams,
+        tokens=np.zeros((n, 0), np.int32),
+        parsed=Parsed(
+            perceive=jnp.asarray(perceive),
+            compare=jnp.asarray(said),
+            conclude=jnp.asarray(said),
+            formatted=jnp.ones(n, bool),
+            truncated=jnp.zeros(n, bool),
+            length=jnp.zeros(n, jnp.int32),
+        ),
+        label=asked.label,
+        alone=single if sensors > 1 else None,
+    )

@@ -1,0 +1,104 @@
+"""The data of an experiment: contacts on disk, split by object into the parts that the stages use."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import grain
+import numpy as np
+
+from experiments.core.errors import DataError
+from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
+from sensors_io.records import RecordStore
+from sensors_io.schema import ATTRIBUTES, LEVELS
+
+PARTS = ("sft", "grpo", "val", "test")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Dataset:
+    """Contacts on disk and what the stages need to know of them.
+
+    `parts` maps each of `PARTS` to contact indices; no object is in two of them.  `label` is int32 [contact, A].
+    Every seed reads the same clips, so `memory` keeps them; `threads` read those of the batches to come.
+    """
+
+    store: RecordStore
+    clip: ClipConfig
+    memory: ClipMemory
+    parts: dict[str, np.ndarray]
+    label: np.ndarray
+    object_ids: np.ndarray
+    visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
+    has_force: bool
+    threads: int = 1
+
+    def batches(self, rows: np.ndarray, **order: Any) -> grain.IterDataset:
+        """Clips of some contacts, as `clip_batches` takes the other arguments, through the memory and the threads."""
+        return clip_batches(self.store, rows, self.clip, memory=self.memory, threads=self.threads, **order)
+
+    def prior(self) -> np.ndarray:
+        """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0.
+
+        An attribute that nobody annotated has equal shares: no question asks for it.
+        """
+        train = self.label[np.concatenate([self.parts["sft"], self.parts["grpo"]])]
+        rows = np.zeros((len(ATTRIBUTES), max(LEVELS.values())), np.float32)
+        for a, name in enumerate(ATTRIBUTES):
+            known = train[train[:, a] >= 0, a]
+            counts = np.bincount(known, minlength=LEVELS[name]) if len(known) else np.ones(LEVELS[name])
+            rows[a, : LEVELS[name]] = counts / counts.sum()
+        return rows
+
+    def summary(self) -> dict[str, Any]:
+        """Counts for the report."""
+        counts = {f"{part}_contacts": len(rows) for part, rows in self.parts.items()}
+        counts |= {f"{part}_objects": len(set(self.object_ids[rows])) for part, rows in self.parts.items()}
+        test = self.parts["test"]
+        return counts | {
+            "source": self.store.meta.source,
+            "sensors": list(self.clip.sensors),
+            "frames_per_clip": self.clip.frames,
+            "image_px": self.clip.image_px,
+            "test_visual_lie_share": float(self.visual_lies[test].mean()),
+        }
+
+
+def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
+
+    Raises:
+      DataError: a part without a contact.
+    """
+    train = store.contacts_of_split("train")
+    ids = np.array([store.contacts[i].object_id for i in train])
+    names = np.unique(ids)
+    held = np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))]
+    kept = np.isin(ids, held)
+    val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
+    parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
+    for name, rows in parts.items():
+        if not len(rows):
+            raise DataError(
+                f"part {name!r} of the data set holds no contact: every part needs one; use more objects, another "
+                f"grpo_share (now {grpo_share}), or splits with objects in train, val and test"
+            )
+    return parts
+
+
+def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: float = 0.0, threads: int = 1) -> Dataset:
+    """Open records and split them; `memory_gib` of their clips stay in memory once so many threads have read them."""
+    store = RecordStore(path)
+    clip = dataclasses.replace(clip, sensors=store.meta.sensors)
+    cards = [store.objects[key.object_id] for key in store.contacts]
+    return Dataset(
+        store=store,
+        clip=clip,
+        memory=ClipMemory(clip, round(memory_gib * 2**30)),
+        parts=split_parts(store, grpo_share),
+        label=np.stack([card.label_row() for card in cards]),
+        object_ids=np.array([card.object_id for card in cards]),
+        visual_lies=np.array([bool(card.visual_lies) for card in cards]),
+        has_force=any(sequence.force_n is not None for sequence in store.contact(0).values()),
+        threads=threads,
+    )

@@ -1,0 +1,87 @@
+"""From the scores of every seed to the estimates and comparisons of the results."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from experiments.core.checks import require
+from experiments.core.results import Comparison, Estimate
+from touchr1_jax.bench import statistics
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.bench.scoring import REPORTED
+
+
+def estimate(per_seed: Sequence[Scores], objects: np.ndarray, *, resamples: int = 2_000, seed: int = 0) -> Estimate:
+    """Mean over seeds, and its object-clustered bootstrap interval: the seeds' values pooled, whole objects resampled.
+
+    Args:
+      per_seed: the scores of every seed on the same N questions.
+      objects: [N], the object of each question.
+    """
+    means = tuple(scores.mean() for scores in per_seed)
+    interval = statistics.clustered_bootstrap(
+        np.concatenate([s.values for s in per_seed]),
+        np.concatenate([objects[s.items] for s in per_seed]),
+        strata=np.concatenate([s.strata for s in per_seed]),
+        resamples=resamples,
+        seed=seed,
+    )
+    return Estimate(mean=float(np.mean(means)), ci95=(interval.low, interval.high), per_seed=means)
+
+
+def compare_over_seeds(metric: str, arm: str, against: str, a: Estimate, b: Estimate) -> Comparison:
+    """`arm` minus `against`, paired by seed: Student t interval, sign-flip p-value, probability of improvement.
+
+    The last is `None` for a metric that has no better direction.
+    """
+    counts = len(a.per_seed), len(b.per_seed)
+    require(counts[0] == counts[1], f"{arm} and {against}", counts, "must have the same seeds", "run the missing ones")
+    difference = np.subtract(a.per_seed, b.per_seed)
+    interval = statistics.student_interval(difference)
+    better = REPORTED[metric].better
+    columns = [np.asarray(side.per_seed)[:, None] * (-1.0 if better == "lower" else 1.0) for side in (a, b)]
+    return Comparison(
+        metric=metric,
+        arm=arm,
+        against=against,
+        difference=interval.mean,
+        ci95=(interval.low, interval.high),
+        over="seeds",
+        n=len(difference),
+        p_value=statistics.sign_flip_test(difference),
+        improvement=None if better == "none" else statistics.probability_of_improvement(*columns),
+    )
+
+
+def compare_over_objects(
+    metric: str,
+    arm: str,
+    against: str,
+    a: Sequence[Scores],
+    b: Sequence[Scores],
+    objects: np.ndarray,
+    *,
+    resamples: int = 2_000,
+    seed: int = 0,
+) -> Comparison:
+    """`arm` minus `against`, paired by question and seed: object-clustered bootstrap interval.
+
+    Args:
+      a, b: the scores of every seed on the same N questions; a baseline without seeds is repeated by the caller.
+      objects: [N], the object of each question.
+    """
+    for x, y in zip(a, b, strict=True):
+        same = np.array_equal(x.items, y.items) and np.array_equal(x.strata, y.strata)
+        require(same, metric, f"{arm} and {against}", "must be scored on the same answers", "align the questions")
+    paired = [dataclasses.replace(x, values=x.values - y.values) for x, y in zip(a, b, strict=True)]
+    difference = estimate(paired, objects, resamples=resamples, seed=seed)
+    return Comparison(
+        metric=metric,
+        arm=arm,
+        against=against,
+        difference=difference.mean,
+        ci95=difference.ci95,
+        over="objects",
+        n=len(np.unique(objects[a[0].items])),
+    )

@@ -1,0 +1,145 @@
+"""What every training of a policy depends on, whichever model it is: data, stages, seeds."""
+
+import dataclasses
+from pathlib import Path
+from typing import TypeVar
+
+from experiments.core.context import Context
+from experiments.study.assembly import TouchConfig
+from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.pretrained import load_encoder
+from experiments.study.sources import Source, SourceConfig, prepare_records
+from experiments.study.stages import SFTConfig
+from sensors_io.importers.physiclear import PhysiclearConfig
+from sensors_io.pipeline import ClipConfig
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import Flag
+from touchr1_jax.limits import at_least
+from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.types import Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """Data, what is felt of them, SFT and GRPO."""
+
+    seeds: int = 5
+    """Training seeds, paired between arms."""
+    data: Source = "generated"
+    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
+    data_dir: Path | None = None
+    """Folder of the videos or records."""
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1)
+    physiclear: PhysiclearConfig = PhysiclearConfig()
+    grpo_share: float = 0.35
+    """Share of the training objects that SFT never sees."""
+    clip_memory_gib: float = 1.5
+    """Clips that stay in memory once they were read; all of a study's default."""
+    read_threads: int = 1
+    """Threads that read clips ahead; on two cores a second one would only take time from the step."""
+    noise_contacts: int = 64
+    """Contacts whose pixels and forces give noise its statistics; they are in memory at once."""
+    model: TouchConfig = TouchConfig()
+    encoder: Path | None = None
+    """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
+    probe: ProbeConfig = ProbeConfig()
+    sft: SFTConfig = SFTConfig()
+    blind: SFTConfig = SFTConfig(micro_contacts=16)
+    """Without touch there is no encoder, and micro-batches would only cost."""
+    grpo: GRPOConfig = GRPOConfig.paper()
+    grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
+    """What GRPO asks about; the arms may differ in how they pay for it."""
+    grpo_steps: int = 900
+    grpo_save_every: int = 200
+    grpo_lora_rank: int = 0
+    """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
+    grpo_lora_alpha: float = 32.0
+    """The adapters' change is multiplied by grpo_lora_alpha / grpo_lora_rank."""
+
+    @property
+    def grpo_loop(self) -> LoopConfig:
+        """Steps of GRPO and when they are saved."""
+        return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
+
+    @property
+    def grpo_lora(self) -> LoraConfig | None:
+        """Adapters that GRPO trains, or none."""
+        return LoraConfig(rank=self.grpo_lora_rank, alpha=self.grpo_lora_alpha) if self.grpo_lora_rank else None
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank")
+        if not 0 < self.grpo_share < 1:
+            raise ValueError(
+                f"grpo_share is {self.grpo_share}: must lie between 0 and 1: SFT and GRPO both need objects; change it"
+            )
+        if self.grpo.group < 2:
+            raise ValueError(
+                f"grpo.group is {self.grpo.group}: must be at least 2: a rollout is held against its group; raise it"
+            )
+        self.source()
+        known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
+        unknown = sorted(set(self.grpo_attributes) - set(known))
+        if unknown or not self.grpo_attributes:
+            raise ValueError(
+                f"grpo_attributes is {self.grpo_attributes}: must be some of {', '.join(known)}; correct it"
+            )
+        self.check_told("tactile.sensors", self.model.tactile.sensors)
+        if self.grpo.length != self.model.completion_tokens:
+            raise ValueError(
+                f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
+                "the length that SFT teaches; set both"
+            )
+
+    def source(self) -> SourceConfig:
+        """Where its data come from.
+
+        Raises:
+          ValueError: recordings or records without a folder, or a folder for generated scenes.
+        """
+        return SourceConfig(kind=self.data, directory=self.data_dir, scenes=self.scenes, physiclear=self.physiclear)
+
+    @staticmethod
+    def check_told(field: str, value: int) -> None:
+        """Refuse a number of the model that something else tells.
+
+        Raises:
+          ValueError: it is not 0.
+        """
+        if value:
+            raise ValueError(f"model.{field} is {value}: must be 0, the data and the language tell it; leave it out")
+
+
+def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset:
+    """Records of the configured source, with clips of the model's size.
+
+    Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
+
+    Args:
+      config: source and sizes.
+      view_px: rows and columns of the object's picture.
+      context: the run.
+    """
+    path = prepare_records(config.source(), context)
+    clip = ClipConfig(
+        frames=config.model.frames,
+        image_px=config.model.image_px,
+        view_px=view_px,
+        rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
+    )
+    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib, config.read_threads)
+
+
+M = TypeVar("M", bound=TouchConfig)
+
+
+def starting_model(model: M, encoder: Path | None, sensors: tuple[str, ...]) -> tuple[M, Params | None]:
+    """The sizes to train and the tactile encoder to start from, if one is given: then its shape is the encoder's."""
+    if encoder is None:
+        return model, None
+    pretrained = load_encoder(encoder).for_sensors(sensors)
+    return dataclasses.replace(model, tactile=pretrained.config), pretrained.params

@@ -1,1 +1,0 @@
-"""Of the tangential experiment: scenes, methods, checks, charts."""

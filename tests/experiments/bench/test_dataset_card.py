@@ -1,0 +1,106 @@
+"""The data card on the command line, shrunk, and its commands on the same records."""
+
+import dataclasses
+
+import pytest
+
+from experiments.bench import dataset_card
+from experiments.bench.__main__ import main
+from experiments.bench.draw import Quota
+from experiments.core.artifacts import read_json
+from sensors_io.records import RecordStore
+from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.bench.items import KINDS, read_items
+from touchr1_jax.bench.json_lines import read_lines, write_lines
+
+NONE = dict.fromkeys(KINDS, 0)
+QUOTA = Quota(**NONE | {"identify": 12, "scale": 6, "compose": 4, "compare": 4, "one_sensor": 16})
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory, records):
+    config = dataclasses.replace(dataset_card.SMOKE, data="records", data_dir=records, quota=QUOTA)
+    return run_shrunk(dataset_card, config, tmp_path_factory.mktemp("runs"))
+
+
+def test_everything_is_reported(directory):
+    results = read_json(directory / "results.json")
+    assert all(r["met"] for r in results["requirements"])
+    titles = [table["title"] for table in results["tables"]]
+    assert titles == ["Questions", "Answers", "Rules", "What one number tells", "Objects of the bench", "One of each"]
+    assert {row[0]: row[2] for row in results["tables"][0]["rows"]} == {
+        kind: count for kind, count in dataclasses.asdict(QUOTA).items() if count
+    }
+    assert (directory / "plots" / "answers.svg").exists()
+
+
+def test_its_items_are_of_test_objects_alone(directory, records):
+    objects = RecordStore(records).objects
+    items = read_items(directory / "items.jsonl")
+    assert len(items) == QUOTA.total
+    assert {objects[t.object].split for item in items for t in item.ask.touches} == {"test"}
+
+
+def quotas() -> list[str]:
+    return [
+        part
+        for kind, count in dataclasses.asdict(QUOTA).items()
+        for part in (f"--{kind.replace('_', '-')}", str(count))
+    ]
+
+
+def test_the_command_makes_the_same_bench(directory, records, tmp_path):
+    assert main(["generate", str(records), "--out", str(tmp_path / "items.jsonl"), *quotas()]) == 0
+    assert (tmp_path / "items.jsonl").read_bytes() == (directory / "items.jsonl").read_bytes()
+
+
+def test_another_author_by_command(directory, records, tmp_path):
+    requests, answers, out = (tmp_path / name for name in ("requests.jsonl", "answers.jsonl", "items.jsonl"))
+    assert main(["propose", str(records), "--out", str(requests), *quotas()]) == 0
+    words = {tree["id"]: tree["answer"] for _, tree in read_lines(requests)}
+    trees = [item.to_json() for item in read_items(directory / "items.jsonl")]
+    write_lines(
+        answers,
+        (
+            {"answer": words[t["id"]]} | {name: t[name] for name in ("id", "question", "rationale", "evidence")}
+            for t in trees
+        ),
+    )
+    assert main(["accept", str(records), str(answers), "--out", str(out), *quotas()]) == 0
+    assert out.read_bytes() == (directory / "items.jsonl").read_bytes()
+    assert read_lines(out.with_suffix(".rejected.jsonl")) == []
+
+
+def test_anybody_is_scored(directory, tmp_path, capsys):
+    items = read_items(directory / "items.jsonl")
+    write_lines(tmp_path / "said.jsonl", ({"id": i.ask.id, "text": i.rationale} for i in items[:-1]))
+    assert main(["score", str(directory / "items.jsonl"), str(tmp_path / "said.jsonl")]) == 0
+    shown = capsys.readouterr().out
+    assert f"parsed {100 * (len(items) - 1) / len(items):.1f} %" in shown
+    assert "no average without" in shown
+    write_lines(tmp_path / "said.jsonl", [{"id": "nobody", "text": "?"}])
+    assert main(["score", str(directory / "items.jsonl"), str(tmp_path / "said.jsonl")]) == 1
+    assert "line 1: id is 'nobody'" in capsys.readouterr().err
+
+
+def test_a_sample_is_drawn_by_command(directory, records, tmp_path):
+    sheet = tmp_path / "sheet.csv"
+    assert main(["audit-sheet", str(directory / "items.jsonl"), str(records), "--out", str(sheet), "--count", "5"]) == 0
+    assert len(sheet.read_text().splitlines()) == 6
+    assert len(read_json(sheet.with_suffix(".key.json"))) == 5
+
+
+def test_a_card_that_fails_writes_nothing(records, tmp_path, capsys):
+    few = [
+        "--identify",
+        "1",
+        *[p for kind in KINDS if kind != "identify" for p in (f"--{kind.replace('_', '-')}", "0")],
+    ]
+    assert main(["generate", str(records), "--out", str(tmp_path / "items.jsonl"), *few]) == 1
+    assert "objects never shown" in capsys.readouterr().err
+    assert not (tmp_path / "items.jsonl").exists()
+
+
+def test_a_known_error_is_one_line(tmp_path, capsys):
+    assert main(["generate", str(tmp_path), "--out", str(tmp_path / "items.jsonl")]) == 1
+    assert "MissingIndexError" in capsys.readouterr().err

@@ -1,0 +1,186 @@
+"""Logging, stages, timing and progress of a run."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from experiments.core import progress
+from experiments.core.artifacts import DamagedFileError
+from experiments.core.context import Context, MetricLog, read_metrics
+
+
+@pytest.fixture
+def context(tmp_path):
+    made = Context(tmp_path, tmp_path / "cache", Console(file=io.StringIO()))
+    yield made
+    made.close()
+
+
+def log_steps(path, stage, steps):
+    log = MetricLog(path)
+    for step in steps:
+        log.append(stage, step, {"loss": 1 / (1 + step)})
+    log.close()
+
+
+def test_an_interrupted_log_equals_an_uninterrupted_one(tmp_path):
+    whole, broken = tmp_path / "whole.jsonl", tmp_path / "broken.jsonl"
+    log_steps(whole, "sft/0", range(10))
+    log_steps(broken, "sft/0", range(8))
+    with broken.open("a") as file:
+        file.write('{"stage": "sft/0", "step": 8, "lo')  # torn by a crash
+    log_steps(broken, "sft/0", range(5, 10))
+    assert broken.read_bytes() == whole.read_bytes()
+
+
+def test_rewinding_one_stage_leaves_the_others(context):
+    for step in range(3):
+        context.log("sft/0", step, loss=1.0)
+    context.log("sft/1", 5, loss=2.0)
+    context.rewind("sft/0", 1)
+    assert [(row["stage"], row["step"]) for row in read_metrics(context.directory)] == [("sft/0", 0), ("sft/1", 5)]
+
+
+def test_several_lines_of_one_step_are_kept(context):
+    context.log("sft/0", 0, loss=1.0)
+    context.log("sft/0", 0, accuracy=np.float32(0.5))
+    assert read_metrics(context.directory)[1] == {"stage": "sft/0", "step": 0, "accuracy": 0.5}
+
+
+def test_a_diverged_scalar_is_named(context):
+    with pytest.raises(ValueError, match=r"grpo/paid/0 step 7\.kl is nan"):
+        context.log("grpo/paid/0", 7, kl=float("nan"))
+    with pytest.raises(ValueError, match="step"):
+        context._log.append("sft/0", 0, {"step": 1})
+
+
+@pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
+def test_a_stage_name_is_a_safe_path(context, stage):
+    with pytest.raises(ValueError, match="stage is"):
+        context.checkpoint_dir(stage)
+
+
+def test_a_stage_is_done_once_it_is_saved(context):
+    assert not context.done("sft/0")
+    with pytest.raises(FileNotFoundError, match="sft/0"):
+        context.load_stage("sft/0")
+    context.save_stage("sft/0", {"answers": np.arange(3)})
+    assert context.done("sft/0")
+    assert context.load_stage("sft/0") == {"answers": [0, 1, 2]}
+
+
+def test_timing_adds_up_and_survives_an_error(context):
+    with context.timed("sft/0"):
+        pass
+    first = context.timing()["sft/0"]
+    with pytest.raises(KeyError), context.timed("sft/0"):
+        raise KeyError
+    assert context.timing()["sft/0"] >= first
+
+
+def test_the_time_of_a_run_counts_what_came_before_an_interruption(context):
+    assert 0 < context.elapsed_s < 60
+    context.add_time("total", 1000.0)
+    assert 1000 < context.elapsed_s < 1060
+
+
+def test_progress_writes_plain_lines_where_there_is_no_terminal(context, monkeypatch):
+    monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
+    with context.progress("sft [0]", 4, completed=2) as advance:
+        advance(1, "loss 0.5")
+        advance()
+    first, last = context.console.file.getvalue().splitlines()
+    assert first.startswith("sft [0]: 3/4")
+    assert " left" in first
+    assert first.endswith("loss 0.5")
+    assert last.startswith("sft [0]: 4/4")
+    assert " left" not in last
+
+
+def test_the_first_step_bounds_the_time_left_and_later_ones_tell_it(monkeypatch):
+    """The first compiled for 60 s; those after it take 2 s each."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    loop = progress.Loop("sft", 11)
+    assert (loop.left_s, loop.left) == (None, "")
+    now = 60.0
+    loop.advance(1)
+    assert (loop.left_s, loop.left) == (600.0, "at most 10 min 0 s")
+    now = 62.0
+    loop.advance(1)
+    assert (loop.rate, loop.left) == (0.5, "18 s")
+    loop.advance(9)
+    assert loop.left == ""
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    with progress.progress(console, progress.Loop("grpo", 2)) as advance:
+        advance(2, "reward 0.5")
+    assert "2/2" in console.file.getvalue()
+    assert "reward 0.5" in console.file.getvalue()
+
+
+def test_rounds_are_drawn_between_them_alone(tmp_path):
+    """A bar that draws itself ten times a second would take time of what is timed."""
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    context = Context(tmp_path, tmp_path / "cache", console)
+    for _ in context.rounds("timing", 2):
+        before = console.file.getvalue()
+        time.sleep(0.3)
+        assert console.file.getvalue() == before
+    assert "2/2" in console.file.getvalue()
+    context.close()
+
+
+def test_bars_within_a_still_one_are_drawn_with_their_steps_alone(tmp_path):
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    context = Context(tmp_path, tmp_path / "cache", console)
+    for _ in context.each("pieces", "a", still=True):
+        for step in context.each("programs", range(2)):
+            before = console.file.getvalue()
+            assert f"{step}/2" in before
+            time.sleep(0.3)
+            assert console.file.getvalue() == before
+    context.close()
+
+
+def test_a_loop_that_tells_of_itself_is_shown_from_its_first_word(context):
+    with context.told("contacts") as tell:
+        assert not context._loops
+        tell(4, 10)  # an earlier session's
+        (loop,) = context._loops
+        assert (loop.completed, loop.total, loop.rate) == (4, 10, 0.0)
+        tell(7, 10)
+        tell(7, 10)
+        assert loop.completed == 7
+        assert loop.rate > 0
+    assert not context._loops
+    assert "contacts: 7/10" in context.console.file.getvalue()
+
+
+def test_bytes_are_told_in_megabytes_and_end_at_all_of_them():
+    told: list[tuple[int, int]] = []
+    tell = progress.in_megabytes(lambda *word: told.append(word))
+    for done in (0, 1, 2_000_000, 2_500_000):
+        tell(done, 2_500_000)
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])
+def test_a_log_with_a_flipped_byte_is_named(context, flipped):
+    context.log("sft/0", 0, loss=1.0)
+    path = context.directory / "metrics.jsonl"
+    path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
+    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start the run anew with --fresh"):
+        read_metrics(context.directory)
+
+
+def test_items_one_after_the_other_count_when_the_next_is_asked_for(context):
+    seen = [(item, context._loops[0].completed) for item in context.each("panels", "abc")]
+    assert seen == [("a", 0), ("b", 1), ("c", 2)]
+    assert not context._loops
+    assert "panels: 3/3" in context.console.file.getvalue()

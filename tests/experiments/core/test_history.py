@@ -1,0 +1,119 @@
+"""What ran, as `list` shows it, and how a run is named."""
+
+import dataclasses
+import subprocess
+import sys
+
+import pytest
+
+from experiments.core.artifacts import write_json
+from experiments.core.history import aligned, duration, locate, read_run
+from experiments.core.runner import main
+from experiments.core.runs import locked
+
+FAKES = "tests.experiments.fakes"
+COMMAND = "python -m experiments coin --steps 9"
+
+
+def make_run(home, stamp, *, results=None, total=None):
+    """A run directory of the fake experiment."""
+    directory = home / "coin" / stamp
+    description = {
+        "experiment": "coin",
+        "scale": "smoke",
+        "config": {"steps": 9},
+        "git": {"commit": "0123456789", "dirty": True},
+        "versions": {"python": "3.11"},
+        "machine": {"cpus": 2},
+        "command": f"{COMMAND} --fresh",
+    }
+    write_json(directory / "config.json", description)
+    if total is not None:
+        write_json(directory / "timing.json", {"total": total})
+    if results is not None:
+        write_json(directory / "results.json", results)
+    return directory
+
+
+FINISHED = {"verdict": ["It is a coin.", "Really."], "requirements": [{"met": True}, {"met": False}]}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (1170, "19 min 30 s"), (7500, "2 h 5 min")],
+)
+def test_times_are_read_easily(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_the_list_shows_the_newest_run_its_cost_and_its_result(tmp_path, capsys):
+    make_run(tmp_path, "20260101-000000", total=5)
+    make_run(tmp_path, "20260102-000000", results=FINISHED, total=1170)
+    assert main(["list", "--runs-dir", str(tmp_path)], package=FAKES) == 0
+    out = capsys.readouterr().out
+    assert "20260102-000000  smoke, code 0123456+: finished, 19 min 30 s (and 1 more)  1 of 2 requirements met." in out
+    assert "20260101" not in out
+
+
+def test_the_list_of_one_experiment_shows_every_run_and_how_to_go_on(tmp_path, capsys):
+    oldest = make_run(tmp_path, "20260101-000000")
+    make_run(tmp_path, "20260102-000000")
+    make_run(tmp_path, "20260103-000000", results=FINISHED, total=2)
+    with locked(oldest):
+        assert main(["list", "coin", "--runs-dir", str(tmp_path)], package=FAKES) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines if line.strip().startswith("2026")] == [
+        "20260103-000000", "20260102-000000", "20260101-000000",
+    ]  # fmt: skip
+    assert "      Really." in lines
+    assert f"      to go on: {COMMAND}" in lines
+    assert lines[-1].endswith("going on")
+    with locked(oldest):  # looking at it has left it free
+        assert read_run(oldest).state == "going on"
+    assert read_run(oldest).state == "unfinished"
+
+
+def test_an_experiment_without_runs_says_so(tmp_path, capsys):
+    assert main(["list", "coin", "--runs-dir", str(tmp_path)], package=FAKES) == 0
+    assert "has not run under" in capsys.readouterr().out
+    assert main(["list", "coyn", "--runs-dir", str(tmp_path)], package=FAKES) == 2
+    assert "Did you mean coin?" in capsys.readouterr().err
+
+
+def test_a_damaged_run_hides_no_other(tmp_path, capsys):
+    make_run(tmp_path, "20260101-000000", results=FINISHED, total=2)
+    (make_run(tmp_path, "20260102-000000") / "config.json").write_text("{")
+    (make_run(tmp_path, "20260103-000000") / "config.json").write_text('{"model_type": "qwen2_5_vl"}')
+    for arguments in (["list"], ["list", "coin"]):
+        assert main([*arguments, "--runs-dir", str(tmp_path)], package=FAKES) == 0
+        out = capsys.readouterr().out
+        assert "20260101-000000  smoke, code 0123456+: finished, 2 s" in out
+        assert "20260102-000000/config.json is damaged" in out
+        assert "20260103-000000/config.json is not that of a run" in out
+
+
+def test_a_run_of_an_installed_package_shows_its_version(tmp_path):
+    run = read_run(make_run(tmp_path, "20260101-000000"))
+    away = {**run.description, "git": {"commit": "unknown", "dirty": False}, "versions": {"touchr1-jax": "0.1.0"}}
+    assert dataclasses.replace(run, description=away).code == "version 0.1.0"
+
+
+def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
+    directory = make_run(tmp_path, "20260101-000000")
+    (tmp_path / "coin" / "latest").symlink_to(directory.name)
+    for name in (str(directory), "coin/20260101-000000", "coin", str(tmp_path / "coin")):
+        assert locate(name, tmp_path) == directory.resolve()
+    with pytest.raises(FileNotFoundError, match=r"'dice' is no run: must be a directory with config\.json"):
+        locate("dice", tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"holds no config\.json"):
+        read_run(tmp_path)
+
+
+def test_columns_are_aligned():
+    assert aligned([("a", "bb", ""), ("ccc", "d", "e")]) == "a    bb\nccc  d   e"
+
+
+def test_listing_runs_waits_for_nothing_heavy():
+    """JAX, SciPy and charts take seconds to import, of use to runs alone."""
+    source = "import sys, experiments.__main__; sys.exit(bool({'jax', 'scipy', 'matplotlib'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0

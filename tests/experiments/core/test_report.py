@@ -1,0 +1,213 @@
+"""The report is one well-formed page that needs nothing from outside and trusts no text."""
+
+import base64
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments.core import charts
+from experiments.core.artifacts import write_text
+from experiments.core.page import Html, tag
+from experiments.core.report import is_best, write_report
+from experiments.core.report_rollouts import highlighted, rollouts, strip_png
+from experiments.core.results import Comparison, Estimate, Results
+from tests.experiments.fakes import coin
+from touchr1_jax.bench.metrics import METRICS
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+HOSTILE = '<script>alert("x")</script>&"\''
+DESCRIPTION = {
+    "experiment": "coin",
+    "scale": "smoke",
+    "config": {"steps": 3},
+    "git": {"commit": "a" * 40, "dirty": True},
+}
+
+
+class Reader(HTMLParser):
+    """Checks that elements nest, and keeps the text, the elements and what they load."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: set[str] = set()
+        self.loads: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.add(tag)
+        self.loads += [value for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def read(page: str) -> Reader:
+    reader = Reader()
+    reader.feed(page)
+    reader.close()
+    assert not reader.open
+    return reader
+
+
+def row(value: float) -> dict[str, Estimate]:
+    return {m: Estimate(mean=value, ci95=(value - 1, value + 1), per_seed=(value, value)) for m in METRICS}
+
+
+def compared(metric: str, arm: str, against: str, low: float, high: float) -> Comparison:
+    mean = (low + high) / 2
+    return Comparison(
+        metric=metric, arm=arm, against=against, difference=mean, ci95=(low, high), over="seeds", n=2, p_value=0.5
+    )
+
+
+@pytest.fixture
+def results() -> Results:
+    return Results(
+        arms={"paid": row(60.0), "unpaid": row(50.0)},
+        baselines={"blind": row(30.0)},
+        settings={"preset": "paper", "lr_scale": 100.0},
+        comparisons=(compared("acc", "paid", "unpaid", 5, 15), compared("omae", "unpaid", "paid", -15, -5)),
+        verdict=("Being paid helps.",),
+        data={"objects": {"train": 10}},
+        timing={"sft/0": 1.0, "sft/1": 3.0},
+        examples=(coin.example(),),
+    )
+
+
+def write(directory, results, about="Does it?\n\nPerhaps.", description=DESCRIPTION) -> str:
+    lines = [f'{{"stage": "sft/{s}", "step": {t}, "loss": {t + s}}}\n' for s in range(2) for t in range(50)]
+    write_text(directory / "metrics.jsonl", "".join(lines))
+    return write_report(directory, results, about=about, description=description).read_text()
+
+
+def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
+    page = write(tmp_path, results)
+    reader = read(page)
+    assert all(load.startswith("data:image/") for load in reader.loads)
+    assert not re.search(r"https?://|@import|url\(", page)
+    assert not {"script", "link", "iframe"} & reader.seen
+    for text in ("Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss"):
+        assert text in reader.text or text in page
+    for metric in METRICS.values():
+        assert metric.title in reader.text
+        assert metric.meaning in reader.text
+    assert (tmp_path / "plots" / "curves_sft.svg").exists()
+
+
+def test_hostile_text_stays_text(tmp_path, results):
+    example = dataclasses.replace(
+        coin.example(),
+        question=HOSTILE, label=HOSTILE, trace=HOSTILE, object_id=HOSTILE, slots=((0, 4, "perceive"),),
+        reward={HOSTILE: 1.0}, frames={HOSTILE: np.zeros((2, 4, 4, 3), np.uint8)},
+    )  # fmt: skip
+    hostile = dataclasses.replace(
+        results,
+        arms={HOSTILE: row(60.0), "b": row(50.0)},
+        baselines={"c" + HOSTILE: row(1.0)},
+        settings={"preset": HOSTILE, "lr_scale": 1.0},
+        comparisons=(compared("acc", HOSTILE, "b", 1, 2),),
+        verdict=(HOSTILE,),
+        data={HOSTILE: HOSTILE},
+        timing={HOSTILE: 1.0},
+        examples=(example,),
+    )
+    page = write(tmp_path, hostile, about=HOSTILE, description={**DESCRIPTION, "experiment": HOSTILE})
+    reader = read(page)
+    assert "<script" not in page
+    assert "script" not in reader.seen
+    assert reader.text.count(HOSTILE) >= 9
+
+
+def test_an_attribute_cannot_be_left():
+    assert tag("i", "x", title='"><b>') == '<i title="&quot;&gt;&lt;b&gt;">x</i>'
+    assert tag("i", Html("<b></b>"), "<b>") == "<i><b></b>&lt;b&gt;</i>"
+
+
+def test_bold_needs_a_paired_interval_without_zero(results):
+    assert is_best("acc", "paid", results)
+    assert not is_best("acc", "unpaid", results)
+    assert is_best("omae", "unpaid", results)  # lower is better, and the pair may be given either way round
+    assert not is_best("h_acc", "paid", results)  # never compared
+    assert not is_best("middle_rate", "paid", results)  # no direction
+    doubtful = dataclasses.replace(
+        results, comparisons=(*results.comparisons, compared("acc", "paid", "unpaid", -1, 9))
+    )
+    assert not is_best("acc", "paid", doubtful)
+
+
+def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_path):
+    arms = {"a": {"acc": Estimate(mean=1.0, ci95=(0.0, 2.0), per_seed=(1.0,))}}
+    bare = Results(arms=arms, baselines={}, settings={"preset": "paper", "lr_scale": 1.0})
+    path = write_report(tmp_path, bare, about="Why?", description=DESCRIPTION)
+    text = read(path.read_text()).text
+    assert "Training curves" not in text
+    assert "rollouts" not in text
+    assert "middle" not in text
+
+
+def test_the_report_of_the_same_run_is_the_same_file(tmp_path, results):
+    assert write(tmp_path / "a", results) == write(tmp_path / "b", results)
+
+
+def test_slots_are_marked_in_place():
+    assert highlighted("a <b> c", ((2, 5, "compare"),)) == (
+        '<div class="trace">a <mark class="compare">&lt;b&gt;</mark> c</div>'
+    )
+
+
+def test_a_strip_holds_every_frame_in_its_true_colours(tmp_path, results):
+    frames = np.random.default_rng(0).integers(0, 255, (3, 5, 4, 3), dtype=np.uint8)
+    strip = cv2.imdecode(np.frombuffer(strip_png(frames), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert strip.shape == (5, 3 * 6, 3)
+    for f in range(3):
+        np.testing.assert_array_equal(strip[:, 6 * f + 1 : 6 * f + 5], frames[f])
+    embedded = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", write(tmp_path, results))
+    assert base64.b64decode(embedded[1]) == strip_png(coin.example().frames["xense"])
+
+
+def test_curves_are_sorted_by_phase_arm_and_seed():
+    lines = [
+        {"stage": "grpo/paid/1", "step": 1, "reward": 0.5},
+        {"stage": "grpo/paid/1", "step": 0, "reward": 0.25, "note": "text"},
+        {"stage": "sft/0", "step": 0, "loss": 1},
+    ]
+    curves = charts.curves_by_phase(lines)
+    steps, values = curves["grpo"]["reward"]["paid", "1"]
+    assert (steps.tolist(), values.tolist()) == ([0, 1], [0.25, 0.5])
+    assert list(curves["sft"]["loss"]) == [("", "0")]
+    assert "note" not in curves["grpo"]
+
+
+def test_running_mean_keeps_lines_and_short_series():
+    line = np.arange(100.0)
+    assert charts.running_mean(line)[10:90] == pytest.approx(line[10:90])
+    assert charts.running_mean(np.array([1.0, 5.0])).tolist() == [1.0, 5.0]
+    assert charts.running_mean(np.array([2.0])).tolist() == [2.0]
+
+
+def test_another_arm_does_not_recolour_the_others():
+    colour = charts.colours(["a", "b", "c"])
+    assert colour.items() <= charts.colours(["a", "b", "c", "d"]).items()
+    assert len(set(colour.values())) == 3
+
+
+def test_rollouts_of_a_group_fold_away_under_its_heading():
+    example = coin.example()
+    grouped = [dataclasses.replace(example, group=name) for name in (HOSTILE, HOSTILE, "far off")]
+    section = rollouts([*grouped, example], {})
+    assert read(section).text.count("Question ") == 4
+    assert section.count("<details") == 2
+    assert section.count('<details open="open">') == 1
+    assert section.index("far off") > section.rindex("alert(")
+    assert "<script>" not in section
+    assert "<details" not in rollouts([example], {})

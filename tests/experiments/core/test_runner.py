@@ -1,0 +1,211 @@
+"""The command line end to end: finding, overriding, running, continuing, stopping."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.core import runner, runs
+from experiments.core.artifacts import read_json
+from experiments.core.catalogue import find
+from experiments.core.runner import Experiment, main, parse
+from tests.experiments.fakes import coin
+
+FAKES = "tests.experiments.fakes"
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture(autouse=True)
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*arguments: str) -> int:
+    return main(arguments, package=FAKES)
+
+
+def directories() -> list[Path]:
+    return sorted(p for p in Path("runs/coin").iterdir() if not p.is_symlink())
+
+
+def test_list_prints_names_and_questions(capsys):
+    assert run("list") == 0
+    assert "coin  Does a coin that is paid for heads" in capsys.readouterr().out
+
+
+def test_no_name_prints_the_usage(capsys):
+    assert run() == 2
+    assert "usage" in capsys.readouterr().out
+
+
+def test_an_unknown_name_is_answered_with_close_ones(capsys):
+    assert run("coyn") == 2
+    error = capsys.readouterr().err
+    assert "Did you mean coin?" in error
+    assert "experiments:" in error
+
+
+def test_the_modules_of_the_runner_are_no_experiments():
+    assert not {"runner", "report", "context", "results"} & set(find("experiments"))
+    with pytest.raises(ModuleNotFoundError, match="no such package"):
+        find("tests.experiments.nowhere")
+
+
+@pytest.mark.parametrize(
+    ("typo", "right"), [("--stepz", "--steps"), ("--toss.bia", "--toss.bias"), ("--scael", "--scale")]
+)
+def test_a_typo_is_answered_with_the_right_name(capsys, typo, right):
+    with pytest.raises(SystemExit) as stop:
+        run("coin", typo, "3")
+    assert stop.value.code == 2
+    assert right in "".join(capsys.readouterr())
+
+
+def test_an_unknown_scale_is_refused(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("coin", "--scale", "huge")
+    assert stop.value.code == 2
+    assert "smoke" in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize("scales", [{"default": coin.Config()}, {"smoke": coin.Toss()}])
+def test_the_scales_of_an_experiment_are_of_one_kind(scales):
+    with pytest.raises(ValueError, match="coin"):
+        Experiment(name="coin", config=coin.Config(), scales=scales, run=coin.run)
+
+
+def test_an_experiment_is_named_after_its_module(monkeypatch):
+    monkeypatch.setattr(coin, "EXPERIMENT", Experiment(name="dice", config=coin.Config(), run=coin.run))
+    with pytest.raises(ValueError, match="must be 'coin'"):
+        run("coin")
+
+
+def test_a_run_leaves_the_agreed_files(capsys):
+    assert run("coin", "--scale=smoke", "--toss.bias", "0.25", "--coin", "silver") == 0
+    (directory,) = directories()
+    assert Path("runs/coin/latest").resolve() == directory.resolve()
+    description = read_json(directory / "config.json")
+    assert description["config"]["toss"] == {"bias": 0.25}
+    assert (description["config"]["steps"], description["config"]["coin"]) == (3, "silver")
+    assert description["command"] == "python -m experiments coin --scale=smoke --toss.bias 0.25 --coin silver"
+    assert {"jax", "numpy", "python"} <= set(description["versions"])
+    results = read_json(directory / "results.json")
+    assert list(results["arms"]) == ["paid", "unpaid"]
+    assert len(results["arms"]["paid"]["acc"]["per_seed"]) == 2
+    assert results["timing"]["total"] >= results["timing"]["train/paid/0"] > 0
+    assert {p.name for p in (directory / "plots").iterdir()} == {"curves_train.svg", "accuracy_against_middle.svg"}
+    assert "report.html" in capsys.readouterr().out
+
+
+def test_compiled_programs_are_kept_beside_the_data(monkeypatch):
+    kept = []
+
+    @contextlib.contextmanager
+    def keeper(directory):
+        kept.append(directory)
+        yield
+
+    monkeypatch.setattr(runner, "compilations_kept", keeper)
+    assert run("coin", "--scale=smoke", "--cache-dir", "elsewhere") == 0
+    assert kept == [Path("elsewhere/compiled")]
+
+
+def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
+    arguments = ("coin", "--seeds", "2", "--crash-at", "7")
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    with pytest.raises(RuntimeError, match="rolled away"):
+        run(*arguments)
+    monkeypatch.delenv("COIN_CRASHES")
+    assert run(*arguments) == 0
+    assert "continuing runs/coin" in capsys.readouterr().out
+    assert run(*arguments) == 0  # the first is finished, so this one is new
+    assert "new run" in capsys.readouterr().out
+    continued, straight = directories()
+    assert (continued / "metrics.jsonl").read_bytes() == (straight / "metrics.jsonl").read_bytes()
+    a, b = (read_json(d / "results.json") for d in (continued, straight))
+    assert a["arms"] == b["arms"]
+
+
+def test_another_configuration_or_fresh_starts_anew(monkeypatch):
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    for extra in ((), ("--steps", "9"), ("--fresh",)):
+        with pytest.raises(RuntimeError):
+            run("coin", "--crash-at", "1", *extra)
+    assert len(directories()) == 3
+    with pytest.raises(RuntimeError):
+        run("coin", "--crash-at", "1")
+    assert len(directories()) == 3
+
+
+def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    with pytest.raises(RuntimeError):
+        run("coin", "--crash-at", "1")
+    with runs.locked(directories()[0]):
+        assert run("coin", "--crash-at", "1") == 1
+    assert "another process" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_stops_cleanly_and_says_how_to_go_on(workplace, number, code):
+    program = f"import sys; from experiments.core.runner import main; sys.exit(main(sys.argv[1:], package={FAKES!r}))"
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "coin", "--step-s", "0.05", "--fresh"],
+        cwd=workplace, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(workplace.glob("runs/coin/*/checkpoints/train/paid/0/state.json")):
+        assert process.poll() is None, "the run ended before it could be stopped"
+        assert time.monotonic() < deadline, "the run did not start"
+        time.sleep(0.02)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert "To go on: python -m experiments coin --step-s 0.05" in out
+    assert "--fresh" not in out.splitlines()[-1]
+    (directory,) = (p for p in workplace.glob("runs/coin/*") if not p.is_symlink())
+    lines = (directory / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == list(range(len(lines)))
+    assert not (directory / "results.json").exists()
+    assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"
+
+
+def git(directory, *arguments):
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b")
+    subprocess.run(["git", *identity, *arguments], cwd=directory, check=True, capture_output=True)
+
+
+def test_revision_tells_clean_dirty_and_unknown(tmp_path, monkeypatch):
+    assert runs.revision(tmp_path).commit == "unknown"
+    git(tmp_path, "init")
+    (tmp_path / "code.py").write_text("1")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "one")
+    clean = runs.revision(tmp_path)
+    assert len(clean.commit) == 40
+    assert not clean.dirty
+    (tmp_path / "code.py").write_text("2")
+    assert str(runs.revision(tmp_path)) == f"{clean.commit}-dirty"
+    (tmp_path / "inside").mkdir()
+    assert runs.revision(tmp_path / "inside").commit == "unknown"  # installed below somebody else's checkout
+    monkeypatch.setenv("PATH", "")
+    assert runs.revision(tmp_path).commit == "unknown"
+
+
+def test_runs_of_one_second_get_their_own_directories(tmp_path):
+    made = {runs.create(tmp_path / "coin", {"config": {}}) for _ in range(3)}
+    assert len(made) == 3
+    assert runs.newest_unfinished(tmp_path / "coin", {}) == max(made)
+    assert runs.newest_unfinished(tmp_path / "coin", {"a": 1}) is None
+    assert runs.newest_unfinished(tmp_path / "none", {}) is None
+
+
+def test_no_argument_at_all_is_the_default_scale():
+    assert parse(coin.EXPERIMENT, [], "about").scale == "default"

@@ -1,0 +1,156 @@
+"""Signals: at once where nothing is lost by it, after the step inside a loop, for good the second time."""
+
+import contextlib
+import gc
+import signal
+import time
+
+import pytest
+
+from experiments.core.stopping import AGAIN_S, SIGNALS, Stopped, Stopping
+
+
+@pytest.fixture(autouse=True)
+def restored():
+    """The handlers that the test began with, whatever happens."""
+    before = {n: signal.getsignal(n) for n in SIGNALS}
+    yield
+    for n, handler in before.items():
+        signal.signal(n, handler)
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_raises_at_once(number):
+    with pytest.raises(Stopped, match=number.name) as stop, Stopping().listening():
+        signal.raise_signal(number)
+    assert stop.value.number == number
+
+
+def patiently(inside) -> None:
+    """Run a function in a patient block, in which a SIGTERM comes first."""
+    stopping = Stopping()
+    with stopping.listening(), stopping.patient() as asked:
+        assert not asked()
+        signal.raise_signal(signal.SIGTERM)
+        assert asked()
+        inside()
+
+
+def test_a_patient_block_is_told_and_ends_before_it_raises():
+    done = []
+    with pytest.raises(Stopped, match="SIGTERM"):
+        patiently(lambda: done.append("the step"))
+    assert done == ["the step"]
+
+
+def test_all_processes_leave_where_one_was_asked():
+    """Another process was asked before the second look; this one never was."""
+    others, seen = iter([False, True]), []
+
+    def agreed(here: bool) -> bool:
+        seen.append(here)
+        return next(others)
+
+    def train(stopping: Stopping) -> None:
+        with stopping.patient(agreed) as asked:
+            assert not asked()
+            assert asked()
+            assert asked()  # known by now: nobody is asked again
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train(Stopping())
+    assert seen == [False, False]
+
+
+def test_a_signal_after_the_last_step_is_agreed_on_as_well():
+    seen = []
+
+    def train(stopping: Stopping) -> None:
+        with stopping.listening(), stopping.patient(lambda here: bool(seen.append(here)) or here):
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train(Stopping())
+    assert seen == [True]
+
+
+def test_a_second_signal_acts_as_if_nobody_listened():
+    handlers = []
+    with pytest.raises(Stopped):
+        patiently(lambda: handlers.extend(signal.getsignal(n) for n in SIGNALS))
+    assert handlers == [signal.SIG_DFL] * 2
+
+
+def test_an_error_inside_is_what_comes_out():
+    with pytest.raises(ZeroDivisionError):
+        patiently(lambda: 1 / 0)
+
+
+def test_handlers_come_back():
+    before = [signal.getsignal(n) for n in SIGNALS]
+    with Stopping().listening():
+        assert [signal.getsignal(n) for n in SIGNALS] != before
+    assert [signal.getsignal(n) for n in SIGNALS] == before
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_a_stop_that_the_garbage_collector_swallows_is_raised_again(twice):
+    """Its callbacks, and `__del__`, cannot raise: Python would report the stop, and the run would go on."""
+    struck = []
+
+    def strike(phase, info):
+        if phase == "stop" and not struck:
+            struck.append(info)
+            with contextlib.suppress(*[Stopped] * twice):
+                signal.raise_signal(signal.SIGTERM)
+            time.sleep(1.0)  # the stop comes again while it is within
+
+    def work(seconds):
+        gc.collect()
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            time.sleep(0.01)
+
+    gc.callbacks.append(strike)
+    try:
+        with pytest.raises(Stopped, match="SIGTERM"), Stopping().listening():
+            work(10.0)
+    finally:
+        gc.callbacks.remove(strike)
+    assert struck
+
+
+def test_what_is_put_away_on_the_way_up_is_not_disturbed():
+    closed = []
+
+    def train() -> None:
+        with Stopping().listening():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                time.sleep(5 * AGAIN_S)
+                closed.append(True)
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train()
+    assert closed == [True]
+
+
+def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
+    said = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: said.append(lost.exc_value))
+
+    class Broken:
+        def __del__(self):
+            raise OSError("the disk is gone")
+
+    with Stopping().listening():
+        broken = Broken()
+        del broken
+    assert [str(x) for x in said] == ["the disk is gone"]
+
+
+def test_a_stop_that_has_to_wait_says_so(capfd):
+    with pytest.raises(Stopped):
+        patiently(lambda: None)
+    assert "stopping once this step is done and saved" in capfd.readouterr().err

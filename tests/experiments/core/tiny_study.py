@@ -1,0 +1,44 @@
+"""A study with one arm at the tests' smallest sizes, for processes of their own: `python -m` this module NAME.
+
+With `--strike N` in front of all else it gets a SIGTERM while it makes batch N of SFT.
+"""
+
+import dataclasses
+import importlib
+import signal
+import sys
+
+from experiments.core.catalogue import find
+from experiments.core.runner import main
+from experiments.paper.presets import SMALL_QUOTA
+from experiments.study.feeds import AnswerFeed
+from tests.experiments import tiny
+
+
+def strike(batch: int) -> None:
+    """Send this process a SIGTERM while it makes a batch."""
+    make, made = AnswerFeed.make, []
+
+    def struck(feed, element, rng):
+        made.append(None)
+        if len(made) == batch:
+            signal.raise_signal(signal.SIGTERM)
+        return make(feed, element, rng)
+
+    AnswerFeed.make = struck
+
+
+if __name__ == "__main__":
+    name, *arguments = sys.argv[1:]
+    if name == "--strike":
+        strike(int(arguments[0]))
+        name, *arguments = arguments[1:]
+    module = importlib.import_module(find("experiments")[name].module)
+    config = dataclasses.replace(tiny.STUDY, seeds=1, grpo_steps=3)
+    if name == "ablation_ordinal":
+        module.ARMS = {"ordinal": module.ARMS["ordinal"]}
+    if name == "main_table":
+        quota = dataclasses.replace(SMALL_QUOTA, identify=8, scale=0, compose=3, compare=2, order=0, conflict=0)
+        config = module.MainConfig(study=config, quota=quota)
+    module.EXPERIMENT = dataclasses.replace(module.EXPERIMENT, config=config)
+    sys.exit(main([name, *arguments]))

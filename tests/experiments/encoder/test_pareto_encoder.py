@@ -1,0 +1,66 @@
+"""The ladder of encoders: what is chosen, and two of its variants, shrunk."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.encoder import pareto_encoder
+from experiments.encoder.data import TouchConfig
+from experiments.encoder.pareto_encoder import Measured, choose, loss, pieces_table
+from experiments.encoder.pretrain import PretrainConfig
+from experiments.encoder.variants import REFERENCE, variants
+from tests.experiments import tiny
+from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.models.predictor import PredictorConfig
+from touchr1_jax.training.evidence import ProbeConfig
+
+LADDER = {v.name: v for v in variants(PretrainConfig(frames=8))}
+
+
+def measured(name: str, seconds: float, choosing: list[bool], right: list[bool]) -> Measured:
+    answers = {"choosing": np.array(choosing)[:, None], "right": np.array(right)[:, None]}
+    return Measured(variant=LADDER[name], **answers, seconds=seconds, gflop=1.0)
+
+
+def test_the_fastest_within_a_point_on_validation_is_chosen_whatever_the_test_says():
+    eight, seven = [True] * 8 + [False] * 2, [True] * 7 + [False] * 3
+    ladder = {
+        REFERENCE: measured(REFERENCE, 0.4, eight, eight),
+        "64 tokens": measured("64 tokens", 0.05, eight, seven),
+        "32 tokens": measured("32 tokens", 0.01, seven, seven),
+    }
+    assert choose(ladder).variant.name == "64 tokens"
+    assert choose(ladder).rate == 160
+    lost = loss(ladder["32 tokens"], ladder, np.arange(10))
+    assert lost.mean == 10
+    assert lost.low <= 10 <= lost.high
+
+
+def test_parts_add_up_to_the_whole():
+    best = measured("64 tokens", 0.008, [True], [True])
+    table = pieces_table(best, {"a": 0.002, "b": 0.006, "c": 0.008}, {"a": 0.1, "b": 0.5, "c": 0.6}, 200.0)
+    assert [round(row[2]) for row in table.rows] == [25, 50, 25]
+    np.testing.assert_allclose([row[1] for row in table.rows], [0.25, 0.5, 0.25])
+    np.testing.assert_allclose(table.rows[1][4], 0.4 / 0.004 / 200)
+
+
+@pytest.mark.slow
+def test_every_variant_stands_in_the_table(tmp_path, cache_dir):
+    config = pareto_encoder.Config(
+        touch=TouchConfig(scenes=dataclasses.replace(tiny.SCENES, frames=8), probe=ProbeConfig(folds=2, iterations=2)),
+        pretrain=PretrainConfig(
+            encoder=dataclasses.replace(PretrainConfig().encoder, width=12, num_layers=1),
+            predictor=PredictorConfig(width=12, num_layers=1),
+            frames=8,
+            steps=1,
+            batch_size=2,
+            probe_every=1,
+        ),
+        rounds=1,
+    )
+    directory = run_shrunk(pareto_encoder, config, tmp_path, "--cache-dir", str(cache_dir))
+    results = read_json(directory / "results.json")
+    assert [row[0] for row in results["tables"][0]["rows"]] == list(LADDER)
+    assert (directory / "plots" / "pareto_encoder.svg").exists()

@@ -1,0 +1,54 @@
+"""Collapse, shrunk, and how its outcomes are read."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.encoder import stability_encoder
+from experiments.encoder.data import TouchConfig
+from experiments.encoder.stability_encoder import ARMS, Outcome
+from tests.experiments import tiny
+from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.training.evidence import ProbeConfig
+
+TINY = dataclasses.replace(
+    stability_encoder.SMOKE,
+    touch=TouchConfig(scenes=dataclasses.replace(tiny.SCENES, split_shares=(0.6, 0.2, 0.2))),
+    encoder=dataclasses.replace(stability_encoder.DEFAULT.encoder, width=8, num_layers=0, stem_px=4, stem_width=2),
+    batch_size=3,
+    probe=ProbeConfig(folds=2, iterations=2),
+)
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory, cache_dir):
+    return run_shrunk(stability_encoder, TINY, tmp_path_factory.mktemp("runs"), "--cache-dir", str(cache_dir))
+
+
+@pytest.mark.slow
+def test_every_arm_is_reported(directory):
+    results = read_json(directory / "results.json")
+    assert [row[0] for row in results["tables"][0]["rows"]] == [arm.name for arm in ARMS]
+    assert (directory / "plots" / "stability_encoder.svg").exists()
+    failed = {row[0]: row[5] for row in results["tables"][0]["rows"]}
+    assert len(results["verdict"]) == 1 + sum(failed.get(arm.cures, 0) > 0 for arm in ARMS)
+
+
+def test_every_cure_names_an_arm():
+    names = {arm.name for arm in ARMS}
+    assert {arm.cures for arm in ARMS if arm.cures} < names
+
+
+def test_failure_is_told_by_what_is_left_and_alarms_by_measurements():
+    """Seed 0 falls and recovers, seed 1 falls for good and keeps a third of what told contacts apart."""
+    looks = {
+        "kept": np.array([[0.2, 0.3, 0.9], [0.9, 0.4, 0.3]]),  # what a fresh encoder shows raises no alarm
+        "rank_share": np.full((2, 3), 0.5),
+        "skill": np.full((2, 3), 0.3),
+    }
+    outcome = Outcome(arm=ARMS[0], looks=looks, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
+    np.testing.assert_array_equal(outcome.failed, [False, True])
+    np.testing.assert_array_equal(outcome.alarmed, [False, True])
+    assert outcome.first_alarm(1) == 2

@@ -1,0 +1,168 @@
+"""The timed job computes what it says, and the experiment reports it."""
+
+import dataclasses
+from typing import get_args
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.core.processes import in_own_process
+from experiments.core.runner import main
+from experiments.engine import speed_grpo
+from experiments.engine.harness import PeerTimes
+from experiments.engine.job import Job, config_of, init_decoder, make_agent, make_batch
+from experiments.engine.peers import PeerFailed
+from experiments.engine.size import Size
+from experiments.engine.speed import Course, Option, many_steps, options, time_alone
+from experiments.engine.speed_tables import steadiness
+
+TINY = speed_grpo.SMOKE.size
+
+
+def test_the_decoder_has_its_advertised_size():
+    agent, batch = make_agent(Size(), 64), make_batch(Size(), 64, 1)
+    assert sum(x.size for x in jax.tree.leaves(init_decoder(agent, batch))) == 1_050_752
+
+
+def test_work_by_hand():
+    """One layer of width 2 with one head of 2, MLP 2, vocabulary 2: 16 + 12 weights, 4 to the vocabulary."""
+    size = Size(
+        prompts=1,
+        group=1,
+        length=1,
+        vocab_size=2,
+        hidden_size=2,
+        num_layers=1,
+        num_heads=1,
+        num_kv_heads=1,
+        head_dim=2,
+        intermediate_size=2,
+    )
+    weights, pair = 8 + 8 + 12, 4
+    prompt, completion = 3 * weights + pair * 6, weights + 4 + pair * (3 + 1)
+    assert size.gflop(3) == pytest.approx(2 * 5 * (prompt + completion) / 1e9)
+    assert size.gflop(3, 0.0) == pytest.approx(2 * 4 * (prompt + completion) / 1e9)
+
+
+@pytest.mark.slow
+def test_the_second_process_reads_what_the_first_compiled(tmp_path):
+    """Shown by the files that one leaves and by none that the other adds."""
+    measure = lambda: in_own_process(time_alone, TINY, 16, config_of(TINY), 1, tmp_path)
+    measure()
+    kept = sorted(p.name for p in tmp_path.rglob("*-cache"))
+    measure()
+    assert kept
+    assert sorted(p.name for p in tmp_path.rglob("*-cache")) == kept
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    """Every option, small, after one step each."""
+    every = options(TINY, 16, 1, (4,), get_args(Option))
+    return {name: (job, jax.device_get(job.step())) for name, job in ((name, make()) for name, make in every.items())}
+
+
+@pytest.mark.slow
+def test_the_repeated_way_does_the_same_number_of_rollouts():
+    job = Job(TINY, 16, config_of(TINY), repeated=True)
+    metrics = jax.device_get(job.step())
+    assert job.batch.ids.shape == (TINY.prompts * TINY.group, 16)
+    assert metrics["length"] == TINY.length
+    assert np.isfinite(metrics["loss"])
+
+
+@pytest.mark.slow
+def test_options_change_the_cost_and_not_the_step(jobs):
+    """Rewards in the graph and on the host, one micro-batch or several, weights of an exact sampler, rematerialised."""
+    plain = jobs["this"][1]
+    for name in ("one micro-batch", "remat", "lean compilation", "importance weights", "host reward"):
+        assert jobs[name][1]["reward"] == pytest.approx(float(plain["reward"]), rel=1e-6), name
+        assert jobs[name][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=1e-4), name
+    assert jobs["bfloat16"][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=0.2)
+    short, cut = jobs["short answers"][1], jobs["short answers, buckets"][1]
+    assert short["length"] < TINY.length
+    assert cut["grad_norm"] == pytest.approx(float(short["grad_norm"]), rel=1e-4)
+
+
+def test_one_program_serves_all_steps():
+    job = Job(TINY, 16, config_of(TINY))
+    before = jax.tree.map(np.array, job.state.params)
+    for _ in range(3):
+        job.step()
+    assert job.compilations == 1
+    assert any(
+        (a != np.asarray(b)).any() for a, b in zip(*map(jax.tree.leaves, (before, job.state.params)), strict=True)
+    )
+
+
+def test_seeds_share_a_program_and_nothing_else():
+    one, two = (Job(TINY, 16, config_of(TINY), seed=seed) for seed in (0, 1))
+    assert (one.batch.ids != two.batch.ids).any()
+    norms = [float(job.step()["grad_norm"]) for job in (one, two)]
+    assert norms[0] != norms[1]
+    assert one.compilations == two.compilations == 1
+
+
+@pytest.mark.slow
+def test_many_steps_take_every_length_in_one_program():
+    size = dataclasses.replace(speed_grpo.SMOKE.steps_size, vocab_size=16, hidden_size=16)
+    told: list[tuple[int, int]] = []
+    course = many_steps(size, 16, (4, 8), 200, lambda *word: told.append(word))
+    assert told == [(100, 200), (200, 200)]
+    assert course.seconds.shape == (200,)
+    assert course.resident_mb.shape == (2,)
+    assert course.programs == 1
+    assert course.lengths[0] < size.length
+
+
+def test_drift_and_growth_by_hand():
+    """Steps that slow down by half, and memory that grows by 20 MB."""
+    seconds = np.concatenate([np.full(500, 1.0), np.full(500, 1.5), np.full(1000, 9.0)])
+    course = Course(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
+    time, memory, programs = steadiness(course)
+    assert (time.measured, time.met) == (1.5, False)  # judged by the first thousand
+    assert (memory.measured, memory.met) == (20.0, False)
+    assert programs.met
+
+
+@pytest.mark.slow
+def test_the_experiment_reports_every_prefix(tmp_path):
+    small = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16,), words=256)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(speed_grpo, "EXPERIMENT", dataclasses.replace(speed_grpo.EXPERIMENT, config=small))
+        patch.setattr(speed_grpo, "in_own_process", lambda work, *arguments, **tell: work(*arguments, **tell))
+        assert main(["speed_grpo", "--runs-dir", str(tmp_path)]) == 0
+    (directory,) = (p for p in (tmp_path / "speed_grpo").iterdir() if not p.is_symlink())
+    results = read_json(directory / "results.json")
+    assert [row[0] for row in results["tables"][0]["rows"]] == [16]
+    names = {row[0] for row in results["tables"][1]["rows"]}
+    assert names == {"this", "importance weights", "short answers, buckets"}
+    assert {p.name for p in (directory / "plots").iterdir()} == {"prefixes.svg", "steps.svg"}
+    measured = {r["name"]: r["measured"] for r in results["requirements"]}
+    assert measured["programs for one shape"] == measured["programs for all lengths"] == 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Limited:
+    """An engine that fails past a prefix."""
+
+    name: str
+    most: int
+
+    def measure(self, job):
+        if job.prefix > self.most:
+            raise PeerFailed(f"{self.name} ended with -9", -9)
+        return PeerTimes(seconds=(1.0,), first_s=2.0, peak_gb=0.5, versions={})
+
+
+def test_an_engine_that_fails_at_a_long_prefix_costs_no_other_figure(context, monkeypatch):
+    config = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16, 32))
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("Short", 16), Limited("Long", 32)))
+    found, failed = speed_grpo.measure_peers(config, context)
+    assert list(found) == [("Short", 16), ("Long", 16), ("Long", 32)]
+    assert failed == ("Short has no figure at 32: its process ended with -9.",)
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("None", 0),))
+    with pytest.raises(PeerFailed, match="None ended with -9"):
+        speed_grpo.measure_peers(config, context)

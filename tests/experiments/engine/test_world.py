@@ -1,0 +1,80 @@
+"""The small world: what is felt tells the level, verified answers say it, and a broken stream says nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.engine.training import lenient_credit
+from experiments.engine.world import CONCLUDE, LENGTH, PARSER, WORDS, K, World, draw, noise_bank, verified_answers
+
+P = 64
+TIDY = World(sloppy=0.0, noise=0.2)
+parse = jax.jit(jax.vmap(PARSER))
+
+
+@pytest.mark.parametrize("asked", [0, 1])
+def test_verified_answers_say_the_evidence_and_conclude_the_label(asked):
+    world = TIDY._replace(asked=asked)
+    scene = draw(world, jax.random.key(0), P)
+    tokens, counts = verified_answers(world, scene, jax.random.key(1))
+    said = parse(tokens)
+    assert tokens.shape == (P, LENGTH)
+    assert np.asarray(said.formatted).all()
+    assert not np.asarray(said.truncated).any()
+    np.testing.assert_array_equal(said.conclude[:, asked], scene.level)
+    nearest = np.clip(np.round(scene.evidence), 0, K - 1)
+    np.testing.assert_array_equal(said.perceive[:, :, asked], nearest)
+    np.testing.assert_array_equal(np.asarray(counts).sum(1), np.asarray(said.length) + 1)
+    assert np.asarray(scene.batch.ordered).all() == bool(asked)
+
+
+def test_anchored_answers_conclude_what_is_seen_and_sloppy_ones_two_levels():
+    scene = draw(World(), jax.random.key(0), P)
+    seen = parse(verified_answers(TIDY._replace(anchored=1.0), scene, jax.random.key(1))[0])
+    np.testing.assert_array_equal(seen.conclude[:, 0], scene.seen)
+    loose = verified_answers(World(sloppy=1.0), scene, jax.random.key(1))[0]
+    assert (np.asarray(parse(loose).conclude[:, 0]) == -1).all()
+    assert np.asarray(parse(loose).formatted).all()
+
+
+def test_a_lenient_scorer_pays_for_the_right_word_among_others():
+    scene = draw(World(), jax.random.key(0), P)
+    loose = verified_answers(World(sloppy=1.0), scene, jax.random.key(1))[0]
+    tidy = verified_answers(TIDY, scene, jax.random.key(1))[0]
+    credit = jax.vmap(lenient_credit)
+    assert np.asarray(credit(loose, parse(loose), scene.batch.target)).all()
+    assert not np.asarray(credit(tidy, parse(tidy), scene.batch.target)).any()
+    elsewhere = loose.at[:, -6:].set(CONCLUDE).at[:, 0].set(WORDS[0, 0])  # nothing is said after the tag
+    assert not np.asarray(credit(elsewhere, parse(elsewhere), scene.batch.target)).any()
+
+
+def test_touch_tells_the_level_and_a_ramp_turned_around_another():
+    scene = draw(TIDY._replace(asked=1), jax.random.key(2), P)
+    touch = np.asarray(scene.batch.features.touch)
+    ramp = (touch[:, :, 1] - touch[:, :, 0]).mean(1)
+    rising, falling = (ramp[np.asarray(scene.level) == k].mean(0) for k in (0, 2))
+    np.testing.assert_allclose(rising, -falling, atol=0.3)
+    assert np.linalg.norm(rising) > 1.5
+
+
+def test_a_broken_stream_carries_nothing_and_the_other_all():
+    scene = draw(World(kept=0.0), jax.random.key(0), P)
+    whole = draw(World(), jax.random.key(0), P)
+    touch, same = (np.asarray(s.batch.features.touch) for s in (scene, whole))
+    assert np.ptp(touch[:, 1], axis=0).max() == 0
+    np.testing.assert_array_equal(touch[:, 0], same[:, 0])
+    bank = np.asarray(noise_bank(World(kept=0.0), jax.random.key(1)))
+    np.testing.assert_allclose(bank[:, 1] - touch[:1, 1], 0, atol=1e-6)
+
+
+def test_noise_has_the_statistics_of_touch():
+    bank = np.asarray(noise_bank(World(), jax.random.key(1), draws=400))
+    touch = np.asarray(draw(World(), jax.random.key(3), 400).batch.features.touch)
+    np.testing.assert_allclose(bank.mean((0, 2)), touch.mean((0, 2)), atol=0.15)
+    np.testing.assert_allclose(bank.std((0, 2)), touch.std((0, 2)), atol=0.15)
+
+
+def test_a_view_is_right_as_often_as_it_should_be():
+    scene = draw(World(sight=0.7), jax.random.key(4), 4000)
+    assert float(jnp.mean(scene.seen == scene.level)) == pytest.approx(0.7 + 0.3 / K, abs=0.03)

@@ -1,0 +1,267 @@
+"""What touch tells, shrunk; presses are the generator's own, probes ask about objects that they never felt."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.mechanics import (
+    identifiability,
+    identify_draw,
+    identify_geometry,
+    identify_motions,
+    identify_presses,
+    identify_probes,
+)
+from experiments.mechanics.identify_motions import Moved
+from experiments.mechanics.identify_studies import SOURCES, STATIC
+from experiments.mechanics.identify_threads import in_threads
+from experiments.mechanics.identify_touch import Felt, Tier, feel, means, see
+from sensors_io.scenes import schedule, surface
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.press import make_kernels
+from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
+from sensors_io.scenes.sequence import make_sequence
+from sensors_io.schema import SENSORS, Phase
+from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.training.evidence import ProbeConfig, cross_fit
+
+SCENES = SceneConfig(objects=8, sites=1, frames=3, min_force_n=0.3, max_force_n=3.0, image_px=24, contact_grid=24)
+TINY = dataclasses.replace(
+    identifiability.SMOKE,
+    presses=SCENES,
+    exact_grid=32,
+    noise=(0.0, 1.0),
+    probe=ProbeConfig(folds=2, iterations=3),
+    batch=3,
+)
+PROBE = ProbeConfig(folds=4, iterations=20)
+
+
+def run(home):
+    """Results of the experiment at the tiny scale."""
+    directory = run_shrunk(identifiability, TINY, home)
+    assert {p.name for p in (directory / "plots").iterdir()} == {"identifiability.svg", "label_transfer.svg"}
+    return read_json(directory / "results.json")
+
+
+def check(results):
+    """Every table has every row, every cell is a percentage or a difference of two."""
+    touch, blind, tiers, moved = (table["rows"] for table in results["tables"])
+    assert [row[0] for row in touch] == [f"{name}, {source}" for name in STATIC for source in SOURCES]
+    assert [row[0] for row in blind] == list(STATIC)
+    assert [row[0] for row in tiers] == [f"{t}: {n}" for t in ("24²", "24², 0.01", "springs, 24²") for n in STATIC]
+    assert len(moved) == 6
+    for row in (*touch, *blind, *tiers, *moved):
+        assert np.all(np.abs(row[1:]) <= 100), row
+    assert [r["name"].split(":")[0] for r in results["requirements"]] == [
+        "trained at 24², asked about exact records",
+        "trained at 24², 0.01, asked about exact records",
+        "control",
+    ]
+
+
+@pytest.mark.slow
+def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
+    """What takes long to compile is replaced by random features."""
+    rng = np.random.default_rng(0)
+
+    def felt(config, tier, order, draws, factors, batch):
+        n, frames = len(draws), config.frame_count
+        return Felt(
+            features=rng.normal(size=(n, len(factors), 6)),
+            strain=np.zeros((n, frames)),
+            converged=np.ones((n, frames), bool),
+        )
+
+    def moved(config, motion, moments, advance):
+        advance()
+        return Moved(
+            touch=tuple(rng.normal(size=(8, 6)) for _ in SENSORS),
+            force=rng.normal(size=(8, 4, 15)),
+            shape=rng.normal(size=(8, 14)),
+            levels={name: np.arange(8) % 3 for name in ("elasticity", "friction")},
+            objects=np.arange(8),
+        )
+
+    monkeypatch.setattr(identify_presses, "feel", felt)
+    monkeypatch.setattr(identify_motions, "feel", moved)
+    monkeypatch.setattr(identify_motions, "rows_of", lambda scenes, motion: [0])
+    check(run(tmp_path))
+
+
+def test_features_repeat_whatever_the_batch_and_grow_with_noise():
+    order, tier = SENSORS.index("tac3d"), Tier(name="", grid=24)
+    draws = identify_draw.touches(SCENES, order)[:3]
+    two, one = (feel(SCENES, tier, order, draws, (0.0, 4.0), batch) for batch in (2, 1))
+    assert two.features.shape[:2] == (3, 2)
+    np.testing.assert_allclose(two.features, one.features, atol=2e-3)
+    assert np.all(two.converged)
+    assert np.all(np.diff(two.strain, axis=1) > 0)
+    assert np.abs(two.features[:, 1] - two.features[:, 0]).max() > 0.1
+
+
+@pytest.mark.slow  # compiles eight more programs
+def test_a_whole_study_runs(tmp_path):
+    check(run(tmp_path))
+
+
+@pytest.mark.parametrize("order", [SENSORS.index("gelsight_mini"), SENSORS.index("tac3d")])
+def test_a_press_is_the_generators_own(order):
+    tier = Tier(name="", grid=SCENES.contact_grid, tolerance=SCENES.solver_tolerance)
+    by = means(SCENES, tier, order, (1.0,))
+    drawn = identify_draw.touches(SCENES, order)[2]
+    kernels = make_kernels(MODELS[order], by.grid)
+    seen = jax.jit(lambda touch: see(touch, kernels, tier.tolerance, by))(drawn)
+    made = make_sequence(SCENES, 2, schedule.press_slot(SCENES, 2), order, 0)
+    np.testing.assert_array_equal(drawn.measured_n, made.force_n)
+    np.testing.assert_allclose(seen.fields.depth_mm[:, 0], made.depth_mm, atol=1e-5)
+    if made.deformation_mm is not None:
+        np.testing.assert_allclose(seen.fields.deformation_mm[:, 0], made.deformation_mm, atol=1e-5)
+    if made.frames is not None:
+        off = np.abs(seen.pictures[:, 0].astype(int) - made.frames.astype(int))
+        assert off.max() <= 1
+        assert np.mean(off > 0) < 1e-3
+
+
+def test_noise_is_scaled_and_nothing_else():
+    assert identify_draw.noisier(XENSE, 1.0) == XENSE
+    louder = identify_draw.noisier(XENSE, 3.0)
+    assert louder.depth_noise_mm == pytest.approx(3 * XENSE.depth_noise_mm)
+    assert louder.lateral_noise_mm == pytest.approx(3 * XENSE.lateral_noise_mm)
+    assert louder.shot_noise == pytest.approx(tuple(3 * s for s in XENSE.shot_noise))
+    silent = identify_draw.noisier(TAC3D, 0.0)
+    assert silent.read_noise == (0, 0, 0)
+    assert (silent.gel, silent.window_mm, silent.name) == (TAC3D.gel, TAC3D.window_mm, TAC3D.name)
+
+
+def skin(radius_mm=(20.0, 40.0), wave_mm=1.5, amplitude_mm=0.0):
+    """A paraboloid with one plane wave along x."""
+    f = lambda value: jnp.asarray(value, jnp.float32)
+    return surface.Skin(
+        curvature_per_mm=f(1 / np.array(radius_mm)),
+        turn_rad=f(0.3),
+        feature_height_mm=f(0.0),
+        feature_pitch_mm=f(3.0),
+        feature_width=f(0.2),
+        pattern=jnp.asarray(0),
+        site_mm=f(np.zeros(2)),
+        wave_numbers=f([[2 * np.pi / wave_mm, 0.0]]),
+        wave_amplitudes_mm=f([amplitude_mm]),
+        wave_phases_rad=f([0.0]),
+    )
+
+
+def test_statistics_of_a_paraboloid():
+    (found,) = np.exp(identify_geometry.statistics([skin()]))
+    np.testing.assert_allclose(found[:2], [1 / 40, 1 / 20], rtol=1e-3)
+    np.testing.assert_allclose(found[2:9], 0, atol=1e-4)
+    below = 2 * np.pi * np.sqrt(20 * 40) * np.array([0.1, 0.3]) / identify_geometry.WINDOW_MM**2  # π√(R₁R₂)·2h
+    np.testing.assert_allclose(found[11:13], below, rtol=0.05)
+
+
+@pytest.mark.parametrize(("wave_mm", "band"), [(1.5, 5), (1.0, 6)])
+def test_a_wave_lies_in_its_band(wave_mm, band):
+    (found,) = np.exp(identify_geometry.statistics([skin((1e4, 1e4), wave_mm, 0.02)]))
+    rms = found[2:9]
+    assert rms[band] == pytest.approx(0.02 / np.sqrt(2) * 0.375, rel=0.05)  # Hann's mean square along each axis is 3/8
+    assert np.delete(rms, band).max() < 0.1 * rms[band]
+
+
+def test_a_coarse_grid_leaves_out_short_waves():
+    fine, coarse = (
+        np.exp(identify_geometry.statistics(identify_draw.skins(dataclasses.replace(SCENES, contact_grid=n))))[:, 8]
+        for n in (64, 24)
+    )
+    assert np.median(coarse / fine) < 0.5
+
+
+@pytest.fixture(scope="module")
+def asked():
+    """Features that tell the level of 60 contacts of 30 objects, levels, objects."""
+    rng = np.random.default_rng(1)
+    objects = np.repeat(np.arange(30), 2)
+    labels = (objects % 3).astype(int)
+    features = (np.eye(3)[labels] + 0.4 * rng.normal(size=(60, 3))).astype(np.float32)
+    return features, labels, objects
+
+
+def test_reading_the_training_records_is_cross_fitting(asked):
+    features, labels, objects = asked
+    own, again = identify_probes.transfer(features, [features], labels, objects, PROBE)
+    expected = cross_fit(features, labels, objects, 3, PROBE)
+    np.testing.assert_allclose(own.log_probs, expected, atol=1e-5)
+    np.testing.assert_array_equal(again.log_probs, own.log_probs)
+    assert own.right.mean() > 0.8
+
+
+def test_an_object_that_was_felt_before_is_not_asked_about(asked):
+    _, labels, objects = asked
+    names = np.eye(30, dtype=np.float32)[objects]  # tells everything about objects that were trained on
+    (answers,) = identify_probes.transfer(names, [], labels, objects, PROBE)
+    assert answers.right.mean() < 0.5
+
+
+def test_a_probe_carries_over_what_its_records_taught(asked):
+    features, labels, objects = asked
+    wrong = features[:, [1, 2, 0]]  # each level looks like another one
+    own, exact = identify_probes.transfer(wrong, [features], labels, objects, PROBE)
+    assert own.right.mean() > 0.8
+    assert exact.right.mean() < 0.2
+
+
+def test_folds_need_objects(asked):
+    features, labels, objects = asked
+    with pytest.raises(ValueError, match="objects has 2 members, fewer than folds = 4; lower folds"):
+        identify_probes.transfer(features, [], labels, objects % 2, PROBE)
+
+
+def test_fused_answers_multiply():
+    labels = np.array([0, 1])
+    first = np.log([[0.6, 0.3, 0.1], [0.4, 0.5, 0.1]])
+    second = np.log([[0.2, 0.1, 0.7], [0.3, 0.6, 0.1]])
+    one, two = (identify_probes.Answers(p, labels) for p in (first, second))
+    both = identify_probes.fuse([one, two])
+    np.testing.assert_allclose(np.exp(both.log_probs[0]), [0.12, 0.03, 0.07])
+    assert (two.right.tolist(), both.right.tolist()) == ([0, 1], [1, 1])
+    assert (two.far_off, both.far_off) == (50, 0)
+
+
+def test_points_are_clustered_by_object():
+    values = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    found = identify_probes.points(values, np.array([0, 0, 1, 1]))
+    assert (found.mean, found.low, found.high) == (25, 0, 50)
+
+
+def test_frames_of_a_motion_are_those_in_which_something_changes():
+    a, load, hold, un = (p.value for p in (Phase.APPROACH, Phase.LOAD, Phase.HOLD, Phase.UNLOAD))
+    phase = np.array([a, a, load, load, hold, hold, hold, un, un])
+    np.testing.assert_array_equal(identify_motions.look_at(phase, 3), [0, 2, 8])
+    np.testing.assert_array_equal(identify_motions.look_at(phase, 5), [0, 2, 3, 7, 8])
+    with pytest.raises(ValueError, match="moments is 6: only 5 frames are there"):
+        identify_motions.look_at(phase, 6)
+
+
+def test_jobs_keep_their_order_and_their_errors():
+    done = []
+    assert in_threads(lambda x: x**2, range(5), lambda: done.append(1)) == [0, 1, 4, 9, 16]
+    assert len(done) == 5
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda x: 1 / x, [1, 0], lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": (0.0, 2.0)}, "noise is"),
+        ({"presses": SceneConfig(objects=1, sequences=4)}, r"presses\.sequences is 4"),
+        ({"motions": SCENES}, r"motions\.sequences is None"),
+        ({"exact_grid": 64}, "exact_grid is 64"),
+    ],
+)
+def test_a_config_that_cannot_answer_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(identifiability.DEFAULT, **change)

@@ -1,0 +1,167 @@
+"""The chooser's experiment, shrunk, and its arithmetic by hand."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.core.runner import main
+from experiments.mechanics import chooser_fit as fit
+from experiments.mechanics import chooser_measure as bench
+from experiments.mechanics import chooser_sequences as sequences
+from experiments.mechanics import chooser_trial as trial
+from experiments.mechanics import pareto_chooser
+from experiments.mechanics.chooser_draw import FAMILIES, draw
+from experiments.mechanics.chooser_measure import Outcomes
+from experiments.mechanics.chooser_sequences import Kept
+from experiments.mechanics.chooser_trial import Trial
+from sensors_io.scenes import chooser_law
+from sensors_io.scenes.chooser_law import LAW, MENU
+from sensors_io.scenes.chooser_survey import FEATURES
+from sensors_io.scenes.sensors import XENSE
+
+TINY = dataclasses.replace(pareto_chooser.SMOKE, batch=5, grids=(24,), asked=(0.5,), sequences=2)
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    home = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pareto_chooser, "EXPERIMENT", dataclasses.replace(pareto_chooser.EXPERIMENT, config=TINY))
+        patch.setattr(fit, "KEPT", 0.0)  # five scenes keep no share
+        assert main(["pareto_chooser", "--runs-dir", str(home)]) == 0
+    (directory,) = (p for p in (home / "pareto_chooser").iterdir() if not p.is_symlink())
+    return directory
+
+
+@pytest.mark.slow
+def test_results_hold_every_error_asked_for(directory):
+    results = read_json(directory / "results.json")
+    summary, families, generated, costs, law = (table["rows"] for table in results["tables"])
+    assert [row[0] for row in summary] == list(TINY.asked)
+    assert [row[0] for row in families] == list(FAMILIES)
+    assert sum(row[1] for row in families) == TINY.batch
+    assert len(costs) == len(chooser_law.PADDINGS)
+    assert len(law) == 2 * len(dataclasses.fields(chooser_law.Law))
+    assert [row[0] for row in generated] == list(TINY.asked)
+    assert len(results["requirements"]) == 3 * len(TINY.asked)
+
+
+@pytest.mark.slow
+def test_the_chart_is_drawn(directory):
+    assert b"</svg>" in (directory / "plots" / "chooser.svg").read_bytes()
+
+
+# By hand -------------------------------------------------------------------------------------------------------------
+
+ERROR = np.array([[0.30, 0.09, 0.02], [0.14, 0.20, 0.01], [0.90, 0.80, 0.70]])
+COST = np.array([1.0, 2.0, 4.0])
+
+
+def test_hindsight_takes_the_cheapest_setting_that_meets_the_error():
+    np.testing.assert_array_equal(trial.in_hindsight(ERROR, COST, 0.1), [1, 2, -1])
+
+
+def test_a_summary_counts_shares_and_times():
+    made = Trial(
+        asked=0.1,
+        index=np.array([1, 0, 2]),
+        met=np.array([True, True, False]),
+        error=np.array([0.09, 0.16, 0.7]),
+        best=np.array([1, 2, -1]),
+        seconds=np.array([0.003]),
+        hindsight=np.array([0.006]),
+        possible=np.array([2]),
+    )
+    found = trial.summary(made, ERROR, COST)
+    assert found["share"] == 0.5
+    assert found["share of all"] == pytest.approx(1 / 3)
+    assert found["flagged"] == found["unreachable"] == found["beyond promise"] == pytest.approx(1 / 3)
+    assert found["flagged in vain"] == 0
+    assert found["ms"] == pytest.approx(1.5)
+    assert found["ratio"] == pytest.approx(0.5)
+    assert np.isnan(found["fixed"])  # the third scene is met by none
+
+
+def test_the_host_picks_as_the_device_does():
+    rng = np.random.default_rng(0)
+    expected = rng.uniform(0.01, 1, (20, 6)).astype(np.float32)
+    index, met = fit.chosen(LAW, expected, 0.1)
+    for row, i, m in zip(expected, index, met, strict=True):
+        found = chooser_law.pick(0.1, jnp.log(row), LAW)
+        assert (int(found[0]), bool(found[2])) == (i, m)
+
+
+def test_the_least_margins_keep_enough():
+    errors, predicted = np.full((100, 1), 0.2), np.full((100, 1), 0.1)
+    found = fit.promised(fit.start(), predicted, errors, [0.1])
+    assert found.margin == pytest.approx(1.5, rel=0.03)  # past it nothing is promised any more
+    assert found.doubt == pytest.approx(1.5, rel=0.03)
+
+
+def test_an_unfit_law_is_refused():
+    with pytest.raises(ValueError, match="the law does not fit"):
+        fit.promised(fit.start(), np.full((9, 1), 1e-6), np.ones((9, 1)), [0.1])
+
+
+def test_the_fit_finds_the_law_that_made_the_errors():
+    rng = np.random.default_rng(1)
+    features = np.concatenate([np.ones((80, 1)), rng.normal(0, 0.5, (80, len(FEATURES) - 1))], 1)
+    made = dataclasses.replace(_outcomes(np.ones((80, len(MENU)))), features=features)
+    truth = fit.start()
+    truth = dataclasses.replace(truth, grid=truth.grid + 0.1, rate=truth.rate - 0.05)
+    exact = fit.predict(truth, made, MENU)
+    found = fit.predict(fit.fit(dataclasses.replace(made, errors=exact), MENU), made, MENU)
+    counts = (exact > fit.RANGE[0]) & (exact < fit.RANGE[1])
+    assert np.quantile(np.abs(np.log(found / exact))[counts], 0.95) < 0.1
+
+
+def test_frames_count_only_where_they_were_promised():
+    made = Kept(
+        asked=0.1,
+        grid=np.array([64, 128]),
+        met=np.array([True, False]),
+        error=np.array([[0.05, 0.16], [0.9, 0.9]]),
+        motion=("press", "twist"),
+    )
+    again = sequences.join([made.to_json()])
+    assert pareto_chooser._kept_share(again) == 0.5
+    (row,) = pareto_chooser._sequence_table([again]).rows
+    assert row[1:4] == (0.5, 0.0, 0.5)
+
+
+def test_batches_survive_a_round_trip():
+    made = _outcomes(ERROR)
+    again = bench.join([made.to_json(), made.to_json()])
+    np.testing.assert_array_equal(again.errors, np.concatenate([made.errors, made.errors]))
+    assert again.family == (*made.family, *made.family)
+
+
+def test_every_batch_has_a_seed_of_its_own():
+    seeds = {pareto_chooser.hash_seed(0, name, s, i) for name in ("a", "b") for s in range(4) for i in range(3)}
+    assert len(seeds) == 24
+
+
+def test_families_are_what_they_say():
+    batch = draw(XENSE, len(FAMILIES), (24,), 192, tuple(FAMILIES), 0)
+    assert batch.family == tuple(FAMILIES)
+    assert set(batch.gap_mm) == {24, 48, 96, 192}
+    ball = batch.gap_mm[48][1]
+    assert ball.min() >= 0
+    assert np.diff(ball, 2, axis=0).std() < 0.05 * np.diff(ball, 2, axis=0).mean()  # one curvature everywhere
+
+
+def _outcomes(error: np.ndarray) -> Outcomes:
+    count, settings = error.shape
+    return Outcomes(
+        features=np.ones((count, len(FEATURES))),
+        radius_mm=np.full(count, 3.0),
+        slope_share=np.zeros(count),
+        window_mm=np.full(count, 18.0),
+        thickness_mm=np.full(count, 4.0),
+        errors=error,
+        ms=np.ones((1, settings)),
+        family=("balls",) * count,
+    )

@@ -1,0 +1,100 @@
+"""What a tiny checkpoint is taught: answers that parse and agree with themselves, and nothing of touch."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.core.context import read_metrics
+from experiments.paper.released_policy import assemble_released, instruction
+from experiments.paper.released_teaching import BESIDE, STAGE, TeachingConfig, drawn_batch, nothing, teach
+from experiments.paper.tiny_checkpoint import write_tiny
+from sensors_io.schema import SENSORS
+from touchr1_jax.models.load import load_checkpoint
+from touchr1_jax.models.policy import Features, prompt_mask
+from touchr1_jax.models.qwen.weights import SINGLE
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.text.oracle import read
+
+
+@pytest.fixture(scope="module")
+def writer(checkpoint):
+    return assemble_released(BESIDE, checkpoint, SENSORS)
+
+
+@pytest.fixture(scope="module")
+def batch(writer):
+    return drawn_batch(writer, nothing(64), TeachingConfig(), np.random.default_rng(0))
+
+
+def answers(writer, batch):
+    for i in range(len(batch.tokens)):
+        asked = (writer.layout.ids == batch.ids[i, 0]).all(-1).argmax()
+        text = writer.tokenizer.decode(batch.tokens[i, 0][batch.token_mask[i, 0]])
+        yield asked, batch.streams[i, 0], read(writer.language, text)
+
+
+def test_drawn_answers_parse_and_agree_with_themselves(writer, batch):
+    """What is concluded was compared, and no other level is perceived by more of the sensors that the prompt names."""
+    for asked, streams, said in answers(writer, batch):
+        assert said.formatted
+        perceived = np.asarray(said.perceive)[:, asked]
+        np.testing.assert_array_equal(perceived >= 0, streams)
+        counts = np.bincount(perceived[streams])
+        assert said.conclude[asked] == said.compare[asked] == counts.argmax()
+
+
+def test_every_level_of_every_question_is_drawn_and_sensors_differ(writer):
+    many = drawn_batch(writer, nothing(512), TeachingConfig(), np.random.default_rng(1))
+    found = [(int(q), int(said.conclude[q])) for q, _, said in answers(writer, many)]
+    assert set(found) == {(q, k) for q, levels in enumerate(writer.levels) for k in range(levels)}
+    perceived = [np.asarray(said.perceive)[streams, q] for q, streams, said in answers(writer, many)]
+    assert 0.2 < np.mean([len(set(levels)) > 1 for levels in perceived if len(levels) > 1]) < 0.9
+
+
+def test_the_prompt_names_sensors_and_shows_nothing(writer, batch):
+    """Of the words of a prompt those alone are left out that stand for touch and picture."""
+    layout, slots = writer.layout, writer.agent.slots
+    touch = jax.tree.map(jnp.asarray, batch.touch)
+    streams = touch.stream_mask[0] & batch.streams[0, 0]
+    features = Features(
+        touch=jnp.zeros((*slots.touch.shape, 1)),
+        touch_time=writer.agent.policy.token_time(touch.frame_index[0], touch.frame_mask[0]),
+        stream_mask=streams,
+        view=jnp.zeros((len(slots.view), 1)),
+        view_mask=touch.view_mask[0],
+    )
+    seen = np.asarray(prompt_mask(features, jnp.asarray(batch.mask[0, 0]), slots))
+    assert not seen[layout.touch].any()
+    assert not seen[layout.view].any()
+    names = [s for s in range(len(SENSORS)) if seen[layout.stream_text == s].all()]
+    assert names == np.flatnonzero(batch.streams[0, 0]).tolist()
+
+
+def test_no_steps_leave_the_weights_as_they_were_drawn(tmp_path, context):
+    write_tiny(tmp_path, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE))
+    before = (tmp_path / SINGLE).read_bytes()
+    teach(tmp_path, TeachingConfig(), context)
+    assert (tmp_path / SINGLE).read_bytes() == before
+    assert not context.done(STAGE)
+
+
+@pytest.mark.slow
+def test_teaching_changes_the_decoder_alone_and_lowers_the_loss(tmp_path, context):
+    write_tiny(tmp_path, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE))
+    before = load_checkpoint(tmp_path).params
+    teach(tmp_path, TeachingConfig(steps=30, batch_size=8), context)
+    after = load_checkpoint(tmp_path).params
+    same = lambda a, b: jax.tree.all(jax.tree.map(lambda x, y: bool((x == y).all()), a, b))
+    assert same(before["vision"], after["vision"])
+    assert not same(before["decoder"]["embedding"], after["decoder"]["embedding"])
+    losses = [row["loss"] for row in read_metrics(context.directory)]
+    assert len(losses) == 30
+    assert losses[-1] < losses[0] - 1
+
+
+def test_a_share_is_a_share():
+    with pytest.raises(ValueError, match=r"agreement is 1\.5: must lie"):
+        dataclasses.replace(TeachingConfig(), agreement=1.5)

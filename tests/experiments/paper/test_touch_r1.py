@@ -1,0 +1,157 @@
+"""The paper's training on released weights: what is refused before anything is made, and the whole run on tiny ones."""
+
+import dataclasses
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.core.context import Context
+from experiments.core.loops import STEPPING, WAITING
+from experiments.core.results import Estimate
+from experiments.core.runner import main
+from experiments.paper.released_gain import kept_shares, least_kept
+from experiments.paper.touch_r1 import ARM, DEFAULT, DRAWN, SMALL, SMOKE, TAUGHT, WRITTEN, ZERO, verdict
+from experiments.study.stages import KEPT, SFTConfig
+from experiments.study.study import BLIND, SFT
+from tests.experiments.shrunk import only_run
+from touchr1_jax.bench.grounding import CONTROLS
+from touchr1_jax.models.load import Load
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sft": SFTConfig()}, r"sft\.lora_rank is 0: must be at least 1"),
+        ({"blind": SFTConfig()}, r"blind\.lora_rank is 0: must be at least 1"),
+        ({"grpo_lora_rank": 0}, "grpo_lora_rank is 0: must be at least 1, released towers stand still"),
+        (
+            {"model": dataclasses.replace(DEFAULT.model, dtype="float32")},
+            r"grpo\.bfloat16 is True: must be False for weights in float32; set both alike",
+        ),
+        (
+            {"model": dataclasses.replace(DEFAULT.model, completion_tokens=20)},
+            r"grpo\.length is 96: must be model\.completion_tokens = 20",
+        ),
+        ({"read_threads": 0}, "read_threads is 0: must be at least 1"),
+    ],
+)
+def test_settings_that_cannot_be_trained_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(DEFAULT, **change)
+
+
+def refused(tmp_path, *arguments: str) -> int:
+    return main(["touch_r1", "--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data"), *arguments])
+
+
+def test_without_weights_there_is_nothing_to_train(tmp_path, capsys):
+    assert refused(tmp_path) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "WeightsError: weights is None: must be the folder of a released Qwen2.5-VL" in said
+    assert "say --weights DIR, or --scale smoke" in said
+    assert not (tmp_path / "data" / "scenes").exists()
+
+
+def test_a_folder_that_is_none_is_named_before_data_are_made(tmp_path, capsys):
+    assert refused(tmp_path, "--weights", str(tmp_path / "nowhere")) == 1
+    said = "".join(capsys.readouterr().err.split())
+    assert "nowhere/config.jsonisnofile:mustbetheconfig.jsonofacheckpoint;correctthedirectory" in said
+    assert not list((tmp_path / "data").glob("scenes-*"))
+
+
+def test_only_a_trial_makes_weights_of_its_own():
+    assert not DEFAULT.tiny
+    assert SMOKE.tiny
+    assert SMALL.tiny
+    assert SMOKE.weights is SMALL.weights is DEFAULT.weights is None
+
+
+@pytest.mark.parametrize(("config", "first"), [(SMOKE, DRAWN), (SMALL, TAUGHT)])
+def test_a_verdict_says_what_its_figures_are_of(config, first):
+    half = Estimate(mean=50.0, ci95=(40.0, 60.0), per_seed=(50.0,))
+    rows = {name: {"acc": half} for name in (ZERO, SFT, ARM, BLIND, "constant")}
+    assert verdict(config, rows, None)[0] == first
+    assert DRAWN not in (said := verdict(dataclasses.replace(config, weights=Path("released")), rows, None))
+    assert TAUGHT not in said
+
+
+def test_what_merging_keeps_is_the_least_of_all_seeds(context):
+    shares = {"sft": (0.97, 0.95), f"grpo/{ARM}": (0.4, 0.99), "blind": (1.0, 1.0)}
+    for stage, of_seeds in shares.items():
+        for seed, share in enumerate(of_seeds):
+            context.save_stage(f"{KEPT}/{stage}/{seed}", share)
+    found = kept_shares(ARM, 2, context)
+    assert found == {SFT: 0.95, ARM: 0.4, BLIND: 1.0}
+    least = least_kept(found)
+    assert least.measured == 0.4
+    assert not least.met
+    assert least_kept({SFT: 0.95}).met
+
+
+def run(home: Path, cache: Path) -> int:
+    return main(["touch_r1", "--scale", "smoke", "--runs-dir", str(home), "--cache-dir", str(cache)])
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nobody stopped."""
+    home = tmp_path_factory.mktemp("whole")
+    assert run(home / "runs", home / "data") == 0
+    return home
+
+
+@pytest.mark.slow
+def test_the_smoke_run_trains_scores_and_writes(whole):
+    directory = only_run(whole / "runs", "touch_r1")
+    results = read_json(directory / "results.json")
+    assert list(results["arms"]) == ["sft", ARM]
+    assert list(results["baselines"])[:2] == [ZERO, "tactile_blind"]
+    assert {"acc", "omae", "csc", "mat_acc", "parse_rate", "reward"} <= set(results["arms"][ARM])
+    assert "csc" not in results["baselines"][ZERO]
+    assert "drawn weights of a tiny model" in results["verdict"][0]
+    same, kept = results["requirements"]
+    assert same["measured"] == 0
+    assert -0.1 < kept["measured"] < 1.1
+    titles = [table["title"] for table in results["tables"]]
+    assert {"What touch is worth", "What merging keeps of the adapters", "Memory, counted from shapes"} <= set(titles)
+    stages = ("sft/0", f"grpo/{ARM}/0", "blind/0")
+    assert {f"{what}/{stage}" for what in (STEPPING, WAITING) for stage in stages} <= set(results["timing"])
+    assert results["settings"]["weights"] == "tiny, bfloat16"
+    assert Load(directory=directory / "weights" / "0").run() == 0
+    page = (directory / "report.html").read_text(encoding="utf-8")
+    assert "the code was tried" in page
+    said = [f"{ARM}-under-{control}" for control in CONTROLS]
+    names = {path.stem for path in (directory / "answers").glob("*.npz")}
+    assert names == {f"{name}-0" for name in ("sft", ARM, "tactile_blind", ZERO, WRITTEN, *said)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [("sft/0", 5), (f"grpo/{ARM}/0", 2)])
+def test_a_stopped_run_ends_in_the_same_bits(whole, tmp_path, monkeypatch, where):
+    log = Context.log
+
+    def stop(self, stage, step, **scalars):
+        log(self, stage, step, **scalars)
+        if (stage, step) == where:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Context, "log", stop)
+        assert run(tmp_path, whole / "data") == 128 + signal.SIGTERM
+    assert run(tmp_path, whole / "data") == 0
+    ended, expected = only_run(tmp_path, "touch_r1"), only_run(whole / "runs", "touch_r1")
+    assert (ended / "metrics.jsonl").read_bytes() == (expected / "metrics.jsonl").read_bytes()
+    for path in (expected / "weights" / "0").iterdir():
+        if path.name != "touch.npz":
+            assert (ended / "weights" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
+    for path in [*(expected / "answers").iterdir(), expected / "weights" / "0" / "touch.npz"]:
+        with np.load(path) as a, np.load(ended / path.relative_to(expected)) as b:
+            assert a.files == b.files
+            assert all(np.array_equal(a[name], b[name]) for name in a.files), path.name
+    lines = [json.loads(line) for line in (ended / "metrics.jsonl").read_text().splitlines()]
+    assert sum(line["stage"] == where[0] for line in lines) == (8 if where[0] == "sft/0" else 4)

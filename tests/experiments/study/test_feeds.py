@@ -1,0 +1,309 @@
+"""What the stages are fed: right answers, random questions, exact resumption."""
+
+import json
+import threading
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from experiments.study.feeds import (
+    AnswerFeed,
+    Feed,
+    QuestionFeed,
+    each,
+    falling_share,
+    question_batch,
+    random_streams,
+    take,
+)
+from sensors_io.augment import AugmentConfig
+from sensors_io.pipeline import clip_batches
+from sensors_io.schema import LEVELS
+from tests.experiments import tiny
+from touchr1_jax.text.oracle import read
+from touchr1_jax.training.packing import Packing
+
+
+@pytest.fixture(scope="module")
+def evidence(data):
+    """Made-up evidence of every contact; −∞ past an attribute's levels."""
+    drawn = np.random.default_rng(0).normal(size=(len(data.store), 4, 4, 9)).astype(np.float32)
+    exists = np.arange(9) < np.array(list(LEVELS.values()))[:, None]
+    return np.where(exists, drawn, -np.inf)
+
+
+@pytest.fixture(scope="module")
+def clips(data):
+    """Three contacts; sensor 3 did not see the last one."""
+    rows = data.parts["sft"][:3]
+    clips = next(iter(clip_batches(data.store, rows, data.clip, batch_size=3, seed=0, shuffle=False, repeat=False)))
+    clips["stream_mask"] = clips["stream_mask"].copy()
+    clips["stream_mask"][2, 3] = False
+    return clips
+
+
+@pytest.fixture
+def answers(assembly, data, evidence):
+    return lambda **changes: AnswerFeed(
+        assembly, data, evidence, **{"batch_size": 3, "questions": 3, "seed": 1, **changes}
+    )
+
+
+@pytest.fixture
+def packed(answers):
+    """Every contact by itself, so that whoever reads some contacts packs those alone."""
+    return lambda **changes: answers(packing=Packing(width=128, contacts=1), **changes)
+
+
+@pytest.fixture
+def easy(answers):
+    """All sensors first, for longer than a test looks."""
+    return lambda **changes: answers(easy_steps=10, **changes)
+
+
+@pytest.fixture(scope="module")
+def features(data):
+    return tiny.features(len(data.parts["grpo"]))
+
+
+@pytest.fixture
+def questions(assembly, data, features):
+    label = data.label[data.parts["grpo"]]
+    return lambda **changes: QuestionFeed(assembly, features, label, **{"batch_size": 4, "seed": 1, **changes})
+
+
+def attribute_of(assembly, ids: np.ndarray) -> int:
+    """The attribute that a prompt asks for."""
+    return int(np.flatnonzero((assembly.layout.ids == ids).all(-1))[0])
+
+
+def readings(assembly, batch):
+    """Contact, attribute, streams and text of every question, read by the slow and obvious parser."""
+    tokenizer, p, q = assembly.tokenizer, *batch.ids.shape[:2]
+    for i in range(p):
+        for j in range(q):
+            tokens = np.asarray(batch.tokens[i, j])[np.asarray(batch.token_mask[i, j])]
+            assert tokens[-1] == tokenizer.end_ids[0]
+            said = read(assembly.language, tokenizer.decode(tokens[:-1]))
+            yield i, attribute_of(assembly, batch.ids[i, j]), np.asarray(batch.streams[i, j]), said
+
+
+def test_answers_say_what_the_evidence_and_the_labels_say(assembly, answers, clips, evidence):
+    seen = 0
+    for draw in range(8):
+        batch = answers().make(clips, np.random.default_rng(draw))
+        for i, a, streams, said in readings(assembly, batch):
+            of_contact = evidence[clips["contact"][i], :, a]
+            assert said.formatted
+            for s in range(4):
+                assert said.perceive[s][a] == (of_contact[s].argmax() if streams[s] else -1)
+            assert said.compare[a] == of_contact[streams].sum(0).argmax()
+            assert said.conclude[a] == clips["label"][i, a]
+            assert [b for b in range(4) if said.conclude[b] >= 0] == [a]  # nothing that was not asked
+            seen += said.compare[a] != said.conclude[a]
+    assert seen, "evidence that always agrees with the label tests nothing"
+
+
+def test_the_questions_of_a_contact_are_about_different_attributes(assembly, answers, clips):
+    batch = answers(questions=4).make(clips, np.random.default_rng(0))
+    for i in range(3):
+        assert sorted(attribute_of(assembly, ids) for ids in batch.ids[i]) == [0, 1, 2, 3]
+
+
+def test_absent_streams_are_never_asked_about(answers, clips):
+    for draw in range(10):
+        streams = np.asarray(answers().make(clips, np.random.default_rng(draw)).streams)
+        assert not streams[2, :, 3].any()
+        assert streams.any(-1).all()
+
+
+def test_an_attribute_that_nobody_annotated_has_no_answer_and_no_loss(assembly, answers, clips):
+    hidden = clips | {"label": np.where(np.arange(4) == 1, -1, clips["label"])}
+    batch = answers(questions=4).make(hidden, np.random.default_rng(0))
+    for i in range(3):
+        for j in range(4):
+            asked = attribute_of(assembly, batch.ids[i, j])
+            assert bool(batch.token_mask[i, j].any()) == (asked != 1)
+            assert (asked != 1) or (batch.tokens[i, j] == assembly.tokenizer.pad_id).all()
+
+
+def test_a_blind_policy_perceives_nothing_and_is_told_the_label(assembly, answers, clips):
+    batch = answers(blind=True).make(clips, np.random.default_rng(0))
+    assert not batch.streams.any()
+    for i, a, _, said in readings(assembly, batch):
+        assert said.perceive == [[-1] * 4] * 4
+        assert said.compare[a] == said.conclude[a] == clips["label"][i, a]
+
+
+def test_a_blind_policy_is_shown_no_touch(answers):
+    batch = next(answers(blind=True))
+    assert not np.asarray(batch.touch.stream_mask).any()
+    assert np.asarray(batch.touch.frames).size < np.asarray(batch.touch.view).size
+
+
+def test_answers_are_given_for_sft_contacts_alone(answers, data):
+    views = {data.store.objects[data.object_ids[i]].view.tobytes() for i in data.parts["sft"]}
+    feed = answers(batch_size=5)
+    assert {view.tobytes() for _ in range(2) for view in np.asarray(next(feed).touch.view)} <= views
+
+
+def test_what_is_felt_can_be_changed_at_random(answers):
+    plain, changed = (next(answers(augment=augment)) for augment in (None, AugmentConfig(mirror=1)))
+    assert (np.asarray(plain.touch.frames) != np.asarray(changed.touch.frames)).any()
+    np.testing.assert_array_equal(changed.touch.force_n[..., 0], -plain.touch.force_n[..., 0])
+    for name in ("ids", "streams", "tokens", "token_mask"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(changed, name))
+
+
+def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(assembly, answers):
+    plain, packed = (next(answers(packing=packing)) for packing in (None, Packing(width=128, contacts=3)))
+    assert equal([leaves(plain)], [leaves(packed.replace(rows=None))])
+    n = packed.ids.shape[-1] + packed.tokens.shape[-1]
+    tokens = np.concatenate([packed.ids, packed.tokens], -1).reshape(-1)
+    said = [tokens[row[at[at >= 0] + 1]] for row, at in rows_of(packed.rows)]
+    assert sorted(np.concatenate(said)) == sorted(packed.tokens[packed.token_mask])
+    felt = np.concatenate([row for row, _ in rows_of(packed.rows)])
+    touch = np.isin(felt % n, assembly.layout.touch.ravel())
+    steps = packed.streams[..., None] & packed.touch.frame_mask[:, None]  # a step is a frame here
+    assert touch.sum() == steps.sum() * assembly.model.tactile.tokens_per_step
+
+
+def rows_of(rows):
+    """Source and predicting places of each row of one group."""
+    for row, at in zip(rows.source.reshape(-1, 128), rows.predicts.reshape(-1, rows.predicts.shape[-1]), strict=True):
+        yield row[row >= 0], at
+
+
+@pytest.mark.parametrize("kind", ["answers", "questions"])
+def test_one_seed_is_one_sequence_of_batches(request, kind):
+    make = request.getfixturevalue(kind)
+    first, again, other = ([leaves(next(feed)) for _ in range(3)] for feed in (make(), make(), make(seed=2)))
+    assert equal(first, again)
+    assert not equal(first, other)
+    assert not equal(first[:1], first[1:2])
+
+
+@pytest.mark.parametrize("kind", ["answers", "questions", "packed", "easy"])
+def test_a_state_resumes_exactly(request, kind):
+    make = request.getfixturevalue(kind)
+    feed = make()
+    next(feed), next(feed)
+    state = json.loads(json.dumps(feed.get_state()))
+    rest = [leaves(next(feed)) for _ in range(3)]
+    fresh = make()
+    fresh.set_state(state)
+    assert equal(rest, [leaves(next(fresh)) for _ in range(3)])
+    feed.set_state(state)  # back again in the feed that went on
+    assert equal(rest[:1], [leaves(next(feed))])
+
+
+@pytest.mark.parametrize("kind", ["answers", "questions", "packed"])
+def test_processes_that_share_batches_make_them_together(request, kind):
+    """What is drawn is drawn for the whole batch, so that it does not matter who makes which rows."""
+    make = request.getfixturevalue(kind)
+    for own in (np.array([0, 2]), np.array([1])):
+        part, whole = make(own=own), make()
+        for _ in range(3):
+            assert equal([leaves(next(part))], [[x[own] for x in leaves(next(whole))]])
+
+
+def leaves(batch) -> list[np.ndarray]:
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(batch)]
+
+
+def equal(a, b) -> bool:
+    return all(np.array_equal(x, y) for m, n in zip(a, b, strict=True) for x, y in zip(m, n, strict=True))
+
+
+def test_a_feed_that_makes_nothing_says_so(questions):
+    with pytest.raises(TypeError, match="Feed must say how it makes a batch"):
+        Feed.make(questions(), None, np.random.default_rng(0))
+
+
+def test_targets_hide_the_labels_that_are_not_asked(assembly, questions, data):
+    label = data.label[data.parts["grpo"]]
+    for _, batch in zip(range(5), questions(), strict=False):
+        target = jax.tree.map(np.asarray, batch.target)
+        assert (target.asked.sum(1) == 1).all()
+        assert (target.label[~target.asked] == -1).all()
+        assert (target.label[target.asked] >= 0).all()
+        assert (target.levels == [3, 3, 3, 9]).all()
+        assert (target.ordinal == [True, True, True, False]).all()
+        for ids, mask, asked, row in zip(batch.ids, batch.mask, target.asked, target.label, strict=True):
+            a = attribute_of(assembly, ids)
+            assert asked[a]
+            assert row[a] in label[:, a]
+            assert np.array_equal(mask, assembly.layout.mask[a])
+
+
+def test_every_question_comes_once_an_epoch_and_none_without_a_label(assembly, features, data):
+    label = np.where(np.arange(4) == 3, -1, data.label[data.parts["grpo"]])
+    total = int((label >= 0).sum())
+    batch = next(QuestionFeed(assembly, features, label, batch_size=total, seed=0))
+    asked = np.asarray(batch.target.asked).argmax(1)
+    contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
+    assert sorted(zip(contact, asked, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
+    assert (np.asarray(batch.target.label).max(1) == label[contact, asked]).all()
+
+
+def test_a_question_is_felt_by_the_streams_that_it_says(assembly, features, data):
+    label, rows, attribute = data.label[data.parts["grpo"]], np.array([2, 0]), np.array([1, 3])
+    streams = np.array([[True, False, False, True], [False, True, True, False]])
+    batch = question_batch(assembly, features, label, rows, attribute, streams)
+    assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
+    assert np.array_equal(batch.target.streams, streams)
+    assert not batch.ordered.any()  # a press shows its peak in whatever order
+    assert np.array_equal(batch.features.touch, features.touch[rows])
+    assert np.array_equal(take(features, rows).view, features.view[rows])
+
+
+@given(
+    present=st.lists(st.lists(st.booleans(), min_size=4, max_size=4), min_size=1, max_size=8),
+    full_share=st.floats(0, 1),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_random_streams_are_some_of_the_present_ones(present, full_share, seed):
+    present = np.array(present)
+    streams = random_streams(present, full_share, np.random.default_rng(seed))
+    assert not (streams & ~present).any()
+    assert np.array_equal(streams.any(1), present.any(1))
+
+
+@pytest.mark.parametrize("full_share", [0.0, 0.5, 1.0])
+def test_all_streams_are_felt_as_often_as_is_asked(full_share):
+    n = 20_000
+    streams = random_streams(np.ones((n, 4), bool), full_share, np.random.default_rng(0))
+    full = full_share + (1 - full_share) / 4  # a random subset of 1 to 4 sensors may be all of them
+    assert streams.all(1).mean() == pytest.approx(full, abs=0.01)
+    assert np.ptp(streams.mean(0)) < 0.02  # no sensor is favoured
+
+
+def test_a_curriculum_begins_with_all_sensors(answers, data):
+    """Of batch after batch, as many questions are felt by all sensors as `falling_share` says; then as without it."""
+    assert [falling_share(step, 4) for step in range(6)] == [1, 0.875, 0.75, 0.625, 0.5, 0.5]
+    assert falling_share(0, 0) == falling_share(100, 0) == 0.5
+    feed, plain = answers(easy_steps=3), answers()
+    felt = [(np.asarray(next(feed).streams), np.asarray(next(plain).streams)) for _ in range(5)]
+    assert felt[0][0].all()
+    assert (felt[0][0] != felt[0][1]).any()
+    assert all((mine >= other).all() for mine, other in felt)
+    assert all((mine == other).all() for mine, other in felt[3:])
+
+
+def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
+    blocks = [(rows.tolist(), real) for rows, real in each(7, 3)]
+    assert blocks == [([0, 1, 2], 3), ([3, 4, 5], 3), ([6, 6, 6], 1)]
+    assert [(rows.tolist(), real) for rows, real in each(2, 4)] == [([0, 1, 1, 1], 2)]
+    assert [real for _, real in each(6, 3)] == [3, 3]
+    assert list(each(0, 3)) == []
+
+
+def test_the_order_of_questions_is_not_made_ahead(questions):
+    """Grain's threads would shuffle 500 batches beside the training that they are for."""
+    before = set(threading.enumerate())
+    feed = questions()
+    next(feed)
+    assert set(threading.enumerate()) <= before  # those of other feeds may end meanwhile

@@ -1,0 +1,51 @@
+"""A pretrained encoder on disk."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.study.assembly import ModelConfig
+from experiments.study.pretrained import EncoderError, PretrainedEncoder, load_encoder, save_encoder
+from tests.experiments import tiny
+
+CONFIG = dataclasses.replace(tiny.MODEL.tactile, sensors=2, causal=True)
+
+
+@pytest.fixture
+def encoder():
+    rng = np.random.default_rng(0)
+    params = {
+        "sensor": {"embedding": rng.normal(size=(2, 16)).astype(np.float32)},
+        "norm": {"scale": rng.normal(size=16).astype(np.float32)},
+        "patch_position": rng.normal(size=(1, 16)).astype(np.float32),
+    }
+    return PretrainedEncoder(config=CONFIG, sensors=("gelsight_mini", "xense"), params=params, notes={"steps": 3})
+
+
+def test_it_comes_back_as_it_was(encoder, tmp_path):
+    save_encoder(tmp_path / "encoder.npz", encoder)
+    for path in (tmp_path, tmp_path / "encoder.npz"):
+        found = load_encoder(path)
+        assert (found.config, found.sensors, found.notes) == (encoder.config, encoder.sensors, encoder.notes)
+        assert jax.tree.structure(found.params) == jax.tree.structure(encoder.params)
+        for a, b in zip(jax.tree.leaves(found.params), jax.tree.leaves(encoder.params), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert [p.name for p in tmp_path.iterdir()] == ["encoder.npz"]
+
+
+def test_sensors_are_picked_by_name(encoder):
+    table = encoder.params["sensor"]["embedding"]
+    other = encoder.for_sensors(("xense", "tac3d", "gelsight_mini"))
+    np.testing.assert_allclose(other.params["sensor"]["embedding"], [table[1], table.mean(0), table[0]], rtol=1e-6)
+    assert (other.config.sensors, other.sensors[1]) == (3, "tac3d")
+    assert dataclasses.replace(ModelConfig(), tactile=other.config).tactile.causal
+
+
+def test_what_is_no_encoder_is_refused(encoder, tmp_path):
+    with pytest.raises(EncoderError, match=r"no such file; give the run directory of pretrain_encoder"):
+        load_encoder(tmp_path)
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(ValueError, match="it has no entry 'about'"):
+        load_encoder(tmp_path / "other.npz")

@@ -1,0 +1,91 @@
+"""Where data comes from: refused combinations, caches named after what made them."""
+
+import dataclasses
+
+import pytest
+from rich.console import Console
+
+from experiments.core.context import Context
+from experiments.study import sources
+from experiments.study.sources import SourceConfig, prepare_records
+from sensors_io.importers.physiclear import PhysiclearConfig
+from sensors_io.records import RecordsExistError
+from sensors_io.scenes.config import SceneConfig, config_hash
+from tests.experiments import tiny
+
+GENERATED = SourceConfig(kind="generated", directory=None, scenes=tiny.SCENES, physiclear=PhysiclearConfig())
+
+
+@pytest.fixture
+def imported(monkeypatch):
+    """Calls of an importer that makes nothing."""
+    calls = []
+
+    def fake(source, out, *, config, progress):
+        calls.append((source, out, config))
+        for done in range(3):
+            progress(done, 2)
+
+    monkeypatch.setattr(sources, "import_physiclear", fake)
+    return calls
+
+
+def test_generated_scenes_take_no_directory(tmp_path):
+    with pytest.raises(ValueError, match=f"data_dir is {tmp_path}: data 'generated' takes no data_dir: drop it"):
+        dataclasses.replace(GENERATED, directory=tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["physiclear", "records"])
+def test_recordings_need_a_directory(kind):
+    with pytest.raises(ValueError, match=f"data_dir is None: data '{kind}' needs data_dir"):
+        dataclasses.replace(GENERATED, kind=kind)
+
+
+def test_records_are_taken_as_they_are(records, context):
+    config = dataclasses.replace(GENERATED, kind="records", directory=records)
+    assert prepare_records(config, context) == records
+    assert context.timing() == {}
+
+
+def test_generated_scenes_are_named_by_their_hash_and_made_once(tmp_path, cache_dir, records):
+    shards = {p.name: p.stat().st_mtime_ns for p in records.glob("*.arrayrecord")}
+    context = Context(tmp_path, cache_dir, Console(quiet=True))
+    path = prepare_records(GENERATED, context)
+    context.close()
+    assert path == cache_dir / f"scenes-{config_hash(tiny.SCENES)}" == records
+    assert {p.name: p.stat().st_mtime_ns for p in records.glob("*.arrayrecord")} == shards
+    assert set(context.timing()) == {"data"}
+
+
+def test_other_scenes_lie_elsewhere(monkeypatch, context):
+    made = []
+    monkeypatch.setattr(sources, "generate_records", lambda config, path, *, progress: made.append(path))
+    for scenes in (tiny.SCENES, dataclasses.replace(tiny.SCENES, seed=1), SceneConfig(), tiny.SCENES):
+        made_at = prepare_records(dataclasses.replace(GENERATED, scenes=scenes), context)
+        assert made[-1] == made_at
+    assert len(set(made)) == 3
+
+
+def test_a_directory_of_other_records_is_not_mixed_with(monkeypatch, cache_dir, tmp_path):
+    monkeypatch.setattr(sources, "config_hash", lambda config: config_hash(tiny.SCENES))
+    other = dataclasses.replace(GENERATED, scenes=dataclasses.replace(tiny.SCENES, seed=1))
+    context = Context(tmp_path, cache_dir, Console(quiet=True))
+    with pytest.raises(RecordsExistError, match="made by config"):
+        prepare_records(other, context)
+    context.close()
+
+
+def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, console, imported):
+    first = dataclasses.replace(GENERATED, kind="physiclear", directory=tmp_path / "a")
+    other = dataclasses.replace(first, physiclear=PhysiclearConfig(height=60))
+    elsewhere = dataclasses.replace(first, directory=tmp_path / "b")
+    roundabout = dataclasses.replace(first, directory=tmp_path / "b" / ".." / "a")
+    paths = [prepare_records(config, context) for config in (first, other, elsewhere, roundabout)]
+    assert len(set(paths)) == 3
+    assert paths[3] == paths[0]
+    assert [(path, config) for _, path, config in imported[:2]] == [
+        (paths[0], PhysiclearConfig()),
+        (paths[1], PhysiclearConfig(height=60)),
+    ]
+    assert all(path.parent == context.cache_dir and path.name.startswith("physiclear-") for path in paths)
+    assert "importing videos" in console.file.getvalue()

@@ -1,0 +1,194 @@
+"""Answers on disk, and the answers that need no policy."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.study.answers import Evaluated, load_answers, save_answers
+from experiments.study.assembly import ModelConfig
+from experiments.study.baselines import baselines, constant_answers, joint_mode, level_answers
+from experiments.study.scores import score, score_study
+from experiments.study.stages import Probed
+from experiments.study.study import SFT, Study, StudyConfig, Way, run_study
+from sensors_io.schema import ATTRIBUTES
+from tests.experiments import tiny
+from touchr1_jax.bench.metrics import evaluate
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.types import Parsed
+
+TEST = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, -1, 1, 4], [1, 0, 0, 8], [1, 2, 2, 0]], np.int32)
+"""Labels of the five test contacts; nobody annotated the roughness of the third."""
+
+
+def answers_about(label: np.ndarray, alone: bool = True) -> Evaluated:
+    """Random answers to every labelled question, felt by all four sensors but the last contact's by two."""
+    rng = np.random.default_rng(0)
+    contact, attribute = np.nonzero(label >= 0)
+    n, asked = len(contact), np.arange(4) == attribute[:, None]
+    streams = np.ones((len(label), 4), bool)
+    streams[-1, 2:] = False
+    return Evaluated(
+        contact=contact,
+        attribute=attribute,
+        streams=streams[contact],
+        tokens=rng.integers(0, 40, (n, 20)).astype(np.int32),
+        parsed=Parsed(
+            perceive=rng.integers(-1, 3, (n, 4, 4)).astype(np.int32),
+            compare=rng.integers(-1, 3, (n, 4)).astype(np.int32),
+            conclude=rng.integers(-1, 3, (n, 4)).astype(np.int32),
+            formatted=rng.random(n) < 0.5,
+            truncated=rng.random(n) < 0.5,
+            length=rng.integers(0, 20, n).astype(np.int32),
+        ),
+        label=np.where(asked, label[contact], -1),
+        alone=rng.integers(-1, 3, (n, 4, 4)).astype(np.int32) if alone else None,
+    )
+
+
+@pytest.fixture(scope="module")
+def study(data, assembly):
+    """A study whose policies were asked about `TEST`, whose measured force is the label of hardness."""
+    label = data.label.copy()
+    label[data.parts["test"]] = TEST
+    data = dataclasses.replace(data, label=label)
+    force = np.repeat(label[:, :1].astype(np.float32), 3, 1) ** [1, 2, 3]
+    streams = np.zeros((len(label), 4, 1), np.float32)
+    return Study(
+        config=dataclasses.replace(tiny.STUDY, probe=ProbeConfig(iterations=30)),
+        data=data,
+        assembly=assembly,
+        probed=Probed(streams=streams, present=np.ones((len(label), 4), bool), force=force.astype(np.float32)),
+        prior=data.prior(),
+        arms={},
+        answers={SFT: [answers_about(TEST)]},
+    )
+
+
+def table(study: Study, said: Evaluated) -> dict[str, float]:
+    scores = evaluate(said.answers(np.zeros(len(said.contact))), ATTRIBUTES, study.assembly.levels)
+    return {name: value.mean() for name, value in scores.items()}
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_answers_survive_the_disk(tmp_path, alone):
+    said = answers_about(TEST, alone)
+    path = tmp_path / "answers" / "sft-0.npz"
+    save_answers(path, said)
+    loaded = load_answers(path)
+    assert (loaded.alone is None) == (not alone)
+    assert jax.tree.structure(vars(loaded)) == jax.tree.structure(vars(said))
+    for a, b in zip(jax.tree.leaves(vars(said)), jax.tree.leaves(vars(loaded)), strict=True):
+        assert a.dtype == b.dtype
+        assert np.array_equal(a, b)
+    assert [p.name for p in path.parent.iterdir()] == ["sft-0.npz"]
+
+
+def test_the_joint_mode_is_that_of_whole_rows():
+    rows = [[0, 0, 0, 5]] * 3 + [[1, 1, 1, 2], [1, 2, 1, 2], [1, 1, 2, 2], [2, 1, 1, 2]]
+    assert joint_mode(np.array(rows)).tolist() == [0, 0, 0, 5]  # not 1 1 1 2, the mode of each column
+    rows = [[2, 1, 0, 7], [2, 1, 0, 3], [2, 1, 0, 3], [0, 0, 0, 7], [0, 0, 0, 7]]
+    assert joint_mode(np.array(rows)).tolist() == [2, 1, 0, 3]  # its own most frequent material
+
+
+def test_the_joint_mode_counts_annotated_rows_alone():
+    assert joint_mode(np.array([[1, 1, 1, 4], [0, 0, -1, 2], [0, 0, -1, 2]])).tolist() == [1, 1, 1, 4]
+
+
+def test_a_constant_scores_what_its_label_share_is(study):
+    scores = table(study, constant_answers(study, np.tile([1, 1, 1, 8], (5, 1))))
+    assert scores["h_acc"] == pytest.approx(100 * 3 / 5)
+    assert scores["r_acc"] == pytest.approx(100 * 2 / 4)
+    assert scores["p_acc"] == pytest.approx(100 * 1 / 5)
+    assert scores["acc"] == pytest.approx((60 + 50 + 20) / 3)
+    assert scores["mat_acc"] == pytest.approx(100 * 2 / 5)
+    assert scores["h_bacc"] == pytest.approx(100 / 3)
+    assert scores["omae"] == pytest.approx((2 + 2 + 4) / 14)
+    assert (scores["middle_rate"], scores["parse_rate"], scores["csc_agree"], scores["csc_slot"]) == (100,) * 4
+
+
+def test_a_constant_agrees_with_itself_and_is_right_where_its_pairs_are(study):
+    said = constant_answers(study, np.tile([1, 1, 1, 8], (5, 1)))
+    right = said.label[np.arange(19), said.attribute] == said.parsed.conclude[np.arange(19), said.attribute]
+    pairs = np.where(said.contact == 4, 1, 6)  # two sensors felt the last contact
+    assert table(study, said)["csc"] == pytest.approx(100 * (right * pairs).sum() / pairs.sum())
+    assert (np.asarray(said.parsed.perceive)[said.contact == 4, 2:] == -1).all()
+
+
+def test_levels_are_given_contact_by_contact(study):
+    scores = table(study, constant_answers(study, TEST))
+    assert (scores["acc"], scores["mat_acc"], scores["omae"], scores["csc"]) == (100, 100, 0, 100)
+
+
+def test_every_baseline_answers_the_questions_of_the_policies(study):
+    rows = baselines(study)
+    assert list(rows) == ["constant", "constant_joint", "constant_middle", "force_only"]
+    asked = study.answers[SFT][0]
+    for said in rows.values():
+        assert np.array_equal(said.contact, asked.contact)
+        assert np.array_equal(said.label, asked.label)
+        assert np.asarray(said.parsed.conclude)[np.arange(19), asked.attribute].min() >= 0
+    modes = [int(np.asarray(rows["constant"].parsed.conclude)[asked.attribute == a].max()) for a in range(4)]
+    assert modes == study.prior.argmax(1).tolist()
+    assert table(study, rows["constant_middle"])["middle_rate"] == 100
+
+
+def test_force_that_gives_hardness_away_is_found_out(study):
+    assert table(study, baselines(study)["force_only"])["h_acc"] == 100
+
+
+def test_data_without_forces_has_no_force_baseline(study):
+    silent = dataclasses.replace(study, data=dataclasses.replace(study.data, has_force=False))
+    assert "force_only" not in baselines(silent)
+
+
+def test_a_right_answer_earns_the_whole_published_reward(study):
+    assert score(study, constant_answers(study, TEST))["reward"].mean() == pytest.approx(1)
+
+
+def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
+    scored = score_study(study)
+    assert list(scored.arms) == list(scored.rows)[:1] == [SFT]
+    assert list(scored.baselines) == ["constant", "constant_joint", "constant_middle", "force_only"]
+    assert list(scored.estimates) == [*scored.arms, *scored.baselines]
+    assert len(scored.objects) == 19
+    for name, said in baselines(study).items():
+        assert scored.baselines[name]["acc"].mean == pytest.approx(table(study, said)["acc"])
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "message"), [("more", "ordinal", "asks 'ordinal'"), ("sft", "sft", "has the name of a policy")]
+)
+def test_another_way_asks_a_policy_that_is_there_under_a_name_of_its_own(context, name, of, message):
+    way = Way(of=of, ask=lambda trained: trained.said)
+    with pytest.raises(ValueError, match=message):
+        run_study(tiny.STUDY, {}, context, ways={name: way})
+
+
+def test_answers_by_single_sensors_are_their_own(study):
+    alone = np.tile([0, 1, 2, 0], (5, 4, 1))
+    alone[:, 0] = TEST
+    said = level_answers(study.assembly, study.answers[SFT][0], TEST, alone)
+    scores = table(study, said)
+    assert scores["acc"] == 100
+    assert np.array_equal(said.alone[:, 0].max(1), said.label.max(1))
+    present = np.asarray(said.streams)
+    assert (np.asarray(said.parsed.perceive)[~present] == -1).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seeds": 0}, "seeds is 0: must be at least 1"),
+        ({"grpo_attributes": ("hardnes",)}, r"grpo_attributes is \('hardnes',\): must be some of hardness, roughness"),
+        ({"grpo_attributes": ()}, r"grpo_attributes is \(\): must be some of"),
+        ({"model": ModelConfig(decoder=DecoderConfig(vocab_size=50))}, r"model\.decoder\.vocab_size is 50: must be 0"),
+        ({"model": ModelConfig(tactile=TactileViTConfig(sensors=2))}, r"model\.tactile\.sensors is 2: must be 0"),
+    ],
+)
+def test_a_study_that_makes_no_sense_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(StudyConfig(), **change)
