@@ -21,7 +21,7 @@ from experiments.study.feeds import AnswerFeed
 from experiments.study.stages import SFTConfig, run_sft
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
-from tests.experiments.paper.released_conftest import MODEL
+from tests.experiments.paper.conftest import MODEL
 from tests.touchr1_jax.text.vocabularies import character_level
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
