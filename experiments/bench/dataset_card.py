@@ -25,7 +25,7 @@ from experiments.bench.draw import Quota
 from experiments.bench.filters import Filtered
 from experiments.bench.generate import Source, generate, read_source, share_at_odds
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.study.sources import Source as SourceName
 from experiments.study.sources import SourceConfig, prepare_records
@@ -48,7 +48,7 @@ class CardConfig:
     faulty: int = 700
 
 
-def run(config: CardConfig, context: Context) -> Findings:
+def run(config: CardConfig, context: Context) -> Results:
     """Make the bench, check it, report."""
     where = SourceConfig(
         kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
@@ -83,10 +83,10 @@ def _findings(
     checks: Sequence[card.CardCheck],
     caught: dict[str, float],
     same: bool,
-) -> Findings:
+) -> Results:
     items, odd = found.kept, share_at_odds(found.kept)
     shown = {touch.object for item in items for touch in item.ask.touches}
-    return Findings(
+    return Results(
         verdict=(
             f"{len(items):,} questions about {len(shown)} objects that no training contact shows pass all "
             f"{len(checks)} checks; the rules removed {len(found.removed)}.",

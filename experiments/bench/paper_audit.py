@@ -20,7 +20,7 @@ from experiments.bench.paper_arithmetic import impossible_distances as impossibl
 from experiments.bench.paper_charts import average_against_mean, distance_against_error
 from experiments.bench.paper_checks import Check, holding, inconsistencies
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 
 
@@ -35,14 +35,14 @@ class AuditConfig:
             raise ValueError(f"vtv_items is {self.vtv_items}: must be ≥ 1; give the size of the test set")
 
 
-def run(config: AuditConfig, context: Context) -> Findings:
+def run(config: AuditConfig, context: Context) -> Results:
     """Compute every check."""
     del context
     wrong, right = inconsistencies(), holding()
     standing = [check for check in wrong if check.verdict == "holds"]
     broken = [check for check in right if check.verdict != "holds"]
     count = {name: sum(c.verdict == name for c in wrong) for name in ("contradiction", "unsupported", "not given")}
-    return Findings(
+    return Results(
         verdict=(
             f"{len(wrong)} statements do not stand: {count['contradiction']} are contradicted by the paper's own "
             f"numbers, {count['unsupported']} are not supported by them, {count['not given']} lack what is needed to "

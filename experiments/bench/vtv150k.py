@@ -32,7 +32,7 @@ from experiments.bench.vtv import ATTRIBUTES, draw_tasks
 from experiments.bench.vtv_report import Rows, tasks_table, vtv_chart, vtv_table
 from experiments.core.context import Context
 from experiments.core.errors import DataError
-from experiments.core.findings import Findings, Picture
+from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
 from experiments.mechanics.identify_motions import Moved, feel, rows_of
 from experiments.mechanics.identify_probes import transfer
@@ -77,7 +77,7 @@ class Recordings:
     objects: np.ndarray
 
 
-def run(config: VTVConfig, context: Context) -> Findings:
+def run(config: VTVConfig, context: Context) -> Results:
     """Make the recordings, probe, ask."""
     with context.progress("planning", 1) as advance:
         rows = one_each(LiveScenes(config.scenes))
@@ -90,7 +90,7 @@ def run(config: VTVConfig, context: Context) -> Findings:
     scores = {name: vtv.score(tasks, log_probs) for name, log_probs in context.each("scoring", told.items())}
     scored = {name: vtv.averaged(score, made.objects) for name, score in scores.items()}
     counts = {task: len(score.values) for task, score in scores[FUSED].items()}
-    return Findings(
+    return Results(
         verdict=verdict(scored),
         tables=(
             vtv_table(scored),

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from experiments.bench import paper_numbers as paper
 from experiments.bench.vtv import CHANCE
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.bench.statistics import Interval
 

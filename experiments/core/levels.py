@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.core.charts import LOOK, MARKERS, colours, svg
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from touchr1_jax.bench.metrics import BOTTOM
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 

@@ -1,4 +1,4 @@
-"""The self-contained report of trained arms: one HTML file without scripts that needs nothing from outside itself."""
+"""The self-contained report of a run: one HTML file without scripts that needs nothing from outside itself."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,16 +27,17 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     """
     question, _, rest = about.strip().partition("\n")
     colour = charts.colours(results.arms)
+    arms = bool(results.arms)
     page = document(
         f"{description['experiment']} · {description['scale']}",
         _header(results, question, rest.strip(), description),
         requirement_section(results.requirements),
-        _answers(results, colour),
+        _answers(results, colour) if arms else Html(""),
         *[picture_section(directory, p) for p in results.pictures],
         *[table_section(t) for t in results.tables],
         _comparisons(results),
-        _middle(directory, results, colour),
-        _curves(directory, results, colour),
+        _middle(directory, results, colour) if arms else Html(""),
+        _curves(directory, results, colour) if arms else Html(""),
         rollouts(results.examples, colour),
         data_and_time(results.data, results.timing),
         appendix(description),
@@ -66,8 +67,10 @@ def _beyond_doubt(metric: str, pair: set[str], results: Results) -> bool:
 
 
 def _header(results: Results, question: str, rest: str, description: Mapping[str, Any]) -> Html:
-    seeds = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
-    return header(question, rest, description, {**results.settings, "seeds": seeds}, results.verdict)
+    settings = dict(results.settings)
+    if results.arms:
+        settings["seeds"] = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
+    return header(question, rest, description, settings, results.verdict)
 
 
 def _answers(results: Results, colour: Mapping[str, str]) -> Html:

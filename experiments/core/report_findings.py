@@ -1,41 +1,17 @@
-"""The self-contained report of a measuring experiment: requirements, tables, pictures in one HTML file."""
+"""Sections of a report: requirements, tables, pictures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from experiments.core.artifacts import write_bytes, write_text
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
-from experiments.core.page import Html, document, image, row, table, tag
-from experiments.core.report_parts import appendix, data_and_time, header, number
+from experiments.core.artifacts import write_bytes
+from experiments.core.page import Html, image, row, table, tag
+from experiments.core.report_parts import number
+from experiments.core.results import Cell, Column, Picture, Requirement, Table
 
 MEDIA = {"svg": "svg+xml", "png": "png"}
 
 LONG = 80
 """Characters of a cell beyond which it is given room: in a narrow column a paragraph is a tower."""
-
-
-def write_findings(directory: Path, findings: Findings, *, about: str, description: Mapping[str, Any]) -> Path:
-    """Write `report.html` and `plots/*` of a run and return the path of the report.
-
-    Args:
-      directory: the run's.
-      about: docstring of the experiment; its first line is the question.
-      description: content of the run's `config.json`.
-    """
-    question, _, rest = about.strip().partition("\n")
-    page = document(
-        f"{description['experiment']} · {description['scale']}",
-        header(question, rest.strip(), description, findings.settings, findings.verdict),
-        requirement_section(findings.requirements),
-        *[picture_section(directory, p) for p in findings.pictures],
-        *[table_section(t) for t in findings.tables],
-        data_and_time(findings.data, findings.timing),
-        appendix(description),
-    )
-    path = directory / "report.html"
-    write_text(path, page)
-    return path
 
 
 def requirement_section(requirements: tuple[Requirement, ...]) -> Html:

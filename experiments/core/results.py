@@ -1,14 +1,14 @@
-"""What an experiment hands back: estimates per arm and metric, comparisons, and the material of the report."""
+"""The outcome of an experiment: requirements, tables and pictures; of trained arms also estimates and comparisons."""
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
+from experiments.core.artifacts import jsonable
 from experiments.core.checks import require
-from experiments.core.findings import Picture, Requirement, Table, outcome_json
 from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")
@@ -16,6 +16,99 @@ SETTINGS = ("preset", "lr_scale")
 
 Slot = tuple[int, int, str]
 """Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
+
+
+Cell = str | float | int | bool | None
+"""What a table holds; `None` where nothing was measured."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """A figure and the bound that it must keep; `better` says on which side of the bound it must lie."""
+
+    name: str
+    measured: float
+    bound: float
+    better: Literal["lower", "higher"]
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def met(self) -> bool:
+        """Whether the figure keeps its bound."""
+        return self.measured <= self.bound if self.better == "lower" else self.measured >= self.bound
+
+    def to_json(self) -> dict[str, Any]:
+        """Its fields, and whether it is met."""
+        return dataclasses.asdict(self) | {"met": self.met}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Column:
+    """One column of a table: heading, unit, format of its numbers, what it means."""
+
+    name: str
+    unit: str = ""
+    format: str = ".3g"
+    meaning: str = ""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Table:
+    """Measured figures under named columns; the first column names the row."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        width = len(self.columns)
+        for i, row in enumerate(self.rows):
+            ok = len(row) == width
+            require(ok, f"table {self.title!r} row {i}", row, f"must have {width} cells", "give every column a cell")
+
+
+def named_table(
+    title: str,
+    rows: Sequence[Mapping[str, Cell]],
+    *,
+    formats: Mapping[str, str] = {},
+    units: Mapping[str, str] = {},
+    meanings: Mapping[str, str] = {},
+    note: str = "",
+) -> Table:
+    """A table from rows that name their cells; the first column names the row.
+
+    Args:
+      title: heading.
+      rows: column → cell; columns stand in the order in which rows first name them, a cell that a row lacks is `None`.
+      formats, units, meanings: column → format of its numbers (".3g" by default), unit, explanation.
+      note: a sentence above the table.
+
+    Raises:
+      ResultsError: a format, unit or meaning of a column that no row names.
+    """
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    for field, given in (("formats", formats), ("units", units), ("meanings", meanings)):
+        unknown = sorted(set(given) - set(names))
+        ok = not rows or not unknown
+        require(ok, f"table {title!r} {field}", unknown, f"must name columns {names}", "rename or drop them")
+    columns = tuple(
+        Column(name=n, unit=units.get(n, ""), format=formats.get(n, ".3g"), meaning=meanings.get(n, "")) for n in names
+    )
+    return Table(title=title, columns=columns, rows=tuple(tuple(row.get(n) for n in names) for row in rows), note=note)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A chart or an image: `kind` says what `content` is; `name` is its file's in `plots/`, without the ending."""
+
+    name: str
+    title: str
+    caption: str
+    content: bytes
+    kind: Literal["svg", "png"] = "svg"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -111,33 +204,47 @@ class Results:
     """The outcome of an experiment, checked when it is made.
 
     Args:
-      arms, baselines: name → metric → estimate; all arms have the same seeds, baselines may differ.
-      settings: what a reader must know first; `preset` and `lr_scale` at least.
       verdict: sentences that answer the experiment's question from the figures.
       requirements: figures with bounds.
-      tables, pictures: what there is to say beyond estimates and comparisons, in the order of the report.
+      tables, pictures: in the order of the report.
+      settings: what a reader must know first, such as machine and sizes; with arms `preset` and `lr_scale` at least.
+      arms, baselines: name → metric → estimate; all arms have the same seeds, baselines may differ.  A measuring
+        experiment has none.
+      comparisons: paired differences between arms.
       data, timing: sizes of the data, seconds; anything that JSON can hold.
       curves: phase → names of the logged scalars to draw; a phase not named is drawn whole.
       examples: a few rollouts; they go into the report, not into `results.json`.
 
     Raises:
-      ResultsError: an unknown metric, a number that is not finite, an interval out of order, unequal numbers of seeds.
+      ResultsError: neither arms nor a verdict, an unknown metric, a number that is not finite, an interval out of
+        order, unequal numbers of seeds, two pictures of one name.
     """
 
-    arms: Mapping[str, Mapping[str, Estimate]]
-    baselines: Mapping[str, Mapping[str, Estimate]]
-    settings: Mapping[str, Any]
-    comparisons: tuple[Comparison, ...] = ()
     verdict: tuple[str, ...] = ()
     requirements: tuple[Requirement, ...] = ()
     tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    arms: Mapping[str, Mapping[str, Estimate]] = dataclasses.field(default_factory=dict)
+    baselines: Mapping[str, Mapping[str, Estimate]] = dataclasses.field(default_factory=dict)
+    comparisons: tuple[Comparison, ...] = ()
     data: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     timing: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    pictures: tuple[Picture, ...] = ()
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     examples: tuple[RolloutExample, ...] = ()
 
     def __post_init__(self) -> None:
+        for r in self.requirements:
+            ok = math.isfinite(r.measured) and math.isfinite(r.bound)
+            require(ok, f"requirement {r.name!r}", (r.measured, r.bound), "must be finite", "leave it out")
+        names = [p.name for p in self.pictures]
+        require(len(set(names)) == len(names), "pictures", names, "must have names of their own", "rename one")
+        if self.arms or self.baselines or self.comparisons:
+            self._check_arms()
+        else:
+            require(bool(self.verdict), "verdict", self.verdict, "must hold a sentence", "answer the question")
+
+    def _check_arms(self) -> None:
         require(bool(self.arms), "arms", dict(self.arms), "must hold one arm at least", "add the arms")
         missing = [name for name in SETTINGS if name not in self.settings]
         require(not missing, "settings", dict(self.settings), f"must hold {', '.join(missing)}", "add them")
@@ -156,8 +263,17 @@ class Results:
         Args:
           description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
         """
-        names = ("arms", "baselines", "comparisons", "verdict", "tables", "settings", "timing", "data")
-        return outcome_json(description, self.requirements, {name: getattr(self, name) for name in names})
+        arms = ("arms", "baselines", "comparisons") if self.arms else ()
+        names = (*arms, "verdict", "tables", "settings", "timing", "data")
+        git = description["git"]
+        return {
+            "experiment": description["experiment"],
+            "scale": description["scale"],
+            "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
+            "requirements": jsonable([r.to_json() for r in self.requirements], where="requirements"),
+            **{name: jsonable(getattr(self, name), where=name) for name in names},
+            "config": description["config"],
+        }
 
     def _check_comparison(self, field: str, comparison: Comparison) -> None:
         _check_metric(f"{field}.metric", comparison.metric)

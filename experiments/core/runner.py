@@ -26,13 +26,11 @@ from experiments.core.catalogue import find
 from experiments.core.commands import PROG, answer, complain, say
 from experiments.core.context import Context
 from experiments.core.distributed import Launch, NoTeam, Team, devices_of, joined
-from experiments.core.findings import Findings
 from experiments.core.history import seconds_of_last
 from experiments.core.live import LivePage
 from experiments.core.machine import Machine, MachineError, require_machine
 from experiments.core.quick import compiled_quickly
 from experiments.core.report import write_report
-from experiments.core.report_findings import write_findings
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.watcher import Watcher
@@ -88,7 +86,7 @@ class Experiment(Generic[C]):
 
     name: str
     config: C
-    run: Callable[[C, Context], Results | Findings]
+    run: Callable[[C, Context], Results]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
     needs: Mapping[str, Machine] = dataclasses.field(default_factory=dict)
@@ -264,13 +262,10 @@ def _run(
         raise
 
 
-def _publish(results: Results | Findings, context: Context, description: Mapping[str, Any], about: str) -> None:
+def _publish(results: Results, context: Context, description: Mapping[str, Any], about: str) -> None:
     """Write the report and, last, `results.json`, which marks the run as finished."""
     results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
-    if isinstance(results, Findings):
-        report = write_findings(context.directory, results, about=about, description=description)
-    else:
-        report = write_report(context.directory, results, about=about, description=description)
+    report = write_report(context.directory, results, about=about, description=description)
     write_json(context.directory / "results.json", results.to_json(description))
     context.say(f"report: {report}")
     for sentence in results.verdict:

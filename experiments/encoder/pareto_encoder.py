@@ -21,7 +21,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.charts import accuracy_against_time
 from experiments.encoder.data import TouchConfig, open_touch, training_rows, watched
@@ -84,7 +84,7 @@ class Measured:
         return float(100 * self.right.mean())
 
 
-def run(config: Config, context: Context) -> Findings:
+def run(config: Config, context: Context) -> Results:
     """Train, probe, time."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
     ladder = variants(config.pretrain)
@@ -161,11 +161,11 @@ def findings(
     peak: float,
     objects: np.ndarray,
     where: Table,
-) -> Findings:
+) -> Results:
     """The chart, the choice and where its time goes."""
     lost = loss(best, measured, objects)
     share = best.gflop / best.seconds / peak
-    return Findings(
+    return Results(
         verdict=(
             f"'{best.variant.name}' reads {best.rate:.0f} prompts a second and its probes are right in "
             f"{best.accuracy:.1f} %; the reference reads {measured[REFERENCE].rate:.0f} and is right in "

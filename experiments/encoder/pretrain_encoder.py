@@ -22,7 +22,7 @@ import dataclasses
 import numpy as np
 
 from experiments.core.context import Context, read_metrics
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.charts import learning_curves
 from experiments.encoder.data import TouchConfig, open_touch, training_rows, watched
@@ -48,7 +48,7 @@ class Config:
     watch_fit: int = 640
 
 
-def run(config: Config, context: Context) -> Findings:
+def run(config: Config, context: Context) -> Results:
     """Train, measure on the test objects before and after, save the encoder."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
     rows = training_rows(data)
@@ -70,14 +70,14 @@ def run(config: Config, context: Context) -> Findings:
     return findings(config, context, data, before, after)
 
 
-def findings(config: Config, context: Context, data: Dataset, before: Assessment, after: Assessment) -> Findings:
+def findings(config: Config, context: Context, data: Dataset, before: Assessment, after: Assessment) -> Results:
     """Requirements, table, curves."""
     objects = data.object_ids[data.parts["test"]]
     copied = skill(after.error, after.copied, objects)
     constant = skill(after.error, after.constant, objects)
     lead = points(after.right.astype(float) - before.right, objects)
     lines = read_metrics(context.directory)
-    return Findings(
+    return Results(
         verdict=(
             f"On unseen objects the predicted latents have a skill of {copied.mean:.2f} {_span(copied)} over the last "
             f"ones, and of {constant.mean:.2f} {_span(constant)} over the mean latent of each step.",

@@ -26,7 +26,7 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.errors import DataError
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.charts import collapse_courses
 from experiments.encoder.collapse import Arm, Course, Runner, in_memory, make_runner
@@ -119,7 +119,7 @@ class Outcome:
         return None
 
 
-def run(config: Config, context: Context) -> Findings:
+def run(config: Config, context: Context) -> Results:
     """Every arm, all seeds at once.
 
     Raises:
@@ -188,7 +188,7 @@ def drive(
     return Outcome(arm=arm, looks=looks, kept=np.asarray(kept), lead=np.array(lead))
 
 
-def findings(config: Config, outcomes: list[Outcome]) -> Findings:
+def findings(config: Config, outcomes: list[Outcome]) -> Results:
     """Who failed, who was noticed, what cured it."""
     failed = np.concatenate([o.failed for o in outcomes])
     alarmed = np.concatenate([o.alarmed for o in outcomes])
@@ -196,7 +196,7 @@ def findings(config: Config, outcomes: list[Outcome]) -> Findings:
     noticed = float(alarmed[failed].mean()) if failed.any() else 1.0
     false = float(alarmed[~failed].mean()) if (~failed).any() else 0.0
     cures = [o for o in outcomes if o.arm.cures and by[o.arm.cures].failed.any()]
-    return Findings(
+    return Results(
         verdict=(
             f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training noticed "
             f"{noticed:.0%} of them and struck in {false:.0%} of the others.",

@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.bench import paper_numbers as paper
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.data import TouchConfig, open_touch, training_rows
 from experiments.encoder.film import FilmConfig, train_film
@@ -62,7 +62,7 @@ class Config:
     mean_of: int = 320
 
 
-def run(config: Config, context: Context) -> Findings:
+def run(config: Config, context: Context) -> Results:
     """Train both predictors, score them and the baselines."""
     data = open_touch(config.touch, config.frames, config.image_px, context)
     rows, test = training_rows(data), data.parts["test"][: config.scored]
@@ -122,7 +122,7 @@ def show(films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.nd
 
 def findings(
     config: Config, data: Dataset, scores: Mapping[str, Scores], objects: np.ndarray, strips: list[Strip]
-) -> Findings:
+) -> Results:
     """Skill of each predictor and skip, table of all metrics, a strip of frames."""
     skills = {
         (name, s): skill(scores[name].of("l1", s), scores[COPY].of("l1", s), objects)
@@ -132,7 +132,7 @@ def findings(
     longest = max(config.skips)
     sight = skill(scores[SIGHT].of("l1", longest), scores[TOUCH].of("l1", longest), objects)
     over_mean = skill(scores[TOUCH].of("l1", longest), scores[MEAN].of("l1", longest), objects)
-    return Findings(
+    return Results(
         verdict=(
             *(
                 f"{s} frames ahead, touch alone errs {skills[TOUCH, s].mean:.0%} less than copying the last frame "

@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.engine.gpu_device import Sheet
 
 

@@ -20,8 +20,8 @@ import jax
 
 from experiments.core.bars import bars
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
 from experiments.core.progress import in_megabytes
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.engine.load_checkpoints import random_checkpoint
 from experiments.engine.load_readers import Reading, measure
@@ -57,13 +57,13 @@ class LoadWeightsConfig:
             )
 
 
-def run(config: LoadWeightsConfig, context: Context) -> Findings:
+def run(config: LoadWeightsConfig, context: Context) -> Results:
     """Write, read, compare, one size after the other."""
     for size in context.each("looking for room", config.sizes):
         check_room(size, config.scratch, copies=2 if size in config.compare else 1)
     readings = {size: read_size(size, config, context) for size in context.each("sizes", config.sizes, still=True)}
     ratios = {size: {name: r.peak / r.held for name, r in by.items()} for size, by in readings.items()}
-    return Findings(
+    return Results(
         verdict=verdict(readings),
         requirements=tuple(
             Requirement(name=f"{size}: peak over weights", measured=by[OURS], bound=BOUND, better="lower")

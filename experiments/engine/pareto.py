@@ -16,9 +16,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.core.fronts import Axis, Point, dominators, front, points_of
 from experiments.core.history import Past, runs_of, summary
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
 from experiments.fields import motion_dense, motion_markers
@@ -138,7 +138,7 @@ class Judgement:
     beaten_by: tuple[Point, ...] | None
 
 
-def run(config: GatherConfig, context: Context) -> Findings:
+def run(config: GatherConfig, context: Context) -> Results:
     """Find the runs, judge the defaults, show the charts."""
     home = context.directory.parent.parent if config.others is None else config.others
     names = dict.fromkeys([*(judged.experiment for judged in DEFAULTS), *ALSO])
@@ -147,7 +147,7 @@ def run(config: GatherConfig, context: Context) -> Findings:
     judgements = [j for judged in DEFAULTS if judged.experiment in ran for j in judge(judged, ran[judged.experiment])]
     missing = [name for name in names if name not in ran]
     beaten = [j for j in judgements if j.beaten_by]
-    return Findings(
+    return Results(
         verdict=verdict(judgements, missing),
         requirements=(Requirement(name="defaults that are dominated", measured=len(beaten), bound=0, better="lower"),)
         if judgements

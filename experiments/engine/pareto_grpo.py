@@ -24,8 +24,8 @@ import jax
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Table
 from experiments.core.progress import Advance
+from experiments.core.results import Cell, Column, Picture, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job
@@ -71,7 +71,7 @@ class ParetoConfig:
             raise ValueError(f"groups holds {uneven}: must divide rollouts = {self.rollouts}; choose divisors of it")
 
 
-def run(config: ParetoConfig, context: Context) -> Findings:
+def run(config: ParetoConfig, context: Context) -> Results:
     """Every algorithm at every group size."""
     rewards, last = {}, {}
     keys = tuple(itertools.product(ALGORITHMS, config.groups))
@@ -86,7 +86,7 @@ def run(config: ParetoConfig, context: Context) -> Findings:
         (name, group): Course(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
         for name, group in rewards
     }
-    return Findings(
+    return Results(
         verdict=verdict(config, courses),
         tables=(table(config, courses),),
         pictures=pictures(config, courses),

@@ -21,7 +21,7 @@ sampling gathers the sharded weights once, not at every token.
 import dataclasses
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings, Picture, Requirement
+from experiments.core.results import Picture, Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.engine.paper_shapes import PAPER_PROMPT, TINY_PROMPT, Setup, Training, model_of
 from experiments.engine.scale_charts import memory_bars
@@ -89,7 +89,7 @@ class ScaleConfig:
         )
 
 
-def run(config: ScaleConfig, context: Context) -> Findings:
+def run(config: ScaleConfig, context: Context) -> Results:
     """Count every setup, compile the first, predict."""
     training = config.training
     lines = {setup: counted(training, setup) for setup in context.each("counting", config.setups)}
@@ -97,7 +97,7 @@ def run(config: ScaleConfig, context: Context) -> Findings:
         setup: compiled(config, setup, context) for setup in context.each("compilers", config.setups[: config.compiled])
     }
     full = tuple(setup for setup in config.setups if setup.lora is None)
-    return Findings(
+    return Results(
         verdict=verdict(config, lines, reserved),
         requirements=requirements(config, lines, reserved),
         tables=(

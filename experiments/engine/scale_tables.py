@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.engine.paper_shapes import Setup, Training
 from touchr1_jax.distributed.memory import Compiled, counted_peak
 from touchr1_jax.distributed.work import Machine, model_flops, seconds

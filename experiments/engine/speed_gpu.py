@@ -23,7 +23,7 @@ import jax
 
 from experiments.core.bars import bars
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.engine.attention import Heads, draw_heads, errors
@@ -46,7 +46,7 @@ OFF_FLOAT32 = 0.02
 GB = 1e9
 
 
-def run(config: GpuConfig, context: Context) -> Findings:
+def run(config: GpuConfig, context: Context) -> Results:
     """Time every piece, then compare attention and memory with what they must be."""
     device = accelerator(anywhere=config.anywhere)
     with context.progress("drawing what attends", 1) as advance:
@@ -64,7 +64,7 @@ def run(config: GpuConfig, context: Context) -> Findings:
     sheet = sheet_of(device.device_kind)
     first = timed[PRODUCT]
     peak = first.flops / min(first.seconds) if sheet is None else sheet.flops
-    return Findings(
+    return Results(
         verdict=verdict(device, timed, peak, sheet),
         requirements=tuple(
             Requirement(name=f"attention, {name}: off float32", measured=e, bound=OFF_FLOAT32, better="lower")

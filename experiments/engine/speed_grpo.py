@@ -27,8 +27,8 @@ from typing import get_args
 import jax
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings, Picture
 from experiments.core.processes import in_own_process
+from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
 from experiments.engine.harness import PeerJob, PeerTimes
 from experiments.engine.job import config_of
@@ -109,7 +109,7 @@ class SpeedConfig:
             )
 
 
-def run(config: SpeedConfig, context: Context) -> Findings:
+def run(config: SpeedConfig, context: Context) -> Results:
     """Every prefix alone, the variants side by side, many words, many steps, the peers."""
     lean_at = config.repeated_at[-1]
     with tempfile.TemporaryDirectory() as folder:
@@ -133,7 +133,7 @@ def run(config: SpeedConfig, context: Context) -> Findings:
         tell(0, config.steps)
         course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps, tell=tell)
     peers, failed = measure_peers(config, context)
-    return Findings(
+    return Results(
         verdict=(*verdict(alone, twice, peers), *failed),
         requirements=requirements(alone, first, lean, peers, course, parser_seconds(config.size)),
         pictures=pictures(config.size, alone, first, peers, course),

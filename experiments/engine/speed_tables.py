@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.engine.harness import PeerTimes
 from experiments.engine.size import Size
 from experiments.engine.speed import Alone, Course

@@ -21,7 +21,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings, Picture
+from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
 from experiments.engine.failures import PAPER, PLAIN, SCENARIOS, STABLE, Scenario
 from experiments.engine.outcomes import Outcome, Raised, Side
@@ -53,7 +53,7 @@ class StabilityConfig:
     """Margins δ of the tactile-use reward whose odds are tabulated."""
 
 
-def run(config: StabilityConfig, context: Context) -> Findings:
+def run(config: StabilityConfig, context: Context) -> Results:
     """Drive every knob, judge every seed, listen to the alarms."""
     courses = Courses(config.effort, range(config.first_seed, config.first_seed + config.seeds))
     outcomes = []
@@ -61,7 +61,7 @@ def run(config: StabilityConfig, context: Context) -> Findings:
         outcomes.append(drive(scenario, config, courses, context))
         context.say(outcomes[-1].sentence)
     sound = undriven(config, courses, context)
-    return Findings(
+    return Results(
         verdict=verdict(outcomes, sound),
         requirements=requirements(outcomes),
         tables=(summary(outcomes), criteria(outcomes), alarm_table(outcomes), odds_table(config.margins)),

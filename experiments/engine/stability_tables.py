@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.engine.outcomes import Outcome, Raised, share
 from touchr1_jax.rl.alarms import RULES
 from touchr1_jax.rl.config import GRPOConfig, Stable

@@ -27,7 +27,7 @@ import numpy as np
 
 from experiments.core.bars import bars
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.engine.feed_demand import grpo_seconds, sft_seconds
 from experiments.engine.feed_scales import Scale, answers, clip_bytes, memory_share, questions
@@ -98,10 +98,10 @@ class Fed:
         return f"{self.scale}, {self.stage}, {self.source}"
 
 
-def run(config: FeedingConfig, context: Context) -> Findings:
+def run(config: FeedingConfig, context: Context) -> Results:
     """Measure every feed, then run each beside a device that stands in."""
     fed = [one for name, scale in config.scales.items() for one in feeds_of(config, name, scale, context)]
-    return Findings(
+    return Results(
         verdict=verdict(config, fed),
         requirements=tuple(
             Requirement(

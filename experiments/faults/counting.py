@@ -18,8 +18,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings
 from experiments.core.loops import run_loop
+from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import falling_adamw
@@ -54,14 +54,14 @@ class CountingState:
     key: Array
 
 
-def run(config: CountingConfig, context: Context) -> Findings:
+def run(config: CountingConfig, context: Context) -> Results:
     """Follow the targets to the end."""
     optimizer = falling_adamw(0.1, 1.0, config.steps, max_grad_norm=1.0)
     params = jnp.zeros(3)
     zero, key = jnp.zeros((), jnp.int32), jax.random.key(0)
     state = CountingState(params=params, opt_state=optimizer.init(params), step=zero, key=key)
     end = run_loop(_step(optimizer), state, targets(config), config.loop(), context, STAGE)
-    return Findings(verdict=(f"They went to {', '.join(f'{x:.3f}' for x in end.params)}.",))
+    return Results(verdict=(f"They went to {', '.join(f'{x:.3f}' for x in end.params)}.",))
 
 
 def targets(config: CountingConfig) -> grain.DatasetIterator:

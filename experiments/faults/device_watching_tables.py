@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.core.findings import Column, Requirement, Table
+from experiments.core.results import Column, Requirement, Table
 from experiments.faults.device_flood import SHAPE
 from experiments.faults.device_watching import Bridged, Watched, quantiles_ms
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.core.findings import Findings
 from experiments.core.loops import run_loop
+from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.faults.victim import ARM, MODEL
 from experiments.study.arrays import flat, nested
@@ -63,7 +63,7 @@ class ReinforcingConfig:
         return LoopConfig(steps=self.steps, save_every=self.save_every)
 
 
-def run(config: ReinforcingConfig, context: Context) -> Findings:
+def run(config: ReinforcingConfig, context: Context) -> Results:
     """Reinforce to the end."""
     assembly = assemble(MODEL, SENSORS)
     prior = uniform_prior(list(assembly.levels))
@@ -88,7 +88,7 @@ def run(config: ReinforcingConfig, context: Context) -> Findings:
         make_log=watched_log,
         held_out=lambda s: float(judge(s.params)),
     )
-    return Findings(verdict=("It came to its end.",))
+    return Results(verdict=("It came to its end.",))
 
 
 def _certainty(assembly: Assembly, params: Params, held: GRPOBatch) -> jax.Array:

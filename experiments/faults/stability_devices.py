@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 
 from experiments.core.charts import LOOK, PALETTE, svg
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.faults import device_vendor as vendor
 from experiments.faults import device_watching as watching
@@ -77,7 +77,7 @@ class StabilityConfig:
     seed: int = 0
 
 
-def run(config: StabilityConfig, context: Context) -> Findings:
+def run(config: StabilityConfig, context: Context) -> Results:
     """Replay, check the vendor's recordings, time the decoders."""
     outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
     short = dataclasses.replace(config, seconds=config.traced_seconds)
@@ -92,7 +92,7 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     watchers = context.each("watched recordings", (None, *config.browsers))
     seen = [watching.watched(_source(config), config.watch_seconds, n) for n in watchers]
     carried = watching.bridged(config.bridge_frames)
-    return Findings(
+    return Results(
         verdict=(*verdict(outcomes, checked, decode), _watched(seen, carried)),
         requirements=(
             *requirements(outcomes, traced, checked, decode),

@@ -22,8 +22,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
 from experiments.core.progress import Advance
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.faults.bad_inputs import cases
 from experiments.faults.cases import provoke
@@ -74,14 +74,14 @@ class Killed:
     differs: tuple[str, ...]
 
 
-def run(config: FaultsConfig, context: Context) -> Findings:
+def run(config: FaultsConfig, context: Context) -> Results:
     """Kill, damage, feed nonsense, time."""
     victims = {GRPO: (_grpo(config.grpo_steps), config.grpo), "study": (_study(config.study_scale), config.study)}
     killed = {name: _killed(name, *each, context) for name, each in victims.items()}
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
         damage, outcomes = _damage(config, context, Path(scratch)), _bad_inputs(config, context, Path(scratch))
     waited = waits(config.waiting, context)
-    return Findings(
+    return Results(
         verdict=_verdict(killed, damage, outcomes, waited),
         requirements=_requirements(killed, damage, outcomes, waited),
         tables=(_kill_table(killed), _damage_table(damage), _input_table(outcomes), _waiting_table(waited)),

@@ -10,7 +10,7 @@ written.
 import dataclasses
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings
+from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.study.assembly import ModelConfig
 from experiments.study.scores import PUBLISHED
@@ -76,10 +76,10 @@ SHORT = dataclasses.replace(
 )
 
 
-def run(config: StudyConfig, context: Context) -> Findings:
+def run(config: StudyConfig, context: Context) -> Results:
     """Train and ask every policy; what matters lies in the run's directory."""
     study = run_study(config, {ARM: PUBLISHED}, context)
-    return Findings(
+    return Results(
         verdict=("It came to its end.",),
         data={"questions": {name: len(said[0].contact) for name, said in study.answers.items()}},
     )

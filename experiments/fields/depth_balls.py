@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Picture, Requirement, Table
 from experiments.core.pareto import speed_against_error
+from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.depth_methods import MAPS, Slopes
 from experiments.fields.panel import Panel

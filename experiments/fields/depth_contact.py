@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.fields import depth_data
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.panel import Panel

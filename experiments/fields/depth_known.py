@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields import depth_data
 from experiments.fields.depth_balls import calibrated

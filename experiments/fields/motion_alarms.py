@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Table
+from experiments.core.results import Column, Table
 from experiments.fields.motion_frames import load, reduced
 from experiments.fields.panel import Panel
 from sensors_io.fields.deformation import DeformationReader

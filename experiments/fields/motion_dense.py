@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Picture, Requirement, Table
 from experiments.core.pareto import Point, speed_against_error
+from experiments.core.results import Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.motion_frames import Rest
 from experiments.fields.motion_peers import farneback_flow

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.core.charts import LOOK, PALETTE, svg
-from experiments.core.findings import Cell, Column, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.fields.motion_peers import FOLLOWERS
 from experiments.fields.motion_subjects import NOISE_GREY, PEAK_PX, Subject, grey
 from experiments.fields.motion_truth import REST_PICTURES, Film

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import cv2
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Requirement, Table
+from experiments.core.results import Column, Requirement, Table
 from experiments.fields.motion_frames import load
 from experiments.fields.panel import Panel
 from sensors_io.fields.evidence import Pattern, examine

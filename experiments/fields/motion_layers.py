@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Requirement, Table
+from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.fields.motion_shear import BASELINE, MAIN, ShearConfig, methods, pressing, reader, shear_errors
 from experiments.fields.motion_slides import Slide, make_slides
 from experiments.fields.panel import Panel

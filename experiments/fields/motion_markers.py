@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Picture, Requirement, Table
 from experiments.core.pareto import Point, speed_against_error
+from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.motion_peers import FOLLOWERS
 from experiments.fields.motion_subjects import FIRST_SEED, JUMP_PX, NOISE_GREY, PEAK_PX, Subject, grey

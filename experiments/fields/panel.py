@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from experiments.core.findings import Picture, Requirement, Table
+from experiments.core.results import Picture, Requirement, Table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

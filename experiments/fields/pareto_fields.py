@@ -22,7 +22,7 @@ import pathlib
 from collections.abc import Callable
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings
+from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.fields import (
     depth_balls,
@@ -76,14 +76,14 @@ class FieldsConfig:
     seed: int = 0
 
 
-def run(config: FieldsConfig, context: Context) -> Findings:
+def run(config: FieldsConfig, context: Context) -> Results:
     """Measure field by field, gather."""
     panels: list[Panel] = []
     for name, make in context.each("panels", panels_of(config, context).items()):
         context.say(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
             panels += make()
-    return Findings(
+    return Results(
         verdict=tuple(sentence for panel in panels for sentence in panel.verdict),
         requirements=tuple(r for panel in panels for r in panel.requirements),
         tables=tuple(t for panel in panels for t in panel.tables),

@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.findings import Cell, Column, Findings, Picture, Table
+from experiments.core.results import Cell, Column, Picture, Results, Table
 from experiments.core.runner import Experiment
 from experiments.fields.real_folders import FOLDERS, Folder, read_folder
 from experiments.fields.real_pictures import Row, field_rows
@@ -45,7 +45,7 @@ class RealConfig:
     folds: int = 5
 
 
-def run(config: RealConfig, context: Context) -> Findings:
+def run(config: RealConfig, context: Context) -> Results:
     """Calibrate each folder, extract, draw."""
     if config.data_dir is None:
         raise ConfigurationError("data_dir is None: must be the folder of recordings; give --data-dir")
@@ -63,7 +63,7 @@ def run(config: RealConfig, context: Context) -> Findings:
         known = ", ".join(f.path for f in FOLDERS)
         raise FileNotFoundError(f"data_dir is {config.data_dir}: must hold one of {known}; correct it")
     made = sum(row[3] is not None for row in rows)
-    return Findings(
+    return Results(
         verdict=(f"{made} of {len(rows)} folders calibrate with one setting; the others say why they do not.",),
         tables=(_table(rows), _notes(notes)),
         pictures=tuple(pictures),

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.fields import motion_alarms, motion_evidence
 from experiments.fields.depth_breaks import BROKEN_DEPTH, DEPTH_STRESSES, attempt_depth
@@ -74,7 +74,7 @@ Outcomes = Mapping[str, Mapping[tuple[str, float], Sequence[Outcome]]]
 """Method → (stress, level) → outcomes over gels and motions."""
 
 
-def run(config: StabilityConfig, context: Context) -> Findings:
+def run(config: StabilityConfig, context: Context) -> Results:
     """Break everything, draw it, judge the gels."""
     chosen = gels(config.data_dir)[: config.gels]
     outcomes: dict[str, dict[tuple[str, float], list[Outcome]]] = {}
@@ -90,7 +90,7 @@ def run(config: StabilityConfig, context: Context) -> Findings:
             motion_alarms.panel(config.data_dir, context),
             motion_evidence.panel(config.data_dir, config.pictures, context),
         ]
-    return Findings(
+    return Results(
         verdict=tuple(v for p in panels for v in p.verdict),
         requirements=tuple(r for p in panels for r in p.requirements),
         tables=tuple(t for p in panels for t in p.tables),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Table
+from experiments.core.results import Column, Table
 from sensors_io import layer
 from sensors_io.scenes import adhesion, contact, hertz, press
 from sensors_io.scenes.config import SceneConfig

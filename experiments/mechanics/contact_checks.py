@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.mechanics import oracles as contact_oracles
 from sensors_io import layer
 from sensors_io.scenes import contact

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.core.timing import interleaved
 from experiments.mechanics import tangential_scenes
 from experiments.mechanics.tangential_scenes import Bench, Motion

@@ -24,7 +24,7 @@ from collections.abc import Sequence as Seq
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings, Requirement
+from experiments.core.results import Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.mechanics import identify_motions, identify_tables
 from experiments.mechanics.identify_figures import Figures, Studied, figures
@@ -105,7 +105,7 @@ class IdentifiabilityConfig:
         return Tier(name=f"springs, {self.usual_grid}²", grid=self.usual_grid, springs=True)
 
 
-def run(config: IdentifiabilityConfig, context: Context) -> Findings:
+def run(config: IdentifiabilityConfig, context: Context) -> Results:
     """Press, move, ask."""
     tiers = (*config.solved, config.springs)
     with context.timed("presses"), context.progress("presses", len(SENSORS) * (1 + len(tiers))) as advance:
@@ -148,11 +148,11 @@ def _ask(config: IdentifiabilityConfig, pressed: Pressed, moved: dict[str, Moved
         )
 
 
-def findings(config: IdentifiabilityConfig, studied: Studied) -> Findings:
+def findings(config: IdentifiabilityConfig, studied: Studied) -> Results:
     """Everything that is reported."""
     made, scenes = figures(studied), config.presses
     strain = studied.pressed.felt[studied.exact, 0].strain
-    return Findings(
+    return Results(
         verdict=verdict(config, studied, made),
         requirements=requirements(config, studied, made),
         tables=(

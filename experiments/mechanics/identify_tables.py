@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Picture, Table
+from experiments.core.results import Cell, Column, Picture, Table
 from experiments.mechanics import identify_charts
 from experiments.mechanics.identify_figures import Figures, Studied
 from experiments.mechanics.identify_probes import LEVELS

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.mechanics import chooser_charts as charts
 from experiments.mechanics import chooser_fit as fit
@@ -60,7 +60,7 @@ class ChooserConfig:
     seed: int = 12
 
 
-def run(config: ChooserConfig, context: Context) -> Findings:
+def run(config: ChooserConfig, context: Context) -> Results:
     """Measure, refit, choose, judge."""
     menu = make_menu(config.grids)
     fitted = _outcomes("fitted", config.fitted_batches, config, menu, context)
@@ -71,7 +71,7 @@ def run(config: ChooserConfig, context: Context) -> Findings:
     trials = _trials(config, menu, tested, cost, context)
     summaries = [trial.summary(t, tested.errors, cost) for t in trials]
     made = _sequences(config, context)
-    return Findings(
+    return Results(
         verdict=(*_verdict(summaries), _sequence_verdict(made)),
         requirements=(*(r for s in summaries for r in _requirements(s)), *map(_kept_requirement, made)),
         tables=(

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.ndimage import zoom
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
 from experiments.core.pareto import Point, speed_against_error
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.mechanics import contact_checks
@@ -81,7 +81,7 @@ def methods() -> tuple[Method, ...]:
     )
 
 
-def run(config: ParetoConfig, context: Context) -> Findings:
+def run(config: ParetoConfig, context: Context) -> Results:
     """Measure, compare, chart."""
     context.say(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
     bench, scenes = make_bench(SENSOR, config.grid), sample(SENSOR, config.scenes, config.grid, config.seed)
@@ -92,7 +92,7 @@ def run(config: ParetoConfig, context: Context) -> Findings:
     published = contact_checks.published(config.oracle_scenes, config.grid, config.seed, context)
     hertz = contact_checks.hertz(config.grid, context)
     main = rows[MAIN]
-    return Findings(
+    return Results(
         verdict=verdict(rows, hertz),
         requirements=requirements(rows, oracles, hertz),
         tables=(_tier_table(rows, config), _ladder_table(ladder), contact_checks.oracle_table(oracles), published),

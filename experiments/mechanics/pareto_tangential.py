@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Findings, Requirement
+from experiments.core.results import Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.mechanics import coupling as tangential_coupling
@@ -119,7 +119,7 @@ def methods() -> dict[str, tuple[Method, ...]]:
     }
 
 
-def run(config: TangentialConfig, context: Context) -> Findings:
+def run(config: TangentialConfig, context: Context) -> Results:
     """Draw, solve exactly, measure, compare, chart."""
     loops = () if config.data_dir is None else (tangential_loops.loop_table(config.data_dir),)
     with context.timed("contacts"):
@@ -132,7 +132,7 @@ def run(config: TangentialConfig, context: Context) -> Findings:
     with context.timed("coupling"):
         coupled = couple(config, context)
     promises = hold_promises(gels, tasks["force"][SUPERPOSED])
-    return Findings(
+    return Results(
         verdict=(*verdict(tasks, promises), tangential_coupling.verdict(coupled)),
         requirements=requirements(tasks, promises, mindlin, torque),
         tables=(

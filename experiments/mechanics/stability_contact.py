@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.mechanics import adhesion as contact_adhesion
 from experiments.mechanics import contact_charts
@@ -76,7 +76,7 @@ class Outcome:
     strain: float
 
 
-def run(config: StabilityConfig, context: Context) -> Findings:
+def run(config: StabilityConfig, context: Context) -> Results:
     """Suite, maps, ordinary scenes."""
     cases = suite(config.grid)
     outcomes = {case.name: attempt(case) for case in context.each("cases", cases)}
@@ -86,7 +86,7 @@ def run(config: StabilityConfig, context: Context) -> Findings:
     sticky = contact_adhesion.thresholds(config.adhesion_grid, context)
     every = [*outcomes.values(), *by_roughness.values(), *by_thickness.values()]
     kept = [outcomes[c.name].flagged for c in cases if c.refused]
-    return Findings(
+    return Results(
         verdict=_verdict(outcomes, ordinary),
         requirements=(
             _count("frames with a NaN", sum(not o.finite for o in every) + ordinary["not finite"]),

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from sensors_io.scenes import partial_slip, tangential
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.sensors import BODY, SensorModel

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.core.checks import require
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from sensors_io.scenes import history
 
 RECORDING = "example_1_AD2-0065L.npz"

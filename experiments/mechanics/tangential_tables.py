@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Picture, Table
 from experiments.core.pareto import Point
+from experiments.core.results import Cell, Column, Picture, Table
 from experiments.mechanics import tangential_charts
 from experiments.mechanics.tangential_checks import Promise
 from sensors_io.scenes import tangential

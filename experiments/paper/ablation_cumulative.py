@@ -19,8 +19,7 @@ import itertools
 
 from experiments.bench import paper_numbers as paper
 from experiments.core.context import Context
-from experiments.core.findings import Requirement
-from experiments.core.results import Results
+from experiments.core.results import Requirement, Results
 from experiments.paper import presets
 from experiments.paper.aggregate import aggregate_table
 from experiments.paper.deltas import FOUR, MEASURES, Delta, Step

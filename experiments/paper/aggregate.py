@@ -4,8 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.core.findings import Cell, Column, Table
-from experiments.core.results import Estimate
+from experiments.core.results import Cell, Column, Estimate, Table
 from experiments.paper.paper_comparison import COLUMNS
 from touchr1_jax.bench.averages import WORST_OMAE
 from touchr1_jax.bench.scoring import REPORTED

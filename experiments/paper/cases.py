@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 
 from experiments.bench.languages import answer_words
 from experiments.bench.phrases import question
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.paper.conflict_metrics import Asked, spoken
 from experiments.study.answers import Evaluated
 from sensors_io.schema import ATTRIBUTES

@@ -20,8 +20,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Picture, Requirement
-from experiments.core.results import Results
+from experiments.core.results import Picture, Requirement, Results
 from experiments.paper import presets
 from experiments.paper.conflict_metrics import (
     Asked,

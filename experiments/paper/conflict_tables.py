@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.paper.conflict_metrics import Contrast, Use
 from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE
 

@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 
 from experiments.bench import paper_numbers as paper
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
-from experiments.core.findings import Cell, Column, Table
-from experiments.core.results import Estimate
+from experiments.core.results import Cell, Column, Estimate, Table
 from experiments.paper.paper_comparison import COLUMNS
 from experiments.paper.sizes import Cost
 from experiments.study.study import StudyConfig

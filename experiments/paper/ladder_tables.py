@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from experiments.bench import paper_numbers as paper
-from experiments.core.findings import Cell, Column, Table
-from experiments.core.results import Estimate
+from experiments.core.results import Cell, Column, Estimate, Table
 from experiments.paper.deltas import MEASURES, Delta
 from experiments.paper.ladder_arms import LADDER
 from touchr1_jax.bench.statistics import Interval

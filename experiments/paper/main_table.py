@@ -25,8 +25,7 @@ import numpy as np
 from experiments.bench import paper_numbers as paper
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
-from experiments.core.findings import Requirement
-from experiments.core.results import Comparison, Estimate, Results
+from experiments.core.results import Comparison, Estimate, Requirement, Results
 from experiments.paper import presets
 from experiments.paper.aggregate import aggregate_table
 from experiments.paper.baselines import Known, Levels, nearest, probed

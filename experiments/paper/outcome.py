@@ -4,8 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from experiments.core.context import Context, read_metrics
-from experiments.core.findings import Picture
-from experiments.core.results import Estimate
+from experiments.core.results import Estimate, Picture
 from experiments.paper.deltas import FOUR, Delta, Step, deltas, with_four
 from experiments.paper.diagnosis import Case, course_of, diagnose
 from experiments.paper.ladder_charts import delta_chart

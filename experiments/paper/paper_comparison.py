@@ -4,8 +4,7 @@ import collections
 from collections.abc import Mapping, Sequence
 
 from experiments.bench import paper_numbers as paper
-from experiments.core.findings import Cell, Column, Table
-from experiments.core.results import Estimate
+from experiments.core.results import Cell, Column, Estimate, Table
 from touchr1_jax.bench.averages import touch_average
 from touchr1_jax.bench.items import KINDS, Ask
 from touchr1_jax.bench.scoring import REPORTED

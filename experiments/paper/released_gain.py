@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Requirement, Table
+from experiments.core.results import Column, Requirement, Table
 from experiments.study.stages import KEPT
 from experiments.study.study import BLIND, SFT
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import jax
 
-from experiments.core.findings import Column, Table
+from experiments.core.results import Column, Table
 from experiments.paper.released_policy import ReleasedAssembly
 from experiments.study.dataset import Dataset
 from experiments.study.training import TrainingConfig

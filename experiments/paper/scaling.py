@@ -22,8 +22,7 @@ import numpy as np
 
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
-from experiments.core.findings import Picture
-from experiments.core.results import Estimate, Results, RolloutExample
+from experiments.core.results import Estimate, Picture, Results, RolloutExample
 from experiments.core.timing import interleaved
 from experiments.paper import presets
 from experiments.paper.experiment import bench_experiment

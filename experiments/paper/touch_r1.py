@@ -41,9 +41,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Requirement
 from experiments.core.progress import in_megabytes
-from experiments.core.results import Comparison, Estimate, Results
+from experiments.core.results import Comparison, Estimate, Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.paper.conflict_metrics import Use, asked_of, touch_use
 from experiments.paper.conflict_tables import use_table

@@ -26,7 +26,7 @@ import numpy as np
 from experiments.core.artifacts import write_bytes, write_json
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.recordings.charts import against_objects, confusions
 from experiments.recordings.descriptions import Described, describe_folder, describe_source
@@ -84,7 +84,7 @@ class PhysiclearStudy:
     learn: LearnConfig = LearnConfig()
 
 
-def run(config: PhysiclearStudy, context: Context) -> Findings:
+def run(config: PhysiclearStudy, context: Context) -> Results:
     """Validate and train, or predict.
 
     Raises:
@@ -99,7 +99,7 @@ def run(config: PhysiclearStudy, context: Context) -> Findings:
     return validate(config, config.data_dir, context)
 
 
-def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) -> Findings:
+def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) -> Results:
     """Answer for a folder of videos with a trained policy."""
     path = config.policy or kept(config, context)
     if config.data_dir is not None and not path.exists():
@@ -116,14 +116,14 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
     left = "".join(f" Left out: {skip.name}, {skip.reason}." for skip in videos.skipped)
     columns = (Column(name="video"), *(Column(name=name, format="d") for name in NAMES))
     rows = tuple((name, *levels.values()) for name, levels in answers.items())
-    return Findings(
+    return Results(
         verdict=(f"{len(answers)} videos answered in {out}.{left}",),
         tables=(Table(title="Answers", columns=columns, rows=rows),),
         settings={"objects learned from": len(np.unique(learned.memory.objects))},
     )
 
 
-def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findings:
+def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Results:
     """Cross-validate, measure what contributes and what limits, keep a policy of all objects."""
     everything = describe_source(data_dir, config.frames, context, config.objects)
     videos = everything.labelled()
@@ -143,7 +143,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Findi
         contributions += ablate(config.learn, videos, background, elsewhere, config.ablation_seed, context)
     limits = label_limits(config.learn, videos, background, elsewhere, context)
     score = lambda title, rows, note="": score_table(title, rows, videos.label, videos.objects, note)
-    return Findings(
+    return Results(
         verdict=verdict(main, curve, videos, answer),
         requirements=requirements(main, spent),
         tables=(

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import ConfigurationError
-from experiments.core.findings import Cell, Column, Table
+from experiments.core.results import Cell, Column, Table
 from experiments.recordings.policy import COMBINATIONS, LANGUAGE, LEVELS
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap

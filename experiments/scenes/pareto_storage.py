@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.scenes.storage_charts import size_against_rates
 from experiments.scenes.storage_clips import GENERATED, IMPORTED, generated_clips, recorded_clips
@@ -64,7 +64,7 @@ class StorageConfig:
     core_share: float = 0.15
 
 
-def run(config: StorageConfig, context: Context) -> Findings:
+def run(config: StorageConfig, context: Context) -> Results:
     """Store, feed, compare."""
     clips = {GENERATED: generated_clips(config.scenes, context.each("making scenes", range(config.contacts)))}
     if config.data_dir is not None:
@@ -81,7 +81,7 @@ def run(config: StorageConfig, context: Context) -> Findings:
     need = config.training_fps / config.core_share
     best = fastest_small(rows, need)
     filters = {kind: chosen_filters(context.each(f"filters, {kind}", group)) for kind, group in clips.items()}
-    return Findings(
+    return Results(
         verdict=verdict(rows, best, need, stages, rates),
         requirements=requirements(rows, best),
         tables=(*(_table(kind, r) for kind, r in rows.items()), _filters(filters), _stages(stages), _rates(rates)),

@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.core.charts import PALETTE
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Table
+from experiments.core.results import Cell, Column, Picture, Results, Table
 from experiments.core.runner import Experiment
 from experiments.scenes.sheets import depth_picture, field_picture, picture_rows, strips
 from sensors_io.scenes import appearance, objects, properties, surface
@@ -54,7 +54,7 @@ class GalleryConfig:
     seed: int = 0
 
 
-def run(config: GalleryConfig, context: Context) -> Findings:
+def run(config: GalleryConfig, context: Context) -> Results:
     """Draw all sheets."""
     sheets = {
         "views": lambda: [views(config)],
@@ -69,7 +69,7 @@ def run(config: GalleryConfig, context: Context) -> Findings:
             with context.timed(name):
                 pictures += draw()
             advance(1)
-    return Findings(
+    return Results(
         verdict=(f"{len(pictures)} sheets, drawn from seed {config.seed}.",),
         tables=(odds(),),
         pictures=tuple(pictures),

@@ -23,7 +23,7 @@ import numpy as np
 
 from experiments.core.artifacts import write_text
 from experiments.core.context import Context
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.scenes import realism
 from experiments.scenes.shadows import shadow_gain
@@ -58,7 +58,7 @@ class RealismConfig:
     seed: int = 0
 
 
-def run(config: RealismConfig, context: Context) -> Findings:
+def run(config: RealismConfig, context: Context) -> Results:
     """Fit, render the held-out presses, compare."""
     presses = realism.read(
         config.data_dir,
@@ -76,7 +76,7 @@ def run(config: RealismConfig, context: Context) -> Findings:
         rows[name] = compare(real, rendered[name], study, config.judge)
     shadows = shadow_gain(study.presses, study.profiles, study.touches, study.fitted, study.held_out, context)
     drift = float(np.sqrt(np.mean((realism.clean(study, study.fitted) - realism.clean(study, photometric.MINI)) ** 2)))
-    return Findings(
+    return Results(
         verdict=verdict(rows, shadows),
         requirements=(
             Requirement(

@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.findings import Cell, Column, Findings, Picture, Requirement, Table
+from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.scenes import charts as scene_charts
 from experiments.scenes import kills as scene_kills
@@ -109,7 +109,7 @@ class Written:
     kept: Kept
 
 
-def run(config: ThroughputConfig, context: Context) -> Findings:
+def run(config: ThroughputConfig, context: Context) -> Results:
     """Feed, write, kill, take apart; what was measured before an interruption is not measured again."""
     feed = Rate(**_once(context, "feed/0", lambda: _feed(config, context, config.feed_contacts, config.image_px)))
     large = Rate(**_once(context, "large/0", lambda: _feed(config, context, config.large_contacts, config.large_px)))
@@ -124,7 +124,7 @@ def run(config: ThroughputConfig, context: Context) -> Findings:
     with context.progress("planning the paper's set", 1) as advance:
         leaks = scene_protocol.leaks(paper)
         advance()
-    return Findings(
+    return Results(
         verdict=_verdict(feed, large, written),
         requirements=_requirements(feed, large, written, leaks),
         tables=(

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments.core.charts import PALETTE
-from experiments.core.findings import Picture, Table
 from experiments.core.levels import Levels, confusion_chart, reliability_table, trust_chart
+from experiments.core.results import Picture, Table
 from experiments.study.answers import Evaluated
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES

@@ -1,4 +1,4 @@
-"""Findings refuse what must not be published, say whether bounds are kept, and fill a self-contained report."""
+"""Results refuse what must not be published, say whether bounds are kept, and fill a self-contained report."""
 
 import dataclasses
 import json
@@ -6,8 +6,8 @@ import json
 import pytest
 
 from experiments.core.checks import ResultsError
-from experiments.core.findings import Column, Findings, Picture, Requirement, Table
-from experiments.core.report_findings import write_findings
+from experiments.core.report import write_report
+from experiments.core.results import Column, Picture, Requirement, Results, Table
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, VOID, read
 
 FAST = Requirement(name="frame", measured=2.0, bound=2.5, better="lower", unit="ms")
@@ -15,7 +15,7 @@ SLOW = Requirement(name="rate", measured=399.0, bound=400.0, better="higher", un
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
 
-def findings(**changes) -> Findings:
+def findings(**changes) -> Results:
     table = Table(
         title="Tiers",
         columns=(
@@ -27,7 +27,7 @@ def findings(**changes) -> Findings:
     )
     chart = Picture(name="pareto", title="Speed", caption="left is faster", content=SVG)
     made = {"verdict": ("It is fast.",), "requirements": (FAST, SLOW), "tables": (table,), "pictures": (chart,)}
-    return Findings(**(made | changes))
+    return Results(**(made | changes))
 
 
 def test_a_bound_is_kept_on_its_own_side():
@@ -47,7 +47,7 @@ def test_the_json_holds_the_figures_and_whether_bounds_are_kept():
 
 
 def test_the_report_shows_everything_and_loads_nothing(tmp_path):
-    path = write_findings(tmp_path, findings(), about="How fast?\n\nmake it", description=DESCRIPTION)
+    path = write_report(tmp_path, findings(), about="How fast?\n\nmake it", description=DESCRIPTION)
     page = read(path.read_text())
     for text in ("How fast?", "It is fast.", "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster"):
         assert text in page.text
@@ -58,7 +58,7 @@ def test_the_report_shows_everything_and_loads_nothing(tmp_path):
 
 def test_hostile_text_stays_text(tmp_path):
     bad = findings(verdict=(HOSTILE,), requirements=(dataclasses.replace(SLOW, note=HOSTILE),))
-    page = read(write_findings(tmp_path, bad, about=HOSTILE, description=DESCRIPTION).read_text())
+    page = read(write_report(tmp_path, bad, about=HOSTILE, description=DESCRIPTION).read_text())
     assert "script" not in page.seen
     assert page.text.count(HOSTILE) >= 3
 

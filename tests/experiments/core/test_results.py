@@ -29,7 +29,7 @@ def changed(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"arms": {}}, "one arm"),
+        ({"arms": {}, "baselines": {"constant": {}}}, "one arm"),
         ({"arms": {"a": {}}}, "one metric"),
         ({"arms": {"a": {"H_acc": GOOD}}}, "H_acc.*h_acc"),
         ({"arms": changed(ci95=(60.0, 40.0))}, "low, high"),
