@@ -9,7 +9,7 @@ import math
 import numpy as np
 from scipy import optimize, special
 
-from experiments.bench import paper_numbers as paper
+from experiments.study import paper_numbers as paper
 
 SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005
 """Half of the last digit of a percentage, and of OMAE and ρ."""

@@ -2,7 +2,7 @@
 
     make experiment EXP=paper_audit
 
-Every number of the paper that a conclusion hangs on is typed in `bench/paper_numbers.py` under the table or section it
+Every number of the paper that a conclusion hangs on is typed in `study/paper_numbers.py` under the table or section it
 stands in; every inconsistency is a check that computes anew what follows from them, with rounding granted.  Nothing is
 trained and no data is read.
 
@@ -14,7 +14,6 @@ out.  So results here are held to the directions of the paper, never to its valu
 
 import dataclasses
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.paper_arithmetic import best_weighting, columns_as_scores, error_and_distance, gain_interval
 from experiments.bench.paper_arithmetic import impossible_distances as impossible
 from experiments.bench.paper_charts import average_against_mean, distance_against_error
@@ -22,6 +21,7 @@ from experiments.bench.paper_checks import Check, holding, inconsistencies
 from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
+from experiments.study import paper_numbers as paper
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,9 +4,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.paper_arithmetic import columns_as_scores, error_and_distance, impossible_distances
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
+from experiments.study import paper_numbers as paper
 
 
 def distance_against_error() -> bytes:

@@ -7,7 +7,6 @@ import dataclasses
 import math
 from typing import Literal
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.paper_arithmetic import (
     SHARE_ROUNDING,
     TOUCHES,
@@ -19,6 +18,7 @@ from experiments.bench.paper_arithmetic import (
     impossible_distances,
     perfect_average,
 )
+from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.agreement import wilson_interval
 
 Verdict = Literal["contradiction", "not given", "unsupported", "holds"]

@@ -26,7 +26,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench import vtv
 from experiments.bench.vtv import ATTRIBUTES, draw_tasks
 from experiments.bench.vtv_report import Rows, tasks_table, vtv_chart, vtv_table
@@ -36,7 +35,8 @@ from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
 from experiments.mechanics.identify_motions import Moved, feel, rows_of
 from experiments.mechanics.identify_probes import transfer
-from experiments.paper.ladder_tables import differences_table
+from experiments.study import paper_numbers as paper
+from experiments.study.paper_numbers import differences_table
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS

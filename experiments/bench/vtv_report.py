@@ -6,10 +6,10 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.vtv import CHANCE
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 from experiments.core.results import Cell, Column, Table
+from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.bench.statistics import Interval
 

@@ -20,7 +20,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
@@ -29,6 +28,7 @@ from experiments.encoder.film import FilmConfig, train_film
 from experiments.encoder.film_scores import COPY, MEAN, Film, Judge, Scores, answer_all, batches, judged, mean_frames
 from experiments.encoder.film_strip import Strip, film_strip
 from experiments.encoder.intervals import skill
+from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from experiments.study.pretrained import PretrainedEncoder, load_encoder
 from sensors_io.scenes.config import SceneConfig

@@ -17,7 +17,6 @@ reward makes slots agree and raises CSC little or not at all; format adds nothin
 
 import itertools
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.context import Context
 from experiments.core.results import Requirement, Results
 from experiments.paper import presets
@@ -26,11 +25,13 @@ from experiments.paper.deltas import FOUR, MEASURES, Delta, Step
 from experiments.paper.eval_variants import untrained
 from experiments.paper.experiment import bench_experiment
 from experiments.paper.ladder_arms import LADDER, arms
-from experiments.paper.ladder_tables import attribute_table, delta_table, differences_table, rung_table
+from experiments.paper.ladder_tables import DIFFERS, attribute_table, delta_table, rung_table
 from experiments.paper.outcome import CURVES, Outcome, delta_picture, find, outcome, phrase, shown
+from experiments.study import paper_numbers as paper
 from experiments.study.ablation import compared_pairs
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import SFT, StudyConfig, Way, run_study
 
@@ -71,7 +72,7 @@ def run(config: StudyConfig, context: Context) -> Results:
             attribute_table(result.estimates),
             *aggregate_table(result.scored.arms, SFT),
             *reliability,
-            differences_table(),
+            differences_table(DIFFERS),
         ),
         pictures=(*delta_picture(result.found, "What each rung changes"), *pictures),
         data=study.data.summary(),

@@ -17,7 +17,6 @@ and are wrong (F2).  The other components matter less than seeds differ.
 
 import functools
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.paper import presets
@@ -26,11 +25,13 @@ from experiments.paper.deltas import FOUR, Step
 from experiments.paper.eval_variants import without_sft
 from experiments.paper.experiment import bench_experiment
 from experiments.paper.ladder_arms import FULL, NO_SFT, OMISSIONS, WHOLE, omitted
-from experiments.paper.ladder_tables import delta_table, differences_table
+from experiments.paper.ladder_tables import DIFFERS, delta_table
 from experiments.paper.outcome import CURVES, Outcome, delta_picture, outcome, phrase, shown
+from experiments.study import paper_numbers as paper
 from experiments.study.ablation import compared_pairs
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import SFT, StudyConfig, Way, run_study
 
@@ -73,7 +74,7 @@ def run(config: StudyConfig, context: Context) -> Results:
             delta_table(result.found, result.why, "What each component is worth", NOTE),
             *aggregate_table(result.scored.arms, FULL),
             *reliability,
-            differences_table(),
+            differences_table(DIFFERS),
         ),
         pictures=(*delta_picture(result.found, "What each component is worth"), *pictures),
         data=study.data.summary(),

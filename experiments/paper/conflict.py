@@ -39,9 +39,10 @@ from experiments.paper.eval_variants import control_name, under_controls
 from experiments.paper.experiment import bench_experiment
 from experiments.paper.ladder_arms import FULL
 from experiments.paper.ladder_charts import believed_chart
-from experiments.paper.ladder_tables import DIFFERS, differences_table
+from experiments.paper.ladder_tables import DIFFERS
 from experiments.paper.outcome import CURVES
 from experiments.study.examples import rollout_examples
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES

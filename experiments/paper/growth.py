@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 from experiments.core.results import Cell, Column, Estimate, Table
 from experiments.paper.paper_comparison import COLUMNS
 from experiments.paper.sizes import Cost
+from experiments.study import paper_numbers as paper
 from experiments.study.study import StudyConfig
 from touchr1_jax.bench.averages import touch_average
 from touchr1_jax.bench.scoring import REPORTED

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.results import Cell, Column, Estimate, Table
 from experiments.paper.deltas import MEASURES, Delta
 from experiments.paper.ladder_arms import LADDER
+from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.statistics import Interval
 
 PER_ATTRIBUTE = ("h_acc", "r_acc", "p_acc", "mat_acc")
@@ -119,15 +119,6 @@ def delta_table(found: Sequence[Delta], why: Mapping[Delta, Sequence[str]], titl
         ),
         rows=tuple(rows),
         note=note,
-    )
-
-
-def differences_table(rows: Sequence[tuple[str, str, str]] = DIFFERS) -> Table:
-    """What is different between the paper's experiment and this one."""
-    return Table(
-        title="What differs from the paper",
-        columns=(Column(name=""), Column(name="paper"), Column(name="here")),
-        rows=tuple(rows),
     )
 
 

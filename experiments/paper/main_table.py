@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Requirement, Results
@@ -33,16 +32,18 @@ from experiments.paper.eval_variants import by_encoder
 from experiments.paper.experiment import bench_experiment
 from experiments.paper.features import Seen, field_features, picture_features
 from experiments.paper.ladder_arms import FULL
-from experiments.paper.ladder_tables import DIFFERS, differences_table
+from experiments.paper.ladder_tables import DIFFERS
 from experiments.paper.outcome import CURVES
 from experiments.paper.paper_comparison import beside_table, tier_table
 from experiments.paper.questions import answered, questions
 from experiments.paper.rows import bench_row
+from experiments.study import paper_numbers as paper
 from experiments.study.answers import Evaluated
 from experiments.study.baselines import baselines, level_answers
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, Study, StudyConfig, Way, run_study
 from touchr1_jax.bench.items import Ask

@@ -3,8 +3,8 @@
 import collections
 from collections.abc import Mapping, Sequence
 
-from experiments.bench import paper_numbers as paper
 from experiments.core.results import Cell, Column, Estimate, Table
+from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.averages import touch_average
 from touchr1_jax.bench.items import KINDS, Ask
 from touchr1_jax.bench.scoring import REPORTED

@@ -14,9 +14,9 @@ are ours, the paper gives none.  Neither scale has been run: no machine of that 
 import dataclasses
 from collections.abc import Mapping
 
-from experiments.bench import paper_numbers as paper
 from experiments.bench.draw import Quota
 from experiments.core.machine import Machine
+from experiments.study import paper_numbers as paper
 from experiments.study.assembly import ModelConfig
 from experiments.study.stages import SFTConfig
 from experiments.study.study import SMOKE, StudyConfig

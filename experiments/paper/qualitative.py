@@ -26,11 +26,12 @@ from experiments.paper.conflict_metrics import Asked, asked_of
 from experiments.paper.eval_variants import control_name, under_controls
 from experiments.paper.experiment import bench_experiment
 from experiments.paper.ladder_arms import FULL
-from experiments.paper.ladder_tables import DIFFERS, differences_table
+from experiments.paper.ladder_tables import DIFFERS
 from experiments.paper.outcome import CURVES
 from experiments.paper.questions import answered, questions, touch_rows
 from experiments.study.answers import Evaluated
 from experiments.study.examples import rollouts_of
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES

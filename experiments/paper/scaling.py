@@ -37,7 +37,7 @@ from experiments.paper.growth import (
     size_table,
 )
 from experiments.paper.ladder_arms import FULL
-from experiments.paper.ladder_tables import DIFFERS, differences_table
+from experiments.paper.ladder_tables import DIFFERS
 from experiments.paper.outcome import CURVES
 from experiments.paper.paper_comparison import tier_table
 from experiments.paper.questions import answered, questions
@@ -45,6 +45,7 @@ from experiments.paper.rows import bench_row
 from experiments.paper.sizes import CALLS, LARGE, SMALL, Calls, Cost, calls_of, grpo_step_s, study_apart
 from experiments.study.assembly import ModelConfig
 from experiments.study.examples import rollout_examples
+from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, StudyConfig
 from touchr1_jax.bench.items import Ask

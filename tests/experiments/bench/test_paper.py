@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments.bench import paper_arithmetic, paper_checks, paper_numbers
+from experiments.bench import paper_arithmetic, paper_checks
+from experiments.study import paper_numbers
 
 
 def test_every_known_inconsistency_shows_and_every_other_statement_holds():

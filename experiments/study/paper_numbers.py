@@ -1,9 +1,11 @@
-"""The numbers of Touch-R1 (arXiv 2605.27154) as they are printed, each group under the place it stands in.
+"""The printed numbers of Touch-R1 (arXiv 2605.27154), each group under the table or section where it is printed.
 
 Nothing here is computed.  Shares are percentages, OMAE is in levels, ρ is Spearman's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+
+from experiments.core.results import Table, named_table
 
 COLUMNS = ("H-Acc", "R-Acc", "P-Acc", "Mat-Acc", "OMAE", "L2-EM", "SFD", "SOI-ρ", "CSC")
 """Columns of the main table, before Avg."""
@@ -156,3 +158,8 @@ INTERVALS = 0
 
 AUDITED, AUDIT_PASSED = 2_000, 91.6
 """Section 3.1, "QA Generation and Quality Verification"."""
+
+
+def differences_table(rows: Sequence[tuple[str, str, str]]) -> Table:
+    """Differences between the paper's experiment and this one: topic, in the paper, here."""
+    return named_table("What differs from the paper", [{"": topic, "paper": a, "here": b} for topic, a, b in rows])
