@@ -5,7 +5,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl import kl
 from touchr1_jax.text import lexer
 
@@ -21,6 +21,6 @@ def test_dimensions_of_arguments_must_agree():
 
 
 def test_functions_without_shapes_are_left_alone():
-    assert hasattr(Agent.group_logits, "__wrapped__")
+    assert hasattr(PolicyFns.group_logits, "__wrapped__")
     assert not hasattr(lexer.phrases_of, "__wrapped__")
     assert not hasattr(lexer.Lexer.__init__, "__wrapped__")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from experiments.engine.training import Effort
-from experiments.engine.world import AGENT, LENGTH, PARSER, K, S, Scene, World, draw, noise_bank
+from experiments.engine.world import FNS, LENGTH, PARSER, K, S, Scene, World, draw, noise_bank
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch, swap_touch
@@ -55,8 +55,8 @@ def examine(effort: Effort, world: World, params: Params, reference: Params, key
 def answers(effort: Effort, params: Params, scene: Scene, features: Features, key: Array) -> tuple[Rollout, Parsed]:
     """Sampled answers, and what they say; leading axes P and G."""
     batch = dataclasses.replace(scene.batch, features=features)
-    config = SampleConfig(group=effort.answers, length=LENGTH, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id, inverse=True)
-    rollout = sample_prompts(AGENT, params, encode_prompts(AGENT, params, batch), key, config)
+    config = SampleConfig(group=effort.answers, length=LENGTH, end_ids=FNS.end_ids, pad_id=FNS.pad_id, inverse=True)
+    rollout = sample_prompts(FNS, params, encode_prompts(FNS, params, batch), key, config)
     return rollout, jax.vmap(jax.vmap(PARSER))(rollout.tokens)
 
 
@@ -88,7 +88,7 @@ def divergences(
 
     def log_p(which: Params, touch: Float[Array, "P S N D"]) -> Array:
         batch = dataclasses.replace(scene.batch, features=dataclasses.replace(features, touch=touch))
-        logits = jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0))(
+        logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))(
             which, batch.features, batch.ids, batch.mask, rollout.tokens
         )
         return jax.nn.log_softmax(logits)

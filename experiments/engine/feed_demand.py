@@ -42,7 +42,7 @@ def sft_seconds(assembly: Assembly, config: SFTConfig, batch: SFTBatch, devices:
       devices: that share it.
       machine: what each can do.
     """
-    optimizer, step = sft_program(assembly.agent, config, False)
+    optimizer, step = sft_program(assembly.fns, config, False)
 
     def start(touch: TouchBatch) -> SFTState:
         params = assembly.init(0, touch)
@@ -61,7 +61,7 @@ def grpo_seconds(assembly: Assembly, config: GRPOConfig, devices: int, machine: 
       machine: what each can do.
     """
     shape = GRPOShape(
-        decoder=assembly.agent.policy.config.decoder,
+        decoder=assembly.fns.module.config.decoder,
         grpo=config,
         mesh=MeshConfig(fsdp=devices),
         prompt_tokens=assembly.layout.ids.shape[1],

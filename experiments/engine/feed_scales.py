@@ -60,7 +60,7 @@ def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
 def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: Scale) -> QuestionFeed:
     """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
     params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
-    one = jax.eval_shape(encode_program(assembly.agent, False), params, touch)
+    one = jax.eval_shape(encode_program(assembly.fns, False), params, touch)
     n = len(data.store)
     zeros: Features = jax.tree.map(lambda x: np.zeros((n, *x.shape[1:]), x.dtype), one)
     there: Any = np.ones(zeros.stream_mask.shape, bool)

@@ -121,11 +121,11 @@ class Learning:
     def decoding(self) -> Piece:
         """Completions of encoded prompts, token by token."""
         size = self._config.size
-        agent = dataclasses.replace(self._job.agent, cache_dtype=jnp.dtype(jnp.bfloat16))
+        fns = dataclasses.replace(self._job.fns, cache_dtype=jnp.dtype(jnp.bfloat16))
         params = jax.tree.map(lambda x: x.astype(jnp.bfloat16), self._job.state.params)
-        prompts = jax.jit(functools.partial(encode_prompts, agent))(params, self._job.batch)
-        draw = SampleConfig(group=size.group, length=size.length, end_ids=agent.end_ids, pad_id=0, inverse=True)
-        decode = jax.jit(lambda p, prompts, key: sample_prompts(agent, p, prompts, key, draw))
+        prompts = jax.jit(functools.partial(encode_prompts, fns))(params, self._job.batch)
+        draw = SampleConfig(group=size.group, length=size.length, end_ids=fns.end_ids, pad_id=0, inverse=True)
+        decode = jax.jit(lambda p, prompts, key: sample_prompts(fns, p, prompts, key, draw))
         work, key = grpo_work(self._shape)["sampling"], jax.random.key(3)
         made = size.prompts * size.group * size.length
         return Piece(lambda: decode(params, prompts, key), work.flops, work.read_bytes, made, "tokens")

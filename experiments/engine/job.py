@@ -15,9 +15,9 @@ import numpy as np
 import optax
 
 from experiments.engine.size import BETA, LEARNING_RATE, Size
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
@@ -64,9 +64,9 @@ class Job:
                 group=1,
                 micro_prompts=config.micro_prompts * size.group,
             )
-        self.agent, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
+        self.fns, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
         self.batch = make_batch(size, prefix, config.drawn, seed)
-        params = init_decoder(self.agent, self.batch)
+        params = init_decoder(self.fns, self.batch)
         self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
         self._state = start_state(params, optimizer, jax.random.key(seed), config)
 
@@ -93,12 +93,12 @@ class Job:
 @functools.cache
 def engine(
     size: Size, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
-) -> tuple[Agent, optax.GradientTransformation, Any]:
+) -> tuple[PolicyFns, optax.GradientTransformation, Any]:
     """Policy, optimizer and compiled step, made once for all seeds."""
-    agent = make_agent(size, prefix, end_share)
+    fns = make_fns(size, prefix, end_share)
     score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
     optimizer = optax.adamw(learning_rate)
-    return agent, optimizer, make_grpo_step(agent, score, optimizer, config)
+    return fns, optimizer, make_grpo_step(fns, score, optimizer, config)
 
 
 def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
@@ -122,7 +122,7 @@ def decoder_config(size: Size) -> DecoderConfig:
     return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
 
 
-def make_agent(size: Size, prefix: int, end_share: float = 0.0) -> Agent:
+def make_fns(size: Size, prefix: int, end_share: float = 0.0) -> PolicyFns:
     """A policy of the given decoder whose prompts have `prefix` tokens; the highest ids end a completion."""
     policy = Policy(
         PolicyConfig(
@@ -135,7 +135,7 @@ def make_agent(size: Size, prefix: int, end_share: float = 0.0) -> Agent:
     banned = np.zeros(size.vocab_size, bool)
     out_of_reach = (size.vocab_size,)
     ends = tuple(range(size.vocab_size - round(end_share * size.vocab_size), size.vocab_size)) or out_of_reach
-    return Agent(policy=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
+    return PolicyFns(module=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
 
 
 def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
@@ -160,7 +160,7 @@ def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatc
     return GRPOBatch(features=features, ids=ids, mask=jnp.ones((prompts, prefix), bool), target=target)
 
 
-def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
+def init_decoder(fns: PolicyFns, batch: GRPOBatch) -> Params:
     """N(0, .02²) weights and unit scales, drawn in NumPy: compiling an initialisation would count as the job's memory.
 
     The shapes come from tracing one forward pass.
@@ -168,10 +168,10 @@ def init_decoder(agent: Agent, batch: GRPOBatch) -> Params:
     one = jax.tree.map(lambda x: x[0], batch)
 
     def forward(module: Policy) -> jax.Array:
-        first, prefix = module.prefill_state(one.features, one.ids, one.mask, agent.slots)
-        return module.logits(module.completion_states(one.ids, first, prefix), jnp.asarray(agent.banned))
+        first, prefix = module.prefill_state(one.features, one.ids, one.mask, fns.slots)
+        return module.logits(module.completion_states(one.ids, first, prefix), jnp.asarray(fns.banned))
 
-    shapes = jax.eval_shape(lambda: agent.policy.init(jax.random.key(0), method=forward))["params"]
+    shapes = jax.eval_shape(lambda: fns.module.init(jax.random.key(0), method=forward))["params"]
     rng = np.random.default_rng(0)
 
     def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> jax.Array:

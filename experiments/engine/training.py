@@ -17,8 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from experiments.engine.job import init_decoder
 from experiments.engine.world import (
-    AGENT,
     CONCLUDE,
+    FNS,
     LENGTH,
     PARSER,
     WORDS,
@@ -98,7 +98,7 @@ def dials_of(variant: Variant) -> Dials:
 
 def fresh_params() -> Params:
     """The same untrained policy for every seed."""
-    return init_decoder(AGENT, draw(World(), jax.random.key(0), 1).batch)
+    return init_decoder(FNS, draw(World(), jax.random.key(0), 1).batch)
 
 
 def pretrain(effort: Effort, world: World, key: Array) -> Params:
@@ -107,7 +107,7 @@ def pretrain(effort: Effort, world: World, key: Array) -> Params:
 
     def loss(params: Params, scene: Scene, tokens: Int[Array, "P T"], counts: Array) -> Array:
         batch = scene.batch
-        logits = jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0))(
+        logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))(
             params, batch.features, batch.ids, batch.mask, tokens[:, None]
         )
         return -masked.mean(token_log_probs(jax.nn.log_softmax(logits[:, 0]), tokens), counts)
@@ -141,7 +141,7 @@ def reinforce(
         inverse_draws=True,
     )
     optimizer = falling_adamw(dials.learning_rate, effort.final_share, effort.steps, config.max_grad_norm)
-    step = make_grpo_step(AGENT, make_world_score(variant, dials), optimizer, config)
+    step = make_grpo_step(FNS, make_world_score(variant, dials), optimizer, config)
     noise_key, run_key, scene_key = jax.random.split(key, 3)
     fixed = Fixed(reference=start, noise=noise_bank(world, noise_key))
     state = start_state(start, optimizer, run_key, config)

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.objective import GRPOBatch
@@ -46,8 +46,8 @@ DECODER = DecoderConfig(
     intermediate_size=48,
     mrope_section=(1, 1, 2),
 )
-AGENT = Agent(
-    policy=Policy(
+FNS = PolicyFns(
+    module=Policy(
         PolicyConfig(
             tactile=TactileViTConfig(sensors=S, width=8, num_layers=0, num_heads=1),
             vision=VisionConfig(image_px=32),
@@ -199,9 +199,9 @@ def verified_answers(world: World, scene: Scene, key: Array) -> tuple[Int[Array,
     perceive = [x for s, slot in zip(LANGUAGE.sensors, slots, strict=True) for x in (*fixed(s.phrases[0]), slot)]
     compare = nearest(jnp.mean(scene.evidence, 1))
     head = [*fixed("<perceive>"), *perceive, *fixed("</perceive> <compare>"), compare, *fixed("</compare> <conclude>")]
-    end, pad = jnp.full(p, AGENT.end_ids[0]), jnp.full(p, AGENT.pad_id)
+    end, pad = jnp.full(p, FNS.end_ids[0]), jnp.full(p, FNS.pad_id)
     (close,) = fixed("</conclude>")
     tidy, loose = jnp.stack([*head, said, close, end, pad], -1), jnp.stack([*head, said, also, close, end], -1)
     tokens = jnp.where(sloppy[:, None], loose, tidy).astype(jnp.int32)
-    tokens = jnp.pad(tokens, ((0, 0), (0, LENGTH - tokens.shape[1])), constant_values=AGENT.pad_id)
-    return tokens, tokens != AGENT.pad_id
+    tokens = jnp.pad(tokens, ((0, 0), (0, LENGTH - tokens.shape[1])), constant_values=FNS.pad_id)
+    return tokens, tokens != FNS.pad_id

@@ -67,8 +67,8 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     """Reinforce to the end."""
     assembly = assemble(MODEL, SENSORS)
     prior = uniform_prior(list(assembly.levels))
-    score, agent = assembly.score(PUBLISHED, prior), assembly.agent
-    optimizer, step = grpo_program(agent, score, config.grpo, config.steps, None)
+    score, fns = assembly.score(PUBLISHED, prior), assembly.fns
+    optimizer, step = grpo_program(fns, score, config.grpo, config.steps, None)
     decoder = {"decoder": _decoder(assembly, context.directory / "start.npz")}
     rng = np.random.default_rng(1)
     noise = _features(rng, NOISE).touch
@@ -93,7 +93,7 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
 
 def _certainty(assembly: Assembly, params: Params, held: GRPOBatch) -> jax.Array:
     """Mean largest log-probability of the first word about held-out contacts: cheap, and any score will do."""
-    first = jax.vmap(lambda f, i, m: assembly.agent.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
+    first = jax.vmap(lambda f, i, m: assembly.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
     return jnp.mean(jnp.max(jax.nn.log_softmax(first), -1))
 
 

@@ -49,7 +49,7 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     sft = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
     params = run_sft(assembly, data, evidence, sft, context, seed=0, stage=STAGES[0])
     features = encode_contacts(assembly, params, data, data.parts["grpo"], context)
-    noise = noise_bank(assembly.agent, params, data, seed=0)
+    noise = noise_bank(assembly.fns, params, data, seed=0)
     asked = Asked(features=features, label=data.label[data.parts["grpo"]], noise=noise)
     arm = make_arm(assembly, PUBLISHED, data.prior(), study.grpo, loop)
     run_grpo(assembly, arm, asked, params, context, seed=0, stage=STAGES[1])

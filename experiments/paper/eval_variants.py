@@ -51,7 +51,7 @@ def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> 
     encode = functools.partial(encode_contacts, assembly, params, data, context=trained.context)
     grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
     arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
-    noise = noise_bank(assembly.agent, params, data, seed=trained.seed)
+    noise = noise_bank(assembly.fns, params, data, seed=trained.seed)
     asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
     stage = f"grpo/no_sft/{trained.seed}"
     tuned = run_grpo(assembly, arm, asked, params, trained.context, seed=trained.seed, stage=stage)

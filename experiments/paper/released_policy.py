@@ -12,7 +12,7 @@ import numpy as np
 from experiments.study.assembly import Assembly, TouchConfig, language_of
 from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.load import Checkpoint
-from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_agent, qwen_policy
+from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.text.chat_layout import build_chat_layout
 from touchr1_jax.text.language import Language
@@ -54,10 +54,10 @@ class ReleasedAssembly(Assembly):
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """The released towers as they are, and beside them a fresh tactile encoder."""
-        agent, layout = self.agent, self.layout
+        fns, layout = self.fns, self.layout
         key = jax.random.key(seed)
-        prompt = layout.ids[0], layout.mask[0], agent.slots
-        return init_on_pretrained(agent.policy, key, batch, *prompt, self.checkpoint.params)
+        prompt = layout.ids[0], layout.mask[0], fns.slots
+        return init_on_pretrained(fns.module, key, batch, *prompt, self.checkpoint.params)
 
 
 def instruction(language: Language) -> str:
@@ -103,7 +103,7 @@ def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[st
         language=language,
         tokenizer=found.tokenizer,
         layout=layout,
-        agent=qwen_agent(policy, layout, found.tokenizer, jnp.dtype(model.dtype)),
+        fns=qwen_fns(policy, layout, found.tokenizer, jnp.dtype(model.dtype)),
         parser=compile_parser(language, found.tokenizer),
         checkpoint=found,
     )

@@ -72,7 +72,7 @@ def teach(directory: Path, config: TeachingConfig, context: Context, seed: int =
     shown = nothing(config.batch_size)
     params = assembly.init(seed, shown)
     optimizer = make_optimizer(config.optimizer, config.steps)
-    step = make_sft_step(assembly.agent, optimizer)
+    step = make_sft_step(assembly.fns, optimizer)
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     with context.timed(STAGE):
         for t in context.each(STAGE, range(config.steps)):

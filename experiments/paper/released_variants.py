@@ -35,6 +35,6 @@ def written(source: Path, trained: Trained) -> Evaluated:
     with context.told("writing weights, MB") as tell:
         context.team.once(lambda: write_policy(folder, source, trained.params, in_megabytes(tell)))
     with context.told("reading weights, MB") as tell:
-        params = read_policy(folder, assembly.agent.cache_dtype, in_megabytes(tell))
+        params = read_policy(folder, assembly.fns.cache_dtype, in_megabytes(tell))
     test = encode_contacts(assembly, params, data, data.parts["test"], context)
     return evaluate_policy(assembly, params, test, trained.label, context, alone=False)

@@ -121,7 +121,7 @@ def calls_of(study: Study) -> Calls:
 
 
 def _answer(assembly: Assembly, params: Params, touch: TouchBatch, label: np.ndarray) -> Callable[[], Any]:
-    encode, answer = encode_program(assembly.agent, False), answer_program(assembly)
+    encode, answer = encode_program(assembly.fns, False), answer_program(assembly)
     contact, attribute = labelled(label)
     decoder = {"decoder": params["decoder"]}
 
@@ -139,7 +139,7 @@ def _train(study: Study, params: Params) -> Callable[[], Any]:
     evidence = np.zeros((len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels)))
     feed = AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, questions=config.questions, seed=0)
     batch = next(feed)
-    optimizer, step = sft_program(assembly.agent, config, False)
+    optimizer, step = sft_program(assembly.fns, config, False)
     mine = jax.tree.map(jnp.array, params)  # a copy: the step gives its buffers away
     states = [SFTState(params=mine, opt_state=optimizer.init(mine), step=jnp.zeros((), jnp.int32))]
 

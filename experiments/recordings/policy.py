@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.losses import token_log_probs
@@ -69,7 +69,7 @@ class TouchPolicy:
     shape: PolicyShape
     tokenizer: Tokenizer
     layout: PromptLayout
-    agent: Agent
+    fns: PolicyFns
     parser: Parser
 
     def init(self, key: Array, inputs: int) -> Params:
@@ -77,9 +77,9 @@ class TouchPolicy:
         encoder_key, decoder_key = jax.random.split(key)
         encoder = DescriptionEncoder(self.shape).init(encoder_key, jnp.zeros(inputs))["params"]
         features = self.features({"encoder": encoder}, jnp.zeros(inputs))
-        banned = jnp.asarray(self.agent.banned)
-        prompt = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0]), self.agent.slots, banned
-        decoder = self.agent.policy.init(decoder_key, features, *prompt, method=Policy.prefill)["params"]["decoder"]
+        banned = jnp.asarray(self.fns.banned)
+        prompt = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0]), self.fns.slots, banned
+        decoder = self.fns.module.init(decoder_key, features, *prompt, method=Policy.prefill)["params"]["decoder"]
         return {"encoder": encoder, "decoder": decoder}
 
     def features(self, params: Params, x: Float[Array, "*n D"]) -> Features:
@@ -97,7 +97,7 @@ class TouchPolicy:
     def log_probs(self, params: Params, x: Float[Array, "D"], tokens: Int[Array, "G T"]) -> Float[Array, "G T"]:
         """Log-probability of every token of answers about one touch."""
         ids, mask = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0])
-        logits = self.agent.group_logits(params, self.features(params, x), ids, mask, tokens)
+        logits = self.fns.group_logits(params, self.features(params, x), ids, mask, tokens)
         return token_log_probs(jax.nn.log_softmax(logits), tokens)
 
     @functools.cached_property
@@ -154,15 +154,15 @@ def assemble_policy(shape: PolicyShape) -> TouchPolicy:
         vision=VisionConfig(),
         decoder=dataclasses.replace(shape.decoder, vocab_size=tokenizer.vocab_size),
     )
-    agent = Agent(
-        policy=Policy(config),
+    fns = PolicyFns(
+        module=Policy(config),
         slots=Slots(layout.touch, layout.view, layout.stream_text),
         banned=tokenizer.banned,
         end_ids=tokenizer.end_ids,
         pad_id=tokenizer.pad_id,
     )
     parser = compile_parser(LANGUAGE, tokenizer)
-    return TouchPolicy(shape=shape, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser)
+    return TouchPolicy(shape=shape, tokenizer=tokenizer, layout=layout, fns=fns, parser=parser)
 
 
 def choose(log_prob: Float[np.ndarray, "n 27"], utility: Float[np.ndarray, "27 27"]) -> Int[np.ndarray, "n A"]:

@@ -185,7 +185,7 @@ def _reinforce_program(policy: TouchPolicy, config: ReinforceConfig) -> tuple[An
     score = make_score(policy.parser, make_rewards(equal), dict(config.weights))
     grpo = config.grpo
     optimizer = falling_adamw(grpo.learning_rate * grpo.lr_scale, grpo.final_share, config.steps, grpo.max_grad_norm)
-    return make_grpo_step(policy.agent, score, optimizer, grpo), optimizer
+    return make_grpo_step(policy.fns, score, optimizer, grpo), optimizer
 
 
 def _questions(policy: TouchPolicy, params: Params, lesson: Lesson, rows: np.ndarray) -> GRPOBatch:

@@ -86,7 +86,7 @@ def evaluate_policy(
 @functools.cache
 def answer_program(assembly: Assembly) -> Any:
     """Compiled greedy answerer, made once."""
-    return make_answer(assembly.agent, assembly.parser, assembly.model.completion_tokens)
+    return make_answer(assembly.fns, assembly.parser, assembly.model.completion_tokens)
 
 
 def _ask(ask, assembly, params, features, label, contact, attribute, streams, advance):

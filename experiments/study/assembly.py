@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rewards import RewardError, check_weights, make_rewards, total_reward, uniform_prior
@@ -62,7 +62,7 @@ class Assembly:
     language: Language
     tokenizer: Tokenizer
     layout: PromptLayout
-    agent: Agent
+    fns: PolicyFns
     parser: Parser
 
     @property
@@ -92,7 +92,7 @@ class Assembly:
     @functools.cached_property
     def _init(self) -> Callable[[Array, TouchBatch], Params]:
         """Compiled once for all seeds."""
-        policy, slots, layout = self.agent.policy, self.agent.slots, self.layout
+        policy, slots, layout = self.fns.module, self.fns.slots, self.layout
         return jax.jit(lambda key, batch: init_policy(policy, key, batch, layout.ids[0], layout.mask[0], slots))
 
     def score(self, weights: Weights, prior: Float[np.ndarray, "A K"]) -> ScoreFn:
@@ -198,12 +198,12 @@ def assemble(model: ModelConfig, sensors: tuple[str, ...]) -> Assembly:
         decoder=dataclasses.replace(model.decoder, vocab_size=tokenizer.vocab_size),
     )
     layout = build_layout(tokenizer, language, tactile_tokens=model.stream_tokens, view_tokens=model.vision.grid**2)
-    agent = Agent(
-        policy=Policy(policy_config),
+    fns = PolicyFns(
+        module=Policy(policy_config),
         slots=Slots(layout.touch, layout.view, layout.stream_text),
         banned=tokenizer.banned,
         end_ids=tokenizer.end_ids,
         pad_id=tokenizer.pad_id,
     )
     parser = compile_parser(language, tokenizer)
-    return Assembly(model=model, language=language, tokenizer=tokenizer, layout=layout, agent=agent, parser=parser)
+    return Assembly(model=model, language=language, tokenizer=tokenizer, layout=layout, fns=fns, parser=parser)

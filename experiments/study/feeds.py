@@ -159,8 +159,8 @@ class AnswerFeed(Feed):
     def _rows(self, touch: TouchBatch, written: dict[str, np.ndarray]) -> PackedRows | None:
         if self._packing is None:
             return None
-        agent, token_mask = self._assembly.agent, written["token_mask"]
-        exists = existing_tokens(agent.policy, agent.slots, touch, written["mask"], written["streams"], token_mask)
+        fns, token_mask = self._assembly.fns, written["token_mask"]
+        exists = existing_tokens(fns.module, fns.slots, touch, written["mask"], written["streams"], token_mask)
         return pack_rows(exists, token_mask, self._packing)
 
     def _answer(

@@ -19,9 +19,9 @@ from experiments.study.assembly import Assembly, Weights
 from experiments.study.feeds import QuestionFeed
 from experiments.study.stages import fresh_adapters, merge_noted
 from experiments.study.watching import watched_log
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lora import LoraConfig, adapt
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import LEAN, Fixed, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.guard import check_streams, stream_influence
@@ -97,9 +97,9 @@ def run_grpo(
         QuestionFeed, assembly, asked.features, asked.label, batch_size=config.drawn, seed=seed
     )
     constraint = assembly.constraint if config.algorithm.constrained else None
-    optimizer, step = grpo_program(assembly.agent, arm.score, config, arm.loop.steps, constraint, lora)
+    optimizer, step = grpo_program(assembly.fns, arm.score, config, arm.loop.steps, constraint, lora)
     decoder = {"decoder": params["decoder"]}
-    influence = influence_program(assembly.agent, config.length)
+    influence = influence_program(assembly.fns, config.length)
     check_streams(*jax.device_get(influence(decoder, next(new_feed()), asked.noise, jax.random.key(seed))))
     feed = new_feed(own=context.devices.rows(config.drawn))
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
@@ -113,7 +113,7 @@ def run_grpo(
 
 @functools.cache
 def grpo_program(
-    agent: Agent,
+    fns: PolicyFns,
     score: ScoreFn,
     config: GRPOConfig,
     steps: int,
@@ -124,20 +124,20 @@ def grpo_program(
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    plain = make_grpo_step(agent, score, optimizer, config, constraint)
+    plain = make_grpo_step(fns, score, optimizer, config, constraint)
     if lora is None:
         return optimizer, plain
     # a jitted step inside another takes no options of the compiler: the outer one gets them
     inner = dataclasses.replace(config, lean_compilation=False)
 
     def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params) -> tuple[GRPOState, dict[str, Array]]:
-        adapted = adapt(agent, frozen, lora)
+        adapted = adapt(fns, frozen, lora)
         return make_grpo_step(adapted, score, optimizer, inner, constraint)(state, batch, fixed)
 
     return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
 @functools.cache
-def influence_program(agent: Agent, length: int) -> Any:
+def influence_program(fns: PolicyFns, length: int) -> Any:
     """Compiled `stream_influence`, made once for all arms and seeds."""
-    return jax.jit(lambda p, batch, noise, key: stream_influence(agent, p, batch, noise, key, length))
+    return jax.jit(lambda p, batch, noise, key: stream_influence(fns, p, batch, noise, key, length))

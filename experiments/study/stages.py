@@ -24,11 +24,11 @@ from experiments.study.feeds import AnswerFeed, touch_batch
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.limits import above, at_least, within
-from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.chunked import MAX_LOGITS
+from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import Adapters, LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
@@ -189,7 +189,7 @@ def run_sft(
         packing=config.packing(math.prod(context.devices.shape[:2])),
         own=context.devices.rows(config.batch_size),
     )
-    optimizer, step = sft_program(assembly.agent, config, blind)
+    optimizer, step = sft_program(assembly.fns, config, blind)
     params = untrained(assembly, data, seed)
     if tactile is not None:
         params = {**params, "tactile": jax.tree.map(jnp.array, tactile)}  # a copy: the step gives its buffers away
@@ -226,10 +226,10 @@ def merge_noted(base: Params, adapters: Adapters, lora: LoraConfig, context: Con
 
 
 @functools.cache
-def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
+def sft_program(fns: PolicyFns, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds; with adapters, (state, batch, frozen towers) → …"""
     optimizer = make_optimizer(config.optimizer, config.steps)
-    agent = dataclasses.replace(agent, policy=agent.policy.clone(remat=True)) if config.remat else agent
+    fns = dataclasses.replace(fns, module=fns.module.clone(remat=True)) if config.remat else fns
     make = functools.partial(
         make_sft_step,
         optimizer=optimizer,
@@ -238,11 +238,11 @@ def sft_program(agent: Agent, config: SFTConfig, blind: bool) -> tuple[optax.Gra
         micro_contacts=config.micro_contacts,
     )
     if config.lora is None:
-        return optimizer, make(agent)
+        return optimizer, make(fns)
     lora = config.lora
 
     def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, Array]]:
-        return make(adapt(agent, frozen, lora))(state, batch)
+        return make(adapt(fns, frozen, lora))(state, batch)
 
     return optimizer, jax.jit(step, donate_argnums=0)
 
@@ -258,7 +258,7 @@ def _encoded(
     assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool
 ) -> Features:
     clips = data.batches(rows, batch_size=ENCODE_BATCH, seed=0, shuffle=False, repeat=False, felt=not blind)
-    encode = encode_program(assembly.agent, blind)
+    encode = encode_program(assembly.fns, blind)
     parts = []
     with context.progress("encoding", len(rows)) as advance:
         for clip in clips:
@@ -268,13 +268,13 @@ def _encoded(
 
 
 @functools.cache
-def encode_program(agent: Agent, blind: bool) -> Any:
+def encode_program(fns: PolicyFns, blind: bool) -> Any:
     """Compiled encoder, made once."""
-    return jax.jit(lambda p, b: agent.encode(p, b, blind=blind))
+    return jax.jit(lambda p, b: fns.encode(p, b, blind=blind))
 
 
 def noise_bank(
-    agent: Agent, params: Params, data: Dataset, *, seed: int, draws: int = 64, probe: int = 64
+    fns: PolicyFns, params: Params, data: Dataset, *, seed: int, draws: int = 64, probe: int = 64
 ) -> Float[Array, "K S N D"]:
     """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
 
@@ -289,11 +289,11 @@ def noise_bank(
     rows = np.arange(draws) % len(clip["frame_index"])
     keys = jax.random.split(jax.random.key(seed), draws)
     times = jnp.asarray(clip["frame_index"][rows]), jnp.asarray(clip["frame_mask"][rows])
-    return noise_program(agent, clip["frames"].shape[3:5])(params, pixels, force, (keys, *times))
+    return noise_program(fns, clip["frames"].shape[3:5])(params, pixels, force, (keys, *times))
 
 
 @functools.cache
-def noise_program(agent: Agent, size: tuple[int, int]) -> Any:
+def noise_program(fns: PolicyFns, size: tuple[int, int]) -> Any:
     """Compiled encoder of noise, (params, pixel statistics, force statistics, (key, index, mask)) → features."""
 
     def draw(params: Params, pixel: Any, force: Any, x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
@@ -303,7 +303,7 @@ def noise_program(agent: Agent, size: tuple[int, int]) -> Any:
         noise = jax.random.normal(pixel_key, (*shape, *size, 3)) * pixel_std[:, None, None, None]
         frames = jnp.clip(noise + pixel_mean[:, None, None, None], 0, 255)
         push = jax.random.normal(force_key, (*shape, 3)) * force_std[:, None] + force_mean[:, None]
-        return agent.encode_streams(params, frames, push, index, mask, jnp.arange(shape[0]))
+        return fns.encode_streams(params, frames, push, index, mask, jnp.arange(shape[0]))
 
     return jax.jit(lambda params, pixel, force, x: jax.lax.map(functools.partial(draw, params, pixel, force), x))
 

@@ -252,7 +252,7 @@ class _Seed:
         params = self._sft(config.sft, f"sft/{seed}", tactile=self.start.tactile)
         encode = functools.partial(encode_contacts, assembly, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
-        noise = noise_bank(assembly.agent, params, data, seed=seed, probe=config.noise_contacts)
+        noise = noise_bank(assembly.fns, params, data, seed=seed, probe=config.noise_contacts)
         asked = Asked(features=train, label=self._grpo_label(), noise=noise)
         self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test"), context))
         self._ask_further(SFT, params, test, noise)

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.touchr1_jax.drawn import draw_params
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots, init_policy
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.objective import GRPOBatch
@@ -48,17 +48,17 @@ WRITABLE = np.flatnonzero(~TOKENIZER.banned)
 """Ids that a completion may hold."""
 
 
-def make_agent(config: PolicyConfig = CONFIG, slots: Slots = SLOTS) -> Agent:
+def make_fns(config: PolicyConfig = CONFIG, slots: Slots = SLOTS) -> PolicyFns:
     """The tiny policy with its prompt layout."""
-    return Agent(
-        policy=Policy(config), slots=slots, banned=TOKENIZER.banned, end_ids=TOKENIZER.end_ids, pad_id=TOKENIZER.pad_id
+    return PolicyFns(
+        module=Policy(config), slots=slots, banned=TOKENIZER.banned, end_ids=TOKENIZER.end_ids, pad_id=TOKENIZER.pad_id
     )
 
 
-AGENT = make_agent()
+FNS = make_fns()
 
 
-SHALLOW = make_agent(dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFIG.decoder, num_layers=1)))
+SHALLOW = make_fns(dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFIG.decoder, num_layers=1)))
 """One decoder layer, for programs that are slow to compile."""
 
 
@@ -70,13 +70,13 @@ def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
 
 @functools.cache
 def params(seed: int = 0, *, loud: float = 0.4) -> Params:
-    """Loud parameters of `AGENT`."""
+    """Loud parameters of `FNS`."""
     return draw_params(jax.eval_shape(lambda: initialise(jax.random.key(0))), seed, loud=loud)
 
 
 def initialise(key: jax.Array) -> Params:
     """Parameters as `init_policy` makes them."""
-    return init_policy(AGENT.policy, key, touch_batch(0), LAYOUT.ids[0], LAYOUT.mask[0], SLOTS)
+    return init_policy(FNS.module, key, touch_batch(0), LAYOUT.ids[0], LAYOUT.mask[0], SLOTS)
 
 
 def touch_batch(seed: int = 0, p: int = 1) -> TouchBatch:

@@ -11,9 +11,9 @@ import optax
 
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
 from touchr1_jax.distributed.placement import shard_step
-from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.lora import LoraAgent, LoraConfig, Trainable, adapt, init_adapters
+from touchr1_jax.models.lora import LoraConfig, LoraFns, Trainable, adapt, init_adapters
 from touchr1_jax.models.policy import Features, Slots
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
@@ -40,9 +40,9 @@ class PromptShape:
 
 
 class AbstractStep(NamedTuple):
-    """Arguments of a step, as `jax.ShapeDtypeStruct`, and its agent."""
+    """Arguments of a step, as `jax.ShapeDtypeStruct`, and its fns."""
 
-    agent: Agent
+    fns: PolicyFns
     state: GRPOState
     batch: GRPOBatch
     fixed: Fixed
@@ -87,8 +87,8 @@ def abstract_grpo(
     length = prompt.tokens
     batch = GRPOBatch(features=features, ids=of((p, length), jnp.int32), mask=of((p, length), bool), target=target)
     decoder = {"decoder": abstract_params(config)["decoder"]}
-    agent = Agent(
-        policy=qwen_policy(config, TactileViTConfig(sensors=s)),
+    fns = PolicyFns(
+        module=qwen_policy(config, TactileViTConfig(sensors=s)),
         slots=_slots(prompt),
         banned=np.zeros(v, bool),
         end_ids=(v - 1,),
@@ -101,9 +101,9 @@ def abstract_grpo(
     if lora is not None:
         base = jax.tree.map(lambda x: of(x.shape, jnp.bfloat16), decoder)
         params = Trainable(adapters=jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key), towers={})
-        agent = adapt(agent, base, lora)
+        fns = adapt(fns, base, lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
-    return AbstractStep(agent, state, batch, Fixed(reference=params, noise=of((draws, s, n, d), kind)), base)
+    return AbstractStep(fns, state, batch, Fixed(reference=params, noise=of((draws, s, n, d), kind)), base)
 
 
 def compile_grpo(
@@ -126,10 +126,10 @@ def compile_grpo(
     arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.fixed)
 
     def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, base: Params | None = None):
-        agent = abstract.agent
-        if isinstance(agent, LoraAgent):
-            agent = dataclasses.replace(agent, base=base)
-        return make_grpo_step(agent, score, optimizer, shape.grpo)(state, batch, fixed)
+        fns = abstract.fns
+        if isinstance(fns, LoraFns):
+            fns = dataclasses.replace(fns, base=base)
+        return make_grpo_step(fns, score, optimizer, shape.grpo)(state, batch, fixed)
 
     if abstract.base is not None:
         arguments = (*arguments, abstract.base)

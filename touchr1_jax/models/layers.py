@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.linear import Dense
+from touchr1_jax.models.vmappable_dense import Dense
 
 MASKED = -1e9
 """Score of a forbidden key or token: finite, so that 0 · MASKED is 0 and no NaN arises from differences."""

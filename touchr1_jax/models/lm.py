@@ -29,7 +29,7 @@ from touchr1_jax.models.layers import (
     mrope,
     rotate,
 )
-from touchr1_jax.models.linear import Dense, Embed, product_with_weights
+from touchr1_jax.models.vmappable_dense import Dense, Embed, product_with_weights
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.types import Params
 
 
@@ -143,7 +143,7 @@ def _change(adapter: Adapter, config: LoraConfig) -> Array:
 
 
 class Trainable(struct.PyTreeNode):
-    """What an adapted agent trains: adapters, and towers that are trained in full, such as the tactile encoder's.
+    """Trained parameters of an adapted policy: adapters, and towers trained in full, such as the tactile encoder.
 
     The reference policy of GRPO is the base itself: fresh adapters, whose B is 0, and no towers.
     """
@@ -153,8 +153,8 @@ class Trainable(struct.PyTreeNode):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class LoraAgent(Agent):
-    """An agent whose parameters are a `Trainable`; the base is part of its context and gets no gradient.
+class LoraFns(PolicyFns):
+    """Policy functions whose parameters are a `Trainable`; the base is part of its context and gets no gradient.
 
     A base of gigabytes must reach a compiled step as an argument and not as a constant: build the step inside the
     compiled function, as `over_base` does.
@@ -163,26 +163,26 @@ class LoraAgent(Agent):
     base: Params
     lora: LoraConfig
 
-    def with_context(self, change: Callable[[Params], Params]) -> "LoraAgent":
-        """The agent on a changed base."""
+    def with_context(self, change: Callable[[Params], Params]) -> "LoraFns":
+        """The functions on a changed base."""
         return dataclasses.replace(self, base=change(self.base))
 
     def _apply(self, params: Trainable, method: Callable[..., Any], *args: Any) -> Any:
         with adapted(params.adapters, self.lora):
-            return self.policy.apply({"params": {**self.base, **params.towers}}, *args, method=method)
+            return self.module.apply({"params": {**self.base, **params.towers}}, *args, method=method)
 
 
-def adapt(agent: Agent, base: Params, config: LoraConfig) -> LoraAgent:
-    """The same agent on a frozen base."""
-    fields = {f.name: getattr(agent, f.name) for f in dataclasses.fields(Agent)}
-    return LoraAgent(**fields, base=base, lora=config)
+def adapt(fns: PolicyFns, base: Params, config: LoraConfig) -> LoraFns:
+    """The same functions on a frozen base."""
+    fields = {f.name: getattr(fns, f.name) for f in dataclasses.fields(PolicyFns)}
+    return LoraFns(**fields, base=base, lora=config)
 
 
-def over_base(agent: LoraAgent, make_step: Callable[[LoraAgent], Callable[..., Any]]) -> Callable[..., Any]:
+def over_base(fns: LoraFns, make_step: Callable[[LoraFns], Callable[..., Any]]) -> Callable[..., Any]:
     """Compile (base, state, …) → result from a maker of the step (state, …) → result; the state is donated."""
 
     def step(base: Params, state: Any, *rest: Any) -> Any:
-        return make_step(dataclasses.replace(agent, base=base))(state, *rest)
+        return make_step(dataclasses.replace(fns, base=base))(state, *rest)
 
     return jax.jit(step, donate_argnums=1)
 

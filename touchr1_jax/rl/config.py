@@ -9,7 +9,7 @@ import enum
 import jax
 
 from touchr1_jax.limits import above, at_least, within
-from touchr1_jax.models.chunked import MAX_LOGITS
+from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.rl.kl import KLEstimator
 
 
@@ -220,7 +220,7 @@ class GRPOConfig:
     remat: bool = False
     """Keep only matrix products for the backward pass and compute the rest again: less memory, more time."""
     max_logits: int = MAX_LOGITS
-    """Logits of a prompt that may exist at once; more tokens than that are scored in blocks (see `models.chunked`)."""
+    """Logits of a prompt that may exist at once; more tokens are scored in blocks (`models.chunked_logits`)."""
     lean_compilation: bool = False
     """Compile by XLA's older code generator on CPUs: half of the memory, in half as long again, for slower steps."""
     bfloat16: bool = False

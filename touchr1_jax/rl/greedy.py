@@ -6,7 +6,7 @@ import jax
 from flax import struct
 from jaxtyping import Array, Int
 
-from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.rollout import SampleConfig
@@ -22,14 +22,14 @@ class Answers:
 
 
 def make_answer(
-    agent: Agent, parser: Callable[[Int[Array, "T"]], Parsed], length: int
+    fns: PolicyFns, parser: Callable[[Int[Array, "T"]], Parsed], length: int
 ) -> Callable[[Params, GRPOBatch], Answers]:
     """Build the jitted (params, batch) → most likely answers of at most `length` tokens."""
-    draw = SampleConfig(group=1, length=length, end_ids=agent.end_ids, pad_id=agent.pad_id, greedy=True)
+    draw = SampleConfig(group=1, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, greedy=True)
 
     @jax.jit
     def answer(params: Params, batch: GRPOBatch) -> Answers:
-        tokens = sample_group(agent, params, batch, jax.random.key(0), draw).tokens[:, 0]
+        tokens = sample_group(fns, params, batch, jax.random.key(0), draw).tokens[:, 0]
         return Answers(tokens=tokens, parsed=jax.vmap(parser)(tokens))
 
     return answer

@@ -20,8 +20,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.lm import PrefixCache
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl import tactile_use
 from touchr1_jax.rl.advantages import added_after, batch_advantage, degenerate, group_advantage, livelier_first
 from touchr1_jax.rl.config import Algorithm, GRPOConfig, TactileUse
@@ -103,7 +103,7 @@ def compiles_leanly() -> bool:
 
 
 def make_grpo_step(
-    agent: Agent,
+    fns: PolicyFns,
     score: ScoreFn,
     optimizer: optax.GradientTransformation,
     config: GRPOConfig,
@@ -112,7 +112,7 @@ def make_grpo_step(
     """Build the jitted step, (state, batch, fixed) → (state, metrics); the state's buffers are donated.
 
     Args:
-      agent: policy, prompts, vocabulary.
+      fns: policy, prompts, vocabulary.
       score: reward of one rollout (see `scoring`).
       optimizer: applied to the gradient of −J.
       config: sizes and algorithm; a batch holds `config.drawn` prompts.
@@ -129,8 +129,8 @@ def make_grpo_step(
     if config.algorithm.constrained and constraint is None:
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.bfloat16:
-        agent = dataclasses.replace(agent, cache_dtype=jnp.dtype(jnp.bfloat16))
-    engine = _Engine(agent, score, optimizer, config, constraint)
+        fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16))
+    engine = _Engine(fns, score, optimizer, config, constraint)
     return jax.jit(engine.step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
@@ -138,7 +138,7 @@ def make_grpo_step(
 class _Engine:
     """The parts of a step, in the order in which it takes them."""
 
-    agent: Agent
+    fns: PolicyFns
     score: ScoreFn
     optimizer: optax.GradientTransformation
     config: GRPOConfig
@@ -149,7 +149,7 @@ class _Engine:
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
         control_key = jax.random.fold_in(key, 2)
-        sampler = dataclasses.replace(self, agent=self.agent.with_context(held))
+        sampler = dataclasses.replace(self, fns=self.fns.with_context(held))
         group, control_metrics = sampler.explore(state.params, batch, fixed, sample_key, control_key)
         reference = fixed.reference if state.reference is None else state.reference
         learn = self.experience(group, fixed, mask_key)
@@ -163,8 +163,8 @@ class _Engine:
     ) -> tuple[Group, dict[str, Array]]:
         """Sample and score; with R_tu also under every control.  Of the candidates the lively groups are kept."""
         params = held(at_precision(self.config, params))
-        prompts = encode_prompts(self.agent, params, batch)
-        rollout = sample_prompts(self.agent, params, prompts, key, self._draw(self.config.group))
+        prompts = encode_prompts(self.fns, params, batch)
+        rollout = sample_prompts(self.fns, params, prompts, key, self._draw(self.config.group))
         reward, terms, parsed = self._scored(rollout, batch.target)
         bonus = jnp.zeros_like(reward)
         metrics: dict[str, Array] = {}
@@ -188,8 +188,8 @@ class _Engine:
         control, counts = [], []
         for perturbed, draw_key in zip(controls(algorithm, batch, fixed.noise, keys), keys[2:], strict=True):
             changed = dataclasses.replace(batch, features=perturbed.features)
-            again = encode_prompts(self.agent, params, changed, prompts.prefix, self.agent.touch_start)
-            said = sample_prompts(self.agent, params, again, draw_key, self._draw(algorithm.controls))
+            again = encode_prompts(self.fns, params, changed, prompts.prefix, self.fns.touch_start)
+            said = sample_prompts(self.fns, params, again, draw_key, self._draw(algorithm.controls))
             control.append(scored(self._scored(said, batch.target)[2], batch.target))
             counts.append(perturbed.applies)
         by_prompt, applies = jnp.stack(control, 1), jnp.stack(counts, 1)
@@ -242,7 +242,7 @@ class _Engine:
             parts = parts | {"grad_norm": optax.tree.norm(grads)}
             moved = optax.apply_updates(params, updates)
             if (trust := self.config.algorithm.trust_nat) is not None:
-                moved, size = within_trust(self.agent, self.config, params, moved, learn, trust)
+                moved, size = within_trust(self.fns, self.config, params, moved, learn, trust)
                 parts |= size
             return (moved, opt_state, old), parts
 
@@ -266,7 +266,7 @@ class _Engine:
             short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
 
             def of(p: Params) -> tuple[Params, dict[str, Array]]:
-                grads, parts = objective_gradient(self.agent, self.config, p, reference, short, first=first)
+                grads, parts = objective_gradient(self.fns, self.config, p, reference, short, first=first)
                 if "old" in parts:
                     parts["old"] = jnp.pad(parts["old"], [(0, 0), (0, 0), (0, self.config.length - length)])
                 return grads, parts
@@ -327,8 +327,8 @@ class _Engine:
         return SampleConfig(
             group=group,
             length=self.config.length,
-            end_ids=self.agent.end_ids,
-            pad_id=self.agent.pad_id,
+            end_ids=self.fns.end_ids,
+            pad_id=self.fns.pad_id,
             inverse=self.config.inverse_draws,
             constraint=self.constraint,
         )
@@ -354,22 +354,22 @@ def controls(algorithm: Algorithm, batch: GRPOBatch, noise: Float[Array, "K S N 
 
 
 def encode_prompts(
-    agent: Agent, params: Params, batch: GRPOBatch, known: PrefixCache | None = None, start: int = 0
+    fns: PolicyFns, params: Params, batch: GRPOBatch, known: PrefixCache | None = None, start: int = 0
 ) -> Prompts:
     """Prefill each prompt once, or only what follows `start` where `known` holds the rest."""
-    prefill = lambda f, i, m, k: agent.prefill(params, f, i, m, k, start)
+    prefill = lambda f, i, m, k: fns.prefill(params, f, i, m, k, start)
     return Prompts(*jax.vmap(prefill)(batch.features, batch.ids, batch.mask, known))
 
 
-def sample_prompts(agent: Agent, params: Params, prompts: Prompts, key: Array, draw: SampleConfig) -> Rollout:
+def sample_prompts(fns: PolicyFns, params: Params, prompts: Prompts, key: Array, draw: SampleConfig) -> Rollout:
     """Draw the completions of encoded prompts."""
-    decode = lambda token, t, past, caches: agent.decode(params, token, t, past, caches)
-    return sample(decode, prompts.first, prompts.prefix, agent.empty_cache(draw.length), key, draw)
+    decode = lambda token, t, past, caches: fns.decode(params, token, t, past, caches)
+    return sample(decode, prompts.first, prompts.prefix, fns.empty_cache(draw.length), key, draw)
 
 
-def sample_group(agent: Agent, params: Params, batch: GRPOBatch, key: Array, draw: SampleConfig) -> Rollout:
+def sample_group(fns: PolicyFns, params: Params, batch: GRPOBatch, key: Array, draw: SampleConfig) -> Rollout:
     """Prefill each prompt once and draw its completions."""
-    return sample_prompts(agent, params, encode_prompts(agent, params, batch), key, draw)
+    return sample_prompts(fns, params, encode_prompts(fns, params, batch), key, draw)
 
 
 def prompt_weights(counts: Bool[Array, "P"]) -> Float[Array, "P"]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.kl import exact_kl
 from touchr1_jax.rl.objective import GRPOBatch
@@ -20,7 +20,7 @@ ROUNDING_NAT = 1e-7
 
 
 def stream_influence(
-    agent: Agent, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
+    fns: PolicyFns, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
 ) -> tuple[Float[Array, "S"], Bool[Array, "S"]]:
     """How much noise in each stream alone moves sampled answers, and which streams any prompt has.
 
@@ -28,7 +28,7 @@ def stream_influence(
     have the stream, nat.
 
     Args:
-      agent: policy, prompts, vocabulary.
+      fns: policy, prompts, vocabulary.
       params: the policy's.
       batch: P prompts.
       noise: encoded noise as in `grpo.Fixed`.
@@ -36,14 +36,14 @@ def stream_influence(
       length: most tokens of an answer.
     """
     sample_key, noise_key = jax.random.split(key)
-    draw = SampleConfig(group=1, length=length, end_ids=agent.end_ids, pad_id=agent.pad_id)
-    rollout = sample_group(agent, params, batch, sample_key, draw)
+    draw = SampleConfig(group=1, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id)
+    rollout = sample_group(fns, params, batch, sample_key, draw)
     p, s = batch.features.stream_mask.shape
     drawn = noise[jax.random.randint(noise_key, (p, s), 0, noise.shape[0]), jnp.arange(s)]
 
     def log_p(touch: Float[Array, "P S N D"]) -> Float[Array, "P G T V"]:
         changed = dataclasses.replace(batch.features, touch=touch)
-        each = jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0))
+        each = jax.vmap(fns.group_logits, in_axes=(None, 0, 0, 0, 0))
         return jax.nn.log_softmax(each(params, changed, batch.ids, batch.mask, rollout.tokens))
 
     own = log_p(batch.features.touch)

@@ -16,10 +16,10 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.chunked import Rows, by_blocks
+from touchr1_jax.models.chunked_logits import Rows, by_blocks
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, left_out
 from touchr1_jax.rl.kl import estimated_kl, exact_kl
 from touchr1_jax.rl.losses import (
@@ -75,7 +75,7 @@ class Scored(NamedTuple):
 
 
 def objective_gradient(
-    agent: Agent,
+    fns: PolicyFns,
     config: GRPOConfig,
     params: Params,
     reference: Params,
@@ -88,7 +88,7 @@ def objective_gradient(
     Summed over micro-batches of `micro_prompts` prompts, whose working set stays in cache.
 
     Args:
-      agent, config: as in `make_grpo_step`.
+      fns, config: as in `make_grpo_step`.
       params: the learner.
       reference: the policy that the KL is taken to.
       experience: rollouts and what they are worth.
@@ -98,7 +98,7 @@ def objective_gradient(
     algorithm = config.algorithm
 
     def loss(params: Params, chunk: Experience) -> tuple[Array, dict[str, Array]]:
-        terms = chunk_terms(agent, config, params, reference, chunk, first)
+        terms = chunk_terms(fns, config, params, reference, chunk, first)
         gain = jnp.sum(chunk.weight * terms["surrogate"])
         extra = grounding_bonus(terms["grounding"], algorithm) - algorithm.beta * terms["kl"]
         bonus = jax.vmap(lambda h: entropy_bonus(h, algorithm))(terms["entropy"])
@@ -151,7 +151,7 @@ def _gathered(name: str, value: Float[Array, "chunk micro"]) -> Float[Array, ""]
 
 
 def chunk_terms(
-    agent: Agent,
+    fns: PolicyFns,
     config: GRPOConfig,
     params: Params,
     reference: Params,
@@ -159,7 +159,7 @@ def chunk_terms(
     first: bool | Bool[Array, ""] = True,
 ) -> dict[str, Array]:
     """`prompt_terms` of every prompt of a micro-batch; a single prompt is not batched, so that its branches stay."""
-    terms = lambda e: prompt_terms(agent, config, params, reference, e, first)
+    terms = lambda e: prompt_terms(fns, config, params, reference, e, first)
     if chunk.weight.shape[0] > 1:
         return jax.vmap(terms)(chunk)
     one = jax.tree.map(lambda x: x[0], chunk)
@@ -167,7 +167,7 @@ def chunk_terms(
 
 
 def prompt_terms(
-    agent: Agent,
+    fns: PolicyFns,
     config: GRPOConfig,
     params: Params,
     reference: Params,
@@ -180,7 +180,7 @@ def prompt_terms(
     """
     rollout, algorithm = experience.rollout, config.algorithm
     mask = rollout.mask
-    tokens = token_terms(agent, config, params, reference, experience)
+    tokens = token_terms(fns, config, params, reference, experience)
     capped = algorithm.importance_cap is not None
     old = jnp.where(first, jax.lax.stop_gradient(tokens["log_prob"]), experience.old) if capped else experience.old
     objective, clipped = jax.vmap(surrogate, in_axes=(None, 0, 0, 0, 0))(
@@ -204,7 +204,7 @@ def prompt_terms(
 
 
 def token_terms(
-    agent: Agent, config: GRPOConfig, params: Params, reference: Params, experience: Experience
+    fns: PolicyFns, config: GRPOConfig, params: Params, reference: Params, experience: Experience
 ) -> dict[str, Float[Array, "G T"]]:
     """Of every token: its log-probability, KL to the reference, tactile grounding, entropy of its distribution.
 
@@ -212,21 +212,21 @@ def token_terms(
     perturbed policy not at γ = 0.
     """
     algorithm, shape = config.algorithm, experience.rollout.tokens.shape
-    score = scorer(agent, config, experience.batch, experience.rollout.tokens)
+    score = scorer(fns, config, experience.batch, experience.rollout.tokens)
     own = score(params, experience.batch.features)
     rows: Rows = {"own": own.states, "token": experience.rollout.tokens}
     if not left_out(algorithm.beta):
         rows["reference"] = jax.lax.stop_gradient(score(reference, experience.batch.features).states)
     if not left_out(algorithm.gamma):
-        rows["perturbed"] = perturbed_states(agent, config, params, experience, own.prefix)
-    terms = vocabulary_terms(agent, config, params, reference)
+        rows["perturbed"] = perturbed_states(fns, config, params, experience, own.prefix)
+    terms = vocabulary_terms(fns, config, params, reference)
     rows = {name: x.reshape(-1, *x.shape[2:]) for name, x in rows.items()}
-    found = by_blocks(terms, rows, width=len(agent.banned), most=config.max_logits)
+    found = by_blocks(terms, rows, width=len(fns.banned), most=config.max_logits)
     return {name: x.reshape(shape) for name, x in found.items()}
 
 
 def vocabulary_terms(
-    agent: Agent, config: GRPOConfig, params: Params, reference: Params
+    fns: PolicyFns, config: GRPOConfig, params: Params, reference: Params
 ) -> Callable[[Rows], dict[str, Float[Array, "n"]]]:
     """The function from hidden states [n, D] of the policies, and tokens [n], to `token_terms`, [n] each."""
     algorithm = config.algorithm
@@ -234,7 +234,7 @@ def vocabulary_terms(
     heads = {name: at_precision(config, p) for name, p in heads.items()}
 
     def terms(rows: Rows) -> dict[str, Float[Array, "n"]]:
-        log = {n: jax.nn.log_softmax(agent.logits(p, rows[n])) for n, p in heads.items() if n in rows}
+        log = {n: jax.nn.log_softmax(fns.logits(p, rows[n])) for n, p in heads.items() if n in rows}
         log_p, nothing = log["own"], jnp.zeros(rows["token"].shape)
         return {
             "log_prob": token_log_probs(log_p, rows["token"]),
@@ -246,15 +246,15 @@ def vocabulary_terms(
     return _remat(config, terms)
 
 
-def scorer(agent: Agent, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]) -> Callable[..., Scored]:
+def scorer(fns: PolicyFns, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]) -> Callable[..., Scored]:
     """The function (params, features, known, start) → `Scored` of one prompt's completions, as configured."""
 
     if config.remat:
-        agent = dataclasses.replace(agent, policy=agent.policy.clone(remat=True))
+        fns = dataclasses.replace(fns, module=fns.module.clone(remat=True))
 
     def score(params: Params, features: Features, known: PrefixCache | None = None, start: int = 0) -> Scored:
         p = at_precision(config, params)
-        return Scored(*agent.group_states(p, features, batch.ids, batch.mask, tokens, known, start))
+        return Scored(*fns.group_states(p, features, batch.ids, batch.mask, tokens, known, start))
 
     return score
 
@@ -281,7 +281,7 @@ def reference_kl(
 
 
 def perturbed_states(
-    agent: Agent, config: GRPOConfig, params: Params, experience: Experience, prefix: PrefixCache
+    fns: PolicyFns, config: GRPOConfig, params: Params, experience: Experience, prefix: PrefixCache
 ) -> Float[Array, "G T D"]:
     """Hidden states of the completions under perturbed touch.
 
@@ -292,10 +292,10 @@ def perturbed_states(
       prefix: the prompt as the policy encodes it.
     """
     batch = experience.batch
-    score = scorer(agent, config, batch, experience.rollout.tokens)
+    score = scorer(fns, config, batch, experience.rollout.tokens)
     features = dataclasses.replace(batch.features, touch=experience.masked_touch)
     known, own = _masked_branch(config, prefix), _masked_branch(config, params)
-    starts = [int(row.min()) for row in agent.slots.touch]
+    starts = [int(row.min()) for row in fns.slots.touch]
 
     def again(start: int, p: Params) -> Array:
         return score(p, features, known, start).states

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.kl import estimated_kl
 from touchr1_jax.rl.objective import Experience, in_order, micro_batches, token_terms
@@ -21,7 +21,7 @@ MOST = 4
 
 
 def within_trust(
-    agent: Agent, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
+    fns: PolicyFns, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
 ) -> tuple[Params, dict[str, Array]]:
     """Shorten an update until it moves the policy by about δ nat a token at most, on the rollouts that it is from.
 
@@ -32,7 +32,7 @@ def within_trust(
     C), here of any optimizer's, with this fixed point for its line search.
 
     Args:
-      agent, config: as in `make_grpo_step`.
+      fns, config: as in `make_grpo_step`.
       before: parameters θ₀ that the rollouts were sampled with.
       after: parameters θ₁ that the optimizer proposes.
       learn: the rollouts.
@@ -45,7 +45,7 @@ def within_trust(
     between = lambda scale: jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
 
     def moved_by(scale: Float[Array, ""]) -> Float[Array, ""]:
-        moved = log_probs(agent, config, between(scale), learn)
+        moved = log_probs(fns, config, between(scale), learn)
         return jnp.mean(masked.mean(estimated_kl(learn.rollout.log_prob, moved, "k3"), learn.rollout.mask, axis=-1))
 
     def too_long(carry: tuple[Array, Array, Array]) -> Array:
@@ -63,9 +63,9 @@ def within_trust(
     return between(scale), {"update_kl": proposed, "update_scale": scale}
 
 
-def log_probs(agent: Agent, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:
+def log_probs(fns: PolicyFns, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters, nothing else."""
     algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
     plain = dataclasses.replace(config, algorithm=algorithm)
-    of_prompt = lambda e: token_terms(agent, plain, params, params, e)["log_prob"]
+    of_prompt = lambda e: token_terms(fns, plain, params, params, e)["log_prob"]
     return in_order(jax.lax.map(jax.vmap(of_prompt), micro_batches(config, learn)))

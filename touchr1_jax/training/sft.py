@@ -17,9 +17,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.models.agent import Agent
-from touchr1_jax.models.chunked import MAX_LOGITS, Rows, by_blocks
+from touchr1_jax.models.chunked_logits import MAX_LOGITS, Rows, by_blocks
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.training.packing import PackedRows, Tokens, padded_tokens, row_of
 from touchr1_jax.types import Params, TouchBatch
@@ -49,7 +49,7 @@ class SFTState:
 
 
 def make_sft_step(
-    agent: Agent,
+    fns: PolicyFns,
     optimizer: optax.GradientTransformation,
     *,
     blind: bool = False,
@@ -59,16 +59,16 @@ def make_sft_step(
     """Build the jitted step, (state, batch) → (state, metrics).
 
     Args:
-      agent: policy, prompts, vocabulary.
+      fns: policy, prompts, vocabulary.
       optimizer: applied to the gradient of `sft_loss`.
       blind: train without touch.
-      max_logits: so many may exist at once (see `models.chunked`).
+      max_logits: so many may exist at once (see `models.chunked_logits`).
       micro_contacts: contacts of a micro-batch, whose working set stays in cache; `None` takes all at once.
     """
 
     def step(state: SFTState, batch: SFTBatch) -> tuple[SFTState, dict[str, Array]]:
         (value, right), grads = sft_gradient(
-            agent, state.params, batch, blind=blind, max_logits=max_logits, micro_contacts=micro_contacts
+            fns, state.params, batch, blind=blind, max_logits=max_logits, micro_contacts=micro_contacts
         )
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
@@ -79,7 +79,7 @@ def make_sft_step(
 
 
 def sft_gradient(
-    agent: Agent,
+    fns: PolicyFns,
     params: Params,
     batch: SFTBatch,
     *,
@@ -109,12 +109,12 @@ def sft_gradient(
     most = jnp.maximum(jnp.sum(batch.token_mask), 1)
 
     def share(params: Params, chunk: SFTBatch) -> tuple[Array, Array]:
-        cost, right = sft_sums(agent, params, chunk, blind=blind, max_logits=max_logits)
+        cost, right = sft_sums(fns, params, chunk, blind=blind, max_logits=max_logits)
         return cost / most, right / most
 
     def body(total: Any, chunk: SFTBatch) -> tuple[Any, None]:
         if (rows := chunk.rows) is not None:
-            return _add_rows(agent, params, chunk, rows, total, most, blind=blind, max_logits=max_logits), None
+            return _add_rows(fns, params, chunk, rows, total, most, blind=blind, max_logits=max_logits), None
         return jax.tree.map(jnp.add, total, jax.value_and_grad(share, has_aux=True)(params, chunk)), None
 
     zero = jnp.zeros(())
@@ -124,26 +124,26 @@ def sft_gradient(
 
 
 def sft_loss(
-    agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
+    fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Cross-entropy of the answer's tokens, −mean log π(o_t | q, touch, o_<t), and the share predicted right.
 
     Questions and answers are padded here, even those of a packed batch.
     """
     most = jnp.maximum(jnp.sum(batch.token_mask), 1)
-    cost, right = sft_sums(agent, params, batch, blind=blind, max_logits=max_logits)
+    cost, right = sft_sums(fns, params, batch, blind=blind, max_logits=max_logits)
     return cost / most, right / most
 
 
 def sft_sums(
-    agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
+    fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """−Σ log π(o_t | q, touch, o_<t) over the answer's tokens, and how many of them are predicted right."""
-    features = agent.encode(params, batch.touch, blind=blind)
+    features = fns.encode(params, batch.touch, blind=blind)
 
     def answer(features, ids, mask, streams, tokens):
         seen = dataclasses.replace(features, stream_mask=features.stream_mask & streams)
-        return agent.group_states(params, seen, ids, mask, tokens[None])[0][0]
+        return fns.group_states(params, seen, ids, mask, tokens[None])[0][0]
 
     per_question = jax.vmap(answer, in_axes=(None, 0, 0, 0, 0))
     states = jax.vmap(per_question)(features, batch.ids, batch.mask, batch.streams, batch.tokens)
@@ -151,24 +151,24 @@ def sft_sums(
     rows = {"state": states.reshape(contacts, -1, states.shape[-1]), "token": batch.tokens.reshape(contacts, -1)}
     # contact by contact, each its share of the bound: blocks over all of them would cut across the devices
     most = max(1, max_logits // contacts)
-    found = jax.vmap(lambda r: _scored(agent, params, r, most))(rows)
+    found = jax.vmap(lambda r: _scored(fns, params, r, most))(rows)
     log_prob, right = (found[name].reshape(batch.tokens.shape) for name in ("log_prob", "right"))
     return -masked.total(log_prob, batch.token_mask), masked.total(right, batch.token_mask).astype(jnp.float32)
 
 
-def _scored(agent: Agent, params: Params, rows: Rows, max_logits: int) -> Rows:
+def _scored(fns: PolicyFns, params: Params, rows: Rows, max_logits: int) -> Rows:
     """Log-probability of each token after its state, and whether it is the likeliest."""
 
     def score(rows: Rows) -> Rows:
-        logits = agent.logits(params, rows["state"])
+        logits = fns.logits(params, rows["state"])
         log_prob = token_log_probs(jax.nn.log_softmax(logits), rows["token"])
         return {"log_prob": log_prob, "right": jnp.argmax(logits, -1) == rows["token"]}
 
-    return by_blocks(score, rows, width=len(agent.banned), most=max_logits)
+    return by_blocks(score, rows, width=len(fns.banned), most=max_logits)
 
 
 def row_scores(
-    agent: Agent,
+    fns: PolicyFns,
     params: Params,
     seen: Float[Array, "n D"],
     tokens: Tokens,
@@ -179,27 +179,27 @@ def row_scores(
     """Log-probability `log_prob` [K] of what follows each predicting place of a row, and whether it is `right`.
 
     Args:
-      agent, params, max_logits: as in `sft_gradient`.
+      fns, params, max_logits: as in `sft_gradient`.
       seen: encoded touch and view of the contacts of a group.
       tokens: of the examples of the group.
       source, predicts: the row, as in `PackedRows`; what is said of places that are none means nothing.
     """
     row, following = row_of(tokens, source, predicts)
-    states = agent.packed_states(params, seen, row)
-    return _scored(agent, params, {"state": states, "token": following}, max_logits)
+    states = fns.packed_states(params, seen, row)
+    return _scored(fns, params, {"state": states, "token": following}, max_logits)
 
 
 def encoded_group(
-    agent: Agent, params: Params, batch: SFTBatch, *, blind: bool = False
+    fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False
 ) -> tuple[Float[Array, "P n D"], Features]:
     """Tokens of each contact's streams and view, one after the other, and the features that they are of."""
-    features = agent.encode(params, batch.touch, blind=blind)
+    features = fns.encode(params, batch.touch, blind=blind)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1])
     return jnp.concatenate([touch, features.view.astype(touch.dtype)], 1), features
 
 
 def _add_rows(
-    agent: Agent,
+    fns: PolicyFns,
     params: Params,
     chunk: SFTBatch,
     rows: PackedRows,
@@ -214,14 +214,14 @@ def _add_rows(
     As many rows are computed as the fullest group has.  Their gradients with respect to the encoded contacts are
     summed, and go through the encoder once.
     """
-    encode = lambda p: encoded_group(agent, p, chunk, blind=blind)
+    encode = lambda p: encoded_group(fns, p, chunk, blind=blind)
     encoded, back, features = jax.vjp(encode, params, has_aux=True)
     groups = len(encoded) // rows.contacts
     by_group = lambda x: x.reshape(groups, -1, *x.shape[2:])
     prompt = chunk.ids, chunk.mask, chunk.streams, chunk.tokens
-    made = padded_tokens(agent.policy, agent.slots, features, *prompt, rows.contacts)
+    made = padded_tokens(fns.module, fns.slots, features, *prompt, rows.contacts)
     source, predicts, tokens = jax.tree.map(by_group, (rows.source, rows.predicts, made))
-    of_group = functools.partial(row_scores, agent, max_logits=max(1, max_logits // groups))
+    of_group = functools.partial(row_scores, fns, max_logits=max(1, max_logits // groups))
 
     def share(params: Params, seen: Array, i: Array) -> tuple[Array, Array]:
         found = jax.vmap(of_group, in_axes=(None, 0, 0, 0, 0))(params, seen, tokens, source[:, i], predicts[:, i])

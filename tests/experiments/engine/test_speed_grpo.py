@@ -12,7 +12,7 @@ from experiments.core.processes import in_own_process
 from experiments.core.runner import main
 from experiments.engine import speed_grpo
 from experiments.engine.harness import PeerTimes
-from experiments.engine.job import Job, config_of, init_decoder, make_agent, make_batch
+from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
 from experiments.engine.peers import PeerFailed
 from experiments.engine.size import Size
 from experiments.engine.speed import Course, Option, many_steps, options, time_alone
@@ -22,8 +22,8 @@ TINY = speed_grpo.SMOKE.size
 
 
 def test_the_decoder_has_its_advertised_size():
-    agent, batch = make_agent(Size(), 64), make_batch(Size(), 64, 1)
-    assert sum(x.size for x in jax.tree.leaves(init_decoder(agent, batch))) == 1_050_752
+    fns, batch = make_fns(Size(), 64), make_batch(Size(), 64, 1)
+    assert sum(x.size for x in jax.tree.leaves(init_decoder(fns, batch))) == 1_050_752
 
 
 def test_work_by_hand():

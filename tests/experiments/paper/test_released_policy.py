@@ -115,5 +115,5 @@ def test_towers_that_stand_still_need_adapters(policy, streamed, context):
 
 
 def test_the_cache_has_the_type_of_the_weights(policy, checkpoint):
-    assert policy.agent.cache_dtype == jnp.float32
+    assert policy.fns.cache_dtype == jnp.float32
     assert {x.dtype for x in jax.tree.leaves(checkpoint.params)} == {jnp.dtype(jnp.float32)}

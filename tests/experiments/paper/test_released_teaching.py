@@ -56,12 +56,12 @@ def test_every_level_of_every_question_is_drawn_and_sensors_differ(writer):
 
 def test_the_prompt_names_sensors_and_shows_nothing(writer, batch):
     """Of the words of a prompt those alone are left out that stand for touch and picture."""
-    layout, slots = writer.layout, writer.agent.slots
+    layout, slots = writer.layout, writer.fns.slots
     touch = jax.tree.map(jnp.asarray, batch.touch)
     streams = touch.stream_mask[0] & batch.streams[0, 0]
     features = Features(
         touch=jnp.zeros((*slots.touch.shape, 1)),
-        touch_time=writer.agent.policy.token_time(touch.frame_index[0], touch.frame_mask[0]),
+        touch_time=writer.fns.module.token_time(touch.frame_index[0], touch.frame_mask[0]),
         stream_mask=streams,
         view=jnp.zeros((len(slots.view), 1)),
         view_mask=touch.view_mask[0],

@@ -48,8 +48,8 @@ def test_what_was_written_gives_the_same_logits(folder, trained, policy, streame
 
     @jax.jit
     def logits(params):
-        features = jax.tree.map(lambda x: x[0], policy.agent.encode(params, batch))
-        return policy.agent.prefill(params, features, jnp.asarray(layout.ids[0]), jnp.asarray(layout.mask[0]))[0]
+        features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
+        return policy.fns.prefill(params, features, jnp.asarray(layout.ids[0]), jnp.asarray(layout.mask[0]))[0]
 
     ours = np.asarray(logits(trained))
     assert np.isfinite(ours[~policy.tokenizer.banned]).all()

@@ -49,7 +49,7 @@ def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed, contex
 
 
 class Mirror:
-    """In the place of an agent: the streams that it is given, unencoded."""
+    """In the place of the policy: the streams that it is given, unencoded."""
 
     def encode_streams(self, params, pixels, push, index, mask, sensor):
         del params

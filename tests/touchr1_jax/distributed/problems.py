@@ -26,7 +26,7 @@ from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params, Parsed, Target
 
 ROWS, STEPS, TOKENS = 8, 20, 6
-AGENT = tiny.SHALLOW
+FNS = tiny.SHALLOW
 LORA = LoraConfig(rank=2, alpha=4.0)
 GRPO = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algorithm=Paper(beta=0.1, gamma=0.05))
 OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), STEPS)
@@ -100,7 +100,7 @@ def sft() -> Problem:
 
     params = {**tiny.params(loud=0.2), **tiny.shallow_params(loud=0.2)}
     state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
-    return Problem(make_sft_step(AGENT, OPTIMIZER), state, item)
+    return Problem(make_sft_step(FNS, OPTIMIZER), state, item)
 
 
 def packed() -> Problem:
@@ -109,7 +109,7 @@ def packed() -> Problem:
 
     def finish(batch: SFTBatch) -> SFTBatch:
         prompt = batch.touch, batch.mask, batch.streams, batch.token_mask
-        exists = existing_tokens(AGENT.policy, AGENT.slots, *prompt)
+        exists = existing_tokens(FNS.module, FNS.slots, *prompt)
         return batch.replace(rows=pack_rows(exists, batch.token_mask, Packing(width=40, contacts=2)))
 
     return dataclasses.replace(problem, finish=finish)
@@ -123,7 +123,7 @@ def adapters() -> Problem:
     state = SFTState(params=trained, opt_state=OPTIMIZER.init(trained), step=jnp.int32(0))
 
     def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, jax.Array]]:
-        return make_sft_step(adapt(AGENT, frozen, LORA), OPTIMIZER)(state, batch)
+        return make_sft_step(adapt(FNS, frozen, LORA), OPTIMIZER)(state, batch)
 
     return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (frozen,))
 
@@ -138,7 +138,7 @@ def adapters_grpo() -> Problem:
     fixed = Fixed(reference=Trainable(adapters=_adapters(frozen, 1), towers={}), noise=plain.shared[0].noise)
 
     def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params):
-        return make_grpo_step(adapt(AGENT, frozen, LORA), score, optimizer, GRPO)(state, batch, fixed)
+        return make_grpo_step(adapt(FNS, frozen, LORA), score, optimizer, GRPO)(state, batch, fixed)
 
     return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (fixed, frozen))
 
@@ -159,7 +159,7 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
     """Share of tokens that are the label modulo 3."""
     level = jnp.where(target.asked, tokens[0] % 3, -1)
     right = jnp.mean(tokens % 3 == jnp.max(target.label))
-    truncated = jnp.all(~jnp.isin(tokens, jnp.asarray(AGENT.end_ids)))
+    truncated = jnp.all(~jnp.isin(tokens, jnp.asarray(FNS.end_ids)))
     parsed = Parsed(
         perceive=jnp.tile(level, (tiny.S, 1)),
         compare=level,
@@ -179,7 +179,7 @@ def grpo() -> Problem:
     fixed = Fixed(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
     item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
     questions = tiny.question_batch(0, 16)
-    return Problem(make_grpo_step(AGENT, score, optimizer, GRPO), state, item, (fixed,))
+    return Problem(make_grpo_step(FNS, score, optimizer, GRPO), state, item, (fixed,))
 
 
 def dynamics() -> Problem:

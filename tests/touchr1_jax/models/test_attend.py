@@ -97,7 +97,7 @@ def test_blocks_of_queries_see_what_the_whole_sees(rows):
     np.testing.assert_allclose(jax.jit(attend_causally)(q, cache, mask), whole, rtol=1e-4, atol=1e-5)
 
 
-prefill = jax.jit(tiny.AGENT.prefill, static_argnums=5)
+prefill = jax.jit(tiny.FNS.prefill, static_argnums=5)
 
 
 @pytest.mark.parametrize("stream", range(tiny.S))
@@ -116,5 +116,5 @@ def test_a_prompt_encoded_again_from_a_change_on_is_the_prompt_encoded_whole(str
 
 def test_touch_starts_at_the_first_sensor_name():
     text = tiny.LAYOUT.stream_text
-    assert tiny.AGENT.touch_start == np.flatnonzero((text >= 0) & (text < tiny.S)).min()
-    assert tiny.AGENT.touch_start < tiny.SLOTS.touch.min()
+    assert tiny.FNS.touch_start == np.flatnonzero((text >= 0) & (text < tiny.S)).min()
+    assert tiny.FNS.touch_start < tiny.SLOTS.touch.min()

@@ -15,7 +15,7 @@ from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapt
 
 LORA = LoraConfig(rank=3, alpha=6.0)
 MLP = LoraConfig(rank=3, layers=("gate", "up", "down"))
-AGENT = tiny.SHALLOW
+FNS = tiny.SHALLOW
 L = 5
 
 
@@ -34,14 +34,14 @@ def loud(adapters):
 def states(params):
     """Hidden states of a prompt of the decoder alone."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(L, tiny.CONFIG.decoder.hidden_size)), jnp.float32)
-    decoder = Decoder(AGENT.policy.config.decoder)
+    decoder = Decoder(FNS.module.config.decoder)
     positions = jnp.tile(jnp.arange(L), (3, 1))
     return decoder.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
 
 
-def logits(agent, params):
+def logits(fns, params):
     batch, tokens = tiny.question_batch(1, 1), tiny.completions(0, 1, 2, 4)
-    forward = jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0))
+    forward = jax.vmap(fns.group_logits, in_axes=(None, 0, 0, 0, 0))
     return jax.jit(forward)(params, batch.features, batch.ids, batch.mask, tokens)
 
 
@@ -69,7 +69,7 @@ def test_fresh_adapters_change_nothing():
 
 def test_adapters_have_the_shapes_of_their_layers(base):
     layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["layers_0"]
-    c = AGENT.policy.config.decoder
+    c = FNS.module.config.decoder
     assert set(layer) == {"q_proj", "k_proj", "v_proj", "o_proj", "mlp"}
     assert layer["k_proj"].a.shape == (c.hidden_size, 3)
     assert layer["k_proj"].b.shape == (3, c.num_kv_heads * c.head_dim)
@@ -81,10 +81,10 @@ def test_adapters_have_the_shapes_of_their_layers(base):
 def test_merged_parameters_compute_the_same(base):
     """Prompt, completion and their gradients by both ways; far from the base."""
     adapters = loud(init_adapters(jax.random.key(0), base, LORA))
-    agent = adapt(AGENT, base, LORA)
-    ours = logits(agent, Trainable(adapters=adapters, towers={}))
-    theirs = logits(AGENT, merge(base, adapters, LORA))
-    assert float(jnp.abs(ours - logits(AGENT, base)).max()) > 0.5
+    fns = adapt(FNS, base, LORA)
+    ours = logits(fns, Trainable(adapters=adapters, towers={}))
+    theirs = logits(FNS, merge(base, adapters, LORA))
+    assert float(jnp.abs(ours - logits(FNS, base)).max()) > 0.5
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-5 * float(jnp.abs(theirs[..., tiny.WRITABLE]).max()))
 
 
@@ -104,10 +104,10 @@ def test_gradients_are_those_through_the_merged_parameters(base):
 def test_layers_that_are_computed_twice_are_adapted_both_times(base):
     """Values and gradients of a policy that keeps little for its backward pass."""
     params = Trainable(adapters=loud(init_adapters(jax.random.key(0), base, LORA)), towers={})
-    agent = adapt(AGENT, base, LORA)
-    lean = dataclasses.replace(agent, policy=agent.policy.clone(remat=True))
+    fns = adapt(FNS, base, LORA)
+    lean = dataclasses.replace(fns, module=fns.module.clone(remat=True))
     total = lambda a: jax.value_and_grad(lambda p: jnp.sum(jnp.sin(logits(a, p)[..., tiny.WRITABLE])))(params)
-    for a, b in zip(jax.tree.leaves(total(lean)), jax.tree.leaves(total(agent)), strict=True):
+    for a, b in zip(jax.tree.leaves(total(lean)), jax.tree.leaves(total(fns)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(jnp.abs(b).max()))
 
 

@@ -23,7 +23,7 @@ HAND = [
     *[(13, 13, 13), (14, 14, 14), (15, 15, 15)],  # padding, then two words
 ]
 
-group_logits = jax.jit(jax.vmap(tiny.AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+group_logits = jax.jit(jax.vmap(tiny.FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 def logits(batch, tokens=TOKENS):
@@ -69,7 +69,7 @@ def test_time_ids_are_distinct_frame_indices():
 
 def test_encoded_touch_carries_its_frame_indices():
     batch = tiny.touch_batch(0, 1)
-    features = jax.jit(lambda b: tiny.AGENT.encode(tiny.params(), b))(batch)
+    features = jax.jit(lambda b: tiny.FNS.encode(tiny.params(), b))(batch)
     np.testing.assert_array_equal(features.touch_time, np.repeat(batch.frame_index[..., ::2], 2, -1))
     assert len(np.unique(features.touch_time[0, 0])) == tiny.FRAMES // 2
 
@@ -120,9 +120,9 @@ def test_absent_stream_is_a_prompt_without_its_tokens(batch):
     keep = np.setdiff1d(np.arange(tiny.L), cut)
     new_place = np.searchsorted(keep, np.arange(tiny.L))
     text = tiny.LAYOUT.stream_text[keep]
-    agent = tiny.make_agent(slots=Slots(new_place[tiny.LAYOUT.touch[1:]], tiny.LAYOUT.view, np.where(text == 1, 0, -1)))
+    fns = tiny.make_fns(slots=Slots(new_place[tiny.LAYOUT.touch[1:]], tiny.LAYOUT.view, np.where(text == 1, 0, -1)))
     shorter = f.replace(touch=f.touch[:, 1:], touch_time=f.touch_time[:, 1:], stream_mask=f.stream_mask[:, 1:])
-    cut_logits = jax.jit(jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0)))(
+    cut_logits = jax.jit(jax.vmap(fns.group_logits, in_axes=(None, 0, 0, 0, 0)))(
         tiny.params(), shorter, batch.ids[:, keep], batch.mask[:, keep], TOKENS
     )
     np.testing.assert_allclose(logits(masked), cut_logits, rtol=1e-5, atol=2e-5)
@@ -132,8 +132,8 @@ def test_more_padding_before_the_question_changes_no_logit(batch, before):
     extra, at = 3, int(tiny.LAYOUT.touch.max()) + 1
     insert = lambda x, value: jnp.insert(x, jnp.full(extra, at), value, axis=1)
     slots = Slots(tiny.LAYOUT.touch, tiny.LAYOUT.view, np.append(tiny.LAYOUT.stream_text, [-1] * extra))
-    agent = tiny.make_agent(slots=slots)
-    longer = jax.jit(jax.vmap(agent.group_logits, in_axes=(None, 0, 0, 0, 0)))(
+    fns = tiny.make_fns(slots=slots)
+    longer = jax.jit(jax.vmap(fns.group_logits, in_axes=(None, 0, 0, 0, 0)))(
         tiny.params(), batch.features, insert(batch.ids, 7), insert(batch.mask, False), TOKENS
     )
     np.testing.assert_allclose(longer, before, rtol=1e-5, atol=2e-5)
@@ -154,7 +154,7 @@ def test_prompts_are_independent(batch, before):
 
 
 def test_vmap_over_prompts_is_the_loop(batch, before):
-    one = jax.jit(tiny.AGENT.group_logits)
+    one = jax.jit(tiny.FNS.group_logits)
     for i in range(P):
         features, ids, mask = jax.tree.map(lambda x, i=i: x[i], (batch.features, batch.ids, batch.mask))
         ours = one(tiny.params(), features, ids, mask, TOKENS[i])

@@ -12,7 +12,7 @@ import pytest
 from tests.touchr1_jax.models.checkpoint import write_checkpoint
 from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge, over_base
-from touchr1_jax.models.qwen.policy import init_on_pretrained, qwen_agent, qwen_policy
+from touchr1_jax.models.qwen.policy import init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.text.chat_layout import build_chat_layout
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -24,7 +24,7 @@ README = Path(__file__).resolve().parents[3] / "touchr1_jax" / "README.md"
 P, S, FRAMES, T = 1, 4, 2, 3
 
 NAMED = (
-    *(load_checkpoint, Trainable, adapt, init_adapters, over_base, init_on_pretrained, qwen_agent, qwen_policy),
+    *(load_checkpoint, Trainable, adapt, init_adapters, over_base, init_on_pretrained, qwen_fns, qwen_policy),
     *(TactileViTConfig, build_chat_layout, make_sft_step),
 )
 """What the lines use, under its own name; only these and those below are known to them."""

@@ -101,7 +101,7 @@ def test_frames_must_divide(shape):
 
 
 encode = jax.jit(
-    lambda p, b: tiny.AGENT.encode_streams(p, b.frames, b.force_n, b.frame_index, b.frame_mask, jnp.arange(2)[None])
+    lambda p, b: tiny.FNS.encode_streams(p, b.frames, b.force_n, b.frame_index, b.frame_mask, jnp.arange(2)[None])
 )
 
 
@@ -162,9 +162,9 @@ def test_permuted_frames_change_the_tokens():
 def test_force_can_be_switched_off():
     config = dataclasses.replace(tiny.CONFIG, tactile=dataclasses.replace(tiny.CONFIG.tactile, use_force=False))
     batch = tiny.touch_batch(0)
-    agent, params = tiny.make_agent(config), tiny.params()
+    fns, params = tiny.make_fns(config), tiny.params()
     blind = {**params, "tactile": {k: v for k, v in params["tactile"].items() if not k.startswith("force")}}
-    run = jax.jit(lambda b: agent.encode(blind, b).touch)
+    run = jax.jit(lambda b: fns.encode(blind, b).touch)
     np.testing.assert_array_equal(run(batch), run(batch.replace(force_n=-3 * batch.force_n)))
 
 

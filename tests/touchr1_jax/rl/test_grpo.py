@@ -16,10 +16,10 @@ from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.types import Parsed, Rollout, Target
 
 P, G, T, K = 4, 3, 4, 3
-AGENT = tiny.SHALLOW
+FNS = tiny.SHALLOW
 ALGORITHM = Paper(beta=0.1, gamma=0.05, drop_degenerate=True)
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=ALGORITHM)
-DRAW = SampleConfig(group=G, length=T, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id)
+DRAW = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
 FIXED = Fixed(
     reference=tiny.shallow_params(1),
     noise=jnp.asarray(
@@ -63,7 +63,7 @@ class Run:
             self.traces += 1
             return score(tokens, target)
 
-        self.step = make_grpo_step(AGENT, counted, OPTIMIZER, CONFIG)
+        self.step = make_grpo_step(FNS, counted, OPTIMIZER, CONFIG)
         self.batches = [tiny.question_batch(seed, P) for seed in (1, 2, 2)]
         self.before, self.metrics = [], []
         now = state()
@@ -86,7 +86,7 @@ def test_no_nan_under_debug_nans(run):
         run.step(jax.tree.map(jnp.copy, run.before[0]), run.batches[0], FIXED)
 
 
-draw = jax.jit(lambda p, b, k: sample_group(AGENT, p, b, k, DRAW))
+draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
 
 
 def experience_of(before: GRPOState, batch):
@@ -95,7 +95,7 @@ def experience_of(before: GRPOState, batch):
     return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FIXED.noise, mask_key)[0]
 
 
-group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 @pytest.mark.parametrize("i", [0, 1])
@@ -215,7 +215,7 @@ def assert_first_step(run, end: GRPOState, metrics: dict[str, jax.Array]) -> Non
 
 def test_step_outside_jit_is_the_compiled_one(run):
     """The Python function itself; its loops are compiled one by one."""
-    plain = make_grpo_step(AGENT, score, OPTIMIZER, CONFIG).__wrapped__
+    plain = make_grpo_step(FNS, score, OPTIMIZER, CONFIG).__wrapped__
     assert_first_step(run, *plain(state(), run.batches[0], FIXED))
 
 
@@ -223,7 +223,7 @@ def test_step_outside_jit_is_the_compiled_one(run):
 def test_uncompiled_step_is_the_compiled_one(run):
     """Operation by operation, loops in Python, and no operation anywhere gives NaN."""
     with jax.disable_jit(), jax.debug_nans(True):
-        end, metrics = make_grpo_step(AGENT, score, OPTIMIZER, CONFIG)(state(), run.batches[0], FIXED)
+        end, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG)(state(), run.batches[0], FIXED)
     assert_first_step(run, end, metrics)
 
 

@@ -43,7 +43,7 @@ def test_a_step_holds_the_sampler_and_not_the_learner():
 
 
 def test_a_frozen_base_is_held_too():
-    agent = adapt(tiny.SHALLOW, {"decoder": {"scale": jnp.ones(2)}}, LoraConfig(rank=1))
-    doubled = agent.with_context(lambda params: jax.tree.map(lambda x: 2 * x, params))
+    fns = adapt(tiny.SHALLOW, {"decoder": {"scale": jnp.ones(2)}}, LoraConfig(rank=1))
+    doubled = fns.with_context(lambda params: jax.tree.map(lambda x: 2 * x, params))
     assert doubled.base["decoder"]["scale"].tolist() == [2, 2]
     assert tiny.SHALLOW.with_context(lambda params: None) is tiny.SHALLOW

@@ -16,14 +16,14 @@ from touchr1_jax.rl.objective import Experience, objective_gradient, prompt_term
 from touchr1_jax.types import Rollout
 
 P, G, T = 4, 2, 4
-AGENT = tiny.SHALLOW
+FNS = tiny.SHALLOW
 PARAMS, REFERENCE = tiny.shallow_params(0), tiny.shallow_params(1)
 ALGORITHM = Paper(beta=0.1, gamma=0.05)
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=ALGORITHM)
 ROUNDING = 1e-6  # nat: the perturbed prompt is encoded from its first change on, by products of other shapes
 ALONE = dataclasses.replace(CONFIG, algorithm=Paper(beta=0.0, gamma=0.0))  # the policy gradient alone
 
-group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def experience() -> Experience:
 
 def gradient(config: GRPOConfig):
     """The jitted (experience, parameters) → gradient and parts."""
-    return jax.jit(lambda e, params=PARAMS: objective_gradient(AGENT, config, params, REFERENCE, e))
+    return jax.jit(lambda e, params=PARAMS: objective_gradient(FNS, config, params, REFERENCE, e))
 
 
 compute = gradient(CONFIG)
@@ -144,7 +144,7 @@ def test_under_a_cap_the_learner_before_the_update_is_old(experience):
     """At the first update its ratio is 1 whatever the sampler said, and the sampler counts in the weight alone."""
     cap = 1.2
     config = dataclasses.replace(ALONE, algorithm=dataclasses.replace(ALONE.algorithm, importance_cap=cap))
-    capped = jax.jit(lambda e, f: objective_gradient(AGENT, config, PARAMS, REFERENCE, e, first=f))
+    capped = jax.jit(lambda e, f: objective_gradient(FNS, config, PARAMS, REFERENCE, e, first=f))
     b, r = experience.batch, experience.rollout
     log_p = jax.nn.log_softmax(group_logits(PARAMS, b.features, b.ids, b.mask, r.tokens))
     learner = token_log_probs(log_p, r.tokens)
@@ -195,14 +195,14 @@ def test_prompts_of_weight_zero_do_not_count(experience, alone):
 def test_what_stands_after_the_end_does_not_count(experience, alone):
     """Other tokens and log-probabilities where the mask is false; padding has a log-probability of −1e9 there."""
     r = experience.rollout
-    filler = r.replace(tokens=jnp.where(r.mask, r.tokens, AGENT.pad_id), log_prob=jnp.where(r.mask, r.log_prob, 0.0))
+    filler = r.replace(tokens=jnp.where(r.mask, r.tokens, FNS.pad_id), log_prob=jnp.where(r.mask, r.log_prob, 0.0))
     assert not r.mask.all()
     both = (alone(experience._replace(rollout=x, old=x.log_prob)) for x in (r, filler))
     for a, b in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7)
 
 
-terms_of = jax.jit(lambda e: prompt_terms(AGENT, CONFIG, PARAMS, REFERENCE, e))
+terms_of = jax.jit(lambda e: prompt_terms(FNS, CONFIG, PARAMS, REFERENCE, e))
 
 
 def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(experience):

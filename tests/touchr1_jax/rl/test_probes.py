@@ -14,7 +14,7 @@ from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Parsed, Target
 
-P, AGENT = 8, tiny.SHALLOW
+P, FNS = 8, tiny.SHALLOW
 CONFIG = GRPOConfig(prompts=P, group=8, length=2, micro_prompts=8, algorithm=Paper(beta=0.0, gamma=0.0))
 OPTIMIZER = optax.adam(0.02)
 PAYS = jnp.array([10, 17])
@@ -39,10 +39,10 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
 @pytest.fixture(scope="module")
 def step():
     """One program for both problems: they differ in their batches."""
-    return make_grpo_step(AGENT, score, OPTIMIZER, CONFIG)
+    return make_grpo_step(FNS, score, OPTIMIZER, CONFIG)
 
 
-prefill = jax.jit(jax.vmap(AGENT.prefill, in_axes=(None, 0, 0, 0)))
+prefill = jax.jit(jax.vmap(FNS.prefill, in_axes=(None, 0, 0, 0)))
 
 
 def batch_of(pattern: np.ndarray, label: np.ndarray):
@@ -85,7 +85,7 @@ def test_touch_problem_cannot_be_solved_blind(step):
 
 
 WORDS = np.array([10, 17, 20, 21, 25])
-FEW = dataclasses.replace(AGENT, banned=~np.isin(np.arange(tiny.V), WORDS))
+FEW = dataclasses.replace(FNS, banned=~np.isin(np.arange(tiny.V), WORDS))
 """The same policy with five words."""
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from tests.touchr1_jax.rl.test_grpo import AGENT, P
+from tests.touchr1_jax.rl.test_grpo import FNS, P
 from touchr1_jax.rl.config import GRPOConfig, Paper, Stable
 from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.losses import grounding_bonus
@@ -26,8 +26,8 @@ DIRECTION = jax.tree.map(lambda a, b: b - a, BEFORE, tiny.shallow_params(1))
 def learn() -> Experience:
     """Rollouts of the policy before the update."""
     batch = tiny.question_batch(1, P)
-    draw = SampleConfig(group=G, length=T, end_ids=AGENT.end_ids, pad_id=AGENT.pad_id)
-    rollout = jax.jit(lambda: sample_group(AGENT, BEFORE, batch, jax.random.key(0), draw))()
+    draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
+    rollout = jax.jit(lambda: sample_group(FNS, BEFORE, batch, jax.random.key(0), draw))()
     touch = batch.features.touch
     zero = jnp.zeros((P, G))
     stream = jnp.zeros(P, jnp.int32)
@@ -38,11 +38,11 @@ def learn() -> Experience:
 def shorten(learn):
     """The parameters and sizes of an update of a given length along one direction, from one program."""
     along = lambda size: jax.tree.map(lambda a, d: a + size * d, BEFORE, DIRECTION)
-    return jax.jit(lambda size: within_trust(AGENT, CONFIG, BEFORE, along(size), learn, DELTA))
+    return jax.jit(lambda size: within_trust(FNS, CONFIG, BEFORE, along(size), learn, DELTA))
 
 
 def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
-    ours = jax.jit(lambda: log_probs(AGENT, CONFIG, BEFORE, learn))()
+    ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn))()
     mask = np.asarray(learn.rollout.mask)
     np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
 

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from tests.touchr1_jax import tiny
-from tests.touchr1_jax.rl.test_grpo import AGENT, FIXED, P, score
+from tests.touchr1_jax.rl.test_grpo import FIXED, FNS, P, score
 from touchr1_jax.rl.config import Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable, TactileUse
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 
@@ -20,7 +20,7 @@ SIZES = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2)
 
 def take(config: GRPOConfig, steps: int = 1, prompts: int = P, **kwargs):
     """State and metrics after some steps on one batch."""
-    step = make_grpo_step(AGENT, score, OPTIMIZER, config, **kwargs)
+    step = make_grpo_step(FNS, score, OPTIMIZER, config, **kwargs)
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config)
     batch = tiny.question_batch(1, prompts).replace(ordered=jnp.arange(prompts) % 2 == 0)
     for _ in range(steps):
@@ -106,7 +106,7 @@ def test_the_reference_is_refreshed_on_time():
 def test_a_state_without_a_reference_cannot_refresh_it():
     config = of(Paper(reference_every=2))
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), of(Paper()))
-    step = make_grpo_step(AGENT, score, OPTIMIZER, config)
+    step = make_grpo_step(FNS, score, OPTIMIZER, config)
     with pytest.raises(ValueError, match="the state has no reference; make it with `start_state`"):
         step(state, tiny.question_batch(1, P), FIXED)
 
@@ -115,10 +115,10 @@ def test_a_state_without_a_reference_cannot_refresh_it():
 @pytest.mark.parametrize("buckets", [(2,), (3, 5)])
 def test_buckets_change_nothing_but_the_time(buckets):
     """Rollouts that end early, by banning all words but the end and one more."""
-    agent = dataclasses.replace(AGENT, banned=~np.isin(np.arange(tiny.V), [1, 10]))
+    fns = dataclasses.replace(FNS, banned=~np.isin(np.arange(tiny.V), [1, 10]))
     found = []
     for config in (of(Paper()), of(Paper(), buckets=buckets)):
-        step = make_grpo_step(agent, score, OPTIMIZER, config)
+        step = make_grpo_step(fns, score, OPTIMIZER, config)
         state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(2), config)
         found.append(step(state, tiny.question_batch(1, P), FIXED))
     (whole, a), (cut, b) = found

@@ -38,7 +38,7 @@ from touchr1_jax.training.sft import (
 
 P, Q, T = 4, 2, 16
 N = tiny.L + T
-AGENT = tiny.AGENT
+FNS = tiny.FNS
 WIDTH = 2 * N
 
 
@@ -79,7 +79,7 @@ def answer(rng: np.random.Generator, streams: np.ndarray, asked: int) -> tuple[n
 def packed(batch: SFTBatch, packing: Packing) -> SFTBatch:
     """The same with rows."""
     given = batch.touch, batch.mask, batch.streams, batch.token_mask
-    exists = existing_tokens(AGENT.policy, AGENT.slots, *given)
+    exists = existing_tokens(FNS.module, FNS.slots, *given)
     return batch.replace(rows=pack_rows(exists, batch.token_mask, packing))
 
 
@@ -95,7 +95,7 @@ def params():
 
 @functools.cache
 def gradient(micro: int | None, *, blind: bool = False):
-    return jax.jit(functools.partial(sft_gradient, AGENT, micro_contacts=micro, blind=blind))
+    return jax.jit(functools.partial(sft_gradient, FNS, micro_contacts=micro, blind=blind))
 
 
 def assert_same(found, expected, tolerance: float = 1e-5) -> None:
@@ -138,17 +138,17 @@ def test_answers_of_which_a_part_counts_teach_that_part(params, batch):
 
 def test_blocks_of_logits_and_rematerialisation_change_nothing(params, batch, padding):
     rows = packed(batch, Packing(width=WIDTH, contacts=4))
-    lean = dataclasses.replace(AGENT, policy=AGENT.policy.clone(remat=True))
+    lean = dataclasses.replace(FNS, module=FNS.module.clone(remat=True))
     found = jax.jit(functools.partial(sft_gradient, lean, max_logits=5 * tiny.V))(params, rows)
     assert_same(found, padding)
 
 
 def test_adapters_learn_from_rows_what_they_learn_from_padding(params, batch):
     lora = LoraConfig(rank=2)
-    agent = adapt(AGENT, params, lora)
+    fns = adapt(FNS, params, lora)
     adapters = jax.tree.map(lambda x: 0.1 + x, init_adapters(jax.random.key(0), params, lora))
     trained = Trainable(adapters=adapters, towers={"tactile": params["tactile"]})
-    found = jax.jit(functools.partial(sft_gradient, agent))
+    found = jax.jit(functools.partial(sft_gradient, fns))
     assert_same(found(trained, packed(batch, Packing(width=WIDTH, contacts=4))), found(trained, batch))
 
 
@@ -162,10 +162,10 @@ def scores(params, batch):
 
     @jax.jit
     def run(batch, seen=None):
-        encoded, features = encoded_group(AGENT, params, batch)
+        encoded, features = encoded_group(FNS, params, batch)
         tokens = tokens_of(features, batch)
         encoded = encoded.reshape(-1, encoded.shape[-1]) if seen is None else seen
-        found = row_scores(AGENT, params, encoded, tokens, source, predicts)["log_prob"]
+        found = row_scores(FNS, params, encoded, tokens, source, predicts)["log_prob"]
         return jnp.where(predicts >= 0, found, 0.0), encoded
 
     return run, np.where(predicts >= 0, examples, -1)
@@ -174,7 +174,7 @@ def scores(params, batch):
 def tokens_of(features, batch: SFTBatch):
     """All tokens of all examples, which are one group."""
     prompt = batch.ids, batch.mask, batch.streams, batch.tokens
-    tokens = padded_tokens(AGENT.policy, AGENT.slots, features, *prompt, contacts=P)
+    tokens = padded_tokens(FNS.module, FNS.slots, features, *prompt, contacts=P)
     return jax.tree.map(lambda x: x.reshape(P * Q, *x.shape[2:]), tokens)
 
 
@@ -216,7 +216,7 @@ def test_it_is_the_segments_that_keep_examples_apart(params, batch, scores):
     examples = scores[1]
     batch = jax.tree.map(jnp.asarray, packed(batch, Packing(width=3 * N, contacts=4)))
     rows = batch.rows
-    encoded, features = jax.jit(functools.partial(encoded_group, AGENT))(params, batch)
+    encoded, features = jax.jit(functools.partial(encoded_group, FNS))(params, batch)
     third = examples == list(dict.fromkeys(examples[examples >= 0]))[2]
 
     @functools.partial(jax.jit, static_argnums=1)
@@ -225,7 +225,7 @@ def test_it_is_the_segments_that_keep_examples_apart(params, batch, scores):
         row, _ = row_of(tokens, rows.source[0, 0], rows.predicts[0, 0])
         one = lm.Segments(number=jnp.zeros_like(row.segments.number), reach=3 * N)
         row = row._replace(segments=one) if together else row
-        return AGENT.packed_states(params, encoded.reshape(-1, encoded.shape[-1]), row)
+        return FNS.packed_states(params, encoded.reshape(-1, encoded.shape[-1]), row)
 
     p, q = divmod(int(list(dict.fromkeys(examples[examples >= 0]))[1]), Q)
     other = batch.ids.at[p, q, -2:].set(11)
@@ -253,7 +253,7 @@ def test_one_program_for_batches_that_fill_other_rows(params):
     """Five batches, of which one fills a single row, and the losses of padding."""
     optimizer = optax.sgd(0.0)
     packing = Packing(width=WIDTH, contacts=2, micro_batches=2)
-    step, losses, used = make_sft_step(AGENT, optimizer, micro_contacts=2), [], set()
+    step, losses, used = make_sft_step(FNS, optimizer, micro_contacts=2), [], set()
     batches = [make_batch(seed) for seed in range(5)]
     batches[4].token_mask[:, 1] = False
     for batch in batches:
@@ -264,18 +264,18 @@ def test_one_program_for_batches_that_fill_other_rows(params):
         losses.append(float(step(state, rows)[1]["loss"]))
     assert len(used) > 1
     assert step._cache_size() == 1
-    padded = jax.jit(functools.partial(sft_loss, AGENT))
+    padded = jax.jit(functools.partial(sft_loss, FNS))
     np.testing.assert_allclose(losses, [float(padded(params, b)[0]) for b in batches], rtol=1e-5)
 
 
 def test_the_host_knows_which_tokens_exist(params, batch):
-    features = jax.jit(lambda p, touch: AGENT.encode(p, touch))(params, batch.touch)
-    exists = existing_tokens(AGENT.policy, AGENT.slots, batch.touch, batch.mask, batch.streams, batch.token_mask)
+    features = jax.jit(lambda p, touch: FNS.encode(p, touch))(params, batch.touch)
+    exists = existing_tokens(FNS.module, FNS.slots, batch.touch, batch.mask, batch.streams, batch.token_mask)
     for p in range(P):
         for q in range(Q):
             seen = jax.tree.map(lambda x, p=p: x[p], features)
             seen = seen.replace(stream_mask=seen.stream_mask & batch.streams[p, q])
-            there = prompt_mask(seen, jnp.asarray(batch.mask[p, q]), AGENT.slots)
+            there = prompt_mask(seen, jnp.asarray(batch.mask[p, q]), FNS.slots)
             np.testing.assert_array_equal(exists[p, q, : tiny.L], there)
     np.testing.assert_array_equal(exists[..., tiny.L :], batch.token_mask)
     assert exists[..., : tiny.L].mean() < 1
@@ -378,7 +378,7 @@ def test_sizes_must_be_positive(field):
 def test_rows_are_of_the_micro_batches_that_are_computed(params, batch):
     rows = packed(batch, Packing(width=WIDTH, contacts=2, micro_batches=2))
     with pytest.raises(ValueError, match="rows were packed for 2 micro-batches: must be as many as the gradient's, 4"):
-        sft_gradient(AGENT, params, rows, micro_contacts=1)
+        sft_gradient(FNS, params, rows, micro_contacts=1)
 
 
 def test_rows_know_how_full_they_are():

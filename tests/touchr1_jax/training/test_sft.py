@@ -11,7 +11,7 @@ from touchr1_jax.text.template import answer_text, encode_answer
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step, sft_gradient, sft_loss
 
 P, Q, T = 2, 2, 12
-AGENT = tiny.SHALLOW
+FNS = tiny.SHALLOW
 
 
 def answer(level: int, asked: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,13 +48,13 @@ def params():
     return {**tiny.params(), **tiny.shallow_params()}
 
 
-loss = jax.jit(lambda p, b: sft_loss(AGENT, p, b))
-group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+loss = jax.jit(lambda p, b: sft_loss(FNS, p, b))
+group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
     """In float64 from the logits of one prompt and answer at a time."""
-    features = jax.jit(lambda p, b: AGENT.encode(p, b))(params, batch.touch)
+    features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
     cost, right, count = 0.0, 0, 0
     for q in range(Q):
         seen = features.replace(stream_mask=features.stream_mask & batch.streams[:, q])
@@ -74,7 +74,7 @@ def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
 def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
     """And the same gradient, five tokens' logits at a time."""
     few, all_at_once = (
-        jax.jit(jax.value_and_grad(lambda p, most=most: sft_loss(AGENT, p, batch, max_logits=most)[0]))(params)
+        jax.jit(jax.value_and_grad(lambda p, most=most: sft_loss(FNS, p, batch, max_logits=most)[0]))(params)
         for most in (5 * tiny.V, 10**9)
     )
     np.testing.assert_allclose(few[0], all_at_once[0], rtol=1e-6)
@@ -87,7 +87,7 @@ def test_micro_batches_sum_to_the_gradient_of_the_batch(params, batch):
     """With unequal numbers of answer tokens: the mean is over the tokens of the batch, not of each micro-batch."""
     uneven = batch.replace(token_mask=batch.token_mask.at[1, 1].set(False).at[0, 0, 5:].set(False))
     whole, micro = (
-        jax.jit(lambda p, size=size: sft_gradient(AGENT, p, uneven, micro_contacts=size))(params) for size in (None, 1)
+        jax.jit(lambda p, size=size: sft_gradient(FNS, p, uneven, micro_contacts=size))(params) for size in (None, 1)
     )
     np.testing.assert_allclose(micro[0], whole[0], rtol=1e-6)
     np.testing.assert_allclose(whole[0], loss(params, uneven), rtol=1e-6)
@@ -98,7 +98,7 @@ def test_micro_batches_sum_to_the_gradient_of_the_batch(params, batch):
 
 def test_micro_batches_must_divide_the_batch(params, batch):
     with pytest.raises(ValueError, match="micro_contacts is 3: must divide the 2 contacts"):
-        sft_gradient(AGENT, params, batch, micro_contacts=3)
+        sft_gradient(FNS, params, batch, micro_contacts=3)
 
 
 def test_only_answer_tokens_count(params, batch):
@@ -132,7 +132,7 @@ def test_rows_without_an_answer_add_nothing(params, batch):
 
 def test_a_few_answers_are_learned_by_heart(params, batch):
     optimizer = optax.adam(3e-3)
-    step = make_sft_step(AGENT, optimizer)
+    step = make_sft_step(FNS, optimizer)
     quiet = jax.tree.map(lambda x: 0.3 * x, params)
     state = SFTState(params=quiet, opt_state=optimizer.init(quiet), step=jnp.int32(0))
     losses = []
@@ -147,7 +147,7 @@ def test_a_few_answers_are_learned_by_heart(params, batch):
 
 
 def test_blind_loss_does_not_depend_on_touch(params, batch):
-    blind = jax.jit(lambda p, b: sft_loss(AGENT, p, b, blind=True)[0])
+    blind = jax.jit(lambda p, b: sft_loss(FNS, p, b, blind=True)[0])
     other = batch.touch.replace(frames=255 - batch.touch.frames, force_n=-batch.touch.force_n)
     assert blind(params, batch) == blind(params, batch.replace(touch=other))
     assert blind(params, batch) != blind(params, batch.replace(touch=batch.touch.replace(view=255 - batch.touch.view)))

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from touchr1_jax.models.agent import Agent
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.pictures import PICTURE_BUDGET, PixelBudget, fitting_size, patchify, resize
@@ -91,12 +91,12 @@ def qwen_policy(
     return Policy(PolicyConfig(tactile=tactile, vision=view, decoder=config.decoder))
 
 
-def qwen_agent(
+def qwen_fns(
     policy: Policy, layout: PromptLayout, tokenizer: Tokenizer, cache_dtype: jnp.dtype | type = jnp.bfloat16
-) -> Agent:
-    """The agent that SFT and GRPO train; `cache_dtype` is the type of the decoder's parameters."""
-    return Agent(
-        policy=policy,
+) -> PolicyFns:
+    """The functions that SFT and GRPO train; `cache_dtype` is the type of the decoder's parameters."""
+    return PolicyFns(
+        module=policy,
         slots=Slots(layout.touch, layout.view, layout.stream_text),
         banned=tokenizer.banned,
         end_ids=tokenizer.end_ids,

@@ -12,7 +12,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Slots, init_policy
 from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.pictures import PixelBudget
-from touchr1_jax.models.qwen.policy import qwen_agent, qwen_policy
+from touchr1_jax.models.qwen.policy import qwen_fns, qwen_policy
 from touchr1_jax.text.chat_layout import build_chat_layout
 from touchr1_jax.types import Params
 
@@ -49,7 +49,7 @@ POLICY = qwen_policy(CONFIG, tiny.CONFIG.tactile, view_px=(16, 16), budget=Pixel
 VIEW_TOKENS = POLICY.config.vision.tokens
 LAYOUT = build_chat_layout(TOKENIZER, tiny.LANGUAGE, tactile_tokens=tiny.N, view_tokens=VIEW_TOKENS)
 SLOTS = Slots(LAYOUT.touch, LAYOUT.view, LAYOUT.stream_text)
-AGENT = qwen_agent(POLICY, LAYOUT, TOKENIZER, jnp.float32)
+FNS = qwen_fns(POLICY, LAYOUT, TOKENIZER, jnp.float32)
 
 
 @functools.cache

@@ -10,13 +10,13 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.models.qwen import small_policy
-from tests.touchr1_jax.models.qwen.small_policy import AGENT, CONFIG, LAYOUT, POLICY, SLOTS, TOKENIZER, VIEW_TOKENS
+from tests.touchr1_jax.models.qwen.small_policy import CONFIG, FNS, LAYOUT, POLICY, SLOTS, TOKENIZER, VIEW_TOKENS
 from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, init_adapters, over_base
 from touchr1_jax.models.policy import init_policy, prompt_mask, prompt_positions
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.model import Inputs, QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget, patchify, resize
-from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_agent
+from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns
 from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
 from touchr1_jax.rl.config import Algorithm, GRPOConfig
 from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
@@ -33,14 +33,14 @@ LORA = LoraConfig(rank=4, alpha=8.0)
 def batch() -> GRPOBatch:
     touch = jax.tree.map(jnp.asarray, tiny.touch_batch(0, P))
     return GRPOBatch(
-        features=jax.jit(lambda p, b: AGENT.encode(p, b))(small_policy.params(), touch),
+        features=jax.jit(lambda p, b: FNS.encode(p, b))(small_policy.params(), touch),
         ids=jnp.asarray(LAYOUT.ids[:P]),
         mask=jnp.asarray(LAYOUT.mask[:P]),
         target=tiny.target(np.arange(P), np.arange(P)),
     )
 
 
-group_logits = jax.jit(jax.vmap(AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 def completions(*shape: int) -> jax.Array:
@@ -134,7 +134,7 @@ def test_one_grpo_step(batch):
     config = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=1, algorithm=algorithm)
     noise = jax.random.normal(jax.random.key(1), (3, *batch.features.touch.shape[1:]))
     state = start_state(start, optimizer, jax.random.key(0), config)
-    step = over_base(adapt(AGENT, base, LORA), lambda agent: make_grpo_step(agent, score, optimizer, config))
+    step = over_base(adapt(FNS, base, LORA), lambda fns: make_grpo_step(fns, score, optimizer, config))
     after, metrics = step(base, state, batch, Fixed(start, noise))
     assert all(np.isfinite(x) for x in metrics.values())
     assert metrics["clip_share"] == 0
@@ -165,7 +165,7 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
     start = Trainable(adapters=init_adapters(jax.random.key(0), frozen, LORA), towers=towers)
     optimizer = optax.adam(2e-2)
     state = SFTState(params=jax.tree.map(jnp.copy, start), opt_state=optimizer.init(start), step=jnp.int32(0))
-    step = over_base(adapt(AGENT, frozen, LORA), lambda agent: make_sft_step(agent, optimizer))
+    step = over_base(adapt(FNS, frozen, LORA), lambda fns: make_sft_step(fns, optimizer))
     kept, batch, losses = jax.tree.map(jnp.copy, frozen), sft_batch(), []
     for _ in range(12):
         state, metrics = step(frozen, state, batch)
@@ -180,14 +180,14 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
 def test_half_precision_decodes_as_the_learner_scores(batch):
     """Keys and values of a bfloat16 decoder are bfloat16; both ways agree to its rounding."""
     half = jax.tree.map(lambda x: (0.5 * x).astype(jnp.bfloat16), {"decoder": small_policy.params()["decoder"]})
-    agent, tokens = qwen_agent(POLICY, LAYOUT, TOKENIZER), completions(1, 2)
+    fns, tokens = qwen_fns(POLICY, LAYOUT, TOKENIZER), completions(1, 2)
     features = jax.tree.map(lambda x: x[0], batch.features)
 
     @jax.jit
     def both(params):
-        states, prefix = agent.group_states(params, features, batch.ids[0], batch.mask[0], tokens)
-        step, caches = agent.decode(params, tokens[0, 0], jnp.int32(0), prefix, agent.empty_cache(T))
-        return step, caches, agent.logits(params, states)[0, 1]
+        states, prefix = fns.group_states(params, features, batch.ids[0], batch.mask[0], tokens)
+        step, caches = fns.decode(params, tokens[0, 0], jnp.int32(0), prefix, fns.empty_cache(T))
+        return step, caches, fns.logits(params, states)[0, 1]
 
     step, caches, scored = both(half)
     assert caches[0].k.dtype == caches[0].v.dtype == jnp.bfloat16
@@ -216,4 +216,4 @@ def test_view_sizes_are_checked():
         view.tower(25)
     other = dataclasses.replace(tiny.touch_batch(0, P), view=np.zeros((P, 8, 8, 3), np.uint8))
     with pytest.raises(ValueError, match="view is 8×8 px, the config says 16×16"):
-        jax.eval_shape(lambda b: AGENT.encode(small_policy.params(), b), other)
+        jax.eval_shape(lambda b: FNS.encode(small_policy.params(), b), other)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from touchr1_jax.models.chunked import MAX_LOGITS, by_blocks
+from touchr1_jax.models.chunked_logits import MAX_LOGITS, by_blocks
 
 N, D, V = 7, 5, 24
 

@@ -22,7 +22,7 @@ BLOCKS = [
     (1, tiny.N),
     ("text", tiny.L - tiny.NV - 2 * tiny.N - 2),
 ]
-DRAW = SampleConfig(group=G, length=T, end_ids=tiny.AGENT.end_ids, pad_id=tiny.AGENT.pad_id)
+DRAW = SampleConfig(group=G, length=T, end_ids=tiny.FNS.end_ids, pad_id=tiny.FNS.pad_id)
 writable = tiny.WRITABLE
 
 
@@ -35,7 +35,7 @@ def batch():
     return batch.replace(features=batch.features.replace(stream_mask=stream_mask, view_mask=view_mask))
 
 
-group_logits = jax.jit(jax.vmap(tiny.AGENT.group_logits, in_axes=(None, 0, 0, 0, 0)))
+group_logits = jax.jit(jax.vmap(tiny.FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 def full_mask(features, mask) -> np.ndarray:
@@ -101,7 +101,7 @@ def test_shared_prefix_gives_the_gradients_of_full_sequences(batch):
 @pytest.fixture(scope="module")
 def rollout(batch):
     """Sampled completions."""
-    draw = jax.jit(lambda p, b, k: sample_group(tiny.AGENT, p, b, k, DRAW))
+    draw = jax.jit(lambda p, b, k: sample_group(tiny.FNS, p, b, k, DRAW))
     return draw(tiny.params(), batch, jax.random.key(3))
 
 
@@ -123,7 +123,7 @@ def test_ratio_to_the_sampler_is_one_on_policy(batch, rollout):
 
 def test_greedy_completion_is_the_most_likely_token_at_every_step(batch):
     greedy = dataclasses.replace(DRAW, group=1, greedy=True)
-    said = jax.jit(lambda p, b, k: sample_group(tiny.AGENT, p, b, k, greedy))(tiny.params(), batch, jax.random.key(0))
+    said = jax.jit(lambda p, b, k: sample_group(tiny.FNS, p, b, k, greedy))(tiny.params(), batch, jax.random.key(0))
     tokens = jnp.tile(said.tokens, (1, G, 1))  # the compiled shape
     best = jnp.argmax(group_logits(tiny.params(), batch.features, batch.ids, batch.mask, tokens), -1)[:, :1]
     np.testing.assert_array_equal(jnp.where(said.mask, best, 0), jnp.where(said.mask, said.tokens, 0))
@@ -137,7 +137,7 @@ def test_banned_ids_are_never_sampled(batch):
         "decoder": {**params["decoder"], "embedding": {"embedding": table.at[tiny.TOKENIZER.banned].multiply(20.0)}}
     }
     many = dataclasses.replace(DRAW, group=1000, length=5)
-    said = jax.jit(lambda p, b, k: sample_group(tiny.AGENT, p, b, k, many))(loved, batch, jax.random.key(0))
+    said = jax.jit(lambda p, b, k: sample_group(tiny.FNS, p, b, k, many))(loved, batch, jax.random.key(0))
     tokens = said.tokens[said.mask]
     assert len(tokens) > 5000
     assert not tiny.TOKENIZER.banned[tokens].any()
@@ -146,14 +146,14 @@ def test_banned_ids_are_never_sampled(batch):
 
 def test_empty_cache_has_the_shape_of_the_decoder():
     c = tiny.CONFIG.decoder
-    caches = tiny.AGENT.empty_cache(7)
+    caches = tiny.FNS.empty_cache(7)
     assert len(caches) == c.num_layers
     assert caches[0].k.shape == caches[0].v.shape == (c.num_kv_heads, 7, c.head_dim)
 
 
 def test_blind_features_hold_no_touch():
     batch = tiny.touch_batch(0, 1)
-    blind = jax.jit(lambda b: tiny.AGENT.encode(tiny.params(), b, blind=True))(batch)
+    blind = jax.jit(lambda b: tiny.FNS.encode(tiny.params(), b, blind=True))(batch)
     assert not blind.stream_mask.any()
     assert not blind.touch.any()
     assert blind.view.any()

@@ -10,8 +10,8 @@ from flax import linen as nn
 from jax.extend.core import jaxprs_in_params
 
 from touchr1_jax.models.layers import mrope
-from touchr1_jax.models.linear import Dense, Embed, linear, linear_p
 from touchr1_jax.models.lm import DecoderConfig, DecoderLayer, Rematerialised
+from touchr1_jax.models.vmappable_dense import Dense, Embed, linear, linear_p
 
 DECODER = DecoderConfig(vocab_size=16)
 RNG = np.random.default_rng(0)

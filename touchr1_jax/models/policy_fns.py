@@ -14,11 +14,11 @@ from touchr1_jax.types import Params, TouchBatch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Agent:
+class PolicyFns:
     """Static context of every forward pass; parameters are always an argument.
 
     Attributes:
-      policy: the Linen module.
+      module: the Linen module.
       slots: where a prompt keeps its tactile and view tokens.
       banned: [V], ids that are never sampled (padding, placeholders).
       end_ids: ids that end a completion.
@@ -26,7 +26,7 @@ class Agent:
       cache_dtype: type of keys and values, that of the decoder's parameters.
     """
 
-    policy: Policy
+    module: Policy
     slots: Slots
     banned: np.ndarray
     end_ids: tuple[int, ...]
@@ -42,8 +42,8 @@ class Agent:
         """Encode any batch of single streams; arguments as in `TactileViT`."""
         return self._apply(params, Policy.encode_streams, *stream)
 
-    def with_context(self, change: Callable[[Params], Params]) -> "Agent":
-        """The agent with parameters that are no argument changed; this one has none."""
+    def with_context(self, change: Callable[[Params], Params]) -> "PolicyFns":
+        """The functions with parameters that are no argument changed; this one has none."""
         del change
         return self
 
@@ -114,9 +114,9 @@ class Agent:
 
     def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
         """Caches of one completion of at most `length` tokens."""
-        c = self.policy.config.decoder
+        c = self.module.config.decoder
         zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim), self.cache_dtype)
         return tuple(LayerCache(zeros, zeros) for _ in range(c.num_layers))
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:
-        return self.policy.apply({"params": params}, *args, method=method)
+        return self.module.apply({"params": params}, *args, method=method)
