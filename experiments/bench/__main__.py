@@ -6,9 +6,18 @@ from typing import Annotated
 import tyro
 
 from experiments.bench.card import CardError
-from experiments.bench.commands import Accept, Annotate, AnnotateSheets, Audit, AuditSheet, Generate, Propose, Score
+from experiments.bench.commands import (
+    Accept,
+    Annotate,
+    AnnotateSheets,
+    Audit,
+    AuditSheet,
+    GenerateItems,
+    Propose,
+    Score,
+)
+from experiments.bench.contacts import ContactError
 from experiments.bench.draw import QuotaError
-from experiments.bench.facts import FactsError
 from experiments.bench.sheets import SheetError
 from sensors_io.commands.console import complain
 from sensors_io.errors import UserError
@@ -16,7 +25,7 @@ from touchr1_jax.bench.items import ItemError
 from touchr1_jax.bench.json_lines import LinesError
 
 Command = (
-    Annotated[Generate, tyro.conf.subcommand("generate")]
+    Annotated[GenerateItems, tyro.conf.subcommand("generate")]
     | Annotated[Propose, tyro.conf.subcommand("propose")]
     | Annotated[Accept, tyro.conf.subcommand("accept")]
     | Annotated[Score, tyro.conf.subcommand("score")]
@@ -29,7 +38,7 @@ Command = (
 KNOWN_ERRORS = (
     CardError,
     QuotaError,
-    FactsError,
+    ContactError,
     ItemError,
     LinesError,
     SheetError,

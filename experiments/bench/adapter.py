@@ -12,9 +12,9 @@ Answers are told to the author and drawn anew when candidates come back, so that
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from experiments.bench.facts import Contact
-from experiments.bench.filters import Candidate
-from experiments.bench.languages import answer_words, choices
+from experiments.bench.contacts import MeasuredContact
+from experiments.bench.rules import CandidateItem
+from experiments.bench.wording import answer_words, choices
 from sensors_io.measures import UNITS, Measured
 from touchr1_jax.bench.items import KINDS, Ask, Touch, citation_of
 from touchr1_jax.bench.json_lines import LinesError
@@ -32,7 +32,7 @@ FIELDS = ("id", "question", "answer", "rationale", "evidence")
 """Of a candidate."""
 
 
-def requests(asks: Iterable[Ask], contacts: Mapping[Touch, Contact]) -> Iterator[dict[str, Any]]:
+def requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContact]) -> Iterator[dict[str, Any]]:
     """One request per question."""
     for ask in asks:
         yield {
@@ -48,7 +48,7 @@ def requests(asks: Iterable[Ask], contacts: Mapping[Touch, Contact]) -> Iterator
         }
 
 
-def candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask]) -> Iterator[Candidate]:
+def candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask]) -> Iterator[CandidateItem]:
     """What came back, in its order; questions without a candidate are simply missing.
 
     Args:
@@ -73,10 +73,12 @@ def candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask
             question, answer, rationale = (str.strip(tree[name]) for name in ("question", "answer", "rationale"))
         except (TypeError, KeyError, ValueError) as error:
             raise LinesError(f"line {number}: {error}; texts and a list of evidence are needed") from error
-        yield Candidate(ask=known[tree["id"]], question=question, answer=answer, rationale=rationale, evidence=evidence)
+        yield CandidateItem(
+            ask=known[tree["id"]], question=question, answer=answer, rationale=rationale, evidence=evidence
+        )
 
 
-def rejected(removed: Iterable[tuple[Candidate, str]]) -> Iterator[dict[str, Any]]:
+def rejected(removed: Iterable[tuple[CandidateItem, str]]) -> Iterator[dict[str, Any]]:
     """Candidates that broke a rule, with the rule, for their author."""
     for candidate, rule in removed:
         yield {
@@ -88,7 +90,7 @@ def rejected(removed: Iterable[tuple[Candidate, str]]) -> Iterator[dict[str, Any
         }
 
 
-def _touch(contact: Contact, sensors: Sequence[str]) -> dict[str, Any]:
+def _touch(contact: MeasuredContact, sensors: Sequence[str]) -> dict[str, Any]:
     touch = contact.touch
     measured = {sensor: _measured(contact.measured[sensor]) for sensor in sensors}
     return {

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
-from experiments.bench.facts import Contact
+from experiments.bench.contacts import MeasuredContact
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.agreement import cohens_kappa
@@ -36,7 +36,7 @@ Labels = Mapping[str, Mapping[str, int]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Agreement:
+class AnnotatorAgreement:
     """Of two annotators about one attribute: κ, κ with quadratic weights where it is ordinal, share of equal labels.
 
     κ is `None` where both gave one and the same label throughout.
@@ -50,7 +50,7 @@ class Agreement:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Doubt:
+class DoubtfulLabel:
     """A label that most sensors' measurements contradict."""
 
     object: str
@@ -80,14 +80,14 @@ def read_labels(path: str, objects: Sequence[str]) -> dict[str, dict[str, int]]:
     return {name: {a: WORDS[a].index(word) for a, word in row.items()} for name, row in rows.items()}
 
 
-def agreement(a: Labels, b: Labels) -> tuple[Agreement, ...]:
+def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
     """How far two annotators agree about the same objects, attribute by attribute."""
     found = []
     for name in ATTRIBUTES:
         x, y = (np.array([labels[o][name] for o in sorted(a)]) for labels in (a, b))
         varied = len({*x.tolist(), *y.tolist()}) > 1
         found.append(
-            Agreement(
+            AnnotatorAgreement(
                 attribute=name,
                 objects=len(x),
                 kappa=cohens_kappa(x, y, LEVELS[name]) if varied else None,
@@ -154,7 +154,7 @@ def _cases(a: Labels, b: Labels) -> dict[str, tuple[str, str]]:
     return {f"{o}: {name}": (o, name) for o, names in open_cells(a, b).items() for name in names}
 
 
-def rank_correlations(labels: Labels, contacts: Sequence[Contact]) -> dict[tuple[str, str], float]:
+def rank_correlations(labels: Labels, contacts: Sequence[MeasuredContact]) -> dict[tuple[str, str], float]:
     """Spearman's ρ of each ordinal label and its quantity, by attribute and sensor, over the objects measured."""
     found = {}
     for name in ORDINAL:
@@ -166,7 +166,7 @@ def rank_correlations(labels: Labels, contacts: Sequence[Contact]) -> dict[tuple
     return found
 
 
-def doubts(labels: Labels, contacts: Sequence[Contact]) -> tuple[Doubt, ...]:
+def doubts(labels: Labels, contacts: Sequence[MeasuredContact]) -> tuple[DoubtfulLabel, ...]:
     """Labels of the lowest or highest level whose measurement lies nearer to the median of the opposite one.
 
     A sensor that measured no object of either end, or whose quantity does not follow the labels, has no say; most of
@@ -188,15 +188,17 @@ def doubts(labels: Labels, contacts: Sequence[Contact]) -> tuple[Doubt, ...]:
         for o, votes in sorted(says.items()):
             against = tuple(sensor for sensor, beyond in votes if beyond)
             if 2 * len(against) > len(votes):
-                found.append(Doubt(object=o, attribute=name, label=WORDS[name][labels[o][name]], sensors=against))
+                found.append(
+                    DoubtfulLabel(object=o, attribute=name, label=WORDS[name][labels[o][name]], sensors=against)
+                )
     return tuple(found)
 
 
-def _sensors(contacts: Sequence[Contact]) -> list[str]:
+def _sensors(contacts: Sequence[MeasuredContact]) -> list[str]:
     return sorted({sensor for contact in contacts for sensor in contact.measured})
 
 
-def _values(labels: Labels, contacts: Sequence[Contact], sensor: str, name: str) -> dict[str, float]:
+def _values(labels: Labels, contacts: Sequence[MeasuredContact], sensor: str, name: str) -> dict[str, float]:
     """Mean of an attribute's quantity over the contacts of each labelled object, by one sensor."""
     quantity, found = PHYSICAL[name], dict[str, list[float]]()
     for contact in contacts:

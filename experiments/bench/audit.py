@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.bench.facts import Contact
-from experiments.bench.languages import answer_words
+from experiments.bench.contacts import MeasuredContact
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
+from experiments.bench.wording import answer_words
 from touchr1_jax.bench.agreement import cohens_kappa, wilson_interval
 from touchr1_jax.bench.items import Item, Touch
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
@@ -29,7 +29,7 @@ SHOWN = ("question", "labels", "measured", "rationale", "answer")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Passed:
+class PassRate:
     """How many of the sample passed: with Wilson's interval, as if items were independent, and by whole objects."""
 
     axis: str
@@ -73,7 +73,9 @@ def read_key(path: str | os.PathLike[str], items: Sequence[Item]) -> dict[str, s
     return key
 
 
-def write_blank(path: str, items: Sequence[Item], key: Mapping[str, str], contacts: Mapping[Touch, Contact]) -> None:
+def write_blank(
+    path: str, items: Sequence[Item], key: Mapping[str, str], contacts: Mapping[Touch, MeasuredContact]
+) -> None:
     """The sheet of a judge, the three axes blank.
 
     Raises:
@@ -96,7 +98,7 @@ def read_judgement(path: str, key: Mapping[str, str]) -> dict[str, dict[str, boo
 
 def pass_rates(
     judged: Mapping[str, Mapping[str, bool]], key: Mapping[str, str], items: Sequence[Item]
-) -> tuple[Passed, ...]:
+) -> tuple[PassRate, ...]:
     """Each axis, and all three at once, which is the paper's pass rate.
 
     Raises:
@@ -107,7 +109,7 @@ def pass_rates(
     columns = {axis: [row[axis] for row in judged.values()] for axis in AXES}
     columns["all three"] = [all(row.values()) for row in judged.values()]
     return tuple(
-        Passed(
+        PassRate(
             axis=axis,
             items=len(values),
             rate=wilson_interval(sum(values), len(values)),
@@ -126,7 +128,7 @@ def judges_agree(a: Mapping[str, Mapping[str, bool]], b: Mapping[str, Mapping[st
     return found
 
 
-def _row(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, str]:
+def _row(item: Item, contacts: Mapping[Touch, MeasuredContact]) -> dict[str, str]:
     cited = (f"touch {c.touch + 1} {c.sensor}: {c.quantity} {c.value:g} {c.unit}" for c in item.evidence)
     labels = (
         ", ".join(_word(name, contacts[touch].labels[name]) for name in item.ask.attributes)

@@ -8,8 +8,8 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 
-from experiments.bench.facts import Contact, Facts
-from experiments.bench.languages import choices, understand
+from experiments.bench.contacts import MeasuredContact, SplitContacts
+from experiments.bench.wording import choices, understand
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import Ask, Item
 
@@ -45,7 +45,7 @@ class CardCheck:
         return self.measured <= self.bound
 
 
-def checks(items: Sequence[Item], bench: Facts, train: Facts) -> tuple[CardCheck, ...]:
+def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[CardCheck, ...]:
     """Every check of the card.
 
     Args:
@@ -97,7 +97,7 @@ Cell = tuple[str, str]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Share:
+class AnswerShare:
     """How often each level is the answer of a cell."""
 
     kind: str
@@ -106,10 +106,10 @@ class Share:
     counts: tuple[int, ...]
 
 
-def shares(items: Sequence[Item]) -> list[Share]:
+def shares(items: Sequence[Item]) -> list[AnswerShare]:
     """The answers of every cell."""
     return [
-        Share(
+        AnswerShare(
             kind=kind,
             attribute=attribute,
             questions=len(rows),
@@ -160,7 +160,7 @@ def _commonest(cell: Cell, rows: _Rows) -> float:
     return 100.0 * (max(counts.values()) / len(rows) - 1 / _occurring(rows))
 
 
-def _mode(cell: Cell, rows: _Rows, train: Sequence[Contact]) -> float:
+def _mode(cell: Cell, rows: _Rows, train: Sequence[MeasuredContact]) -> float:
     """What the commonest level of the training contacts would score; comparisons have no such level."""
     kind, attribute = cell
     counts = collections.Counter(c.labels[attribute] for c in train if attribute in c.labels)
@@ -183,7 +183,7 @@ def _zero(name: str, count: int, meaning: str) -> CardCheck:
     return CardCheck(name=name, measured=float(count), bound=0.0, unit="", meaning=meaning)
 
 
-def _copies(items: Sequence[Item], bench: Facts, train: Facts) -> int:
+def _copies(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> int:
     shown = {touch for item in items for touch in item.ask.touches}
     known = {contact.fingerprint for contact in train.contacts}
     return sum(contact.touch in shown and contact.fingerprint in known for contact in bench.contacts)
@@ -215,7 +215,7 @@ def _against(items: Sequence[Item]) -> int:
     return sum(not stands(item) for item in items)
 
 
-def coverage(bench: Facts) -> Iterator[tuple[str, dict[int, int]]]:
+def coverage(bench: SplitContacts) -> Iterator[tuple[str, dict[int, int]]]:
     """How many objects of the split have each level, by attribute."""
     labels = {contact.touch.object: contact.labels for contact in bench.contacts}
     for name in ATTRIBUTES:

@@ -6,11 +6,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.bench.card import Share
+from experiments.bench.card import AnswerShare
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
 
-def answer_shares(rows: Sequence[Share]) -> bytes:
+def answer_shares(rows: Sequence[AnswerShare]) -> bytes:
     """Share of every answer of every kind and attribute, beside the share that equal ones would have."""
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(7.4, 0.7 + 0.24 * len(rows)), layout="constrained")

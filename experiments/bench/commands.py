@@ -12,10 +12,10 @@ from rich.table import Table
 
 from experiments.bench import adapter, annotate, audit, card
 from experiments.bench import scoring as examine
+from experiments.bench.contacts import measure_split
 from experiments.bench.draw import Quota
-from experiments.bench.facts import gather
-from experiments.bench.filters import Filtered, sift
-from experiments.bench.generate import Source, ask_about, generate, read_source
+from experiments.bench.generate import BenchSource, ask_about, generate, read_source
+from experiments.bench.rules import FilteredItems, apply_rules
 from experiments.bench.sheets import SheetError
 from experiments.core.artifacts import write_json
 from sensors_io.commands.console import progress_bar
@@ -37,7 +37,7 @@ class FromRecords:
     quota: Quota = dataclasses.field(default_factory=Quota)
     seed: int = 0
 
-    def source(self) -> Source:
+    def source(self) -> BenchSource:
         """The records, measured."""
         store = RecordStore(self.records)
         with _contacts(store, "test", "train") as tell:
@@ -45,7 +45,7 @@ class FromRecords:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Generate(FromRecords):
+class GenerateItems(FromRecords):
     """Make a bench of questions, worded by rule; nothing is written unless every check of the data card passes."""
 
     out: pathlib.Path
@@ -83,7 +83,7 @@ class Accept(FromRecords):
     def run(self) -> int:
         source = self.source()
         asks, contacts = ask_about(source, self.quota, self.seed), source.bench.by_touch()
-        found = sift(adapter.candidates(read_lines(self.candidates), asks), contacts)
+        found = apply_rules(adapter.candidates(read_lines(self.candidates), asks), contacts)
         write_lines(self.out.with_suffix(".rejected.jsonl"), adapter.rejected(found.removed))
         return _publish(self.out, found, source)
 
@@ -162,7 +162,7 @@ class Annotate:
         labels = annotate.adjudicate(a, b, decided)
         splits = ("train", "val", "test", "unlabelled")
         with _contacts(store, *splits) as tell:
-            contacts = [c for split in splits for c in gather(store, split, tell).contacts]
+            contacts = [c for split in splits for c in measure_split(store, split, tell).contacts]
         for doubt in annotate.doubts(labels, contacts):
             told = f"{doubt.object}: {doubt.attribute} {doubt.label} against {', '.join(doubt.sensors)}"
             OUT.print(f"look again at {told}")
@@ -187,7 +187,7 @@ class AuditSheet:
         items, store = read_items(self.items), RecordStore(self.records)
         key = audit.sample(items, min(self.count, len(items)), self.seed)
         with _contacts(store, "test") as tell:
-            contacts = gather(store, "test", tell).by_touch()
+            contacts = measure_split(store, "test", tell).by_touch()
         audit.write_blank(str(self.out), items, key, contacts)
         write_json(self.out.with_suffix(".key.json"), key)
         OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
@@ -226,7 +226,7 @@ def _contacts(store: RecordStore, *splits: str) -> Iterator[Callable[[], None]]:
         yield lambda: show(next(done), total)
 
 
-def _publish(path: pathlib.Path, found: Filtered, source: Source) -> int:
+def _publish(path: pathlib.Path, found: FilteredItems, source: BenchSource) -> int:
     """Print what was removed and the card, and write the items if all of it passes."""
     OUT.print("removed: " + ", ".join(f"{rule} {count}" for rule, count in found.counts.items()))
     if not found.kept:
@@ -244,7 +244,7 @@ def _publish(path: pathlib.Path, found: Filtered, source: Source) -> int:
     return 0
 
 
-def _agreements(rows: Sequence[annotate.Agreement]) -> Table:
+def _agreements(rows: Sequence[annotate.AnnotatorAgreement]) -> Table:
     table = Table("attribute", "objects", "κ", "κ, quadratic", "equal")
     for row in rows:
         kappas = ["–" if k is None else f"{k:.2f}" for k in (row.kappa, row.weighted)]
@@ -252,7 +252,7 @@ def _agreements(rows: Sequence[annotate.Agreement]) -> Table:
     return table
 
 
-def _rates(title: str, rows: Sequence[audit.Passed]) -> Table:
+def _rates(title: str, rows: Sequence[audit.PassRate]) -> Table:
     table = Table("axis", "items", "passed", "95 %", "95 %, by object", title=title)
     for row in rows:
         spans = [f"{100 * i.low:.1f}–{100 * i.high:.1f}" for i in (row.rate, row.by_object)]

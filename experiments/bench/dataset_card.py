@@ -19,16 +19,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.bench import card, faults
+from experiments.bench import card, planted_errors
 from experiments.bench.card_charts import answer_shares
 from experiments.bench.draw import Quota
-from experiments.bench.filters import Filtered
-from experiments.bench.generate import Source, generate, read_source, share_at_odds
+from experiments.bench.generate import BenchSource, generate, read_source, share_at_odds
+from experiments.bench.rules import FilteredItems
 from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.study.sources import Source as SourceName
-from experiments.study.sources import SourceConfig, prepare_records
+from experiments.study.sources import Source, SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
@@ -36,10 +35,10 @@ from touchr1_jax.bench.items import KINDS, Item, write_items
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CardConfig:
+class DatasetCardConfig:
     """Which records, how many questions, how many of them get faults planted."""
 
-    data: SourceName = "generated"
+    data: Source = "generated"
     data_dir: Path | None = None
     scenes: SceneConfig = SceneConfig(objects=1000, sites=2)
     physiclear: PhysiclearConfig = PhysiclearConfig()
@@ -48,7 +47,7 @@ class CardConfig:
     faulty: int = 700
 
 
-def run(config: CardConfig, context: Context) -> Results:
+def run(config: DatasetCardConfig, context: Context) -> Results:
     """Make the bench, check it, report."""
     where = SourceConfig(
         kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
@@ -66,7 +65,7 @@ def run(config: CardConfig, context: Context) -> Results:
     with context.timed("faults"):
         step = max(1, len(found.kept) // config.faulty)
         sound = found.kept[::step]
-        caught = faults.caught(context.each("planted faults", sound), source.bench.by_touch())
+        caught = planted_errors.caught(context.each("planted faults", sound), source.bench.by_touch())
     return _findings(
         config, source, found, checks, {rule: n / len(sound) for rule, n in caught.items()}, again == found
     )
@@ -77,9 +76,9 @@ def _contacts(store: RecordStore) -> int:
 
 
 def _findings(
-    config: CardConfig,
-    source: Source,
-    found: Filtered,
+    config: DatasetCardConfig,
+    source: BenchSource,
+    found: FilteredItems,
     checks: Sequence[card.CardCheck],
     caught: dict[str, float],
     same: bool,
@@ -134,7 +133,7 @@ def _findings(
     )
 
 
-def _data(source: Source) -> dict[str, Any]:
+def _data(source: BenchSource) -> dict[str, Any]:
     return {
         "test_objects": len(source.bench.objects()),
         "test_contacts": len(source.bench.contacts),
@@ -188,7 +187,7 @@ def _shares(items: Sequence[Item]) -> Table:
     )
 
 
-def _rules(found: Filtered, caught: dict[str, float]) -> Table:
+def _rules(found: FilteredItems, caught: dict[str, float]) -> Table:
     return Table(
         title="Rules",
         columns=(
@@ -200,7 +199,7 @@ def _rules(found: Filtered, caught: dict[str, float]) -> Table:
     )
 
 
-def _readings(source: Source) -> Table:
+def _readings(source: BenchSource) -> Table:
     rows = []
     for (sensor, attribute), scale in sorted(source.readings.scales.items()):
         right: dict[int, list[bool]] = {}
@@ -236,7 +235,7 @@ def _readings(source: Source) -> Table:
     )
 
 
-def _coverage(source: Source) -> Table:
+def _coverage(source: BenchSource) -> Table:
     return Table(
         title="Objects of the bench",
         columns=(Column(name="attribute"), Column(name="objects by level")),
@@ -257,8 +256,8 @@ def _samples(items: Sequence[Item]) -> Table:
     )
 
 
-DEFAULT = CardConfig()
-SMOKE = CardConfig(
+DEFAULT = DatasetCardConfig()
+SMOKE = DatasetCardConfig(
     scenes=SceneConfig(objects=60, sites=1),
     quota=Quota(identify=96, scale=36, compose=32, compare=24, order=18, one_sensor=32, conflict=16),
     faulty=60,

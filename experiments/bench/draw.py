@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 
 import numpy as np
 
-from experiments.bench.facts import Contact
-from experiments.bench.phrases import WORDINGS
+from experiments.bench.contacts import MeasuredContact
+from experiments.bench.wording import WORDINGS
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import KINDS, Ask
@@ -55,7 +55,7 @@ class QuotaError(ValueError):
     """Contacts that do not suffice for a quota; the message names which and the fix."""
 
 
-def draw(contacts: Sequence[Contact], sensors: Sequence[str], quota: Quota, seed: int) -> tuple[Ask, ...]:
+def draw(contacts: Sequence[MeasuredContact], sensors: Sequence[str], quota: Quota, seed: int) -> tuple[Ask, ...]:
     """Draw the questions; the same arguments give the same ones.
 
     Answers of a kind and attribute take each level that occurs equally often (±1); of the contacts that could give an
@@ -70,7 +70,7 @@ def draw(contacts: Sequence[Contact], sensors: Sequence[str], quota: Quota, seed
     Raises:
       QuotaError: too few contacts for a quota.
     """
-    deal = _Deal(contacts, np.random.default_rng(seed))
+    deal = _Dealer(contacts, np.random.default_rng(seed))
     kinds: Mapping[str, Callable[[], Iterator[Ask]]] = {
         "identify": lambda: _singles(deal, sensors, "identify", ATTRIBUTES, quota.identify),
         "scale": lambda: _singles(deal, sensors, "scale", ORDINAL, quota.scale),
@@ -87,10 +87,10 @@ def draw(contacts: Sequence[Contact], sensors: Sequence[str], quota: Quota, seed
     )
 
 
-class _Deal:
+class _Dealer:
     """Hands out contacts, those of the least used objects first, and wordings that were not used with them yet."""
 
-    def __init__(self, contacts: Sequence[Contact], rng: np.random.Generator) -> None:
+    def __init__(self, contacts: Sequence[MeasuredContact], rng: np.random.Generator) -> None:
         self.contacts = contacts
         self.rng = rng
         self._uses = collections.Counter[str]()
@@ -98,7 +98,7 @@ class _Deal:
         self._wordings = collections.Counter[Hashable]()
         self._turns: dict[tuple[str, ...], list[int]] = {}
 
-    def ranked(self, fits: Callable[[Contact], bool]) -> list[Contact]:
+    def ranked(self, fits: Callable[[MeasuredContact], bool]) -> list[MeasuredContact]:
         """The contacts that fit, least used objects first, ties drawn."""
         fitting = [contact for contact in self.contacts if fits(contact)]
         ties = self.rng.random(len(fitting))
@@ -106,8 +106,8 @@ class _Deal:
         return [fitting[i] for i in order]
 
     def take(
-        self, what: tuple[str, ...], answer: Sequence[Hashable], candidates: Iterable[tuple[Contact, ...]]
-    ) -> tuple[list[Contact], int]:
+        self, what: tuple[str, ...], answer: Sequence[Hashable], candidates: Iterable[tuple[MeasuredContact, ...]]
+    ) -> tuple[list[MeasuredContact], int]:
         """The first candidates that some wording was not used with yet, and that wording: the one that asked least
         often for this answer, of equal ones the first of a drawn turn.
 
@@ -138,7 +138,7 @@ class _Deal:
         )
 
 
-def _singles(deal: _Deal, sensors: Sequence[str], kind: str, attributes: Sequence[str], quota: int) -> Iterator[Ask]:
+def _singles(deal: _Dealer, sensors: Sequence[str], kind: str, attributes: Sequence[str], quota: int) -> Iterator[Ask]:
     for attribute, count in zip(attributes, _split(quota, len(attributes)), strict=True):
         for level in _levels(deal, kind, attribute, count):
             ranked = deal.ranked(_with(kind, attribute, level))
@@ -146,7 +146,7 @@ def _singles(deal: _Deal, sensors: Sequence[str], kind: str, attributes: Sequenc
             yield _ask(kind, (attribute,), [contact], sensors, (level,), wording)
 
 
-def _composed(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
+def _composed(deal: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
     for attributes, count in zip(COMPOSED, _split(quota, len(COMPOSED)), strict=True):
         seen: collections.Counter[tuple[str, int]] = collections.Counter()
         for _ in range(count):
@@ -158,7 +158,7 @@ def _composed(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
             yield _ask("compose", attributes, [contact], sensors, levels, wording)
 
 
-def _pairs(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
+def _pairs(deal: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
     for attribute, count in zip(ORDINAL, _split(quota // 2, len(ORDINAL)), strict=True):
         known = {contact.labels.get(attribute) for contact in deal.contacts}
         pairs = [pair for pair in LEVEL_PAIRS if set(pair) <= known]
@@ -174,7 +174,7 @@ def _pairs(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
                 yield dataclasses.replace(ask, group=f"{attribute}-{number:04d}", position=position)
 
 
-def _orders(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
+def _orders(deal: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
     for attribute, count in zip(ORDINAL, _split(quota, len(ORDINAL)), strict=True):
         for answer in _shuffled(deal, range(len(ORDERS)), count):
             rising, wording = _differing(deal, ("order", attribute), (0, 1, 2), (answer,))
@@ -182,7 +182,7 @@ def _orders(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
             yield _ask("order", (attribute,), shown, sensors, (answer,), wording)
 
 
-def _alone(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
+def _alone(deal: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
     if quota % len(sensors) or (quota and len(sensors) < 2):
         raise QuotaError(
             f"quota.one_sensor is {quota}: must be a multiple of the {len(sensors)} sensors, of which there must be "
@@ -199,12 +199,12 @@ def _alone(deal: _Deal, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
 
 
 def _differing(
-    deal: _Deal, what: tuple[str, str], levels: Sequence[int], answer: Sequence[Hashable]
-) -> tuple[list[Contact], int]:
+    deal: _Dealer, what: tuple[str, str], levels: Sequence[int], answer: Sequence[Hashable]
+) -> tuple[list[MeasuredContact], int]:
     """Contacts of as many objects at these levels of the attribute, by the same motion."""
     ranked = [deal.ranked(_with(*what, level)) for level in levels]
 
-    def candidates() -> Iterator[tuple[Contact, ...]]:
+    def candidates() -> Iterator[tuple[MeasuredContact, ...]]:
         for width in range(1, max(map(len, ranked)) + 1):  # the least used of every level first
             for chosen in itertools.product(*(contacts[:width] for contacts in ranked)):
                 if len({contact.touch.motion for contact in chosen}) == 1:
@@ -216,7 +216,7 @@ def _differing(
 def _ask(
     kind: str,
     attributes: tuple[str, ...],
-    contacts: Sequence[Contact],
+    contacts: Sequence[MeasuredContact],
     sensors: Sequence[str],
     answer: tuple[int, ...],
     wording: int,
@@ -234,7 +234,7 @@ def _ask(
     )
 
 
-def _levels(deal: _Deal, kind: str, attribute: str, count: int) -> list[int]:
+def _levels(deal: _Dealer, kind: str, attribute: str, count: int) -> list[int]:
     """As many levels, each that occurs equally often, in a drawn order."""
     known = {c.labels[attribute] for c in deal.contacts if attribute in c.labels and _allowed(kind, c)}
     if count and not known:
@@ -242,25 +242,27 @@ def _levels(deal: _Deal, kind: str, attribute: str, count: int) -> list[int]:
     return _shuffled(deal, sorted(known), count)
 
 
-def _shuffled(deal: _Deal, choices: Sequence[int], count: int) -> list[int]:
+def _shuffled(deal: _Dealer, choices: Sequence[int], count: int) -> list[int]:
     if not count:
         return []
     dealt = list(itertools.islice(itertools.cycle(deal.rng.permutation(choices).tolist()), count))
     return deal.rng.permutation(dealt).tolist()
 
 
-def _with(kind: str, attribute: str, level: int) -> Callable[[Contact], bool]:
+def _with(kind: str, attribute: str, level: int) -> Callable[[MeasuredContact], bool]:
     """Whether a contact may be asked about and has this level."""
     return lambda contact: contact.labels.get(attribute) == level and _allowed(kind, contact)
 
 
-def _least_asked(deal: _Deal, attributes: Sequence[str], seen: Mapping[tuple[str, int], int]) -> list[Contact]:
+def _least_asked(
+    deal: _Dealer, attributes: Sequence[str], seen: Mapping[tuple[str, int], int]
+) -> list[MeasuredContact]:
     """Contacts whose levels were asked for least; of equal ones, those of the least used objects."""
     ranked = deal.ranked(lambda contact: set(attributes) <= set(contact.labels))
     return sorted(ranked, key=lambda contact: sum(seen[a, contact.labels[a]] for a in attributes))
 
 
-def _allowed(kind: str, contact: Contact) -> bool:
+def _allowed(kind: str, contact: MeasuredContact) -> bool:
     return kind != "conflict" or contact.deceptive is True
 
 

@@ -3,27 +3,27 @@
 import dataclasses
 from collections.abc import Callable
 
+from experiments.bench.contacts import ContactError, SplitContacts, measure_split
 from experiments.bench.draw import Quota, draw
-from experiments.bench.facts import Facts, FactsError, gather
-from experiments.bench.filters import Candidate, Filtered, sift
-from experiments.bench.languages import answer_words, slots_of, understand
 from experiments.bench.rationales import compose_item
-from experiments.bench.readings import Readings, fit
+from experiments.bench.rules import CandidateItem, FilteredItems, apply_rules
+from experiments.bench.thresholds import ThresholdReader, fit_thresholds
+from experiments.bench.wording import answer_words, slots_of, understand
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import Ask, Item
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Source:
+class BenchSource:
     """What questions are made from: the contacts to ask about, those that tell how to read numbers, the sensors."""
 
-    bench: Facts
-    train: Facts
-    readings: Readings
+    bench: SplitContacts
+    train: SplitContacts
+    readings: ThresholdReader
     sensors: tuple[str, ...]
 
 
-def read_source(store: RecordStore, split: str = "test", tell: Callable[[], None] = lambda: None) -> Source:
+def read_source(store: RecordStore, split: str = "test", tell: Callable[[], None] = lambda: None) -> BenchSource:
     """Measure the contacts of the bench's split and of the training split.
 
     Args:
@@ -34,22 +34,22 @@ def read_source(store: RecordStore, split: str = "test", tell: Callable[[], None
     Raises:
       FactsError: no labelled contact to ask about, or too few training contacts to read numbers by.
     """
-    bench, train = gather(store, split, tell), gather(store, "train", tell)
+    bench, train = measure_split(store, split, tell), measure_split(store, "train", tell)
     if not bench.objects():
-        raise FactsError(f"split is {split!r}: holds no labelled contact that measured something; choose another")
-    return Source(bench=bench, train=train, readings=fit(train.contacts), sensors=store.meta.sensors)
+        raise ContactError(f"split is {split!r}: holds no labelled contact that measured something; choose another")
+    return BenchSource(bench=bench, train=train, readings=fit_thresholds(train.contacts), sensors=store.meta.sensors)
 
 
-def ask_about(source: Source, quota: Quota, seed: int) -> tuple[Ask, ...]:
+def ask_about(source: BenchSource, quota: Quota, seed: int) -> tuple[Ask, ...]:
     """The questions of a seed, drawn anew from the records, so that no file can change what is right."""
     return draw(source.bench.contacts, source.sensors, quota, seed)
 
 
-def generate(source: Source, quota: Quota, seed: int) -> Filtered:
+def generate(source: BenchSource, quota: Quota, seed: int) -> FilteredItems:
     """Items worded by rule; the same records, quota and seed give the same bytes."""
     contacts = source.bench.by_touch()
     items = [compose_item(ask, contacts, source.readings) for ask in ask_about(source, quota, seed)]
-    return sift([_candidate(item) for item in items], contacts)
+    return apply_rules([_candidate(item) for item in items], contacts)
 
 
 def share_at_odds(items: tuple[Item, ...]) -> float:
@@ -64,8 +64,8 @@ def share_at_odds(items: tuple[Item, ...]) -> float:
     return odd / len(items)
 
 
-def _candidate(item: Item) -> Candidate:
-    return Candidate(
+def _candidate(item: Item) -> CandidateItem:
+    return CandidateItem(
         ask=item.ask,
         question=item.question,
         answer=answer_words(item.ask),

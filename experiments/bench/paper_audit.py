@@ -17,7 +17,7 @@ import dataclasses
 from experiments.bench.paper_arithmetic import best_weighting, columns_as_scores, error_and_distance, gain_interval
 from experiments.bench.paper_arithmetic import impossible_distances as impossible
 from experiments.bench.paper_charts import average_against_mean, distance_against_error
-from experiments.bench.paper_checks import Check, holding, inconsistencies
+from experiments.bench.paper_checks import StatementCheck, holding, inconsistencies
 from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
@@ -25,7 +25,7 @@ from experiments.study import paper_numbers as paper
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class AuditConfig:
+class PaperAuditConfig:
     """Nothing to choose but how many questions a property of VTV150K's test set has."""
 
     vtv_items: int = paper.VTV_ITEMS
@@ -35,7 +35,7 @@ class AuditConfig:
             raise ValueError(f"vtv_items is {self.vtv_items}: must be ≥ 1; give the size of the test set")
 
 
-def run(config: AuditConfig, context: Context) -> Results:
+def run(config: PaperAuditConfig, context: Context) -> Results:
     """Compute every check."""
     del context
     wrong, right = inconsistencies(), holding()
@@ -79,7 +79,7 @@ def run(config: AuditConfig, context: Context) -> Results:
     )
 
 
-def _checks(title: str, checks: tuple[Check, ...]) -> Table:
+def _checks(title: str, checks: tuple[StatementCheck, ...]) -> Table:
     return Table(
         title=title,
         columns=(
@@ -127,7 +127,7 @@ def _distances() -> Table:
     )
 
 
-def _vtv(config: AuditConfig) -> Table:
+def _vtv(config: PaperAuditConfig) -> Table:
     ours, theirs = paper.VTV["Ours"][0], paper.VTV["VTV-LLM-7B"][0]
     rows = []
     for column, a, b in list(zip(paper.VTV_COLUMNS, ours, theirs, strict=True))[:5]:
@@ -147,6 +147,6 @@ def _vtv(config: AuditConfig) -> Table:
     )
 
 
-DEFAULT = AuditConfig()
+DEFAULT = PaperAuditConfig()
 
 EXPERIMENT = Experiment(name="paper_audit", config=DEFAULT, scales={"smoke": DEFAULT}, run=run)

@@ -27,7 +27,7 @@ OURS = "Touch-R1-7B"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Check:
+class StatementCheck:
     """One statement about the paper: where it stands, what is printed, what follows, and which of the two it is."""
 
     title: str
@@ -37,7 +37,7 @@ class Check:
     verdict: Verdict
 
 
-def inconsistencies() -> tuple[Check, ...]:
+def inconsistencies() -> tuple[StatementCheck, ...]:
     """Every known inconsistency, in the order of the report."""
     return (
         _average(),
@@ -57,10 +57,10 @@ def inconsistencies() -> tuple[Check, ...]:
     )
 
 
-def holding() -> tuple[Check, ...]:
+def holding() -> tuple[StatementCheck, ...]:
     """Statements of the paper that its numbers bear out."""
     gains = [
-        Check(
+        StatementCheck(
             title=f"{column} over {whom}",
             where=where,
             published=f"{gain:+.1f}",
@@ -80,11 +80,11 @@ def _column(model: str, column: str) -> float:
     return average if column == "Avg" else row[paper.COLUMNS.index(column)]
 
 
-def _average() -> Check:
+def _average() -> StatementCheck:
     mean = best_weighting(sum_to_one=True)
     low, high, average = columns_as_scores()
     plain = ((low + high) / 2).mean(1)
-    return Check(
+    return StatementCheck(
         title="Avg is no mean of the columns",
         where="main table, Avg “over the full metric set”",
         published=f"Avg {average[-1]} for {OURS}",
@@ -95,10 +95,10 @@ def _average() -> Check:
     )
 
 
-def _ladder_average() -> Check:
+def _ladder_average() -> StatementCheck:
     worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.PER_ATTRIBUTE.values())
     ladder = all(paper.LADDER[name][2] == avg for name, (_, avg) in paper.PER_ATTRIBUTE.items())
-    return Check(
+    return StatementCheck(
         title="Avg is the mean of four accuracies",
         where="ablation tables (a) and (b)",
         published="one Avg for main table and ablation",
@@ -107,14 +107,14 @@ def _ladder_average() -> Check:
     )
 
 
-def _two_tables() -> Check:
+def _two_tables() -> StatementCheck:
     pairs = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
     gaps = [
         abs(a - b)
         for main, ablation in pairs.items()
         for a, b in zip(paper.MAIN[main][0][:4], paper.PER_ATTRIBUTE[ablation][0], strict=True)
     ]
-    return Check(
+    return StatementCheck(
         title="The same models have two sets of accuracies",
         where="main table against ablation table (b)",
         published=f"{OURS} hardness {paper.MAIN[OURS][0][0]} and {paper.PER_ATTRIBUTE['Touch-R1'][0][0]}",
@@ -123,10 +123,10 @@ def _two_tables() -> Check:
     )
 
 
-def _distance() -> Check:
+def _distance() -> StatementCheck:
     rows, impossible = error_and_distance(), impossible_distances()
     error, omae = rows[OURS]
-    return Check(
+    return StatementCheck(
         title="OMAE lies below the error rate",
         where="main table and ablation",
         published=f"{OURS}: OMAE {omae}",
@@ -136,10 +136,10 @@ def _distance() -> Check:
     )
 
 
-def _tactile_use() -> Check:
+def _tactile_use() -> StatementCheck:
     in_equations = {*paper.REWARD_WEIGHTS, *paper.ABLATED_TERMS}
     gone = [term for term in paper.ADVERTISED_TERMS if term not in in_equations]
-    return Check(
+    return StatementCheck(
         title="The tactile-use reward is in no equation",
         where="abstract, introduction; reward equations, ablation",
         published=f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
@@ -149,9 +149,9 @@ def _tactile_use() -> Check:
     )
 
 
-def _hyperparameters() -> Check:
+def _hyperparameters() -> StatementCheck:
     gone = [name for name in paper.OBJECTIVE_NEEDS if name not in paper.HYPERPARAMETERS]
-    return Check(
+    return StatementCheck(
         title="The objective cannot be computed from what is given",
         where="overall objective; implementation details",
         published=", ".join(f"{name} {value:g}" for name, value in list(paper.HYPERPARAMETERS.items())[:2]),
@@ -160,9 +160,9 @@ def _hyperparameters() -> Check:
     )
 
 
-def _conflict() -> Check:
+def _conflict() -> StatementCheck:
     gone = [name for name in paper.ADVERTISED_MEASURES if name not in paper.MEASURED]
-    return Check(
+    return StatementCheck(
         title="Visual–tactile conflict is never measured",
         where="abstract and introduction; metrics",
         published=f"evaluates {', '.join(paper.ADVERTISED_MEASURES)}",
@@ -171,11 +171,11 @@ def _conflict() -> Check:
     )
 
 
-def _subsets() -> Check:
+def _subsets() -> StatementCheck:
     asked = paper.SFT_QA + paper.RL_QA
     left = paper.RECORDS - paper.PRETRAIN_FRAMES
     training = round(paper.RECORDS * (1 - paper.HELD_OUT_OBJECTS / paper.OBJECTS)) - paper.PRETRAIN_FRAMES
-    return Check(
+    return StatementCheck(
         title="Disjoint subsets do not fit",
         where="training data and protocol",
         published=f"{paper.PRETRAIN_FRAMES:,} frames, then {asked:,} questions on other data",
@@ -185,9 +185,9 @@ def _subsets() -> Check:
     )
 
 
-def _backbones() -> Check:
+def _backbones() -> StatementCheck:
     unknown = [size for size in paper.BACKBONES if size not in paper.RELEASED_BACKBONES]
-    return Check(
+    return StatementCheck(
         title="A backbone that does not exist",
         where="scaling figure",
         published=", ".join(f"{size}B" for size in paper.BACKBONES),
@@ -197,12 +197,12 @@ def _backbones() -> Check:
     )
 
 
-def _noise() -> Check:
+def _noise() -> StatementCheck:
     gains = [
         gain_interval(a, b, paper.VTV_ITEMS)
         for a, b in zip(paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5], strict=True)
     ]
-    return Check(
+    return StatementCheck(
         title="Gains on VTV150K are within one run's noise",
         where=f"VTV150K table, {paper.VTV_ITEMS} questions a property",
         published=f"{min(g for g, _, _ in gains):+.1f} to {max(g for g, _, _ in gains):+.1f} points",
@@ -212,8 +212,8 @@ def _noise() -> Check:
     )
 
 
-def _seeds() -> Check:
-    return Check(
+def _seeds() -> StatementCheck:
+    return StatementCheck(
         title="No seeds, no intervals",
         where="all tables",
         published="single numbers",
@@ -222,9 +222,9 @@ def _seeds() -> Check:
     )
 
 
-def _sequences() -> Check:
+def _sequences() -> StatementCheck:
     each = paper.SENSORS * paper.MOTIONS
-    return Check(
+    return StatementCheck(
         title="Sequences do not fit the protocol",
         where="overview and acquisition",
         published=f"{paper.SEQUENCES:,} sequences of {paper.OBJECTS:,}+ objects, {paper.SENSORS} sensors, a press and "
@@ -234,11 +234,11 @@ def _sequences() -> Check:
     )
 
 
-def _counts() -> Check:
+def _counts() -> StatementCheck:
     shares = {name: row[:4] for name, (row, _) in paper.VTV.items()}
     fit = {name: sum(attainable(share, paper.VTV_ITEMS) for share in row) for name, row in shares.items()}
     peers = sum(fit.values()) - fit["Ours"]
-    return Check(
+    return StatementCheck(
         title="Shares that no count gives",
         where=f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
         published=f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
@@ -248,9 +248,9 @@ def _counts() -> Check:
     )
 
 
-def _pictures() -> Check:
+def _pictures() -> StatementCheck:
     errors = [e for row in paper.VIDEO_L1.values() for e in row]
-    return Check(
+    return StatementCheck(
         title="L1 worse than a grey picture's",
         where="video prediction table",
         published=f"L1 {min(errors)} to {max(errors)}",
@@ -260,9 +260,9 @@ def _pictures() -> Check:
     )
 
 
-def _vtv_average() -> Check:
+def _vtv_average() -> StatementCheck:
     worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.VTV.values())
-    return Check(
+    return StatementCheck(
         title="VTV150K's Average is the mean of its nine columns",
         where="VTV150K table",
         published=f"{len(paper.VTV)} averages",
@@ -271,8 +271,8 @@ def _vtv_average() -> Check:
     )
 
 
-def _frames() -> Check:
-    return Check(
+def _frames() -> StatementCheck:
+    return StatementCheck(
         title="Records are sequences of 90 frames",
         where="acquisition",
         published=f"{paper.RECORDS:,}",
@@ -281,13 +281,13 @@ def _frames() -> Check:
     )
 
 
-def _shared_rows() -> Check:
+def _shared_rows() -> StatementCheck:
     pairs = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
     same = all(
         (_column(main, "OMAE"), _column(main, "CSC"), _column(main, "Avg")) == paper.LADDER[rung]
         for main, rung in pairs.items()
     )
-    return Check(
+    return StatementCheck(
         title="The ladder's ends are the main table's",
         where="ablation table (a)",
         published="OMAE, CSC, Avg of two models",
@@ -296,10 +296,10 @@ def _shared_rows() -> Check:
     )
 
 
-def _audit() -> Check:
+def _audit() -> StatementCheck:
     passed = round(paper.AUDITED * paper.AUDIT_PASSED / 100)
     interval = wilson_interval(passed, paper.AUDITED)
-    return Check(
+    return StatementCheck(
         title="Audit of the questions",
         where="QA generation and quality verification",
         published=f"{paper.AUDIT_PASSED} % of {paper.AUDITED:,}",

@@ -8,10 +8,9 @@ fine-tuning.  `perceive` says what each sensor's own number suggests by `reading
 import collections
 from collections.abc import Mapping, Sequence
 
-from experiments.bench.facts import Contact
-from experiments.bench.languages import PLACES, answer_words, language_of
-from experiments.bench.phrases import question
-from experiments.bench.readings import Readings
+from experiments.bench.contacts import MeasuredContact
+from experiments.bench.thresholds import ThresholdReader
+from experiments.bench.wording import PLACES, answer_words, language_of, question
 from sensors_io.measures import UNITS, Measured
 from touchr1_jax.bench.items import Ask, Citation, Item, Touch
 from touchr1_jax.bench.metrics import ORDINAL
@@ -27,7 +26,7 @@ UNCLEAR = "no reading"
 """What is perceived where the quantity that would be read was not measured."""
 
 
-def compose_item(ask: Ask, contacts: Mapping[Touch, Contact], readings: Readings) -> Item:
+def compose_item(ask: Ask, contacts: Mapping[Touch, MeasuredContact], readings: ThresholdReader) -> Item:
     """The item with its question, rationale and evidence.
 
     Args:
@@ -45,7 +44,9 @@ def compose_item(ask: Ask, contacts: Mapping[Touch, Contact], readings: Readings
     return Item(ask=ask, question=question(ask), rationale=rationale, evidence=tuple(evidence))
 
 
-def _single(ask: Ask, shown: Sequence[Contact], readings: Readings, evidence: list[Citation]) -> tuple[str, str]:
+def _single(
+    ask: Ask, shown: Sequence[MeasuredContact], readings: ThresholdReader, evidence: list[Citation]
+) -> tuple[str, str]:
     contact, reports = shown[0], []
     levels: dict[str, list[int]] = {name: [] for name in ask.attributes}
     for sensor in ask.sensors:
@@ -62,7 +63,9 @@ def _single(ask: Ask, shown: Sequence[Contact], readings: Readings, evidence: li
     return "; ".join(reports), " and ".join(together) or UNCLEAR
 
 
-def _several(ask: Ask, shown: Sequence[Contact], readings: Readings, evidence: list[Citation]) -> tuple[str, str]:
+def _several(
+    ask: Ask, shown: Sequence[MeasuredContact], readings: ThresholdReader, evidence: list[Citation]
+) -> tuple[str, str]:
     name, reports, votes = ask.attributes[0], [], []
     for sensor in ask.sensors:
         numbers = [_numbers(t, contact, sensor, name, readings, evidence) for t, contact in enumerate(shown)]
@@ -80,7 +83,9 @@ def _several(ask: Ask, shown: Sequence[Contact], readings: Readings, evidence: l
     return "; ".join(reports), f"{count} of {len(votes)} sensors say {text}"
 
 
-def _numbers(touch: int, contact: Contact, sensor: str, name: str, readings: Readings, evidence: list[Citation]) -> str:
+def _numbers(
+    touch: int, contact: MeasuredContact, sensor: str, name: str, readings: ThresholdReader, evidence: list[Citation]
+) -> str:
     """What a sensor measured that speaks for an attribute, in words, what is read first; noted as evidence."""
     measured = contact.measured[sensor]
     attributes = ORDINAL if name == "material" else (name,)

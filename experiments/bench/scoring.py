@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from experiments.bench.languages import understand
+from experiments.bench.wording import understand
 from touchr1_jax.bench.averages import AVERAGED, touch_average
 from touchr1_jax.bench.items import Item
 from touchr1_jax.bench.json_lines import LinesError
@@ -15,12 +15,12 @@ from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 RESAMPLES = 2_000
 """Of each interval: its ends are then good to a tenth of its width."""
 
-Understood = Mapping[str, tuple[int, ...]]
+AnswerLevels = Mapping[str, tuple[int, ...]]
 """Id of an item → the levels that were read in its answer, −1 for ⊥."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Row:
+class MetricRow:
     """One metric: what it means, its interval over objects, how many values it is the mean of."""
 
     name: str
@@ -63,7 +63,7 @@ def understood(
     return ask_all(items, lambda item: texts.get(item.ask.id, ""))
 
 
-def table(items: Sequence[Item], said: Understood, by_sight: Understood | None = None) -> list[Row]:
+def table(items: Sequence[Item], said: AnswerLevels, by_sight: AnswerLevels | None = None) -> list[MetricRow]:
     """Every metric that the items define; one about a single object has no interval and is left out.
 
     Args:
@@ -76,16 +76,16 @@ def table(items: Sequence[Item], said: Understood, by_sight: Understood | None =
         objects = clusters(asks, scores)
         if len(set(objects)) > 1:
             span = clustered_bootstrap(scores.values, objects, strata=scores.strata, resamples=RESAMPLES)
-            rows.append(Row(name=name, metric=BENCH_METRICS[name], interval=span, values=len(scores.values)))
+            rows.append(MetricRow(name=name, metric=BENCH_METRICS[name], interval=span, values=len(scores.values)))
     return rows
 
 
-def parsed(said: Understood) -> float:
+def parsed(said: AnswerLevels) -> float:
     """Share of the answers all of whose parts were understood."""
     return sum(-1 not in levels for levels in said.values()) / len(said)
 
 
-def average_line(items: Sequence[Item], said: Understood) -> str:
+def average_line(items: Sequence[Item], said: AnswerLevels) -> str:
     """The average in words, or what is missing for one."""
     means = {name: scores.mean() for name, scores in score([item.ask for item in items], said).items()}
     missing = [name for name in AVERAGED if name not in means]

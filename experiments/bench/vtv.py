@@ -43,7 +43,7 @@ RESAMPLES = 2_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scenario:
+class UseScenario:
     """A use, and what it asks of an object: attribute → +1 for more of it, −1 for less."""
 
     text: str
@@ -55,19 +55,19 @@ class Scenario:
         return np.array([self.wants.get(name, 0) for name in ATTRIBUTES], float)
 
 
-SCENARIOS: tuple[Scenario, ...] = (
-    Scenario(text="to be held with wet hands", wants={"friction": 1}),
-    Scenario(text="to slide under a cupboard", wants={"friction": -1, "protrusion": -1}),
-    Scenario(text="to drive a tent peg into the ground", wants={"hardness": 1, "friction": 1}),
-    Scenario(text="to sit on for an hour", wants={"hardness": -1, "elasticity": 1}),
-    Scenario(text="to give back the push of a spring", wants={"elasticity": 1}),
-    Scenario(text="to be found by its relief in the dark", wants={"protrusion": 1}),
+SCENARIOS: tuple[UseScenario, ...] = (
+    UseScenario(text="to be held with wet hands", wants={"friction": 1}),
+    UseScenario(text="to slide under a cupboard", wants={"friction": -1, "protrusion": -1}),
+    UseScenario(text="to drive a tent peg into the ground", wants={"hardness": 1, "friction": 1}),
+    UseScenario(text="to sit on for an hour", wants={"hardness": -1, "elasticity": 1}),
+    UseScenario(text="to give back the push of a spring", wants={"elasticity": 1}),
+    UseScenario(text="to be found by its relief in the dark", wants={"protrusion": 1}),
 )
 """Ours: those of the benchmark are not published."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tasks:
+class VTVTasks:
     """Questions over n recordings of different objects; every row of `pairs` and the like names recordings.
 
     Attributes:
@@ -91,7 +91,7 @@ class Tasks:
     scenario: Int[np.ndarray, "F"]
 
 
-def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> Tasks:
+def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks:
     """`count` questions of each comparing task; attributes, levels, assignments and scenarios come in turn.
 
     Args:
@@ -113,7 +113,7 @@ def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> Tasks:
     threes = [turned for i in range(count // 3) for turned in _rotations(_differing(label, i, 3, rng))]
     scenario = np.arange(count) // 2 % len(SCENARIOS)
     fits = [turned for which in scenario[::2] for turned in _both_orders(_unequal(label, int(which), rng))]
-    return Tasks(
+    return VTVTasks(
         label=label,
         pairs=np.array(pairs),
         pair_of=np.arange(count) // 2 % len(ATTRIBUTES),
@@ -162,7 +162,7 @@ def _unequal(label: np.ndarray, scenario: int, rng: np.random.Generator) -> Int[
     return np.array([one, rng.choice(others)])
 
 
-def score(tasks: Tasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, Scores]:
+def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, Scores]:
     """Percent right in every task, keyed as `averages.VTV`; `Scores.items` names a recording of each question,
     the same one in all orders.
 
@@ -199,12 +199,12 @@ def _second(value: np.ndarray, pairs: np.ndarray, column: np.ndarray) -> np.ndar
     return value[pairs[:, 1], column] >= value[pairs[:, 0], column]
 
 
-def _extreme(value: np.ndarray, tasks: Tasks, sign: np.ndarray) -> np.ndarray:
+def _extreme(value: np.ndarray, tasks: VTVTasks, sign: np.ndarray) -> np.ndarray:
     """The place of the most or the least of three."""
     return (sign[:, None] * value[tasks.threes, tasks.three_of[:, None]]).argmax(1)
 
 
-def _matched(log_probs: np.ndarray, tasks: Tasks) -> np.ndarray:
+def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:
     """The likeliest assignment of three names to three recordings, as a position in `ASSIGNMENTS`."""
     order = np.argsort(np.array(ASSIGNMENTS), axis=1)[tasks.shown]
     recordings = np.take_along_axis(tasks.names, order, 1)  # place p holds the recording of the name it was given

@@ -56,7 +56,7 @@ FUSED, WITH_FORCE, FORCE, SHAPE, PRIOR = (
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class VTVConfig:
+class VTVProtocolConfig:
     """The protocol that recordings are taken from, how they are looked at, and how many questions compare them."""
 
     scenes: SceneConfig = SceneConfig(objects=400, sequences=4 * 2800, frames=24, image_px=56, contact_grid=32)
@@ -69,7 +69,7 @@ class VTVConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Recordings:
+class RecordingFeatures:
     """n objects: features by each source, [n, D], right levels [n, A], names [n]."""
 
     features: Mapping[str, Float[np.ndarray, "n D"]]
@@ -77,7 +77,7 @@ class Recordings:
     objects: np.ndarray
 
 
-def run(config: VTVConfig, context: Context) -> Results:
+def run(config: VTVProtocolConfig, context: Context) -> Results:
     """Make the recordings, probe, ask."""
     with context.progress("planning", 1) as advance:
         rows = one_each(LiveScenes(config.scenes))
@@ -138,12 +138,12 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
     return {name: [rows[object_id] for object_id in shared] for name, rows in first.items()}
 
 
-def together(moved: Sequence[Moved]) -> Recordings:
+def together(moved: Sequence[Moved]) -> RecordingFeatures:
     """Contacts of several motions with the same objects, side by side."""
     beside = lambda parts: np.concatenate(list(parts), 1)
     touch = {sensor: beside(m.touch[s] for m in moved) for s, sensor in enumerate(SENSORS)}
     first = moved[0]
-    return Recordings(
+    return RecordingFeatures(
         features={
             **touch,
             FORCE: beside(m.force.reshape(len(m.force), -1) for m in moved),
@@ -154,7 +154,7 @@ def together(moved: Sequence[Moved]) -> Recordings:
     )
 
 
-def answers(made: Recordings, config: ProbeConfig, context: Context) -> dict[str, Float[np.ndarray, "n A K"]]:
+def answers(made: RecordingFeatures, config: ProbeConfig, context: Context) -> dict[str, Float[np.ndarray, "n A K"]]:
     """log p of every level by every source; sensors together as if they erred independently."""
     told = {}
     with context.progress("probes", len(made.features) * len(ATTRIBUTES)) as advance:
@@ -209,7 +209,7 @@ def verdict(rows: Rows) -> tuple[str, ...]:
     )
 
 
-DEFAULT = VTVConfig()
+DEFAULT = VTVProtocolConfig()
 
 EXPERIMENT = Experiment(
     name="vtv150k",

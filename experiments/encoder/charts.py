@@ -56,7 +56,7 @@ BOUNDED = {"kept": "told apart, over untrained", "rank_share": "effective rank, 
 """Panels of the courses of collapse, by the name of the alarm."""
 
 
-def collapse_courses(courses: Mapping[str, Mapping[str, np.ndarray]], block_steps: int) -> bytes:
+def collapse_curves(courses: Mapping[str, Mapping[str, np.ndarray]], block_steps: int) -> bytes:
     """One panel per alarm: measurements [seed, block] of every arm over steps, and the alarm's bound.
 
     Args:

@@ -29,7 +29,7 @@ from touchr1_jax.types import TouchBatch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Arm:
+class CollapseArm:
     """One way to train: guards, learning rate, and which arm's failure it is meant to cure, if any."""
 
     name: str
@@ -39,7 +39,7 @@ class Arm:
 
 
 @struct.dataclass
-class Look:
+class LatentMeasures:
     """What is measured of an encoder on held-out contacts; `telling` is `probes.told_apart`."""
 
     telling: Float[Array, ""]
@@ -48,7 +48,7 @@ class Look:
 
 
 @struct.dataclass
-class Course:
+class CollapseRun:
     """One run.
 
     Args:
@@ -57,15 +57,15 @@ class Course:
       before, after: features of all contacts but those watched.
     """
 
-    untrained: Look
-    looks: Look
-    start: Look
-    end: Look
+    untrained: LatentMeasures
+    looks: LatentMeasures
+    start: LatentMeasures
+    end: LatentMeasures
     before: Float[Array, "n D"]
     after: Float[Array, "n D"]
 
 
-Runner = Callable[[Guards, Float[Array, ""], Array], Course]
+Runner = Callable[[Guards, Float[Array, ""], Array], CollapseRun]
 
 
 def make_runner(
@@ -90,20 +90,20 @@ def make_runner(
     """
     rows, held = np.flatnonzero(train), _take(contacts, np.flatnonzero(~train))
 
-    def run(guards: Guards, rate: Float[Array, ""], key: Array) -> Course:
+    def run(guards: Guards, rate: Float[Array, ""], key: Array) -> CollapseRun:
         optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.95), optax.scale(-rate))
         start_key, draw_key = jax.random.split(key)
         start = start_dynamics(config, optimizer, start_key, contacts)
         draws = jax.random.choice(draw_key, jnp.asarray(rows), (blocks, block_steps, batch_size))
 
-        def block(state: DynamicsState, drawn: Int[Array, "steps batch"]) -> tuple[DynamicsState, Look]:
+        def block(state: DynamicsState, drawn: Int[Array, "steps batch"]) -> tuple[DynamicsState, LatentMeasures]:
             step = lambda s, i: (dynamics_update(config, optimizer, guards, s, _take(contacts, i))[0], None)
             state, _ = jax.lax.scan(step, state, drawn)
             return state, look_at(config, state, watched)
 
         end, looks = jax.lax.scan(block, start, draws)
         features = functools.partial(_features, config, contacts)
-        return Course(
+        return CollapseRun(
             untrained=look_at(config, start, watched),
             looks=looks,
             start=look_at(config, start, held),
@@ -115,7 +115,7 @@ def make_runner(
     return jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
 
 
-def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> Look:
+def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> LatentMeasures:
     """Held-out skill, and how the averaged encoder's latents differ between contacts."""
     steps = steps_of(batch, config.encoder.frames_per_step)
     latent = encode_batch(config.encoder, state.target, batch)
@@ -123,7 +123,7 @@ def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> 
     seen = encode_batch(config.encoder, state.params["encoder"], batch)
     predicted = predict_next(config, state.params["predictor"], seen, steps, batch.stream_mask)
     error, copied = prediction_errors(predicted, goal, steps)
-    return Look(
+    return LatentMeasures(
         telling=told_apart(latent, steps.exists),
         rank_share=rank_me(residuals(latent, steps.exists)) / latent.shape[-1],
         skill=1.0 - error / jnp.maximum(copied, COPY_FLOOR),

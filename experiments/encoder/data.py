@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.encoder.held_out import Watched
+from experiments.encoder.held_out import HeldOutContacts
 from experiments.study.dataset import Dataset, open_dataset
 from experiments.study.sources import Source, SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
@@ -20,7 +20,7 @@ STAGE_ONE_SEED = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TouchConfig:
+class StageOneDataConfig:
     """Which recordings, and how many labelled contacts the probes are fitted on (at most)."""
 
     data: Source = "generated"
@@ -33,7 +33,7 @@ class TouchConfig:
     probe: ProbeConfig = ProbeConfig()
 
 
-def open_touch(config: TouchConfig, frames: int, image_px: int, context: Context) -> Dataset:
+def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
     """The records, made first where the cache lacks them; frames past the strain limit stay in, as in the studies."""
     source = SourceConfig(
         kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
@@ -47,7 +47,7 @@ def training_rows(data: Dataset) -> np.ndarray:
     return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
 
 
-def watched(data: Dataset, part: str, config: TouchConfig, fit: int | None = None) -> Watched:
+def watched(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
     """Probes fitted on training contacts and read on a part.
 
     Args:
@@ -56,7 +56,7 @@ def watched(data: Dataset, part: str, config: TouchConfig, fit: int | None = Non
       config: how many contacts to fit on, and the probe.
       fit: another number of them.
     """
-    return Watched(
+    return HeldOutContacts(
         store=data.store,
         clip=data.clip,
         fit_rows=training_rows(data)[: config.probe_fit if fit is None else fit],

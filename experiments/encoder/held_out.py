@@ -39,7 +39,7 @@ RANK_ROWS = 4096
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Watched:
+class HeldOutContacts:
     """Contacts to measure on: probes are fitted on `fit_rows` and everything is read on `read_rows`.
 
     `label` int32 [contact, A] and `objects` [contact] are of the whole store.
@@ -65,7 +65,7 @@ class Watched:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Assessment:
+class EncoderAssessment:
     """Everything by contact, so that intervals can resample objects.
 
     Args:
@@ -108,7 +108,9 @@ class Assessment:
         }
 
 
-def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched, context: Context) -> Assessment:
+def assess(
+    networks: DynamicsConfig, state: DynamicsState, watched: HeldOutContacts, context: Context
+) -> EncoderAssessment:
     """Measure; all streams that are there are shown."""
     rows = np.concatenate([watched.fit_rows, watched.read_rows])
     look = _look(networks)
@@ -122,7 +124,7 @@ def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched, con
     constant = masked.mean(np.abs(goal[~fitted][:, :, 1:] - mean[:, 1:]), both[~fitted], (1, 2, 3, 4))
     features = np.asarray(contact_features(seen["latent"], exists))
     spread = spread_of(jnp.asarray(seen["latent"]), jnp.asarray(exists))
-    return Assessment(
+    return EncoderAssessment(
         error=seen["error"][~fitted],
         copied=seen["copied"][~fitted],
         constant=np.asarray(constant),
@@ -133,7 +135,7 @@ def assess(networks: DynamicsConfig, state: DynamicsState, watched: Watched, con
     )
 
 
-def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: Watched, context: Context) -> np.ndarray:
+def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: HeldOutContacts, context: Context) -> np.ndarray:
     """Whether the probes on an encoder alone are right, bool [read, 3]."""
 
     def encode(batch: TouchBatch) -> dict[str, Any]:

@@ -24,12 +24,12 @@ from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.charts import accuracy_against_time
-from experiments.encoder.data import TouchConfig, open_touch, training_rows, watched
+from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows, watched
 from experiments.encoder.held_out import probe_encoder
 from experiments.encoder.intervals import points
 from experiments.encoder.pretrain import PretrainConfig, clip_of, pretrain
 from experiments.encoder.speed import forward, matrix_product, medians, parts
-from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, FieldsOnly, Variant, variants
+from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import clip_batches
@@ -45,10 +45,10 @@ NOISE = 0.02  # share of the time below which the difference of two programs say
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config:
+class ParetoEncoderConfig:
     """Data, training of every variant, rounds of timing."""
 
-    touch: TouchConfig = TouchConfig()
+    touch: StageOneDataConfig = StageOneDataConfig()
     pretrain: PretrainConfig = PretrainConfig(
         frames=FRAMES, image_px=IMAGE_PX, steps=100, batch_size=16, probe_every=100
     )
@@ -56,7 +56,7 @@ class Config:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Measured:
+class MeasuredVariant:
     """One variant.
 
     Args:
@@ -67,7 +67,7 @@ class Measured:
       gflop: of it.
     """
 
-    variant: Variant
+    variant: EncoderVariant
     choosing: np.ndarray
     right: np.ndarray
     seconds: float
@@ -84,7 +84,7 @@ class Measured:
         return float(100 * self.right.mean())
 
 
-def run(config: Config, context: Context) -> Results:
+def run(config: ParetoEncoderConfig, context: Context) -> Results:
     """Train, probe, time."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
     ladder = variants(config.pretrain)
@@ -99,7 +99,7 @@ def run(config: Config, context: Context) -> Results:
     seconds = medians({**programs, "product": product}, context.rounds("timing variants", config.rounds))
     between = len(data.parts["val"])
     measured = {
-        v.name: Measured(
+        v.name: MeasuredVariant(
             variant=v,
             choosing=right[v.name][:between],
             right=right[v.name][between:],
@@ -119,7 +119,9 @@ def run(config: Config, context: Context) -> Results:
     return findings(config, data, measured, best, peak, objects, where)
 
 
-def learn(config: Config, variant: Variant, data: Dataset, context: Context, name: str) -> tuple[Params, np.ndarray]:
+def learn(
+    config: ParetoEncoderConfig, variant: EncoderVariant, data: Dataset, context: Context, name: str
+) -> tuple[Params, np.ndarray]:
     """The trained encoder, and whether its probes are right about the validation and then the test contacts."""
     store = FieldsOnly(data.store) if variant.fields else data.store
     rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
@@ -135,29 +137,29 @@ def learn(config: Config, variant: Variant, data: Dataset, context: Context, nam
     return state.target, right
 
 
-def prompts(variant: Variant, data: Dataset) -> TouchBatch:
+def prompts(variant: EncoderVariant, data: Dataset) -> TouchBatch:
     """A batch to time, pictures whatever the variant reads: both are bytes of one size."""
     clip = clip_of(variant.config, data.clip)
     rows = np.resize(data.parts["test"], TIMED)
     return touch_batch(next(iter(clip_batches(data.store, rows, clip, batch_size=TIMED, seed=0, shuffle=False))))
 
 
-def choose(measured: Mapping[str, Measured]) -> Measured:
+def choose(measured: Mapping[str, MeasuredVariant]) -> MeasuredVariant:
     """The fastest of those whose probes are at most a point below the reference's on the validation contacts."""
     bound = measured[REFERENCE].choosing.mean() - MOST_LOSS / 100
     return max((m for m in measured.values() if m.choosing.mean() >= bound), key=lambda m: m.rate)
 
 
-def loss(m: Measured, measured: Mapping[str, Measured], objects: np.ndarray) -> Interval:
+def loss(m: MeasuredVariant, measured: Mapping[str, MeasuredVariant], objects: np.ndarray) -> Interval:
     """Points below the reference, paired by contact."""
     return points(measured[REFERENCE].right.astype(float) - m.right, objects)
 
 
 def findings(
-    config: Config,
+    config: ParetoEncoderConfig,
     data: Dataset,
-    measured: Mapping[str, Measured],
-    best: Measured,
+    measured: Mapping[str, MeasuredVariant],
+    best: MeasuredVariant,
     peak: float,
     objects: np.ndarray,
     where: Table,
@@ -201,7 +203,7 @@ def findings(
     )
 
 
-def picture(measured: Mapping[str, Measured], objects: np.ndarray) -> Picture:
+def picture(measured: Mapping[str, MeasuredVariant], objects: np.ndarray) -> Picture:
     """The chart."""
     reference = measured[REFERENCE].accuracy
     return Picture(
@@ -220,7 +222,7 @@ def picture(measured: Mapping[str, Measured], objects: np.ndarray) -> Picture:
     )
 
 
-def ladder_table(measured: Mapping[str, Measured], objects: np.ndarray, peak: float) -> Table:
+def ladder_table(measured: Mapping[str, MeasuredVariant], objects: np.ndarray, peak: float) -> Table:
     """All variants."""
     rows: list[tuple[Cell, ...]] = []
     for name, m in measured.items():
@@ -246,7 +248,7 @@ def ladder_table(measured: Mapping[str, Measured], objects: np.ndarray, peak: fl
     )
 
 
-def pieces_table(best: Measured, spent: Mapping[str, float], gflop: Mapping[str, float], peak: float) -> Table:
+def pieces_table(best: MeasuredVariant, spent: Mapping[str, float], gflop: Mapping[str, float], peak: float) -> Table:
     """What each part adds to the time and to the arithmetic."""
     rows: list[tuple[Cell, ...]] = []
     before_s = before_gflop = 0.0
@@ -269,9 +271,9 @@ def pieces_table(best: Measured, spent: Mapping[str, float], gflop: Mapping[str,
     )
 
 
-DEFAULT = Config()
-SMOKE = Config(
-    touch=TouchConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
+DEFAULT = ParetoEncoderConfig()
+SMOKE = ParetoEncoderConfig(
+    touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
     pretrain=PretrainConfig(frames=FRAMES, image_px=IMAGE_PX, steps=2, batch_size=4, probe_every=2),
     rounds=2,
 )

@@ -11,7 +11,7 @@ import optax
 
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
-from experiments.encoder.held_out import Watched, assess
+from experiments.encoder.held_out import HeldOutContacts, assess
 from experiments.study.feeds import Feed, host_touch, touch_batch
 from experiments.study.pretrained import PretrainedEncoder
 from sensors_io.augment import AugmentConfig
@@ -101,7 +101,7 @@ def pretrain(
     *,
     stage: str,
     seed: int,
-    watched: Watched | None = None,
+    watched: HeldOutContacts | None = None,
     start: PretrainedEncoder | None = None,
 ) -> DynamicsState:
     """Train encoder and predictor on some contacts, without their labels; a stopped stage goes on where it was.
@@ -177,7 +177,7 @@ def _measure(
     networks: DynamicsConfig,
     context: Context,
     stage: str,
-    watched: Watched | None,
+    watched: HeldOutContacts | None,
     state: DynamicsState,
     step: int,
     before: int = 0,

@@ -25,8 +25,8 @@ from experiments.core.context import Context, read_metrics
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.charts import learning_curves
-from experiments.encoder.data import TouchConfig, open_touch, training_rows, watched
-from experiments.encoder.held_out import Assessment, assess
+from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows, watched
+from experiments.encoder.held_out import EncoderAssessment, assess
 from experiments.encoder.intervals import points, skill
 from experiments.encoder.pretrain import PretrainConfig, clip_of, encoder_of, pretrain, untrained
 from experiments.study.dataset import Dataset
@@ -40,15 +40,15 @@ LEAST_SKILL, LEAST_LEAD = 0.2, 15.0  # over copy-last; points over the random en
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config:
+class PretrainEncoderConfig:
     """Data and training; `watch_fit` contacts fit the probes during training."""
 
-    touch: TouchConfig = TouchConfig()
+    touch: StageOneDataConfig = StageOneDataConfig()
     pretrain: PretrainConfig = PretrainConfig()
     watch_fit: int = 640
 
 
-def run(config: Config, context: Context) -> Results:
+def run(config: PretrainEncoderConfig, context: Context) -> Results:
     """Train, measure on the test objects before and after, save the encoder."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
     rows = training_rows(data)
@@ -70,7 +70,9 @@ def run(config: Config, context: Context) -> Results:
     return findings(config, context, data, before, after)
 
 
-def findings(config: Config, context: Context, data: Dataset, before: Assessment, after: Assessment) -> Results:
+def findings(
+    config: PretrainEncoderConfig, context: Context, data: Dataset, before: EncoderAssessment, after: EncoderAssessment
+) -> Results:
     """Requirements, table, curves."""
     objects = data.object_ids[data.parts["test"]]
     copied = skill(after.error, after.copied, objects)
@@ -118,7 +120,7 @@ def _span(x: Interval) -> str:
     return f"[{x.low:.2f}, {x.high:.2f}]"
 
 
-def _table(before: Assessment, after: Assessment, objects: np.ndarray) -> Table:
+def _table(before: EncoderAssessment, after: EncoderAssessment, objects: np.ndarray) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for a, name in enumerate((*ORDINAL, "mean of three")):
         pick = slice(a, a + 1) if a < len(ORDINAL) else slice(None)
@@ -139,9 +141,9 @@ def _table(before: Assessment, after: Assessment, objects: np.ndarray) -> Table:
     )
 
 
-DEFAULT = Config()
-SMOKE = Config(
-    touch=TouchConfig(scenes=SceneConfig(objects=60, sites=1)),
+DEFAULT = PretrainEncoderConfig()
+SMOKE = PretrainEncoderConfig(
+    touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1)),
     pretrain=PretrainConfig(steps=6, batch_size=8, probe_every=3),
     watch_fit=24,
 )

@@ -18,19 +18,19 @@ MATRIX = 1024  # side of the matrices whose product is the yardstick of the mach
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Program:
+class CompiledProgram:
     """A compiled call and its arithmetic, in Gflop."""
 
     call: Callable[[], Any]
     gflop: float
 
 
-def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> Program:
+def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> CompiledProgram:
     """The encoder from the bytes of a batch to its tokens."""
     return by_contact(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
 
 
-def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Callable[[], Program]]:
+def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Callable[[], CompiledProgram]]:
     """How to compile programs that each do one thing more than the one before, contact by contact, up to the whole
     encoder.
     """
@@ -67,21 +67,23 @@ class _Stem(nn.Module):
         return patch_tokens(frames, self.config, kept)
 
 
-def matrix_product() -> Program:
+def matrix_product() -> CompiledProgram:
     """One product of square matrices."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
     product = lambda a: a @ a
-    return Program(call=held(product, x), gflop=arithmetic(product, x))
+    return CompiledProgram(call=held(product, x), gflop=arithmetic(product, x))
 
 
-def by_contact(function: Callable[..., Any], *arguments: Any) -> Program:
+def by_contact(function: Callable[..., Any], *arguments: Any) -> CompiledProgram:
     """A program that reads the contacts of a batch, its last argument, one after the other.
 
     XLA counts one turn of a loop, however many it takes: the arithmetic is that of one contact, times their number.
     """
     *others, batch = arguments
     one = jax.tree.map(lambda x: x[:1], batch)
-    return Program(call=held(function, *arguments), gflop=len(batch.frames) * arithmetic(function, *others, one))
+    return CompiledProgram(
+        call=held(function, *arguments), gflop=len(batch.frames) * arithmetic(function, *others, one)
+    )
 
 
 def held(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
@@ -97,7 +99,7 @@ def arithmetic(function: Callable[..., Any], *arguments: Any) -> float:
     return float(cost["flops"]) / 1e9
 
 
-def medians(programs: Mapping[str, Program], rounds: Iterable[object]) -> dict[str, float]:
+def medians(programs: Mapping[str, CompiledProgram], rounds: Iterable[object]) -> dict[str, float]:
     """Median seconds of each, in interleaved rounds."""
     for program in programs.values():
         jax.block_until_ready(program.call())

@@ -28,9 +28,9 @@ from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.encoder.charts import collapse_courses
-from experiments.encoder.collapse import Arm, Course, Runner, in_memory, make_runner
-from experiments.encoder.data import TouchConfig, open_touch, training_rows
+from experiments.encoder.charts import collapse_curves
+from experiments.encoder.collapse import CollapseArm, CollapseRun, Runner, in_memory, make_runner
+from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import clip_batches
@@ -47,14 +47,14 @@ from touchr1_jax.types import TouchBatch
 RATE = 1e-3
 NONE = Guards(variance=0.0, covariance=0.0)
 ARMS = (
-    Arm(name="all guards", guards=Guards(), rate=RATE),
-    Arm(name="no terms", guards=NONE, rate=RATE),
-    Arm(name="no terms, no average", guards=dataclasses.replace(NONE, ema=0.0), rate=RATE),
-    Arm(name="no guards", guards=dataclasses.replace(NONE, ema=0.0, leak=1.0), rate=RATE),
-    Arm(name="variance alone", guards=dataclasses.replace(NONE, variance=1.0), rate=RATE, cures="no terms"),
-    Arm(name="terms without average", guards=Guards(ema=0.0), rate=RATE, cures="no terms, no average"),
-    Arm(name="terms alone", guards=Guards(ema=0.0, leak=1.0), rate=RATE, cures="no guards"),
-    Arm(name="all guards, rate × 30", guards=Guards(), rate=30 * RATE),
+    CollapseArm(name="all guards", guards=Guards(), rate=RATE),
+    CollapseArm(name="no terms", guards=NONE, rate=RATE),
+    CollapseArm(name="no terms, no average", guards=dataclasses.replace(NONE, ema=0.0), rate=RATE),
+    CollapseArm(name="no guards", guards=dataclasses.replace(NONE, ema=0.0, leak=1.0), rate=RATE),
+    CollapseArm(name="variance alone", guards=dataclasses.replace(NONE, variance=1.0), rate=RATE, cures="no terms"),
+    CollapseArm(name="terms without average", guards=Guards(ema=0.0), rate=RATE, cures="no terms, no average"),
+    CollapseArm(name="terms alone", guards=Guards(ema=0.0, leak=1.0), rate=RATE, cures="no guards"),
+    CollapseArm(name="all guards, rate × 30", guards=Guards(), rate=30 * RATE),
 )
 """Guards taken away, then given back."""
 
@@ -66,10 +66,10 @@ FAILED_SHARE = 0.5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config:
+class StabilityEncoderConfig:
     """Data in memory, networks, length."""
 
-    touch: TouchConfig = TouchConfig(scenes=SceneConfig(objects=600, sites=1, image_px=28, seed=1))
+    touch: StageOneDataConfig = StageOneDataConfig(scenes=SceneConfig(objects=600, sites=1, image_px=28, seed=1))
     sensors: int = 2
     """The first ones of the records."""
     frames: int = 4
@@ -85,7 +85,7 @@ class Config:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Outcome:
+class CollapseOutcome:
     """One arm: what was seen of every seed, [seed, block].
 
     Args:
@@ -95,7 +95,7 @@ class Outcome:
       lead: [seed], points of the probes over those on the untrained encoder, at the end.
     """
 
-    arm: Arm
+    arm: CollapseArm
     looks: dict[str, np.ndarray]
     kept: np.ndarray
     lead: np.ndarray
@@ -119,7 +119,7 @@ class Outcome:
         return None
 
 
-def run(config: Config, context: Context) -> Results:
+def run(config: StabilityEncoderConfig, context: Context) -> Results:
     """Every arm, all seeds at once.
 
     Raises:
@@ -150,7 +150,7 @@ def run(config: Config, context: Context) -> Results:
     return findings(config, outcomes)
 
 
-def load(data: Dataset, config: Config, context: Context) -> tuple[TouchBatch, np.ndarray, np.ndarray]:
+def load(data: Dataset, config: StabilityEncoderConfig, context: Context) -> tuple[TouchBatch, np.ndarray, np.ndarray]:
     """All contacts of training and test objects, their ordinal labels, and which are for training."""
     fit, read = training_rows(data), data.parts["test"]
     rows = np.concatenate([fit, read])
@@ -158,7 +158,7 @@ def load(data: Dataset, config: Config, context: Context) -> tuple[TouchBatch, n
     return batch_of(data, config, rows, context), label, np.arange(len(rows)) < len(fit)
 
 
-def batch_of(data: Dataset, config: Config, rows: np.ndarray, context: Context) -> TouchBatch:
+def batch_of(data: Dataset, config: StabilityEncoderConfig, rows: np.ndarray, context: Context) -> TouchBatch:
     """Some contacts as one batch."""
     clip = dataclasses.replace(data.clip, sensors=data.clip.sensors[: config.sensors], view_px=1)
     clips = clip_batches(data.store, rows, clip, batch_size=64, seed=0, shuffle=False, repeat=False)
@@ -171,10 +171,10 @@ def batch_of(data: Dataset, config: Config, rows: np.ndarray, context: Context) 
 
 
 def drive(
-    runner: Runner, arm: Arm, keys: jax.Array, label: np.ndarray, train: np.ndarray, probe: ProbeConfig
-) -> Outcome:
+    runner: Runner, arm: CollapseArm, keys: jax.Array, label: np.ndarray, train: np.ndarray, probe: ProbeConfig
+) -> CollapseOutcome:
     """Train all seeds of an arm and probe them."""
-    course: Course = jax.device_get(runner(arm.guards, jnp.float32(arm.rate), keys))
+    course: CollapseRun = jax.device_get(runner(arm.guards, jnp.float32(arm.rate), keys))
     lead = [
         100.0 * (probe_right(after, label, train, probe).mean() - probe_right(before, label, train, probe).mean())
         for before, after in zip(course.before, course.after, strict=True)
@@ -185,10 +185,10 @@ def drive(
         "rank_share": np.asarray(course.looks.rank_share),
         "skill": np.asarray(course.looks.skill),
     }
-    return Outcome(arm=arm, looks=looks, kept=np.asarray(kept), lead=np.array(lead))
+    return CollapseOutcome(arm=arm, looks=looks, kept=np.asarray(kept), lead=np.array(lead))
 
 
-def findings(config: Config, outcomes: list[Outcome]) -> Results:
+def findings(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Results:
     """Who failed, who was noticed, what cured it."""
     failed = np.concatenate([o.failed for o in outcomes])
     alarmed = np.concatenate([o.alarmed for o in outcomes])
@@ -240,14 +240,14 @@ def findings(config: Config, outcomes: list[Outcome]) -> Results:
                 title="Courses of collapse",
                 caption="Held-out measurements, a thin line for each seed, a bold one for their median; dotted: the "
                 "bound of the alarm.",
-                content=collapse_courses({o.arm.name: o.looks for o in outcomes}, config.block_steps),
+                content=collapse_curves({o.arm.name: o.looks for o in outcomes}, config.block_steps),
             ),
         ),
         settings={"seeds": config.seeds, "steps": config.blocks * config.block_steps, "learning rate": RATE},
     )
 
 
-def _table(config: Config, outcomes: list[Outcome]) -> Table:
+def _table(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for o in outcomes:
         first = [b for seed in range(config.seeds) if (b := o.first_alarm(seed)) is not None]
@@ -280,9 +280,9 @@ def _table(config: Config, outcomes: list[Outcome]) -> Table:
     )
 
 
-DEFAULT = Config()
-SMOKE = Config(
-    touch=TouchConfig(scenes=SceneConfig(objects=60, sites=1, image_px=28, seed=1)),
+DEFAULT = StabilityEncoderConfig()
+SMOKE = StabilityEncoderConfig(
+    touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, image_px=28, seed=1)),
     seeds=2,
     batch_size=8,
     blocks=2,

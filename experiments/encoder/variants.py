@@ -18,7 +18,7 @@ STUDIED = "4 frames by salience"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Variant:
+class EncoderVariant:
     """One encoder: its kind of saving, its networks and clips, and whether it reads fields instead of pictures."""
 
     name: str
@@ -39,14 +39,18 @@ class Variant:
         return frames // e.frames_per_step * kept
 
 
-def variants(base: PretrainConfig) -> tuple[Variant, ...]:
+def variants(base: PretrainConfig) -> tuple[EncoderVariant, ...]:
     """Every saving on its own, the reference first, then those that go together."""
     two = dataclasses.replace(base.encoder, frames_per_step=2)
     kept = lambda count, rest: dataclasses.replace(two, patches_kept=count, rest=rest)
     fine = dataclasses.replace(two, stem_px=2)
 
-    def variant(name: str, kind: str, encoder: TactileViTConfig, *, fields: bool = False, **other: Any) -> Variant:
-        return Variant(name=name, kind=kind, config=dataclasses.replace(base, encoder=encoder, **other), fields=fields)
+    def variant(
+        name: str, kind: str, encoder: TactileViTConfig, *, fields: bool = False, **other: Any
+    ) -> EncoderVariant:
+        return EncoderVariant(
+            name=name, kind=kind, config=dataclasses.replace(base, encoder=encoder, **other), fields=fields
+        )
 
     return (
         variant(REFERENCE, "tokens", fine),

@@ -23,11 +23,21 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.encoder.data import TouchConfig, open_touch, training_rows
-from experiments.encoder.film import FilmConfig, train_film
-from experiments.encoder.film_scores import COPY, MEAN, Film, Judge, Scores, answer_all, batches, judged, mean_frames
-from experiments.encoder.film_strip import Strip, film_strip
+from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows
 from experiments.encoder.intervals import skill
+from experiments.encoder.video_scores import (
+    COPY,
+    MEAN,
+    FrameMetrics,
+    FrameScores,
+    VideoPredictor,
+    answer_all,
+    batches,
+    judged,
+    mean_frames,
+)
+from experiments.encoder.video_strip import FrameStrip, video_strip
+from experiments.encoder.video_training import VideoTrainingConfig, train_predictor
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from experiments.study.pretrained import PretrainedEncoder, load_encoder
@@ -45,10 +55,10 @@ SHOWN = 3  # contacts in the picture
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Config:
+class VideoPredictionConfig:
     """Data, networks, training; how many test contacts are scored and how many training ones make the mean frame."""
 
-    touch: TouchConfig = TouchConfig()
+    touch: StageOneDataConfig = StageOneDataConfig()
     encoder: Path | None = None
     """Run of `pretrain_encoder` to start from; from scratch without."""
     lpips_weights: Path | None = None
@@ -57,12 +67,12 @@ class Config:
     skips: tuple[int, ...] = (3, 5)
     tactile: TactileViTConfig = TactileViTConfig(sensors=0, causal=True)
     decoder: FrameDecoderConfig = FrameDecoderConfig()
-    film: FilmConfig = FilmConfig()
+    film: VideoTrainingConfig = VideoTrainingConfig()
     scored: int = 120
     mean_of: int = 320
 
 
-def run(config: Config, context: Context) -> Results:
+def run(config: VideoPredictionConfig, context: Context) -> Results:
     """Train both predictors, score them and the baselines."""
     data = open_touch(config.touch, config.frames, config.image_px, context)
     rows, test = training_rows(data), data.parts["test"][: config.scored]
@@ -77,8 +87,13 @@ def run(config: Config, context: Context) -> Results:
 
 
 def train(
-    config: Config, name: str, data: Dataset, rows: np.ndarray, context: Context, start: PretrainedEncoder | None
-) -> Film:
+    config: VideoPredictionConfig,
+    name: str,
+    data: Dataset,
+    rows: np.ndarray,
+    context: Context,
+    start: PretrainedEncoder | None,
+) -> VideoPredictor:
     """One predictor; the encoder has the shape of the one that it starts from."""
     tactile = config.tactile if start is None else start.config
     video = VideoConfig(
@@ -88,11 +103,11 @@ def train(
         skips=config.skips,
     )
     stage = f"film/{name.replace(' + ', '-')}/{SEED}"
-    params = train_film(video, config.film, data, rows, context, stage=stage, seed=SEED, start=start)
-    return Film(config=video, params=params)
+    params = train_predictor(video, config.film, data, rows, context, stage=stage, seed=SEED, start=start)
+    return VideoPredictor(config=video, params=params)
 
 
-def make_judge(config: Config, start: PretrainedEncoder | None, film: Film) -> Judge:
+def make_judge(config: VideoPredictionConfig, start: PretrainedEncoder | None, film: VideoPredictor) -> FrameMetrics:
     """The metrics; features are those of the encoder that training starts from, else of the predictor by touch alone.
 
     Raises:
@@ -104,10 +119,16 @@ def make_judge(config: Config, start: PretrainedEncoder | None, film: Film) -> J
             weights = dict(file)
         check_weights(weights)
     params = film.params["encoder"] if start is None else start.params
-    return Judge(encoder=film.config.encoder, params=jax.device_get(params), lpips_weights=weights)
+    return FrameMetrics(encoder=film.config.encoder, params=jax.device_get(params), lpips_weights=weights)
 
 
-def show(films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.ndarray, config: Config) -> list[Strip]:
+def show(
+    films: Mapping[str, VideoPredictor],
+    mean: np.ndarray,
+    data: Dataset,
+    rows: np.ndarray,
+    config: VideoPredictionConfig,
+) -> list[FrameStrip]:
     """Frames of the first test contacts by the first sensor, predicted from the first frame over the longest skip."""
     batch, _ = next(batches(data, rows))
     k = int(np.argmax(config.skips))
@@ -115,13 +136,17 @@ def show(films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.nd
     first = np.asarray(batch.frames[:, 0, 0]) / 255.0
     names = (*films, MEAN, "goal")
     return [
-        Strip(title=f"object {i + 1}", frames={"seen": first[i], **{n: answers[n][i, 0] for n in names}})
+        FrameStrip(title=f"object {i + 1}", frames={"seen": first[i], **{n: answers[n][i, 0] for n in names}})
         for i in range(min(SHOWN, len(rows)))
     ]
 
 
 def findings(
-    config: Config, data: Dataset, scores: Mapping[str, Scores], objects: np.ndarray, strips: list[Strip]
+    config: VideoPredictionConfig,
+    data: Dataset,
+    scores: Mapping[str, FrameScores],
+    objects: np.ndarray,
+    strips: list[FrameStrip],
 ) -> Results:
     """Skill of each predictor and skip, table of all metrics, a strip of frames."""
     skills = {
@@ -168,7 +193,7 @@ def findings(
                 name="film_strip",
                 title=f"From the first frame to the one {longest} later",
                 caption="GelSight Mini, unseen objects: what is seen, what is predicted, what came.",
-                content=film_strip(strips),
+                content=video_strip(strips),
                 kind="png",
             ),
         ),
@@ -177,7 +202,9 @@ def findings(
     )
 
 
-def _table(config: Config, scores: Mapping[str, Scores], skills: Mapping[tuple[str, int], Interval]) -> Table:
+def _table(
+    config: VideoPredictionConfig, scores: Mapping[str, FrameScores], skills: Mapping[tuple[str, int], Interval]
+) -> Table:
     metrics = tuple(next(iter(scores.values())).values)
     rows: list[tuple[Cell, ...]] = []
     for s in config.skips:
@@ -196,11 +223,11 @@ def _table(config: Config, scores: Mapping[str, Scores], skills: Mapping[tuple[s
     )
 
 
-def _beside_table(config: Config, scores: Mapping[str, Scores]) -> Table:
+def _beside_table(config: VideoPredictionConfig, scores: Mapping[str, FrameScores]) -> Table:
     """The predictors and what costs nothing, beside the paper's rows for its own recordings."""
     metrics = ("l1", "ssim", "lpips")
 
-    def line(name: str, s: int, found: Scores) -> tuple[Cell, ...]:
+    def line(name: str, s: int, found: FrameScores) -> tuple[Cell, ...]:
         return f"{name}, {s} ahead", *(float(found.of(m, s).mean()) if m in found.values else None for m in metrics)
 
     ours = [line(name, s, found) for s in config.skips for name, found in scores.items()]
@@ -231,7 +258,7 @@ MEANINGS = {
 }
 
 
-def _sensor_table(config: Config, data: Dataset, scores: Mapping[str, Scores]) -> Table:
+def _sensor_table(config: VideoPredictionConfig, data: Dataset, scores: Mapping[str, FrameScores]) -> Table:
     rows: list[tuple[Cell, ...]] = [
         (sensor, *(float(scores[name].by_sensor("l1", s)[i]) for s in config.skips for name in (TOUCH, COPY, MEAN)))
         for i, sensor in enumerate(data.clip.sensors)
@@ -246,10 +273,10 @@ def _sensor_table(config: Config, data: Dataset, scores: Mapping[str, Scores]) -
     )
 
 
-DEFAULT = Config()
-SMOKE = Config(
-    touch=TouchConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
-    film=FilmConfig(steps=4, batch_size=2),
+DEFAULT = VideoPredictionConfig()
+SMOKE = VideoPredictionConfig(
+    touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
+    film=VideoTrainingConfig(steps=4, batch_size=2),
     scored=8,
     mean_of=16,
 )

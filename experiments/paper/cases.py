@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experiments.bench.languages import answer_words
-from experiments.bench.phrases import question
+from experiments.bench.wording import answer_words, question
 from experiments.core.results import Cell, Column, Table
 from experiments.paper.conflict_metrics import Asked, spoken
 from experiments.study.answers import Evaluated

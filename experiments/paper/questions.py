@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Int
 
+from experiments.bench.contacts import measure_split
 from experiments.bench.draw import Quota, draw
-from experiments.bench.facts import gather
 from experiments.core.context import Context
 from experiments.study.answers import Evaluated
 from experiments.study.dataset import Dataset
@@ -65,7 +65,7 @@ class Answerer:
 def questions(data: Dataset, quota: Quota, context: Context) -> tuple[Ask, ...]:
     """The bench's questions about the test contacts."""
     with context.progress("measuring contacts", len(data.store.contacts_of_split("test"))) as advance:
-        contacts = gather(data.store, "test", advance).contacts
+        contacts = measure_split(data.store, "test", advance).contacts
     return draw(contacts, data.clip.sensors, quota, seed=0)
 
 

@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from experiments.bench.facts import Contact, Facts
-from experiments.bench.generate import Source
-from experiments.bench.readings import fit
+from experiments.bench.contacts import MeasuredContact, SplitContacts
+from experiments.bench.generate import BenchSource
+from experiments.bench.thresholds import fit_thresholds
 from sensors_io.measures import Measured
 from touchr1_jax.bench.items import Touch
 
 SENSORS = ("xense", "tac3d")
 
 
-def contacts(prefix: str, seed: int, copies: int = 2) -> tuple[Contact, ...]:
+def contacts(prefix: str, seed: int, copies: int = 2) -> tuple[MeasuredContact, ...]:
     """Every combination of three levels, `copies` objects each, two sites; stiffness, texture and relief follow."""
     rng, found = np.random.default_rng(seed), []
     for n in range(27 * copies):
@@ -22,7 +22,7 @@ def contacts(prefix: str, seed: int, copies: int = 2) -> tuple[Contact, ...]:
     return tuple(found)
 
 
-def _contact(name: str, site: int, levels: dict[str, int], n: int, rng: np.random.Generator) -> Contact:
+def _contact(name: str, site: int, levels: dict[str, int], n: int, rng: np.random.Generator) -> MeasuredContact:
     values = {
         "stiffness": 2.0 + 3 * levels["hardness"] + rng.normal(0, 0.5),
         "fine texture": 1.0 + 2 * levels["roughness"] + rng.normal(0, 0.5),
@@ -32,7 +32,7 @@ def _contact(name: str, site: int, levels: dict[str, int], n: int, rng: np.rando
     }
     box = (0.3, 0.3, 0.7, 0.7)
     measured = {s: Measured(frame=3, quantities=values, at=(0.5, 0.45), box=box) for s in SENSORS}
-    return Contact(
+    return MeasuredContact(
         touch=Touch(object=name, site=site, motion="press", trial=0),
         labels=levels | {"material": n % 9},
         deceptive=n % 3 != 1,
@@ -41,12 +41,12 @@ def _contact(name: str, site: int, levels: dict[str, int], n: int, rng: np.rando
     )
 
 
-def source() -> Source:
+def source() -> BenchSource:
     """54 objects to ask about, 54 others to read numbers by."""
     train = contacts("train", 1)
-    return Source(
-        bench=Facts(contacts=contacts("test", 0), skipped={}),
-        train=Facts(contacts=train, skipped={}),
-        readings=fit(train),
+    return BenchSource(
+        bench=SplitContacts(contacts=contacts("test", 0), skipped={}),
+        train=SplitContacts(contacts=train, skipped={}),
+        readings=fit_thresholds(train),
         sensors=SENSORS,
     )

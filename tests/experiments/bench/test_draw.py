@@ -6,7 +6,7 @@ import dataclasses
 import pytest
 
 from experiments.bench.draw import Quota, QuotaError, draw
-from experiments.bench.filters import true_answer
+from experiments.bench.rules import true_answer
 from tests.experiments.bench import made_up
 from touchr1_jax.bench.comparison import ORDERS
 

@@ -5,13 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.bench import adapter, faults
-from experiments.bench.filters import RULES, Candidate, broken_rule, sift
+from experiments.bench import adapter, planted_errors
 from experiments.bench.generate import generate, share_at_odds
-from experiments.bench.languages import answer_words, understand
-from experiments.bench.phrases import WORDINGS
 from experiments.bench.rationales import compose_item
-from experiments.bench.readings import Scale, fit
+from experiments.bench.rules import RULES, CandidateItem, apply_rules, broken_rule
+from experiments.bench.thresholds import LevelThresholds, fit_thresholds
+from experiments.bench.wording import WORDINGS, answer_words, understand
 from tests.experiments.bench import made_up
 from touchr1_jax.bench.items import Ask, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError
@@ -19,7 +18,7 @@ from touchr1_jax.bench.scoring import score
 
 
 def test_cuts_by_hand():
-    scale = Scale(quantity="stiffness", cuts=(3.0, 6.0), rising=True, accuracy=1.0)
+    scale = LevelThresholds(quantity="stiffness", cuts=(3.0, 6.0), rising=True, accuracy=1.0)
     assert [scale.read(v) for v in (2.9, 3.0, 5.9, 6.0)] == [0, 1, 1, 2]
     falling = dataclasses.replace(scale, rising=False)
     assert [falling.read(v) for v in (2.9, 4.0, 7.0)] == [2, 1, 0]
@@ -37,7 +36,7 @@ def test_the_quantity_that_follows_the_level_is_found(source):
 
 def test_too_few_contacts_to_read_by_are_named(source):
     with pytest.raises(ValueError, match="contacts holds 3"):
-        fit(source.train.contacts[:3])
+        fit_thresholds(source.train.contacts[:3])
 
 
 def test_a_rationale_by_hand(source, items):
@@ -72,7 +71,7 @@ def test_other_numbers_stand_beside_the_one_that_is_read(source):
         s: dataclasses.replace(m, quantities=m.quantities | {"contact area": 7.0}) for s, m in contact.measured.items()
     }
     seen = dataclasses.replace(contact, measured=wide)
-    scale = Scale(quantity="contact area", cuts=(5.0, 6.0), rising=True, accuracy=1.0)
+    scale = LevelThresholds(quantity="contact area", cuts=(5.0, 6.0), rising=True, accuracy=1.0)
     scales = {key: scale if key[1] == "hardness" else known for key, known in source.readings.scales.items()}
     ask = Ask(
         id="x", kind="identify", attributes=("hardness",), touches=(contact.touch,), sensors=("xense",), answer=(0,)
@@ -136,11 +135,11 @@ def test_rules_remove_nothing_that_is_sound_and_all_planted_faults(source, found
     assert not found.removed
     assert found.counts == dict.fromkeys(RULES, 0)
     some = found.kept[::9]
-    assert faults.caught(some, source.bench.by_touch()) == dict.fromkeys(RULES, len(some))
+    assert planted_errors.caught(some, source.bench.by_touch()) == dict.fromkeys(RULES, len(some))
 
 
-def sound(item) -> Candidate:
-    return Candidate(
+def sound(item) -> CandidateItem:
+    return CandidateItem(
         ask=item.ask,
         question=item.question,
         answer=answer_words(item.ask),
@@ -213,7 +212,7 @@ def test_another_author_by_files(source, items):
         for n, i in enumerate(reversed(items[:40]), 1)
     ]
     rows[3][1]["answer"] = "no idea"
-    back = sift(adapter.candidates(rows, asks), contacts)
+    back = apply_rules(adapter.candidates(rows, asks), contacts)
     assert len(back.kept) == 39
     assert back.counts["missing answer"] == 1
     (removed,) = adapter.rejected(back.removed)

@@ -23,4 +23,4 @@ def test_everything_is_reported(directory):
 
 def test_a_test_set_has_questions():
     with pytest.raises(ValueError, match="vtv_items is 0"):
-        paper_audit.AuditConfig(vtv_items=0)
+        paper_audit.PaperAuditConfig(vtv_items=0)

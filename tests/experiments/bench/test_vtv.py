@@ -55,7 +55,7 @@ def test_recordings_are_matched_to_names_by_hand():
     label = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [2, 2, 2, 2]])
     for k, given in enumerate(ASSIGNMENTS):
         one = np.zeros((1, 2), int)
-        tasks = vtv.Tasks(
+        tasks = vtv.VTVTasks(
             label=label, pairs=one, pair_of=one[0, :1], threes=np.zeros((1, 3), int), three_of=one[0, :1],
             most=np.array([True]), names=np.array([[0, 1, 2]]), shown=np.array([k]), fits=one, scenario=one[0, :1],
         )  # fmt: skip

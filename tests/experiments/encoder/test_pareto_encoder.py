@@ -7,8 +7,8 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import pareto_encoder
-from experiments.encoder.data import TouchConfig
-from experiments.encoder.pareto_encoder import Measured, choose, loss, pieces_table
+from experiments.encoder.data import StageOneDataConfig
+from experiments.encoder.pareto_encoder import MeasuredVariant, choose, loss, pieces_table
 from experiments.encoder.pretrain import PretrainConfig
 from experiments.encoder.variants import REFERENCE, variants
 from tests.experiments import tiny
@@ -19,9 +19,9 @@ from touchr1_jax.training.evidence import ProbeConfig
 LADDER = {v.name: v for v in variants(PretrainConfig(frames=8))}
 
 
-def measured(name: str, seconds: float, choosing: list[bool], right: list[bool]) -> Measured:
+def measured(name: str, seconds: float, choosing: list[bool], right: list[bool]) -> MeasuredVariant:
     answers = {"choosing": np.array(choosing)[:, None], "right": np.array(right)[:, None]}
-    return Measured(variant=LADDER[name], **answers, seconds=seconds, gflop=1.0)
+    return MeasuredVariant(variant=LADDER[name], **answers, seconds=seconds, gflop=1.0)
 
 
 def test_the_fastest_within_a_point_on_validation_is_chosen_whatever_the_test_says():
@@ -48,8 +48,10 @@ def test_parts_add_up_to_the_whole():
 
 @pytest.mark.slow
 def test_every_variant_stands_in_the_table(tmp_path, cache_dir):
-    config = pareto_encoder.Config(
-        touch=TouchConfig(scenes=dataclasses.replace(tiny.SCENES, frames=8), probe=ProbeConfig(folds=2, iterations=2)),
+    config = pareto_encoder.ParetoEncoderConfig(
+        touch=StageOneDataConfig(
+            scenes=dataclasses.replace(tiny.SCENES, frames=8), probe=ProbeConfig(folds=2, iterations=2)
+        ),
         pretrain=PretrainConfig(
             encoder=dataclasses.replace(PretrainConfig().encoder, width=12, num_layers=1),
             predictor=PredictorConfig(width=12, num_layers=1),

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain as module
-from experiments.encoder.data import TouchConfig, watched
+from experiments.encoder.data import StageOneDataConfig, watched
 from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain, starting_from, untrained
 from experiments.encoder.variants import STUDIED, FieldsOnly, variants
 from sensors_io.pipeline import make_clip
@@ -26,7 +26,7 @@ CONFIG = PretrainConfig(
     batch_size=2,
     probe_every=2,
 )
-TOUCH = TouchConfig(probe_fit=6, probe=ProbeConfig(folds=2, iterations=3))
+TOUCH = StageOneDataConfig(probe_fit=6, probe=ProbeConfig(folds=2, iterations=3))
 
 
 class Stop(RuntimeError):

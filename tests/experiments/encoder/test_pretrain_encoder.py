@@ -8,7 +8,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import pretrain_encoder
-from experiments.encoder.data import TouchConfig
+from experiments.encoder.data import StageOneDataConfig
 from experiments.encoder.pretrain import PretrainConfig
 from experiments.study.assembly import assemble
 from experiments.study.pretrained import load_encoder
@@ -19,7 +19,7 @@ from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.training.evidence import ProbeConfig
 
-TOUCH = TouchConfig(scenes=tiny.SCENES, probe=ProbeConfig(folds=2, iterations=3))
+TOUCH = StageOneDataConfig(scenes=tiny.SCENES, probe=ProbeConfig(folds=2, iterations=3))
 PRETRAIN = PretrainConfig(
     encoder=dataclasses.replace(tiny.MODEL.tactile, causal=True),
     predictor=PredictorConfig(width=8, num_layers=1, num_heads=2),
@@ -32,7 +32,7 @@ PRETRAIN = PretrainConfig(
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory, cache_dir):
-    config = pretrain_encoder.Config(touch=TOUCH, pretrain=PRETRAIN, watch_fit=6)
+    config = pretrain_encoder.PretrainEncoderConfig(touch=TOUCH, pretrain=PRETRAIN, watch_fit=6)
     return run_shrunk(pretrain_encoder, config, tmp_path_factory.mktemp("runs"), "--cache-dir", str(cache_dir))
 
 

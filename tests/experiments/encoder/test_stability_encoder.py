@@ -7,15 +7,15 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import stability_encoder
-from experiments.encoder.data import TouchConfig
-from experiments.encoder.stability_encoder import ARMS, Outcome
+from experiments.encoder.data import StageOneDataConfig
+from experiments.encoder.stability_encoder import ARMS, CollapseOutcome
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.training.evidence import ProbeConfig
 
 TINY = dataclasses.replace(
     stability_encoder.SMOKE,
-    touch=TouchConfig(scenes=dataclasses.replace(tiny.SCENES, split_shares=(0.6, 0.2, 0.2))),
+    touch=StageOneDataConfig(scenes=dataclasses.replace(tiny.SCENES, split_shares=(0.6, 0.2, 0.2))),
     encoder=dataclasses.replace(stability_encoder.DEFAULT.encoder, width=8, num_layers=0, stem_px=4, stem_width=2),
     batch_size=3,
     probe=ProbeConfig(folds=2, iterations=2),
@@ -48,7 +48,7 @@ def test_failure_is_told_by_what_is_left_and_alarms_by_measurements():
         "rank_share": np.full((2, 3), 0.5),
         "skill": np.full((2, 3), 0.3),
     }
-    outcome = Outcome(arm=ARMS[0], looks=looks, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
+    outcome = CollapseOutcome(arm=ARMS[0], looks=looks, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
     np.testing.assert_array_equal(outcome.failed, [False, True])
     np.testing.assert_array_equal(outcome.alarmed, [False, True])
     assert outcome.first_alarm(1) == 2

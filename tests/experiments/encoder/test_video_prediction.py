@@ -7,23 +7,23 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import video_prediction
-from experiments.encoder.data import TouchConfig
-from experiments.encoder.film import FilmConfig
-from experiments.encoder.film_scores import COPY, MEAN, Scores, mean_frames
+from experiments.encoder.data import StageOneDataConfig
 from experiments.encoder.video_prediction import SIGHT, TOUCH
+from experiments.encoder.video_scores import COPY, MEAN, FrameScores, mean_frames
+from experiments.encoder.video_training import VideoTrainingConfig
 from sensors_io.pipeline import clip_batches
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig
 
-TINY = video_prediction.Config(
-    touch=TouchConfig(scenes=dataclasses.replace(tiny.SCENES)),
+TINY = video_prediction.VideoPredictionConfig(
+    touch=StageOneDataConfig(scenes=dataclasses.replace(tiny.SCENES)),
     frames=4,
     image_px=28,
     skips=(1, 2),
     tactile=dataclasses.replace(tiny.MODEL.tactile, causal=True),
     decoder=FrameDecoderConfig(width=4, num_layers=1),
-    film=FilmConfig(steps=2, batch_size=2),
+    film=VideoTrainingConfig(steps=2, batch_size=2),
     scored=3,
     mean_of=4,
 )
@@ -56,6 +56,6 @@ def test_mean_frames_are_means_of_what_was_recorded(data, context):
 
 def test_scores_leave_out_what_is_missing():
     values = np.array([[[1.0, np.nan, 7.0]], [[3.0, 5.0, 9.0]]])
-    scores = Scores(values={"l1": values}, skips=np.array([3, 3, 5]))
+    scores = FrameScores(values={"l1": values}, skips=np.array([3, 3, 5]))
     np.testing.assert_array_equal(scores.of("l1", 3), [1, 4])
     np.testing.assert_array_equal(scores.by_sensor("l1", 3), [3])

@@ -13,12 +13,12 @@ from sensors_io.schema import FRAME_ARRAYS, UNKNOWN, ContactKey, ObjectCard, Seq
 from touchr1_jax.bench.items import Touch
 
 
-class FactsError(ValueError):
+class ContactError(ValueError):
     """Records that no questions can be made of; the message names what is missing and the fix."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Contact:
+class MeasuredContact:
     """One contact: its labels by attribute, what each sensor measured, a fingerprint of what was recorded."""
 
     touch: Touch
@@ -29,22 +29,22 @@ class Contact:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Facts:
+class SplitContacts:
     """The contacts of one split, and how many recordings measured nothing, by reason."""
 
-    contacts: tuple[Contact, ...]
+    contacts: tuple[MeasuredContact, ...]
     skipped: Mapping[str, int]
 
     def objects(self) -> set[str]:
         """The objects that have a label."""
         return {contact.touch.object for contact in self.contacts if contact.labels}
 
-    def by_touch(self) -> dict[Touch, Contact]:
+    def by_touch(self) -> dict[Touch, MeasuredContact]:
         """Every contact by its name."""
         return {contact.touch: contact for contact in self.contacts}
 
 
-def gather(store: RecordStore, split: str, tell: Callable[[], None] = lambda: None) -> Facts:
+def measure_split(store: RecordStore, split: str, tell: Callable[[], None] = lambda: None) -> SplitContacts:
     """Read and measure the contacts of a split, those of unlabelled objects too.
 
     Args:
@@ -64,13 +64,13 @@ def gather(store: RecordStore, split: str, tell: Callable[[], None] = lambda: No
         if measured:
             contacts.append(_contact(store.contacts[i], card, recorded, measured))
         tell()
-    return Facts(contacts=tuple(contacts), skipped=dict(skipped))
+    return SplitContacts(contacts=tuple(contacts), skipped=dict(skipped))
 
 
 def _contact(
     key: ContactKey, card: ObjectCard, recorded: Mapping[str, Sequence], measured: Mapping[str, Measured]
-) -> Contact:
-    return Contact(
+) -> MeasuredContact:
+    return MeasuredContact(
         touch=Touch(object=key.object_id, site=key.site, motion=key.motion, trial=key.trial),
         labels={name: level for name, level in card.labels.items() if level != UNKNOWN},
         deceptive=card.visual_lies,

@@ -14,14 +14,14 @@ SIDE_IN, DPI = 1.5, 150
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Strip:
+class FrameStrip:
     """One row: its title, and frames [H, W, 3] in [0, 1] by name."""
 
     title: str
     frames: Mapping[str, np.ndarray]
 
 
-def film_strip(strips: Sequence[Strip]) -> bytes:
+def video_strip(strips: Sequence[FrameStrip]) -> bytes:
     """All rows as a PNG; names stand above the first row."""
     columns = max(len(strip.frames) for strip in strips)
     with mpl.rc_context(LOOK | {"axes.grid": False}):

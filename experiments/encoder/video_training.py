@@ -19,7 +19,7 @@ from touchr1_jax.types import Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FilmConfig:
+class VideoTrainingConfig:
     """Training of one predictor."""
 
     steps: int = 300
@@ -28,9 +28,9 @@ class FilmConfig:
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=200.0)
 
 
-def train_film(
+def train_predictor(
     video: VideoConfig,
-    config: FilmConfig,
+    config: VideoTrainingConfig,
     data: Dataset,
     rows: np.ndarray,
     context: Context,

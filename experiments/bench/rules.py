@@ -11,8 +11,8 @@ import collections
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from experiments.bench.facts import Contact
-from experiments.bench.languages import understand
+from experiments.bench.contacts import MeasuredContact
+from experiments.bench.wording import understand
 from sensors_io.measures import UNITS, Measured
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import Ask, Citation, Item, Touch
@@ -28,7 +28,7 @@ MARGIN = 0.02
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Candidate:
+class CandidateItem:
     """An item before the rules: `answer` is what its author holds to be right, in the words of its language."""
 
     ask: Ask
@@ -43,11 +43,11 @@ class Candidate:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Filtered:
+class FilteredItems:
     """What passed, and what did not with the rule that it broke."""
 
     kept: tuple[Item, ...]
-    removed: tuple[tuple[Candidate, str], ...]
+    removed: tuple[tuple[CandidateItem, str], ...]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -56,7 +56,7 @@ class Filtered:
         return {rule: counted[rule] for rule in RULES}
 
 
-def sift(candidates: Iterable[Candidate], contacts: Mapping[Touch, Contact]) -> Filtered:
+def apply_rules(candidates: Iterable[CandidateItem], contacts: Mapping[Touch, MeasuredContact]) -> FilteredItems:
     """Apply the rules.
 
     Args:
@@ -70,10 +70,10 @@ def sift(candidates: Iterable[Candidate], contacts: Mapping[Touch, Contact]) -> 
             kept.append(candidate.item())
         else:
             removed.append((candidate, rule))
-    return Filtered(kept=tuple(kept), removed=tuple(removed))
+    return FilteredItems(kept=tuple(kept), removed=tuple(removed))
 
 
-def broken_rule(candidate: Candidate, contacts: Mapping[Touch, Contact]) -> str | None:
+def broken_rule(candidate: CandidateItem, contacts: Mapping[Touch, MeasuredContact]) -> str | None:
     """The first rule that a candidate breaks; `None` if it passes."""
     ask = candidate.ask
     shown = [contacts.get(touch) for touch in ask.touches]
@@ -93,7 +93,7 @@ def broken_rule(candidate: Candidate, contacts: Mapping[Touch, Contact]) -> str 
     return None if concluded == answered else "contradiction"
 
 
-def true_answer(ask: Ask, shown: list[Contact]) -> tuple[int, ...] | None:
+def true_answer(ask: Ask, shown: list[MeasuredContact]) -> tuple[int, ...] | None:
     """The right answer by the labels of the records; `None` where they allow none, such as a tie."""
     if any(name not in contact.labels for contact in shown for name in ask.attributes):
         return None
@@ -111,11 +111,11 @@ def _levels(ask: Ask, answer: str) -> tuple[int, ...]:
     return understand(ask, f"<perceive> . </perceive> <compare> . </compare> <conclude> {answer} </conclude>")[1]
 
 
-def _of(citation: Citation, shown: list[Contact]) -> Measured:
+def _of(citation: Citation, shown: list[MeasuredContact]) -> Measured:
     return shown[citation.touch].measured[citation.sensor]
 
 
-def _inside(citation: Citation, ask: Ask, shown: list[Contact]) -> bool:
+def _inside(citation: Citation, ask: Ask, shown: list[MeasuredContact]) -> bool:
     if not 0 <= citation.touch < len(shown) or citation.sensor not in ask.sensors:
         return False
     if citation.sensor not in shown[citation.touch].measured:
@@ -125,7 +125,7 @@ def _inside(citation: Citation, ask: Ask, shown: list[Contact]) -> bool:
     return left - MARGIN <= x <= right + MARGIN and top - MARGIN <= y <= bottom + MARGIN
 
 
-def _measured(citation: Citation, shown: list[Contact]) -> bool:
+def _measured(citation: Citation, shown: list[MeasuredContact]) -> bool:
     quantities = _of(citation, shown).quantities
     if citation.quantity not in quantities or citation.unit != UNITS[citation.quantity]:
         return False

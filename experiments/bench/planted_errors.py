@@ -3,16 +3,16 @@
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from experiments.bench.facts import Contact
-from experiments.bench.filters import MARGIN, RULES, Candidate, broken_rule
-from experiments.bench.languages import answer_words, choices, language_of
+from experiments.bench.contacts import MeasuredContact
+from experiments.bench.rules import MARGIN, RULES, CandidateItem, broken_rule
+from experiments.bench.wording import answer_words, choices, language_of
 from sensors_io.measures import Box
 from touchr1_jax.bench.items import Ask, Citation, Item, Touch
 
 
-def planted(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, Candidate]:
+def planted(item: Item, contacts: Mapping[Touch, MeasuredContact]) -> dict[str, CandidateItem]:
     """The item with one fault of each kind: rule → what must be caught by it."""
-    sound = Candidate(
+    sound = CandidateItem(
         ask=item.ask,
         question=item.question,
         answer=answer_words(item.ask),
@@ -20,7 +20,7 @@ def planted(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, Candidat
         evidence=item.evidence,
     )
     wrong = other_words(item.ask)
-    faults: Mapping[str, Callable[[], Candidate]] = {
+    faults: Mapping[str, Callable[[], CandidateItem]] = {
         "missing answer": lambda: dataclasses.replace(sound, rationale=_conclude(item, "")),
         "label conflict": lambda: dataclasses.replace(sound, answer=wrong, rationale=_conclude(item, wrong)),
         "outside contact": lambda: dataclasses.replace(sound, evidence=_moved(item.evidence, contacts, item.ask)),
@@ -32,7 +32,7 @@ def planted(item: Item, contacts: Mapping[Touch, Contact]) -> dict[str, Candidat
     return {rule: faults[rule]() for rule in RULES}
 
 
-def caught(items: Iterable[Item], contacts: Mapping[Touch, Contact]) -> dict[str, int]:
+def caught(items: Iterable[Item], contacts: Mapping[Touch, MeasuredContact]) -> dict[str, int]:
     """How many of the planted faults each rule catches; all would be the number of items."""
     counts = dict.fromkeys(RULES, 0)
     for item in items:
@@ -54,7 +54,7 @@ def _conclude(item: Item, words: str) -> str:
     return f"{head}<{tag}> {words} </{tag}>"
 
 
-def _moved(evidence: Sequence[Citation], contacts: Mapping[Touch, Contact], ask: Ask) -> tuple[Citation, ...]:
+def _moved(evidence: Sequence[Citation], contacts: Mapping[Touch, MeasuredContact], ask: Ask) -> tuple[Citation, ...]:
     """The first citation from the corner farthest from the contact; from no touch where that fills the window."""
     first = evidence[0]
     left, top, right, bottom = contacts[ask.touches[first.touch]].measured[first.sensor].box

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.bench.facts import Contact, FactsError
+from experiments.bench.contacts import ContactError, MeasuredContact
 from sensors_io.schema import LEVELS
 from touchr1_jax.bench.metrics import ORDINAL
 
@@ -28,7 +28,7 @@ LEAST_CONTACTS = 6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scale:
+class LevelThresholds:
     """The levels of an attribute on one quantity: `cuts` between them, and whether it rises with the level.
 
     `accuracy` is the balanced share of training contacts that it reads right.
@@ -46,13 +46,13 @@ class Scale:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Readings:
+class ThresholdReader:
     """All scales, by sensor and attribute, and the odds of the materials given the other levels.
 
     `log_odds[a][m, k]` is log P(level k of attribute a | material m) with one count added, `log_prior[m]` log P(m).
     """
 
-    scales: Mapping[tuple[str, str], Scale]
+    scales: Mapping[tuple[str, str], LevelThresholds]
     log_odds: Mapping[str, np.ndarray]
     log_prior: np.ndarray
 
@@ -61,7 +61,7 @@ class Readings:
         names = ORDINAL if attribute == "material" else (attribute,)
         return all((sensor, name) in self.scales for name in names)
 
-    def level(self, contact: Contact, sensor: str, attribute: str) -> int:
+    def level(self, contact: MeasuredContact, sensor: str, attribute: str) -> int:
         """What a sensor's measurements of a contact say."""
         if attribute != "material":
             scale = self.scales[sensor, attribute]
@@ -69,7 +69,7 @@ class Readings:
         said = {name: self.level(contact, sensor, name) for name in ORDINAL}
         return int(np.argmax(self.log_prior + sum(self.log_odds[name][:, level] for name, level in said.items())))
 
-    def can_read(self, contact: Contact, sensor: str, attribute: str) -> bool:
+    def can_read(self, contact: MeasuredContact, sensor: str, attribute: str) -> bool:
         """Whether the sensor measured what its scales need."""
         if sensor not in contact.measured or not self.knows(sensor, attribute):
             return False
@@ -77,7 +77,7 @@ class Readings:
         return all(self.scales[sensor, name].quantity in contact.measured[sensor].quantities for name in names)
 
 
-def fit(contacts: Sequence[Contact]) -> Readings:
+def fit_thresholds(contacts: Sequence[MeasuredContact]) -> ThresholdReader:
     """Fit every scale that the training contacts allow.
 
     Raises:
@@ -87,7 +87,7 @@ def fit(contacts: Sequence[Contact]) -> Readings:
     found = {(s, a): _best(contacts, s, a) for s, a in itertools.product(sensors, ORDINAL)}
     scales = {key: scale for key, scale in found.items() if scale is not None}
     if not scales:
-        raise FactsError(
+        raise ContactError(
             f"contacts holds {len(contacts)}: rationales need {LEAST_CONTACTS} training contacts with all three levels "
             "of an attribute; use more training objects"
         )
@@ -101,12 +101,12 @@ def fit(contacts: Sequence[Contact]) -> Readings:
                 if name in contact.labels:
                     odds[name][contact.labels["material"], contact.labels[name]] += 1
     log_odds = {name: np.log(table / table.sum(1, keepdims=True)) for name, table in odds.items()}
-    return Readings(scales=scales, log_odds=log_odds, log_prior=np.log(prior / prior.sum()))
+    return ThresholdReader(scales=scales, log_odds=log_odds, log_prior=np.log(prior / prior.sum()))
 
 
-def _best(contacts: Sequence[Contact], sensor: str, attribute: str) -> Scale | None:
+def _best(contacts: Sequence[MeasuredContact], sensor: str, attribute: str) -> LevelThresholds | None:
     """The quantity and the cuts that read most training contacts right; `None` where the levels are not all there."""
-    best: Scale | None = None
+    best: LevelThresholds | None = None
     for quantity in QUANTITIES[attribute]:
         rows = [
             (contact.measured[sensor].quantities[quantity], contact.labels[attribute])
@@ -123,7 +123,7 @@ def _best(contacts: Sequence[Contact], sensor: str, attribute: str) -> Scale | N
     return best
 
 
-def _cut(quantity: str, value: np.ndarray, level: np.ndarray) -> Scale:
+def _cut(quantity: str, value: np.ndarray, level: np.ndarray) -> LevelThresholds:
     """Two cuts and a direction of the greatest balanced accuracy.
 
     With c_k(q) the share of level k below cut q, cuts q ≤ r and a rising quantity are right in
@@ -137,7 +137,7 @@ def _cut(quantity: str, value: np.ndarray, level: np.ndarray) -> Scale:
     falling = (below[2, low] + middle + 1 - below[0, high]) / 3
     up = float(rising.max()) >= float(falling.max())
     at = int(np.argmax(rising if up else falling))
-    return Scale(
+    return LevelThresholds(
         quantity=quantity,
         cuts=(float(cuts[low[at]]), float(cuts[high[at]])),
         rising=up,

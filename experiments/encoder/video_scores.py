@@ -34,7 +34,7 @@ SCORE_BATCH = 8  # contacts that are scored at once; a clip of 8 frames by four 
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Film:
+class VideoPredictor:
     """A trained predictor."""
 
     config: VideoConfig
@@ -48,7 +48,7 @@ class Film:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scores:
+class FrameScores:
     """Scores of one method: metric → [contact, S, question], NaN where a stream or frame is missing.
 
     Question q asks about the frame after `skips[q]` others.
@@ -69,7 +69,7 @@ class Scores:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Judge:
+class FrameMetrics:
     """The metrics: L1 and SSIM, the distance of an encoder's features, LPIPS where there are weights for it."""
 
     encoder: TactileViTConfig
@@ -122,8 +122,13 @@ def mean_frames(data: Dataset, rows: np.ndarray, context: Context) -> np.ndarray
 
 
 def judged(
-    films: Mapping[str, Film], mean: np.ndarray, data: Dataset, rows: np.ndarray, judge: Judge, context: Context
-) -> dict[str, Scores]:
+    films: Mapping[str, VideoPredictor],
+    mean: np.ndarray,
+    data: Dataset,
+    rows: np.ndarray,
+    judge: FrameMetrics,
+    context: Context,
+) -> dict[str, FrameScores]:
     """Scores of every predictor, which all know the same skips, and of the baselines on some contacts.
 
     Args:
@@ -146,7 +151,7 @@ def judged(
             advance(count)
     asked = np.array([skips[k] for _, k in questions])
     return {
-        name: Scores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=asked)
+        name: FrameScores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=asked)
         for name, parts in blocks.items()
     }
 
@@ -155,7 +160,7 @@ GOAL, EXISTS = "goal", "exists"
 
 
 def answer_all(
-    films: Mapping[str, Film], mean: np.ndarray, batch: TouchBatch, t: int, k: int, skips: tuple[int, ...]
+    films: Mapping[str, VideoPredictor], mean: np.ndarray, batch: TouchBatch, t: int, k: int, skips: tuple[int, ...]
 ) -> dict[str, np.ndarray]:
     """Every method's frames for the question (t, skip number k), the true ones and whether they exist."""
     shape = batch.stream_mask.shape
