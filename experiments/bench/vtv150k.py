@@ -33,7 +33,7 @@ from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
-from experiments.mechanics.identify_motions import Moved, feel, rows_of
+from experiments.mechanics.identify_motions import MotionData, feel, rows_of
 from experiments.mechanics.identify_probes import transfer
 from experiments.study import paper_numbers as paper
 from experiments.study.paper_numbers import differences_table
@@ -138,7 +138,7 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
     return {name: [rows[object_id] for object_id in shared] for name, rows in first.items()}
 
 
-def together(moved: Sequence[Moved]) -> RecordingFeatures:
+def together(moved: Sequence[MotionData]) -> RecordingFeatures:
     """Contacts of several motions with the same objects, side by side."""
     beside = lambda parts: np.concatenate(list(parts), 1)
     touch = {sensor: beside(m.touch[s] for m in moved) for s, sensor in enumerate(SENSORS)}

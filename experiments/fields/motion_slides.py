@@ -67,27 +67,27 @@ def make_slides(
       frames: of a sequence.
       seed: of objects and noise.
     """
-    bench = scenes.make_bench(sensor, NODES * _PER_NODE)
+    kernels = scenes.friction_kernels(sensor, NODES * _PER_NODE)
     made = []
     for i, (kind, name) in enumerate((k, m) for k in kinds for m in motions):
         rng = np.random.default_rng([seed, i])
-        true = jax.device_get(_solve(bench, scenes.make_motion(bench, scenes.draw(rng, kind), name, frames)))
+        true = jax.device_get(_solve(kernels, scenes.make_motion(kernels, scenes.draw(rng, kind), name, frames)))
         made.append(_measured(sensor, name, kind, true, rng))
     return made
 
 
 @jax.jit
-def _solve(bench: scenes.Bench, motion: scenes.Motion) -> dict[str, jax.Array]:
+def _solve(kernels: scenes.FrictionKernels, motion: scenes.FrictionSequence) -> dict[str, jax.Array]:
     """Displacement [F, 3, N, N], its part by traction, load and resultants of every frame."""
-    series = in_series(bench.gel, bench.body, 1.0, motion.modulus_mpa)
-    bodies = drag.Bodies(compliance=series, coupling=None, response=bench.markers)
+    series = in_series(kernels.gel, kernels.body, 1.0, motion.modulus_mpa)
+    bodies = drag.Bodies(compliance=series, coupling=None, response=kernels.markers)
 
     def advance(history: drag.History, at: tuple[jax.Array, drag.Step]) -> tuple[drag.History, dict[str, jax.Array]]:
         pressure, step = at
-        history, frame = drag.advance(history, pressure, motion.friction, step, bodies, bench.x_mm)
+        history, frame = drag.advance(history, pressure, motion.friction, step, bodies, kernels.x_mm)
         traction = frame.traction_mpa
-        force, moment = resultant(pressure, traction, bench.x_mm, bench.spacing_mm)
-        sheared = shear_displacement(traction, bench.markers.shear)
+        force, moment = resultant(pressure, traction, kernels.x_mm, kernels.spacing_mm)
+        sheared = shear_displacement(traction, kernels.markers.shear)
         return history, {
             "displacement": frame.displacement_mm,
             "shear": jnp.stack([sheared.real, sheared.imag]),
@@ -96,7 +96,7 @@ def _solve(bench: scenes.Bench, motion: scenes.Motion) -> dict[str, jax.Array]:
             "moment": moment,
         }
 
-    return jax.lax.scan(advance, drag.at_rest(bench.x_mm.shape[0]), (motion.pressure_mpa, motion.step))[1]
+    return jax.lax.scan(advance, drag.at_rest(kernels.x_mm.shape[0]), (motion.pressure_mpa, motion.step))[1]
 
 
 def _measured(

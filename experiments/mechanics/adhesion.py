@@ -30,7 +30,7 @@ _TOLERANCE, _ITERATIONS = 1e-4, 400
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Threshold:
+class AdhesionThreshold:
     """A rigid sphere on one gel: force up to which frames are flagged, and up to which adhesion counts, N."""
 
     sensor: str
@@ -44,13 +44,13 @@ class Threshold:
         return self.counts_n / self.flagged_n
 
 
-def thresholds(grid: int, context: Context) -> list[Threshold]:
+def thresholds(grid: int, context: Context) -> list[AdhesionThreshold]:
     """Every gel and radius, with the generator's work of adhesion and tolerance."""
     spheres = itertools.product(MODELS, RADII_MM)
     return [_threshold(sensor, radius, grid) for sensor, radius in context.each("adhesion", spheres)]
 
 
-def threshold_table(found: list[Threshold]) -> Table:
+def threshold_table(found: list[AdhesionThreshold]) -> Table:
     """All of them."""
     config = SceneConfig()
     return Table(
@@ -67,7 +67,7 @@ def threshold_table(found: list[Threshold]) -> Table:
     )
 
 
-def _threshold(sensor: SensorModel, radius_mm: float, grid: int) -> Threshold:
+def _threshold(sensor: SensorModel, radius_mm: float, grid: int) -> AdhesionThreshold:
     config = SceneConfig()
     work = 1e-3 * config.adhesion_j_per_m2  # N/mm
     sphere = adhesion.Adhesion(
@@ -79,7 +79,7 @@ def _threshold(sensor: SensorModel, radius_mm: float, grid: int) -> Threshold:
     stable = slice(int(np.argmin(stuck_force)), None)
     wider = np.sqrt(area[stable] / np.interp(stuck_force[stable], force, area)) - 1
     counts = (wider > config.adhesion_tolerance) & (stuck_force[stable] >= force[0])
-    return Threshold(
+    return AdhesionThreshold(
         sensor=sensor.name,
         radius_mm=radius_mm,
         flagged_n=flagged,

@@ -59,7 +59,7 @@ FAMILIES: Mapping[str, Callable[[np.random.Generator, Solid], Solid]] = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Batch:
+class SceneBatch:
     """S scenes on one gel: gaps [S, n, n] mm by the side n, forces [S] N, moduli [S] MPa, families [S]."""
 
     sensor: SensorModel
@@ -75,7 +75,7 @@ class Batch:
 
 def draw(
     sensor: SensorModel, count: int, grids: Sequence[int], reference: int, families: Sequence[str], seed: int
-) -> Batch:
+) -> SceneBatch:
     """Draw scenes: an object of each family in turn, a pose near the apex, a log-uniform force.
 
     Gaps are evaluated on the reference's grid, and averaged to all coarser ones, whose sides must divide its own.
@@ -96,7 +96,7 @@ def draw(
         gaps.append(jax.device_get(_gaps(skin, pose, x, sides)))
         forces.append(np.exp(rng.uniform(*np.log(FORCES_N))))
         moduli.append(solid.modulus_mpa)
-    return Batch(
+    return SceneBatch(
         sensor=sensor,
         gap_mm={n: np.stack([g[n] for g in gaps]) for n in sides},
         force_n=np.array(forces, np.float32),

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
-from experiments.mechanics.chooser_measure import Outcomes
+from experiments.mechanics.chooser_measure import MenuMeasurements
 from sensors_io.scenes.chooser_law import EASY_ABOVE, SLACK, Law, Setting, log_error, margin_at
 from sensors_io.scenes.chooser_survey import FEATURES
 
@@ -41,7 +41,7 @@ def start() -> Law:
     )
 
 
-def fit(outcomes: Outcomes, menu: tuple[Setting, ...]) -> Law:
+def fit(outcomes: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
     """Fit the law's coefficients to measured errors; its margins are left at 1."""
     counts = (outcomes.errors > RANGE[0]) & (outcomes.errors < RANGE[1])
     theta, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start()))
@@ -63,7 +63,7 @@ def fit(outcomes: Outcomes, menu: tuple[Setting, ...]) -> Law:
     return jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
 
 
-def predict(law: Law, outcomes: Outcomes, menu: tuple[Setting, ...]) -> np.ndarray:
+def predict(law: Law, outcomes: MenuMeasurements, menu: tuple[Setting, ...]) -> np.ndarray:
     """ê of every scene and setting, [S, T]."""
     return np.exp(np.asarray(log_error(outcomes.survey, law, menu)))
 

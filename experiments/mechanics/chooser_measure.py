@@ -16,7 +16,7 @@ from jaxtyping import Array
 from scipy.ndimage import zoom
 
 from experiments.core.timing import interleaved
-from experiments.mechanics.chooser_draw import Batch
+from experiments.mechanics.chooser_draw import SceneBatch
 from sensors_io import layer
 from sensors_io.scenes import chooser, contact, nested
 from sensors_io.scenes.batching import chunks, gather, map_live
@@ -35,7 +35,7 @@ ROUNDS = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Outcomes:
+class MenuMeasurements:
     """What was measured of S scenes in B batches under T settings, each solved from scratch.
 
     Features [S, K] and lengths [S] of the surveys; errors [S, T], the greater of displacement's and slope's; ms a scene
@@ -62,10 +62,10 @@ class Outcomes:
         return {name: v.tolist() if isinstance(v, np.ndarray) else list(v) for name, v in fields.items()}
 
 
-def join(parts: Sequence[Mapping[str, Any]]) -> Outcomes:
+def join(parts: Sequence[Mapping[str, Any]]) -> MenuMeasurements:
     """The outcomes of several batches, each as `Outcomes.to_json` gives it."""
     arrays = {name: np.concatenate([np.asarray(p[name]) for p in parts]) for name in parts[0] if name != "family"}
-    return Outcomes(family=tuple(f for p in parts for f in p["family"]), **arrays)
+    return MenuMeasurements(family=tuple(f for p in parts for f in p["family"]), **arrays)
 
 
 def stage_of(sensor: SensorModel) -> Stage:
@@ -73,7 +73,7 @@ def stage_of(sensor: SensorModel) -> Stage:
     return Stage(gel=sensor.gel, body=BODY, window_mm=sensor.window_mm)
 
 
-def measure(batch: Batch, menu: Iterable[Setting], true: Array) -> Outcomes:
+def measure(batch: SceneBatch, menu: Iterable[Setting], true: Array) -> MenuMeasurements:
     """Errors and times of all settings."""
     everything = np.arange(len(batch.force_n))
     errors, ms = [], []
@@ -83,16 +83,16 @@ def measure(batch: Batch, menu: Iterable[Setting], true: Array) -> Outcomes:
         ms.append(1e3 * np.median(interleaved({"": call}, range(ROUNDS))[""]) / len(everything))
     seen = chooser.look(1.0, batch.gaps, batch.force_n, batch.modulus_mpa, stage_of(batch.sensor)).survey
     surveys = {f.name: np.asarray(getattr(seen, f.name)) for f in dataclasses.fields(Survey)}
-    return Outcomes(errors=np.stack(errors, 1), ms=np.array([ms]), family=batch.family, **surveys)
+    return MenuMeasurements(errors=np.stack(errors, 1), ms=np.array([ms]), family=batch.family, **surveys)
 
 
-def reference(batch: Batch, grid: int) -> Array:
+def reference(batch: SceneBatch, grid: int) -> Array:
     """Displacement on half the reference's grid, [S, K, K]."""
     setting = Setting(grid=grid, padded=round(grid * REFERENCE_PADDING), tolerance=REFERENCE_TOLERANCE)
     return jax.vmap(lambda u: nested.coarsen(u, 2))(from_scratch(batch, setting, np.arange(len(batch.force_n))))
 
 
-def from_scratch(batch: Batch, setting: Setting, rows: np.ndarray) -> np.ndarray:
+def from_scratch(batch: SceneBatch, setting: Setting, rows: np.ndarray) -> np.ndarray:
     """Displacement of some scenes under one setting, [R, n, n]."""
     spacing = batch.sensor.window_mm / setting.grid
     gel, body = _spectra(batch.sensor, setting.padded, spacing)

@@ -1,7 +1,7 @@
 """Whether generated sequences keep the error asked for: frames of `SceneConfig.error`, against a finer solution.
 
 Frames are drawn from those that touch, so most are not among the few that `effort.choose` looks at, and are solved as
-`press.record` solves them.  The reference is that of the chooser's bench.
+`press.record` solves them.  The reference is that of the chooser's measurement (`chooser_measure`).
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.mechanics import chooser_measure as bench
+from experiments.mechanics import chooser_measure as measured
 from sensors_io import layer
 from sensors_io.scenes import contact, effort, nested, protocol
 from sensors_io.scenes.config import SceneConfig
@@ -28,7 +28,7 @@ FRAMES = 6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Kept:
+class SequenceTrial:
     """One error asked for, over S sequences: grid, whether it is promised [S], motions, error of frames [S, FRAMES]."""
 
     asked: float
@@ -43,13 +43,13 @@ class Kept:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in fields.items()}
 
 
-def join(parts: Sequence[Mapping[str, Any]]) -> Kept:
+def join(parts: Sequence[Mapping[str, Any]]) -> SequenceTrial:
     """The sequences of several sensors at one error, each as `Kept.to_json` gives it."""
     arrays = {name: np.concatenate([np.asarray(p[name]) for p in parts]) for name in ("grid", "met", "error")}
-    return Kept(asked=parts[0]["asked"], motion=tuple(m for p in parts for m in p["motion"]), **arrays)
+    return SequenceTrial(asked=parts[0]["asked"], motion=tuple(m for p in parts for m in p["motion"]), **arrays)
 
 
-def try_out(order: int, count: int, asked: Sequence[float], reference: int, seed: int) -> list[Kept]:
+def try_out(order: int, count: int, asked: Sequence[float], reference: int, seed: int) -> list[SequenceTrial]:
     """Choose and solve `count` sequences of sensor `order` at every error asked for, presses and motions by turns."""
     config = SceneConfig(objects=count, sequences=2 * count * len(MODELS), frames=20, seed=seed)
     rng = np.random.default_rng([seed, order])
@@ -66,15 +66,15 @@ def _some_frames(drawn: Draw, rng: np.random.Generator) -> Path:
     return jax.tree.map(lambda leaf: leaf[frames], drawn.press.path)
 
 
-def _kept(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: Array) -> Kept:
+def _kept(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: Array) -> SequenceTrial:
     """The sequences at one error, solved as chosen."""
     efforts = [effort.choose(asked, d.press, d.unit.modulus_factor, d.sensor) for d in drawn]
     errors = []
     for k, (each, path, how) in enumerate(zip(drawn, paths, efforts, strict=True)):
         grid = Grid(contact_grid=how.grid, image_px=how.grid)
         found = _solve(each.press, path, each.unit, make_kernels(each.sensor, grid), how.tolerance, each.sensor, grid)
-        errors.append(bench.errors_of(found, true[k * FRAMES : (k + 1) * FRAMES]))
-    return Kept(
+        errors.append(measured.errors_of(found, true[k * FRAMES : (k + 1) * FRAMES]))
+    return SequenceTrial(
         asked=asked,
         grid=np.array([e.grid for e in efforts]),
         met=np.array([e.met for e in efforts]),
@@ -87,14 +87,14 @@ def _reference(drawn: Draw, path: Path, grid: int) -> Array:
     """Displacement on half the reference's grid, [FRAMES, K, K]."""
     sides = Grid(contact_grid=grid, image_px=grid)
     kernels = _widely_padded(drawn.sensor, grid)
-    found = _solve(drawn.press, path, drawn.unit, kernels, bench.REFERENCE_TOLERANCE, drawn.sensor, sides)
+    found = _solve(drawn.press, path, drawn.unit, kernels, measured.REFERENCE_TOLERANCE, drawn.sensor, sides)
     return jax.vmap(lambda u: nested.coarsen(u, 2))(found)
 
 
 @functools.lru_cache(maxsize=2)
 def _widely_padded(sensor: SensorModel, grid: int) -> Kernels:
-    """Kernels of the normal contact alone, with the padding of the bench's reference."""
-    q = np.hypot(*layer.wave_numbers(round(grid * bench.REFERENCE_PADDING), sensor.window_mm / grid))
+    """Kernels of the normal contact alone, with the padding of the reference solution."""
+    q = np.hypot(*layer.wave_numbers(round(grid * measured.REFERENCE_PADDING), sensor.window_mm / grid))
     gel, body = (jnp.asarray(layer.normal_compliance(q, each), jnp.float32) for each in (sensor.gel, BODY))
     coarse = make_kernels(sensor, Grid(contact_grid=effort.GRIDS[0], image_px=effort.GRIDS[0]))
     return dataclasses.replace(coarse, gel=gel, body=body)

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array
 
 from experiments.core.timing import interleaved
-from experiments.mechanics import chooser_measure as bench
-from experiments.mechanics.chooser_draw import Batch
+from experiments.mechanics import chooser_measure as measured
+from experiments.mechanics.chooser_draw import SceneBatch
 from sensors_io.scenes import chooser
 from sensors_io.scenes.chooser_law import MENU, SLACK, Setting
 
@@ -18,7 +18,7 @@ SHARE = 0.95
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Trial:
+class ChooserTrial:
     """One error asked for, over S scenes: index of the setting in `MENU`, whether it is promised to be met, error [S].
 
     `best` is the index of the cheapest setting that meets the error in hindsight, −1 where none does.  `seconds` and
@@ -41,10 +41,10 @@ class Trial:
         return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in fields.items()}
 
 
-def join(parts: Sequence[Mapping[str, Any]]) -> Trial:
+def join(parts: Sequence[Mapping[str, Any]]) -> ChooserTrial:
     """The trials of several batches at one error, each as `Trial.to_json` gives it."""
     arrays = {name: np.concatenate([np.asarray(p[name]) for p in parts]) for name in parts[0] if name != "asked"}
-    return Trial(asked=parts[0]["asked"], **arrays)
+    return ChooserTrial(asked=parts[0]["asked"], **arrays)
 
 
 def in_hindsight(errors: np.ndarray, cost: np.ndarray, asked: float) -> np.ndarray:
@@ -54,18 +54,18 @@ def in_hindsight(errors: np.ndarray, cost: np.ndarray, asked: float) -> np.ndarr
 
 
 def try_out(
-    batch: Batch, menu: tuple[Setting, ...], errors: np.ndarray, cost: np.ndarray, asked: float, true: Array
-) -> Trial:
+    batch: SceneBatch, menu: tuple[Setting, ...], errors: np.ndarray, cost: np.ndarray, asked: float, true: Array
+) -> ChooserTrial:
     """Let the chooser solve all scenes, then time it against hindsight on those that some setting meets."""
-    stage, best = bench.stage_of(batch.sensor), in_hindsight(errors, cost, asked)
+    stage, best = measured.stage_of(batch.sensor), in_hindsight(errors, cost, asked)
     solved = chooser.solve_many(asked, batch.gaps, batch.force_n, batch.modulus_mpa, stage)
     achieved = np.empty(len(best))
     for bucket in solved.buckets:
-        achieved[bucket.rows] = bench.errors_of(bucket.contacts.displacement_mm, true[bucket.rows])
+        achieved[bucket.rows] = measured.errors_of(bucket.contacts.displacement_mm, true[bucket.rows])
     possible = np.nonzero(best >= 0)[0]
     seconds = _race(batch, menu, best, possible, asked) if len(possible) else {"chooser": 0.0, "hindsight": 0.0}
     settings = [Setting(grid=c.grid, padded=c.padded, tolerance=c.tolerance) for c in solved.choices]
-    return Trial(
+    return ChooserTrial(
         asked=asked,
         index=np.array([MENU.index(s) for s in settings]),
         met=np.array([c.met for c in solved.choices]),
@@ -77,7 +77,7 @@ def try_out(
     )
 
 
-def summary(trial: Trial, errors: np.ndarray, cost: np.ndarray) -> dict[str, float]:
+def summary(trial: ChooserTrial, errors: np.ndarray, cost: np.ndarray) -> dict[str, float]:
     """The figures of a trial; times are ms a scene."""
     kept = trial.error <= SLACK * trial.asked
     possible, reachable = trial.best >= 0, (errors <= SLACK * trial.asked).any(1)
@@ -106,17 +106,17 @@ def cheapest_fixed(errors: np.ndarray, cost: np.ndarray, asked: float) -> float:
 
 
 def _race(
-    batch: Batch, menu: tuple[Setting, ...], best: np.ndarray, possible: np.ndarray, asked: float
+    batch: SceneBatch, menu: tuple[Setting, ...], best: np.ndarray, possible: np.ndarray, asked: float
 ) -> dict[str, float]:
     """Seconds of the chooser and of hindsight over the same scenes, medians of visits in turn."""
-    stage = bench.stage_of(batch.sensor)
+    stage = measured.stage_of(batch.sensor)
     some = lambda grid, rows: batch.gaps(grid, possible[rows])
     given = batch.force_n[possible], batch.modulus_mpa[possible]
     work = [(menu[i], possible[best[possible] == i]) for i in np.unique(best[possible])]
     calls = {
         "chooser": lambda: chooser.solve_many(asked, some, *given, stage).buckets[0].contacts.residual,
-        "hindsight": lambda: [bench.from_scratch(batch, setting, rows) for setting, rows in work],
+        "hindsight": lambda: [measured.from_scratch(batch, setting, rows) for setting, rows in work],
     }
     for call in calls.values():
         call()
-    return {name: float(np.median(s)) for name, s in interleaved(calls, range(bench.ROUNDS)).items()}
+    return {name: float(np.median(s)) for name, s in interleaved(calls, range(measured.ROUNDS)).items()}

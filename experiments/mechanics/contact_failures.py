@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from experiments.mechanics.contact_scenes import Bench
+from experiments.mechanics.contact_scenes import GelKernels
 from sensors_io.layer import Layer, normal_compliance, wave_numbers
 
 SIDE_MM = 16.0
@@ -12,7 +12,7 @@ GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Case:
+class FailureCase:
     """A rigid body over a gel; `refused` says that the theory does not carry it, so that it must be flagged."""
 
     name: str
@@ -21,15 +21,15 @@ class Case:
     gel: Layer = GEL
     refused: bool = False
 
-    def bench(self) -> Bench:
+    def kernels(self) -> GelKernels:
         """Spectra of this gel on a grid padded to one and a half times its side."""
         grid = self.gap_mm.shape[0]
         spacing = SIDE_MM / grid
         gel = normal_compliance(np.hypot(*wave_numbers(grid * 3 // 2, spacing)), self.gel)
-        return Bench(gel=gel, body=np.zeros_like(gel), spacing_mm=spacing, thickness_mm=self.gel.thickness_mm)
+        return GelKernels(gel=gel, body=np.zeros_like(gel), spacing_mm=spacing, thickness_mm=self.gel.thickness_mm)
 
 
-def suite(grid: int) -> tuple[Case, ...]:
+def suite(grid: int) -> tuple[FailureCase, ...]:
     """Every case on a grid of that side, a multiple of 4.
 
     Kernel overflow is that of sinh(qh) in float32, at qh > 88: the finest wave of a thick gel.
@@ -41,26 +41,26 @@ def suite(grid: int) -> tuple[Case, ...]:
     spacing = SIDE_MM / grid
     dimple = r2 / (2 * 1e3 * (2 * spacing) ** 3)  # a dozen pixels at 1 mN, so flat that the gel hardly dents
     return (
-        Case(name="kernel overflow: h = 40 mm", gap_mm=r2 / 16, force_n=5.0, gel=thick),
-        Case(name="a few pixels at 1 mN", gap_mm=r2 / 16, force_n=1e-3, refused=True),
-        Case(name="a dozen pixels at 1 mN", gap_mm=dimple, force_n=1e-3),
-        Case(name="needle beside a shoulder", gap_mm=_needle(grid), force_n=2.0),
-        Case(name="rough flat, 75 % contact", gap_mm=_waves(x, 0.03), force_n=15.0),
-        Case(name="full pad", gap_mm=np.zeros((grid, grid)), force_n=5.0),
-        Case(name="white noise", gap_mm=0.1 * noise, force_n=5.0),
-        Case(name="ν = 0.4999", gap_mm=r2 / 16, force_n=5.0, gel=dataclasses.replace(GEL, poisson=0.4999)),
-        Case(name="ν = 0.5", gap_mm=r2 / 16, force_n=5.0, gel=dataclasses.replace(GEL, poisson=0.5)),
-        Case(name="h = 0.3 mm", gap_mm=r2 / 16, force_n=5.0, gel=thin, refused=True),
-        Case(name="tilt", gap_mm=r2 / 60 + 0.2 * x[None], force_n=5.0),
-        Case(
+        FailureCase(name="kernel overflow: h = 40 mm", gap_mm=r2 / 16, force_n=5.0, gel=thick),
+        FailureCase(name="a few pixels at 1 mN", gap_mm=r2 / 16, force_n=1e-3, refused=True),
+        FailureCase(name="a dozen pixels at 1 mN", gap_mm=dimple, force_n=1e-3),
+        FailureCase(name="needle beside a shoulder", gap_mm=_needle(grid), force_n=2.0),
+        FailureCase(name="rough flat, 75 % contact", gap_mm=_waves(x, 0.03), force_n=15.0),
+        FailureCase(name="full pad", gap_mm=np.zeros((grid, grid)), force_n=5.0),
+        FailureCase(name="white noise", gap_mm=0.1 * noise, force_n=5.0),
+        FailureCase(name="ν = 0.4999", gap_mm=r2 / 16, force_n=5.0, gel=dataclasses.replace(GEL, poisson=0.4999)),
+        FailureCase(name="ν = 0.5", gap_mm=r2 / 16, force_n=5.0, gel=dataclasses.replace(GEL, poisson=0.5)),
+        FailureCase(name="h = 0.3 mm", gap_mm=r2 / 16, force_n=5.0, gel=thin, refused=True),
+        FailureCase(name="tilt", gap_mm=r2 / 60 + 0.2 * x[None], force_n=5.0),
+        FailureCase(
             name="E = 0.01 MPa",
             gap_mm=r2 / 16,
             force_n=1.0,
             gel=dataclasses.replace(GEL, modulus_mpa=0.01),
             refused=True,
         ),
-        Case(name="sphere at 20 N, strain > 0.3", gap_mm=r2 / 8, force_n=20.0, refused=True),
-        Case(name="pin R 0.5 mm at 5 N", gap_mm=_pin(r2), force_n=5.0, refused=True),
+        FailureCase(name="sphere at 20 N, strain > 0.3", gap_mm=r2 / 8, force_n=20.0, refused=True),
+        FailureCase(name="pin R 0.5 mm at 5 N", gap_mm=_pin(r2), force_n=5.0, refused=True),
     )
 
 

@@ -21,7 +21,7 @@ Solver = Callable[[Array, Array, Array, Array, float], tuple[Array, Array]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Method:
+class ContactMethod:
     """A solver and what it is called; `kind` groups the chart."""
 
     name: str

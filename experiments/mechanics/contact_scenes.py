@@ -18,7 +18,7 @@ SHORTEST_WAVE_MM = 0.8
 REFERENCE_TOLERANCE = 1e-8
 
 
-class Scene(NamedTuple):
+class ContactScene(NamedTuple):
     """Gap [N, N] mm, force N, modulus MPa of the object."""
 
     gap_mm: np.ndarray
@@ -27,7 +27,7 @@ class Scene(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scenes:
+class ContactScenes:
     """S scenes on one grid: gaps [S, N, N] mm, forces [S] N, moduli [S] MPa of the objects; float32."""
 
     gap_mm: np.ndarray
@@ -37,12 +37,12 @@ class Scenes:
     def __len__(self) -> int:
         return len(self.force_n)
 
-    def __iter__(self) -> Iterator[Scene]:
-        return map(Scene, self.gap_mm, self.force_n, self.modulus_mpa)
+    def __iter__(self) -> Iterator[ContactScene]:
+        return map(ContactScene, self.gap_mm, self.force_n, self.modulus_mpa)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Bench:
+class GelKernels:
     """Float64 spectra of a sensor's gel and of an object of 1 MPa [M, M//2 + 1], mm/MPa, and the pixel size."""
 
     gel: np.ndarray
@@ -51,11 +51,11 @@ class Bench:
     thickness_mm: float
 
 
-def make_bench(sensor: SensorModel, grid: int) -> Bench:
+def gel_kernels(sensor: SensorModel, grid: int) -> GelKernels:
     """The kernels of a sensor on its padded grid."""
     spacing = sensor.window_mm / grid
     q = np.hypot(*layer.wave_numbers(press.padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm), spacing))
-    return Bench(
+    return GelKernels(
         gel=layer.normal_compliance(q, sensor.gel),
         body=layer.normal_compliance(q, BODY),
         spacing_mm=spacing,
@@ -63,7 +63,7 @@ def make_bench(sensor: SensorModel, grid: int) -> Bench:
     )
 
 
-def sample(sensor: SensorModel, count: int, grid: int, seed: int) -> Scenes:
+def sample(sensor: SensorModel, count: int, grid: int, seed: int) -> ContactScenes:
     """Draw scenes: a procedural object each, a pose near the apex, a log-uniform force.
 
     The draws do not depend on the grid, so the same seed gives the same scenes on every grid.
@@ -82,18 +82,20 @@ def sample(sensor: SensorModel, count: int, grid: int, seed: int) -> Scenes:
         gaps.append(np.asarray(_gap(skin, pose, x)))
         forces.append(np.exp(rng.uniform(*np.log(FORCES_N))))
         moduli.append(solid.modulus_mpa)
-    return Scenes(gap_mm=np.stack(gaps), force_n=np.array(forces, np.float32), modulus_mpa=np.array(moduli, np.float32))
+    return ContactScenes(
+        gap_mm=np.stack(gaps), force_n=np.array(forces, np.float32), modulus_mpa=np.array(moduli, np.float32)
+    )
 
 
-def exact(scenes: Iterable[Scene], bench: Bench) -> np.ndarray:
+def exact(scenes: Iterable[ContactScene], kernels: GelKernels) -> np.ndarray:
     """Float64 displacement of the gel on the same grid, [S, N, N] mm."""
     found = []
     for gap, force, modulus in scenes:
-        compliance = bench.gel + bench.body / float(modulus)
+        compliance = kernels.gel + kernels.body / float(modulus)
         solved = solve_reference(
-            gap.astype(np.float64), float(force), compliance, bench.spacing_mm, REFERENCE_TOLERANCE, 20_000
+            gap.astype(np.float64), float(force), compliance, kernels.spacing_mm, REFERENCE_TOLERANCE, 20_000
         )
-        found.append(convolve(solved.pressure_mpa, bench.gel))
+        found.append(convolve(solved.pressure_mpa, kernels.gel))
     return np.stack(found)
 
 

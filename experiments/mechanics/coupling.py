@@ -14,7 +14,7 @@ from jaxtyping import Array
 from experiments.core.results import Cell, Column, Table
 from experiments.core.timing import interleaved
 from experiments.mechanics import tangential_scenes
-from experiments.mechanics.tangential_scenes import Bench, Motion
+from experiments.mechanics.tangential_scenes import FrictionKernels, FrictionSequence
 from sensors_io.scenes import drag, traction
 from sensors_io.scenes.sensors import BODY, SensorModel
 from sensors_io.scenes.traction import in_series
@@ -27,7 +27,7 @@ _MICROMETRES = 1e3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Change:
+class CouplingEffect:
     """What coupling does to one motion on one gel, over all bodies.
 
     `relative` is the change of the markers' sideways displacement, L₂ over the sequence, relative to it without;
@@ -47,22 +47,22 @@ class Change:
     failed: float
 
 
-def measure(sensor: SensorModel, grid: int, frames: int, bodies: int, seed: int) -> list[Change]:
+def measure(sensor: SensorModel, grid: int, frames: int, bodies: int, seed: int) -> list[CouplingEffect]:
     """Every motion of `MOTIONS` on the gel of one sensor with markers, by `bodies` objects, of every kind in turn."""
-    bench = tangential_scenes.make_bench(sensor, grid)
-    size, spacing = bench.normal_gel.shape[0], sensor.window_mm / grid
+    kernels = tangential_scenes.friction_kernels(sensor, grid)
+    size, spacing = kernels.normal_gel.shape[0], sensor.window_mm / grid
     gel, body = (traction.make_coupling(layer, size, spacing) for layer in (sensor.gel, BODY))
     kinds = tangential_scenes.KINDS
     rng = np.random.default_rng([seed, 2])
     objects = [tangential_scenes.draw(rng, kinds[i % len(kinds)]) for i in range(bodies)]
     found = []
     for name in MOTIONS:
-        motions = [tangential_scenes.make_motion(bench, each, name, frames) for each in objects]
-        found.append(_change(name, sensor, bench, motions, [gel - body / m.modulus_mpa for m in motions]))
+        motions = [tangential_scenes.make_motion(kernels, each, name, frames) for each in objects]
+        found.append(_change(name, sensor, kernels, motions, [gel - body / m.modulus_mpa for m in motions]))
     return found
 
 
-def change_table(changes: Sequence[Change]) -> Table:
+def change_table(changes: Sequence[CouplingEffect]) -> Table:
     """All motions on all gels."""
     rows: list[tuple[Cell, ...]] = [
         (
@@ -94,7 +94,7 @@ def change_table(changes: Sequence[Change]) -> Table:
     )
 
 
-def verdict(changes: Sequence[Change]) -> str:
+def verdict(changes: Sequence[CouplingEffect]) -> str:
     """Which default is right, in a sentence."""
     press, moved = ([c for c in changes if (c.motion == "hold") is still] for still in (True, False))
     hidden = max(c.rms_mm / c.noise_mm for c in changes)
@@ -106,23 +106,27 @@ def verdict(changes: Sequence[Change]) -> str:
     )
 
 
-def _mean(changes: Sequence[Change]) -> float:
+def _mean(changes: Sequence[CouplingEffect]) -> float:
     return float(np.mean([c.relative for c in changes]))
 
 
 def _change(
-    name: str, sensor: SensorModel, bench: Bench, motions: Sequence[Motion], couplings: Sequence[Array]
-) -> Change:
+    name: str,
+    sensor: SensorModel,
+    kernels: FrictionKernels,
+    motions: Sequence[FrictionSequence],
+    couplings: Sequence[Array],
+) -> CouplingEffect:
     calls = {
-        "without": lambda: [_frames(motion, bench, None) for motion in motions],
-        "with": lambda: [_frames(motion, bench, each) for motion, each in zip(motions, couplings, strict=True)],
+        "without": lambda: [_frames(motion, kernels, None) for motion in motions],
+        "with": lambda: [_frames(motion, kernels, each) for motion, each in zip(motions, couplings, strict=True)],
     }
     without, coupled = (jax.device_get(call()) for call in calls.values())
     seconds = interleaved(calls, range(_ROUNDS))
     count = len(motions) * len(motions[0].pressure_mpa)
     ms = {key: 1e3 * float(np.median(s)) / count for key, s in seconds.items()}
     before, after = (np.stack([f.displacement_mm[:, :2] for f in found]) for found in (without, coupled))
-    return Change(
+    return CouplingEffect(
         motion=name,
         sensor=sensor.name,
         relative=float(np.linalg.norm(after - before) / np.linalg.norm(before)),
@@ -135,22 +139,22 @@ def _change(
     )
 
 
-def _force_change(without: drag.Frame, coupled: drag.Frame, motion: Motion) -> float:
+def _force_change(without: drag.Frame, coupled: drag.Frame, motion: FrictionSequence) -> float:
     off = np.linalg.norm(coupled.force_n[:, :2] - without.force_n[:, :2], axis=1)
     limit = float(motion.friction) * np.abs(without.force_n[:, 2]).max()
     return float(off.max() / limit)
 
 
 @jax.jit
-def _frames(motion: Motion, bench: Bench, coupling: Array | None) -> drag.Frame:
+def _frames(motion: FrictionSequence, kernels: FrictionKernels, coupling: Array | None) -> drag.Frame:
     """A sequence as the generator makes it, coupled or not."""
-    series = in_series(bench.gel, bench.body, 1.0, motion.modulus_mpa)
-    bodies = drag.Bodies(compliance=series, coupling=coupling, response=bench.markers)
+    series = in_series(kernels.gel, kernels.body, 1.0, motion.modulus_mpa)
+    bodies = drag.Bodies(compliance=series, coupling=coupling, response=kernels.markers)
 
     def go_on(history: drag.History, frame: tuple[Array, drag.Step]) -> tuple[drag.History, drag.Frame]:
         pressure, step = frame
-        return drag.advance(history, pressure, motion.friction, step, bodies, bench.x_mm)
+        return drag.advance(history, pressure, motion.friction, step, bodies, kernels.x_mm)
 
-    start = drag.at_rest(bench.x_mm.shape[0])
+    start = drag.at_rest(kernels.x_mm.shape[0])
     solved: drag.Frame = jax.lax.scan(go_on, start, (motion.pressure_mpa, motion.step))[1]
     return solved

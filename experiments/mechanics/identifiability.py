@@ -27,9 +27,9 @@ from experiments.core.context import Context
 from experiments.core.results import Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.mechanics import identify_motions, identify_tables
-from experiments.mechanics.identify_figures import Figures, Studied, figures
-from experiments.mechanics.identify_motions import MOTIONS, Moved
-from experiments.mechanics.identify_presses import Pressed, press
+from experiments.mechanics.identify_figures import ProbeFigures, StudyPredictions, figures
+from experiments.mechanics.identify_motions import MOTIONS, MotionData
+from experiments.mechanics.identify_presses import PressData, press
 from experiments.mechanics.identify_studies import (
     DYNAMIC,
     FORCE,
@@ -42,7 +42,7 @@ from experiments.mechanics.identify_studies import (
     without_touch,
 )
 from experiments.mechanics.identify_tables import CHANCE, MAY_LOSE
-from experiments.mechanics.identify_touch import Tier
+from experiments.mechanics.identify_touch import ContactTier
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.validity import STRAIN_LIMIT
@@ -88,21 +88,21 @@ class IdentifiabilityConfig:
         require(self.exact_grid > max(self.grids), "exact_grid", self.exact_grid, "must be finer than all of grids")
 
     @property
-    def exact(self) -> Tier:
+    def exact(self) -> ContactTier:
         """What stands for the exact solution."""
-        return Tier(name=f"exact, {self.exact_grid}²", grid=self.exact_grid, tolerance=self.exact_tolerance)
+        return ContactTier(name=f"exact, {self.exact_grid}²", grid=self.exact_grid, tolerance=self.exact_tolerance)
 
     @property
-    def solved(self) -> tuple[Tier, ...]:
+    def solved(self) -> tuple[ContactTier, ...]:
         """Tiers that solve the contact."""
         usual = self.usual_grid
-        loose = Tier(name=f"{usual}², {self.loose_tolerance:g}", grid=usual, tolerance=self.loose_tolerance)
-        return (*(Tier(name=f"{n}²", grid=n) for n in self.grids), loose)
+        loose = ContactTier(name=f"{usual}², {self.loose_tolerance:g}", grid=usual, tolerance=self.loose_tolerance)
+        return (*(ContactTier(name=f"{n}²", grid=n) for n in self.grids), loose)
 
     @property
-    def springs(self) -> Tier:
+    def springs(self) -> ContactTier:
         """The negative control."""
-        return Tier(name=f"springs, {self.usual_grid}²", grid=self.usual_grid, springs=True)
+        return ContactTier(name=f"springs, {self.usual_grid}²", grid=self.usual_grid, springs=True)
 
 
 def run(config: IdentifiabilityConfig, context: Context) -> Results:
@@ -118,22 +118,24 @@ def run(config: IdentifiabilityConfig, context: Context) -> Results:
     return findings(config, studied)
 
 
-def _move(config: IdentifiabilityConfig, motion: str, context: Context) -> Moved:
+def _move(config: IdentifiabilityConfig, motion: str, context: Context) -> MotionData:
     count = len(identify_motions.rows_of(LiveScenes(config.motions), motion))
     with context.progress(motion, count) as advance:
         return identify_motions.feel(config.motions, motion, config.moments, advance)
 
 
-def _ask(config: IdentifiabilityConfig, pressed: Pressed, moved: dict[str, Moved], context: Context) -> Studied:
+def _ask(
+    config: IdentifiabilityConfig, pressed: PressData, moved: dict[str, MotionData], context: Context
+) -> StudyPredictions:
     """Every probe."""
     tiers, own = (*config.solved, config.springs), config.noise.index(1.0)
     held = [np.asarray(pressed.felt[config.exact.name, order].features)[:, own] for order in range(len(SENSORS))]
-    dynamic: dict[str, tuple[Seq[np.ndarray], Pressed | Moved]] = {"press": (held, pressed)}
+    dynamic: dict[str, tuple[Seq[np.ndarray], PressData | MotionData]] = {"press": (held, pressed)}
     dynamic |= {motion: (m.touch, m) for motion, m in moved.items()}
     per_sensor = len(STATIC) * (len(config.noise) + len(tiers)) + len(DYNAMIC) * len(dynamic)
     blind = 2 * (len(STATIC) + len(DYNAMIC) * len(dynamic))
     with context.progress("probes", len(SENSORS) * per_sensor + blind) as advance:
-        return Studied(
+        return StudyPredictions(
             noise=config.noise,
             exact=config.exact.name,
             solved=tuple(tier.name for tier in config.solved),
@@ -148,7 +150,7 @@ def _ask(config: IdentifiabilityConfig, pressed: Pressed, moved: dict[str, Moved
         )
 
 
-def findings(config: IdentifiabilityConfig, studied: Studied) -> Results:
+def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Results:
     """Everything that is reported."""
     made, scenes = figures(studied), config.presses
     strain = studied.pressed.felt[studied.exact, 0].strain
@@ -179,7 +181,9 @@ def findings(config: IdentifiabilityConfig, studied: Studied) -> Results:
     )
 
 
-def requirements(config: IdentifiabilityConfig, studied: Studied, made: Figures) -> tuple[Requirement, ...]:
+def requirements(
+    config: IdentifiabilityConfig, studied: StudyPredictions, made: ProbeFigures
+) -> tuple[Requirement, ...]:
     """Every tier in use against what it may lose, by its worst property.
 
     Springs, whose pressure is known to be wrong, must lose more than that beyond doubt, or the comparison is blind.
@@ -212,7 +216,7 @@ def requirements(config: IdentifiabilityConfig, studied: Studied, made: Figures)
     return tuple(kept)
 
 
-def verdict(config: IdentifiabilityConfig, studied: Studied, made: Figures) -> tuple[str, ...]:
+def verdict(config: IdentifiabilityConfig, studied: StudyPredictions, made: ProbeFigures) -> tuple[str, ...]:
     """The answer in sentences."""
     own, last, hardness = studied.own, len(studied.noise) - 1, STATIC[0]
     fused = {name: made.told[name, FUSED, own].mean for name in STATIC}

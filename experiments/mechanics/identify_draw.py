@@ -15,7 +15,7 @@ from sensors_io.scenes.sensors import SensorModel
 
 
 @struct.dataclass
-class Touch:
+class DrawnPress:
     """One press by one sensor: what is touched, the unit, the key of all noise, the force that was measured."""
 
     press: Press
@@ -24,7 +24,7 @@ class Touch:
     measured_n: Float[Array, "F 3"]
 
 
-def touches(config: SceneConfig, order: int) -> list[Touch]:
+def touches(config: SceneConfig, order: int) -> list[DrawnPress]:
     """All presses of a config without `sequences` by sensor number `order`; an object that stands has no traction."""
     return [_touch(config, index, order) for index in range(config.contact_count)]
 
@@ -35,7 +35,7 @@ def skins(config: SceneConfig) -> list[surface.Skin]:
     return [draws.site_of(config, what.object_index, what.site, 0).skin for what in slots]
 
 
-def on(drawn: Touch, skin: surface.Skin) -> Touch:
+def on(drawn: DrawnPress, skin: surface.Skin) -> DrawnPress:
     """The same press on another skin."""
     return dataclasses.replace(drawn, press=dataclasses.replace(drawn.press, skin=skin))
 
@@ -51,11 +51,11 @@ def noisier(sensor: SensorModel, factor: float) -> SensorModel:
     )
 
 
-def _touch(config: SceneConfig, index: int, order: int) -> Touch:
+def _touch(config: SceneConfig, index: int, order: int) -> DrawnPress:
     drawn = draws.draw(config, index, schedule.press_slot(config, index), order)
     load = np.column_stack([np.zeros((len(drawn.hand), 2)), -drawn.force_n])
     measured = jnp.asarray(drawn.force_sensor.read(load))
-    return Touch(press=drawn.press, unit=drawn.unit, key=jnp.asarray(drawn.key), measured_n=measured)
+    return DrawnPress(press=drawn.press, unit=drawn.unit, key=jnp.asarray(drawn.key), measured_n=measured)
 
 
 def _scaled(noise: tuple[float, float, float], factor: float) -> tuple[float, float, float]:

@@ -4,16 +4,16 @@ import dataclasses
 
 import numpy as np
 
-from experiments.mechanics.identify_motions import Moved
-from experiments.mechanics.identify_presses import Pressed
-from experiments.mechanics.identify_probes import Answers, accuracy, points
-from experiments.mechanics.identify_studies import FUSED, SOURCES, STATIC, Transferred
+from experiments.mechanics.identify_motions import MotionData
+from experiments.mechanics.identify_presses import PressData
+from experiments.mechanics.identify_probes import ProbePredictions, accuracy, points
+from experiments.mechanics.identify_studies import FUSED, SOURCES, STATIC, TransferPredictions
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import Interval
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Studied:
+class StudyPredictions:
     """Answers of all probes, keyed as in `identify_studies`; `motion` and `still` by motion first, the press too.
 
     `solved`, `springs` and `exact` name the tiers, `noise` the multiples of the sensors' noise.
@@ -23,13 +23,13 @@ class Studied:
     exact: str
     solved: tuple[str, ...]
     springs: str
-    touch: dict[tuple[str, str, int], Answers]
-    blind: dict[tuple[str, str], Answers]
-    tiers: dict[tuple[str, str, str], Transferred]
-    motion: dict[str, dict[tuple[str, str], Answers]]
-    still: dict[str, dict[tuple[str, str], Answers]]
-    pressed: Pressed
-    moved: dict[str, Moved]
+    touch: dict[tuple[str, str, int], ProbePredictions]
+    blind: dict[tuple[str, str], ProbePredictions]
+    tiers: dict[tuple[str, str, str], TransferPredictions]
+    motion: dict[str, dict[tuple[str, str], ProbePredictions]]
+    still: dict[str, dict[tuple[str, str], ProbePredictions]]
+    pressed: PressData
+    moved: dict[str, MotionData]
 
     @property
     def own(self) -> int:
@@ -48,7 +48,7 @@ class Studied:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Figures:
+class ProbeFigures:
     """Accuracies in % and losses in points, with intervals over objects.
 
     `told` by property, source and level of noise; `blind` by property and source; `lost` by tier and property, mean
@@ -63,11 +63,11 @@ class Figures:
     moved: dict[tuple[str, str], Interval]
 
 
-def figures(studied: Studied) -> Figures:
+def figures(studied: StudyPredictions) -> ProbeFigures:
     """Every figure that tables, pictures and sentences share."""
     objects = studied.pressed.objects
     keys = [(tier, name) for tier in (*studied.solved, studied.springs) for name in STATIC]
-    return Figures(
+    return ProbeFigures(
         told={key: accuracy(answers, objects) for key, answers in studied.touch.items()},
         blind={key: accuracy(answers, objects) for key, answers in studied.blind.items()},
         lost={key: points(studied.losses(*key, SENSORS), objects) for key in keys},

@@ -28,7 +28,7 @@ _QUIET = (Phase.APPROACH, Phase.HOLD)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Moved:
+class MotionData:
     """n contacts of one motion: what each sensor felt [n, D], force [n, S, E], true shape [n, G], levels [n].
 
     `levels` are of every property, `objects` [n] says what was touched.
@@ -43,7 +43,7 @@ class Moved:
 
 def feel(
     config: SceneConfig, motion: str, moments: int, advance: Callable[[], object], rows: list[int] | None = None
-) -> Moved:
+) -> MotionData:
     """Make and summarise contacts of one motion.
 
     Args:
@@ -59,7 +59,7 @@ def feel(
     slots = [slot(config, row) for row in rows]
     sites = [site_of(config, s.object_index, s.site, one.trial) for s, one in zip(slots, felt, strict=True)]
     levels = [solid_of(config, s.object_index).levels() for s in slots]
-    return Moved(
+    return MotionData(
         touch=tuple(np.stack([one.touch[order] for one in felt]) for order in range(len(SENSORS))),
         force=np.stack([one.force for one in felt]),
         shape=statistics([s.skin for s in sites]),
@@ -90,7 +90,7 @@ def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Felt:
+class _ContactFeatures:
     """One contact."""
 
     touch: tuple[np.ndarray, ...]
@@ -98,11 +98,11 @@ class _Felt:
     trial: int
 
 
-def _contact(scenes: LiveScenes, row: int, moments: int) -> _Felt:
+def _contact(scenes: LiveScenes, row: int, moments: int) -> _ContactFeatures:
     by_sensor = scenes.contact(row)
     made = [by_sensor[name] for name in SENSORS]
     chosen = look_at(made[0].phase, moments)
-    return _Felt(
+    return _ContactFeatures(
         touch=tuple(_touch(sequence, chosen) for sequence in made),
         force=np.stack([force_of(_known(sequence.force_n)[chosen]) for sequence in made]),
         trial=made[0].key.trial,

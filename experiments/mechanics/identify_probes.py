@@ -16,7 +16,7 @@ RESAMPLES = 2000
 
 
 @dataclasses.dataclass(frozen=True)
-class Answers:
+class ProbePredictions:
     """What a probe says of n held-out contacts: log-probabilities [n, K], and the true levels [n]."""
 
     log_probs: np.ndarray
@@ -38,9 +38,9 @@ class Answers:
         return said
 
 
-def fuse(answers: Seq[Answers]) -> Answers:
+def fuse(answers: Seq[ProbePredictions]) -> ProbePredictions:
     """All sensors together as if they erred independently: the product of their probabilities."""
-    return Answers(np.sum([a.log_probs for a in answers], axis=0), answers[0].labels)
+    return ProbePredictions(np.sum([a.log_probs for a in answers], axis=0), answers[0].labels)
 
 
 def transfer(
@@ -49,7 +49,7 @@ def transfer(
     labels: Int[np.ndarray, "n"],
     objects: np.ndarray,
     config: ProbeConfig,
-) -> list[Answers]:
+) -> list[ProbePredictions]:
     """Answers about the training records themselves, held out by object, and about the same contacts in other records.
 
     Contact i is read by the probe that no contact of its object trained, from `train` and from each of `tests`.  The
@@ -71,10 +71,10 @@ def transfer(
     weights = np.concatenate([trained, np.zeros((config.folds, len(fold) * (copies - 1)), bool)], 1)
     found = probe_log_probs(np.concatenate([train, *tests]), np.tile(labels, copies), weights, LEVELS, config)
     blocks = found.reshape(config.folds, copies, len(fold), LEVELS)
-    return [Answers(blocks[fold, copy, np.arange(len(fold))], labels) for copy in range(copies)]
+    return [ProbePredictions(blocks[fold, copy, np.arange(len(fold))], labels) for copy in range(copies)]
 
 
-def accuracy(answers: Answers, objects: np.ndarray) -> Interval:
+def accuracy(answers: ProbePredictions, objects: np.ndarray) -> Interval:
     """Share of right answers in %, with the interval over objects."""
     return points(answers.right, objects)
 

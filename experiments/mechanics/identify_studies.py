@@ -7,11 +7,11 @@ from collections.abc import Sequence as Seq
 
 import numpy as np
 
-from experiments.mechanics.identify_motions import Moved
-from experiments.mechanics.identify_presses import Pressed
-from experiments.mechanics.identify_probes import Answers, fuse, transfer
+from experiments.mechanics.identify_motions import MotionData
+from experiments.mechanics.identify_presses import PressData
+from experiments.mechanics.identify_probes import ProbePredictions, fuse, transfer
 from experiments.mechanics.identify_threads import in_threads
-from experiments.mechanics.identify_touch import Tier
+from experiments.mechanics.identify_touch import ContactTier
 from sensors_io.schema import SENSORS
 from touchr1_jax.training.evidence import ProbeConfig
 
@@ -28,20 +28,20 @@ Advance = Callable[[], object]
 
 
 @dataclasses.dataclass(frozen=True)
-class Transferred:
+class TransferPredictions:
     """Answers of probes trained at one tier: about that tier's own records, and about the exact ones."""
 
-    own: Answers
-    exact: Answers
+    own: ProbePredictions
+    exact: ProbePredictions
 
 
 def over_noise(
-    pressed: Pressed, exact: Tier, levels: int, config: ProbeConfig, advance: Advance
-) -> dict[tuple[str, str, int], Answers]:
+    pressed: PressData, exact: ContactTier, levels: int, config: ProbeConfig, advance: Advance
+) -> dict[tuple[str, str, int], ProbePredictions]:
     """Answers by property, source and level of noise, each from probes that were trained at that level."""
     jobs = list(itertools.product(STATIC, range(levels), range(len(SENSORS))))
 
-    def work(job: tuple[str, int, int]) -> Answers:
+    def work(job: tuple[str, int, int]) -> ProbePredictions:
         name, level, order = job
         return _held_out(pressed.features(exact, order, level), pressed.levels[name], pressed.objects, config)
 
@@ -53,27 +53,34 @@ def over_noise(
 
 
 def from_tiers(
-    pressed: Pressed, tiers: Seq[Tier], exact: Tier, noise_level: int, config: ProbeConfig, advance: Advance
-) -> dict[tuple[str, str, str], Transferred]:
+    pressed: PressData,
+    tiers: Seq[ContactTier],
+    exact: ContactTier,
+    noise_level: int,
+    config: ProbeConfig,
+    advance: Advance,
+) -> dict[tuple[str, str, str], TransferPredictions]:
     """Answers by tier, property and source; the exact records are taken at `noise_level`, the tiers' at their only."""
     jobs = list(itertools.product(tiers, STATIC, range(len(SENSORS))))
 
-    def work(job: tuple[Tier, str, int]) -> Transferred:
+    def work(job: tuple[ContactTier, str, int]) -> TransferPredictions:
         tier, name, order = job
         train, test = pressed.features(tier, order), pressed.features(exact, order, noise_level)
-        return Transferred(*transfer(train, [test], pressed.levels[name], pressed.objects, config))
+        return TransferPredictions(*transfer(train, [test], pressed.levels[name], pressed.objects, config))
 
     found = dict(zip(jobs, in_threads(work, jobs, advance), strict=True))
     answers = {(tier.name, name, SENSORS[order]): answer for (tier, name, order), answer in found.items()}
     for tier, name in itertools.product(tiers, STATIC):
         each = [found[tier, name, order] for order in range(len(SENSORS))]
-        answers[tier.name, name, FUSED] = Transferred(fuse([t.own for t in each]), fuse([t.exact for t in each]))
+        answers[tier.name, name, FUSED] = TransferPredictions(
+            fuse([t.own for t in each]), fuse([t.exact for t in each])
+        )
     return answers
 
 
 def without_touch(
-    pressed: Pressed | Moved, names: Seq[str], config: ProbeConfig, advance: Advance
-) -> dict[tuple[str, str], Answers]:
+    pressed: PressData | MotionData, names: Seq[str], config: ProbeConfig, advance: Advance
+) -> dict[tuple[str, str], ProbePredictions]:
     """Answers by property from the true shape alone and from the measured forces alone."""
     blind = {SHAPE: pressed.shape, FORCE: pressed.force.reshape(len(pressed.force), -1)}
     jobs = list(itertools.product(names, blind))
@@ -82,8 +89,8 @@ def without_touch(
 
 
 def by_motion(
-    touch: Seq[np.ndarray], moved: Pressed | Moved, config: ProbeConfig, advance: Advance
-) -> dict[tuple[str, str], Answers]:
+    touch: Seq[np.ndarray], moved: PressData | MotionData, config: ProbeConfig, advance: Advance
+) -> dict[tuple[str, str], ProbePredictions]:
     """Answers about the dynamic properties by property and source, of touch without force.
 
     Args:
@@ -99,6 +106,6 @@ def by_motion(
     return answers
 
 
-def _held_out(features: np.ndarray, labels: np.ndarray, objects: np.ndarray, config: ProbeConfig) -> Answers:
+def _held_out(features: np.ndarray, labels: np.ndarray, objects: np.ndarray, config: ProbeConfig) -> ProbePredictions:
     (answers,) = transfer(features, [], labels, objects, config)
     return answers

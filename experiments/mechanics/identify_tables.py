@@ -4,7 +4,7 @@ import numpy as np
 
 from experiments.core.results import Cell, Column, Picture, Table
 from experiments.mechanics import identify_charts
-from experiments.mechanics.identify_figures import Figures, Studied
+from experiments.mechanics.identify_figures import ProbeFigures, StudyPredictions
 from experiments.mechanics.identify_probes import LEVELS
 from experiments.mechanics.identify_studies import DYNAMIC, FORCE, FUSED, SHAPE, SOURCES, STATIC
 from sensors_io.schema import SENSORS
@@ -15,7 +15,7 @@ MAY_LOSE = 2.0
 CHANCE = 100 / LEVELS
 
 
-def touch_table(studied: Studied, figures: Figures) -> Table:
+def touch_table(studied: StudyPredictions, figures: ProbeFigures) -> Table:
     """Accuracy of every property by every source over the noise."""
     rows: list[tuple[Cell, ...]] = []
     for name in STATIC:
@@ -39,7 +39,7 @@ def touch_table(studied: Studied, figures: Figures) -> Table:
     )
 
 
-def blind_table(studied: Studied, figures: Figures) -> Table:
+def blind_table(studied: StudyPredictions, figures: ProbeFigures) -> Table:
     """The lines that touch has to pass."""
     rows: list[tuple[Cell, ...]] = []
     for name in STATIC:
@@ -62,7 +62,7 @@ def blind_table(studied: Studied, figures: Figures) -> Table:
     )
 
 
-def tier_table(studied: Studied, figures: Figures) -> Table:
+def tier_table(studied: StudyPredictions, figures: ProbeFigures) -> Table:
     """The matrix of transfer."""
     rows: list[tuple[Cell, ...]] = []
     for (tier, name), lost in figures.lost.items():
@@ -87,7 +87,7 @@ def tier_table(studied: Studied, figures: Figures) -> Table:
     )
 
 
-def motion_table(studied: Studied, figures: Figures) -> Table:
+def motion_table(studied: StudyPredictions, figures: ProbeFigures) -> Table:
     """Friction and elasticity by motion, by touch without force and without touch."""
     rows: list[tuple[Cell, ...]] = []
     for (name, motion), fused in figures.moved.items():
@@ -111,7 +111,7 @@ def motion_table(studied: Studied, figures: Figures) -> Table:
     )
 
 
-def noise_picture(studied: Studied, figures: Figures) -> Picture:
+def noise_picture(studied: StudyPredictions, figures: ProbeFigures) -> Picture:
     """Accuracy over noise."""
     levels = range(len(studied.noise))
     panels = {n: {s: [figures.told[n, s, level] for level in levels] for s in SOURCES} for n in STATIC}
@@ -125,7 +125,7 @@ def noise_picture(studied: Studied, figures: Figures) -> Picture:
     )
 
 
-def tier_picture(figures: Figures) -> Picture:
+def tier_picture(figures: ProbeFigures) -> Picture:
     """Points lost by tier."""
     panels: dict[str, identify_charts.Bars] = {name: {} for name in STATIC}
     for (tier, name), lost in figures.lost.items():

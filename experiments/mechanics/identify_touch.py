@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, UInt8
 
-from experiments.mechanics.identify_draw import Touch, noisier
+from experiments.mechanics.identify_draw import DrawnPress, noisier
 from sensors_io.scenes import contact, noise, readout, surface, traction
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import Grid, Kernels, make_kernels
@@ -25,7 +25,7 @@ from touchr1_jax.training.evidence import stream_features
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Tier:
+class ContactTier:
     """How a contact is solved: side of its grid, tolerance, and whether springs stand for the gel's compliance."""
 
     name: str
@@ -39,7 +39,7 @@ class Tier:
 
 
 @struct.dataclass
-class Seen:
+class PressReadings:
     """A press of F frames at L levels of noise: pictures, `None` without a camera, fields, and the solver's account."""
 
     pictures: UInt8[Array, "F L H W 3"] | None
@@ -49,7 +49,7 @@ class Seen:
 
 
 @struct.dataclass
-class Felt:
+class PressFeatures:
     """B presses at L levels of noise: features without force, and the solver's account of their frames."""
 
     features: Float[Array, "B L D"]
@@ -58,7 +58,7 @@ class Felt:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Means:
+class PressSetup:
     """What a press is made with: one sensor at L levels of noise, grids, cap of the solver, springs or not."""
 
     sensors: tuple[SensorModel, ...]
@@ -72,9 +72,9 @@ class Means:
         return self.sensors[0].window_mm / self.grid.contact_grid
 
 
-def means(config: SceneConfig, tier: Tier, order: int, factors: tuple[float, ...]) -> Means:
+def means(config: SceneConfig, tier: ContactTier, order: int, factors: tuple[float, ...]) -> PressSetup:
     """Sensor number `order` with its noise multiplied by each factor, and the tier's grid."""
-    return Means(
+    return PressSetup(
         sensors=tuple(noisier(MODELS[order], factor) for factor in factors),
         grid=Grid(contact_grid=tier.grid, image_px=config.image_px),
         max_iterations=config.solver_max_iterations,
@@ -82,7 +82,7 @@ def means(config: SceneConfig, tier: Tier, order: int, factors: tuple[float, ...
     )
 
 
-def see(drawn: Touch, kernels: Kernels, tolerance: Array | float, by: Means) -> Seen:
+def see(drawn: DrawnPress, kernels: Kernels, tolerance: Array | float, by: PressSetup) -> PressReadings:
     """Press, measure and photograph.
 
     Args:
@@ -96,13 +96,13 @@ def see(drawn: Touch, kernels: Kernels, tolerance: Array | float, by: Means) -> 
     x = (jnp.arange(n, dtype=jnp.float32) + 0.5) * by.spacing - sensor.window_mm / 2
     gap = surface.gap(press.skin, press.pose, x)
 
-    def frame(at: tuple[Array, Array, Array]) -> Seen:
+    def frame(at: tuple[Array, Array, Array]) -> PressReadings:
         force, exposure, key = at
         solved = _solve(gap, force, drawn, kernels, tolerance, by)
         gel = _gel(solved, kernels, drawn.unit, sensor)
         fields = [readout.measure(gel, drawn.unit, kernels.resampling, key, s) for s in by.sensors]
         shots = [readout.photograph(gel, drawn.unit, exposure, kernels.resampling, key, s) for s in by.sensors]
-        return Seen(
+        return PressReadings(
             pictures=None if sensor.render is None else jnp.stack([shot for shot in shots if shot is not None]),
             fields=jax.tree.map(lambda *levels: jnp.stack(levels), *fields),
             strain=solved.strain,
@@ -116,8 +116,8 @@ def see(drawn: Touch, kernels: Kernels, tolerance: Array | float, by: Means) -> 
 
 
 def feel(
-    config: SceneConfig, tier: Tier, order: int, draws: Seq[Touch], factors: tuple[float, ...], batch: int
-) -> Felt:
+    config: SceneConfig, tier: ContactTier, order: int, draws: Seq[DrawnPress], factors: tuple[float, ...], batch: int
+) -> PressFeatures:
     """Features of presses by one sensor at one tier, as NumPy arrays.
 
     Args:
@@ -152,18 +152,18 @@ def field_counts(deformation_mm: Float[Array, "*n h w 2"], depth_mm: Float[Array
 
 
 @functools.partial(jax.jit, static_argnames="by")
-def _feel(draws: Touch, kernels: Kernels, tolerance: float, by: Means) -> Felt:
-    def one(drawn: Touch) -> Felt:
+def _feel(draws: DrawnPress, kernels: Kernels, tolerance: float, by: PressSetup) -> PressFeatures:
+    def one(drawn: DrawnPress) -> PressFeatures:
         seen = see(drawn, kernels, tolerance, by)
         counts = jnp.moveaxis(field_counts(seen.fields.deformation_mm, seen.fields.depth_mm), 1, 0)
         pictures = None if seen.pictures is None else jnp.moveaxis(seen.pictures, 1, 0)
-        return Felt(features=features_of(pictures, counts), strain=seen.strain, converged=seen.converged)
+        return PressFeatures(features=features_of(pictures, counts), strain=seen.strain, converged=seen.converged)
 
     return jax.lax.map(one, draws)
 
 
 def _solve(
-    gap: Array, force: Array, drawn: Touch, kernels: Kernels, tolerance: Array | float, by: Means
+    gap: Array, force: Array, drawn: DrawnPress, kernels: Kernels, tolerance: Array | float, by: PressSetup
 ) -> contact.Contact:
     """Springs give a wrong pressure, to which the gel then answers as it would."""
     gel, body = kernels.gel / drawn.unit.modulus_factor, kernels.body / drawn.press.modulus_mpa

@@ -27,13 +27,13 @@ from experiments.core.results import Cell, Column, Picture, Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.mechanics import chooser_charts as charts
 from experiments.mechanics import chooser_fit as fit
-from experiments.mechanics import chooser_measure as bench
+from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_sequences as sequences
 from experiments.mechanics import chooser_trial as trial
-from experiments.mechanics.chooser_draw import FAMILIES, Batch, draw
-from experiments.mechanics.chooser_measure import Outcomes
-from experiments.mechanics.chooser_sequences import Kept
-from experiments.mechanics.chooser_trial import SHARE, Trial
+from experiments.mechanics.chooser_draw import FAMILIES, SceneBatch, draw
+from experiments.mechanics.chooser_measure import MenuMeasurements
+from experiments.mechanics.chooser_sequences import SequenceTrial
+from experiments.mechanics.chooser_trial import SHARE, ChooserTrial
 from sensors_io.scenes import chooser_law, effort
 from sensors_io.scenes.chooser_law import MENU, SLACK, Law, Setting, make_menu
 from sensors_io.scenes.sensors import MODELS
@@ -90,8 +90,8 @@ def run(config: ChooserConfig, context: Context) -> Results:
             "gels": ", ".join(m.name for m in MODELS[: config.sensors]),
             "menu": f"{len(menu)} settings: {_sides(config.grids)}, padding to {_sides(chooser_law.PADDINGS)} of the "
             f"side, tolerance {_sides(chooser_law.TOLERANCES)}",
-            "reference": f"{config.reference}² padded to {bench.REFERENCE_PADDING:g} times the side, tolerance "
-            f"{bench.REFERENCE_TOLERANCE:g}",
+            "reference": f"{config.reference}² padded to {measured.REFERENCE_PADDING:g} times the side, tolerance "
+            f"{measured.REFERENCE_TOLERANCE:g}",
         },
     )
 
@@ -101,13 +101,15 @@ def hash_seed(seed: int, name: str, sensor: int, index: int) -> int:
     return int(np.random.SeedSequence([seed, *name.encode(), sensor, index]).generate_state(1)[0])
 
 
-def _batch(name: str, sensor: int, index: int, config: ChooserConfig) -> Batch:
+def _batch(name: str, sensor: int, index: int, config: ChooserConfig) -> SceneBatch:
     seed = hash_seed(config.seed, name, sensor, index)
     grids = {*config.grids, *chooser_law.GRIDS}
     return draw(MODELS[sensor], config.batch, sorted(grids), config.reference, tuple(FAMILIES), seed)
 
 
-def _outcomes(name: str, batches: int, config: ChooserConfig, menu: tuple[Setting, ...], context: Context) -> Outcomes:
+def _outcomes(
+    name: str, batches: int, config: ChooserConfig, menu: tuple[Setting, ...], context: Context
+) -> MenuMeasurements:
     """Measured batches of every gel, each a stage."""
     parts = []
     for i, sensor in context.each(name, itertools.product(range(batches), range(config.sensors)), still=True):
@@ -115,16 +117,18 @@ def _outcomes(name: str, batches: int, config: ChooserConfig, menu: tuple[Settin
         if not context.done(stage):
             with context.timed(stage):
                 batch = _batch(name, sensor, i, config)
-                true = bench.reference(batch, config.reference)
-                context.save_stage(stage, bench.measure(batch, context.each(stage, menu, still=True), true).to_json())
+                true = measured.reference(batch, config.reference)
+                context.save_stage(
+                    stage, measured.measure(batch, context.each(stage, menu, still=True), true).to_json()
+                )
             context.say(f"{stage}: {config.batch} scenes under {len(menu)} settings")
         parts.append(context.load_stage(stage))
-    return bench.join(parts)
+    return measured.join(parts)
 
 
 def _trials(
-    config: ChooserConfig, menu: tuple[Setting, ...], tested: Outcomes, cost: np.ndarray, context: Context
-) -> list[Trial]:
+    config: ChooserConfig, menu: tuple[Setting, ...], tested: MenuMeasurements, cost: np.ndarray, context: Context
+) -> list[ChooserTrial]:
     """The chooser on the tested batches, each a stage; one trial for every error asked for."""
     parts = []
     batches = itertools.product(range(config.tested_batches), range(config.sensors))
@@ -134,7 +138,7 @@ def _trials(
             with context.timed(stage):
                 batch = _batch("unseen", sensor, i, config)
                 errors = tested.errors[k * config.batch : (k + 1) * config.batch]
-                true = bench.reference(batch, config.reference)
+                true = measured.reference(batch, config.reference)
                 shown = context.each(stage, config.asked, still=True)
                 made = [trial.try_out(batch, menu, errors, cost, a, true) for a in shown]
                 context.save_stage(stage, [t.to_json() for t in made])
@@ -143,7 +147,7 @@ def _trials(
     return [trial.join([p[j] for p in parts]) for j in range(len(config.asked))]
 
 
-def _sequences(config: ChooserConfig, context: Context) -> list[Kept]:
+def _sequences(config: ChooserConfig, context: Context) -> list[SequenceTrial]:
     """Generated sequences of every sensor, each a stage; one account for every error asked for."""
     parts = []
     for sensor in context.each("sequences", range(config.sensors)):
@@ -158,10 +162,12 @@ def _sequences(config: ChooserConfig, context: Context) -> list[Kept]:
     return [sequences.join([p[j] for p in parts]) for j in range(len(config.asked))]
 
 
-def _refit(fitted: Outcomes, selected: Outcomes, menu: tuple[Setting, ...], asked: Sequence[float]) -> Law:
+def _refit(
+    fitted: MenuMeasurements, selected: MenuMeasurements, menu: tuple[Setting, ...], asked: Sequence[float]
+) -> Law:
     """The law of this run's own scenes."""
     law = fit.fit(fitted, menu)
-    both = bench.join([fitted.to_json(), selected.to_json()])
+    both = measured.join([fitted.to_json(), selected.to_json()])
     return fit.promised(law, fit.predict(law, both, menu), both.errors, asked)
 
 
@@ -212,7 +218,7 @@ def _summary_table(summaries: Sequence[dict[str, float]]) -> Table:
     )
 
 
-def _family_table(trials: Sequence[Trial], outcomes: Outcomes) -> Table:
+def _family_table(trials: Sequence[ChooserTrial], outcomes: MenuMeasurements) -> Table:
     family = np.array(outcomes.family)
 
     def row(name: str) -> tuple[Cell, ...]:
@@ -234,17 +240,17 @@ def _family_table(trials: Sequence[Trial], outcomes: Outcomes) -> Table:
     )
 
 
-def _kept_share(kept: Kept) -> float:
+def _kept_share(kept: SequenceTrial) -> float:
     """Share of the frames within reach of the error asked for, of the sequences promised to be."""
     return float(np.mean(kept.error[kept.met] <= SLACK * kept.asked)) if kept.met.any() else 1.0
 
 
-def _sequence_verdict(made: Sequence[Kept]) -> str:
+def _sequence_verdict(made: Sequence[SequenceTrial]) -> str:
     shares = ", ".join(f"{_kept_share(k):.1%} at {k.asked:.0%}" for k in made)
     return f"Frames of generated sequences within {SLACK} times the error asked for: {shares}."
 
 
-def _kept_requirement(kept: Kept) -> Requirement:
+def _kept_requirement(kept: SequenceTrial) -> Requirement:
     return Requirement(
         name=f"{kept.asked:.0%} asked: share of frames of generated sequences within {SLACK} times",
         measured=_kept_share(kept),
@@ -254,8 +260,8 @@ def _kept_requirement(kept: Kept) -> Requirement:
     )
 
 
-def _sequence_table(made: Sequence[Kept]) -> Table:
-    def row(kept: Kept) -> tuple[Cell, ...]:
+def _sequence_table(made: Sequence[SequenceTrial]) -> Table:
+    def row(kept: SequenceTrial) -> tuple[Cell, ...]:
         whole = np.all(kept.error <= SLACK * kept.asked, axis=1)
         grids = ", ".join(f"{n}² {(kept.grid == n).mean():.0%}" for n in effort.GRIDS)
         return (
@@ -312,7 +318,7 @@ def _law_table(refitted: Law) -> Table:
     )
 
 
-def _picture(trials: Sequence[Trial]) -> Picture:
+def _picture(trials: Sequence[ChooserTrial]) -> Picture:
     grids = np.array([s.grid for s in MENU])
     points = [(t.asked, t.error, grids[t.index], t.met) for t in trials]
     return Picture(

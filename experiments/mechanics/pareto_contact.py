@@ -27,7 +27,7 @@ from experiments.core.timing import interleaved
 from experiments.mechanics import contact_checks
 from experiments.mechanics import oracles as contact_oracles
 from experiments.mechanics.contact_methods import (
-    Method,
+    ContactMethod,
     blur,
     polonsky_keer,
     spg_nested,
@@ -36,11 +36,11 @@ from experiments.mechanics.contact_methods import (
     winkler_only,
 )
 from experiments.mechanics.contact_scenes import (
-    Bench,
-    Scenes,
+    ContactScenes,
+    GelKernels,
     displacement_error,
     exact,
-    make_bench,
+    gel_kernels,
     sample,
     slope_error,
 )
@@ -54,7 +54,7 @@ MAIN, BASELINE = "nested 1e-3", "plain 1e-3"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ParetoConfig:
+class ParetoContactConfig:
     """Scenes and side of the main grid; sides of the ladder of grids and its scenes; rounds of timing."""
 
     scenes: int = 48
@@ -66,26 +66,26 @@ class ParetoConfig:
     seed: int = 3
 
 
-def methods() -> tuple[Method, ...]:
+def methods() -> tuple[ContactMethod, ...]:
     """The tiers, cheapest first within each kind."""
-    nested = [Method(name=f"nested {t}", kind="nested SPG", solve=spg_nested(float(t))) for t in _TOLERANCES]
-    plain = [Method(name=f"plain {t}", kind="plain SPG", solve=spg_plain(float(t), False)) for t in _TOLERANCES]
+    nested = [ContactMethod(name=f"nested {t}", kind="nested SPG", solve=spg_nested(float(t))) for t in _TOLERANCES]
+    plain = [ContactMethod(name=f"plain {t}", kind="plain SPG", solve=spg_plain(float(t), False)) for t in _TOLERANCES]
     return (
-        Method(name="Winkler", kind="no iteration", solve=winkler_only),
-        Method(name="blur", kind="no iteration", solve=blur),
-        Method(name="Winkler + response", kind="no iteration", solve=winkler_and_response),
+        ContactMethod(name="Winkler", kind="no iteration", solve=winkler_only),
+        ContactMethod(name="blur", kind="no iteration", solve=blur),
+        ContactMethod(name="Winkler + response", kind="no iteration", solve=winkler_and_response),
         *nested,
         *plain,
-        Method(name="plain 1e-3 as published", kind="published stop", solve=spg_plain(1e-3, True)),
-        Method(name="PK-25", kind="Polonsky–Keer", solve=polonsky_keer(25)),
+        ContactMethod(name="plain 1e-3 as published", kind="published stop", solve=spg_plain(1e-3, True)),
+        ContactMethod(name="PK-25", kind="Polonsky–Keer", solve=polonsky_keer(25)),
     )
 
 
-def run(config: ParetoConfig, context: Context) -> Results:
+def run(config: ParetoContactConfig, context: Context) -> Results:
     """Measure, compare, chart."""
     context.say(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
-    bench, scenes = make_bench(SENSOR, config.grid), sample(SENSOR, config.scenes, config.grid, config.seed)
-    rows = measure(methods(), scenes, bench, config.rounds, context)
+    kernels, scenes = gel_kernels(SENSOR, config.grid), sample(SENSOR, config.scenes, config.grid, config.seed)
+    rows = measure(methods(), scenes, kernels, config.rounds, context)
     ladder = grid_ladder(config, context)
     drawn = context.each("other solvers' scenes", range(config.oracle_scenes))
     oracles = contact_checks.against_oracles(drawn, config.grid // 2, config.seed)
@@ -100,21 +100,22 @@ def run(config: ParetoConfig, context: Context) -> Results:
         settings={
             "sensor": SENSOR.name,
             "grid": config.grid,
-            "padded grid": bench.gel.shape[0],
+            "padded grid": kernels.gel.shape[0],
             "oracles installed": ", ".join(contact_oracles.installed()) or "none",
             "convolutions a frame": f"{main['convolutions']:.1f} of {MAIN}, {rows[BASELINE]['convolutions']:.1f} of "
             f"{BASELINE}",
-            "floor": f"{main['convolutions']:.1f} pruned convolutions of {_convolution_ms(bench, config.grid):.3f} ms",
+            "floor": f"{main['convolutions']:.1f} pruned convolutions of "
+            f"{_convolution_ms(kernels, config.grid):.3f} ms",
         },
     )
 
 
 def measure(
-    tiers: tuple[Method, ...], scenes: Scenes, bench: Bench, rounds: int, context: Context
+    tiers: tuple[ContactMethod, ...], scenes: ContactScenes, kernels: GelKernels, rounds: int, context: Context
 ) -> dict[str, dict[str, Any]]:
     """Time, ratio to the baseline, convolutions and errors of every method."""
-    true = exact(context.each("exact scenes", scenes), bench)
-    calls = {m.name: _call(m, scenes, bench) for m in tiers}
+    true = exact(context.each("exact scenes", scenes), kernels)
+    calls = {m.name: _call(m, scenes, kernels) for m in tiers}
     found = {name: jax.device_get(call()) for name, call in context.each("compiling methods", calls.items())}
     seconds = interleaved(calls, context.rounds("timing methods", rounds))
     baseline = seconds[BASELINE]
@@ -134,7 +135,7 @@ def measure(
     return rows
 
 
-def grid_ladder(config: ParetoConfig, context: Context) -> dict[int, dict[str, float]]:
+def grid_ladder(config: ParetoContactConfig, context: Context) -> dict[int, dict[str, float]]:
     """The package's solver on every grid, by its solution on the finest one."""
     finest = max(config.ladder)
     tiers = {str(n): (1e-3, n) for n in config.ladder} | {_EXACT: (1e-4, finest)}
@@ -199,39 +200,39 @@ def verdict(rows: Mapping[str, Mapping[str, Any]], hertz: Mapping[str, float]) -
     )
 
 
-def _on_grid(tolerance: float, grid: int, config: ParetoConfig) -> Callable[[], Any]:
+def _on_grid(tolerance: float, grid: int, config: ParetoContactConfig) -> Callable[[], Any]:
     """The scenes of the ladder of grids on one of them, by the package's solver."""
-    method = Method(name="nested", kind="", solve=spg_nested(tolerance))
-    return _call(method, sample(SENSOR, config.ladder_scenes, grid, config.seed + 1), make_bench(SENSOR, grid))
+    method = ContactMethod(name="nested", kind="", solve=spg_nested(tolerance))
+    return _call(method, sample(SENSOR, config.ladder_scenes, grid, config.seed + 1), gel_kernels(SENSOR, grid))
 
 
 _EXACT = "finest"  # by which the others are judged
 _TOLERANCES = ("1e-2", "1e-3", "1e-4", "1e-5")
 
 
-def _call(method: Method, scenes: Scenes, bench: Bench) -> Callable[[], Any]:
+def _call(method: ContactMethod, scenes: ContactScenes, kernels: GelKernels) -> Callable[[], Any]:
     """All scenes of a method, compiled, one after the other."""
-    gel, body = jnp.asarray(bench.gel, jnp.float32), jnp.asarray(bench.body, jnp.float32)
+    gel, body = jnp.asarray(kernels.gel, jnp.float32), jnp.asarray(kernels.body, jnp.float32)
     inputs = tuple(map(jnp.asarray, (scenes.gap_mm, scenes.force_n, scenes.modulus_mpa)))
 
     def solve(scene: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         gap, force, modulus = scene
-        return method.solve(gap, force, gel, gel + body / modulus, bench.spacing_mm)
+        return method.solve(gap, force, gel, gel + body / modulus, kernels.spacing_mm)
 
     every = jax.jit(lambda scenes: jax.lax.map(solve, scenes))
     return lambda: every(inputs)
 
 
-def _convolution_ms(bench: Bench, grid: int, repeats: int = 50) -> float:
+def _convolution_ms(kernels: GelKernels, grid: int, repeats: int = 50) -> float:
     """Time of one pruned convolution, the floor's unit."""
-    spectrum = jnp.asarray(bench.gel / bench.gel.max(), jnp.float32)
+    spectrum = jnp.asarray(kernels.gel / kernels.gel.max(), jnp.float32)
     field = jnp.ones((grid, grid), jnp.float32)
     chain = jax.jit(lambda p: jax.lax.fori_loop(0, repeats, lambda _, q: convolve(q, spectrum), p))
     jax.block_until_ready(chain(field))
     return 1e3 / repeats * float(np.median(interleaved({"": lambda: chain(field)}, range(7))[""]))
 
 
-def _tier_table(rows: Mapping[str, Mapping[str, Any]], config: ParetoConfig) -> Table:
+def _tier_table(rows: Mapping[str, Mapping[str, Any]], config: ParetoContactConfig) -> Table:
     names = ("ms", "ratio", "convolutions", "u median", "u p95", "slope median", "slope p95")
     return Table(
         title=f"Tiers at {config.grid}², {config.scenes} random scenes",
@@ -285,7 +286,7 @@ def _ladder_picture(ladder: Mapping[int, Mapping[str, float]]) -> Picture:
     )
 
 
-DEFAULT = ParetoConfig()
-SMOKE = ParetoConfig(scenes=8, grid=64, ladder=(24, 32, 64), ladder_scenes=4, rounds=3, oracle_scenes=2)
+DEFAULT = ParetoContactConfig()
+SMOKE = ParetoContactConfig(scenes=8, grid=64, ladder=(24, 32, 64), ladder_scenes=4, rounds=3, oracle_scenes=2)
 
 EXPERIMENT = Experiment(name="pareto_contact", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -34,11 +34,20 @@ from experiments.core.timing import interleaved
 from experiments.mechanics import coupling as tangential_coupling
 from experiments.mechanics import tangential_checks, tangential_loops, tangential_scenes, tangential_tables
 from experiments.mechanics import tangential_methods as ways
-from experiments.mechanics.coupling import Change
-from experiments.mechanics.tangential_checks import Promise
-from experiments.mechanics.tangential_methods import Method
-from experiments.mechanics.tangential_scenes import Bench, Case, Motion
-from experiments.mechanics.tangential_tables import COMPARED, MAIN, PLAIN, SEQUENCE, SOLVER, SUPERPOSED, Row, Rows
+from experiments.mechanics.coupling import CouplingEffect
+from experiments.mechanics.tangential_checks import PromiseCheck
+from experiments.mechanics.tangential_methods import FrictionMethod
+from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
+from experiments.mechanics.tangential_tables import (
+    COMPARED,
+    MAIN,
+    PLAIN,
+    SEQUENCE,
+    SOLVER,
+    SUPERPOSED,
+    MethodErrors,
+    Rows,
+)
 from sensors_io.scenes import tangential
 from sensors_io.schema import SENSORS
 
@@ -48,7 +57,7 @@ _TOLERANCES = (2e-2, 5e-3, tangential.TOLERANCE, 1e-3, 3e-4)
 _ITERATIONS = (5, 10, 20, 40, 80)
 _PRESSURE_TOLERANCE = 1e-3  # of the superposition's second contact, the generator's
 
-_Solve = Callable[[Any, Bench, jax.Array], Any]
+_Solve = Callable[[Any, FrictionKernels, jax.Array], Any]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,38 +90,38 @@ class TangentialConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Gel:
+class GelContacts:
     """One sensor's gel, the contacts on it with their kinds, its sequences."""
 
     name: str
-    bench: Bench
-    cases: Case
+    kernels: FrictionKernels
+    cases: FrictionContact
     kinds: tuple[str, ...]
-    sequences: tuple[Motion, ...]
+    sequences: tuple[FrictionSequence, ...]
 
 
-def methods() -> dict[str, tuple[Method, ...]]:
+def methods() -> dict[str, tuple[FrictionMethod, ...]]:
     """What is compared, by task, cheapest first within each kind."""
     return {
         "force": (
-            Method(kind="scaled pressure", solve=ways.scaled_pull),
-            Method(kind=FROM_PRESS, solve=ways.ramp_pull),
-            Method(kind=SUPERPOSED, solve=ways.superposed_pull, setting=_PRESSURE_TOLERANCE),
+            FrictionMethod(kind="scaled pressure", solve=ways.scaled_pull),
+            FrictionMethod(kind=FROM_PRESS, solve=ways.ramp_pull),
+            FrictionMethod(kind=SUPERPOSED, solve=ways.superposed_pull, setting=_PRESSURE_TOLERANCE),
             *_to_tolerance(ways.spg_pull),
         ),
         "slide": (
-            Method(kind="full slip", solve=ways.full_slip),
-            Method(kind=FROM_PRESS, solve=ways.ramp_slide),
+            FrictionMethod(kind="full slip", solve=ways.full_slip),
+            FrictionMethod(kind=FROM_PRESS, solve=ways.ramp_slide),
             *_to_tolerance(ways.spg_slide),
             *_plain(ways.plain_slide),
         ),
         "twist": (
-            Method(kind="full slip", solve=ways.full_twist),
+            FrictionMethod(kind="full slip", solve=ways.full_twist),
             *_to_tolerance(ways.spg_twist),
             *_plain(ways.plain_twist),
         ),
         SEQUENCE: (
-            Method(kind="full slip", solve=ways.full_slip_frames),
+            FrictionMethod(kind="full slip", solve=ways.full_slip_frames),
             *_to_tolerance(ways.spg_frames),
             *_plain(ways.plain_frames),
         ),
@@ -146,7 +155,7 @@ def run(config: TangentialConfig, context: Context) -> Results:
         ),
         pictures=(tangential_tables.speed_picture(tasks), tangential_tables.promise_picture(promises)),
         settings={
-            "grid": f"{config.grid}², padded to {gels[0].bench.normal_gel.shape[0]}²",
+            "grid": f"{config.grid}², padded to {gels[0].kernels.normal_gel.shape[0]}²",
             "contacts": sum(len(gel.kinds) for gel in gels),
             "sequences": f"{sum(len(gel.sequences) for gel in gels)} of {config.frames} frames",
             "rounds": config.rounds,
@@ -154,27 +163,29 @@ def run(config: TangentialConfig, context: Context) -> Results:
     )
 
 
-def make_gels(config: TangentialConfig, context: Context) -> tuple[Gel, ...]:
+def make_gels(config: TangentialConfig, context: Context) -> tuple[GelContacts, ...]:
     """Every gel with its contacts and sequences; the objects of the sequences go through the kinds of bodies."""
     models = tangential_scenes.sensors(config.sensors)
     bodies = tangential_scenes.KINDS
     gels = []
     with context.progress("pressing", len(models)) as advance:
         for order, sensor in enumerate(models):
-            bench = tangential_scenes.make_bench(sensor, config.grid)
-            cases, kinds = tangential_scenes.sample(bench, config.contacts, config.seed, order)
+            kernels = tangential_scenes.friction_kernels(sensor, config.grid)
+            cases, kinds = tangential_scenes.sample(kernels, config.contacts, config.seed, order)
             rng = np.random.default_rng([config.seed, order, 1])
             drawn = [tangential_scenes.draw(rng, bodies[(order + i) % len(bodies)]) for i in range(len(config.motions))]
             sequences = tuple(
-                tangential_scenes.make_motion(bench, body, name, config.frames)
+                tangential_scenes.make_motion(kernels, body, name, config.frames)
                 for body, name in zip(drawn, config.motions, strict=True)
             )
-            gels.append(Gel(name=sensor.name, bench=bench, cases=cases, kinds=kinds, sequences=sequences))
+            gels.append(GelContacts(name=sensor.name, kernels=kernels, cases=cases, kinds=kinds, sequences=sequences))
             advance(1)
     return tuple(gels)
 
 
-def measure(gels: Sequence[Gel], config: TangentialConfig, context: Context) -> dict[str, dict[str, Row]]:
+def measure(
+    gels: Sequence[GelContacts], config: TangentialConfig, context: Context
+) -> dict[str, dict[str, MethodErrors]]:
     """Time and errors of every method of every task: task → name → row."""
     every, tasks = methods(), {}
     with context.progress("solving", len(every), still=True) as advance:
@@ -186,15 +197,17 @@ def measure(gels: Sequence[Gel], config: TangentialConfig, context: Context) -> 
             seconds = interleaved(calls, context.rounds(f"{task}: timing", config.rounds))
             units = sum(len(gel.kinds) if task != SEQUENCE else len(gel.sequences) * config.frames for gel in gels)
             ms = {name: 1e3 * float(np.median(s)) / units for name, s in seconds.items()}
-            tasks[task] = {m.name: Row(kind=m.kind, label=m.label, ms=ms[m.name], errors=errors[m.name]) for m in tiers}
+            tasks[task] = {
+                m.name: MethodErrors(kind=m.kind, label=m.label, ms=ms[m.name], errors=errors[m.name]) for m in tiers
+            }
             advance(1)
     return tasks
 
 
-def couple(config: TangentialConfig, context: Context) -> list[Change]:
+def couple(config: TangentialConfig, context: Context) -> list[CouplingEffect]:
     """What coupling changes on every gel with markers."""
     marked = [s for s in tangential_scenes.sensors(config.sensors) if s.marker_depth_mm is not None]
-    found: list[Change] = []
+    found: list[CouplingEffect] = []
     with context.progress("coupling", len(marked), still=True) as advance:
         for sensor in marked:
             found += tangential_coupling.measure(sensor, config.grid, config.frames, config.coupled_bodies, config.seed)
@@ -202,20 +215,20 @@ def couple(config: TangentialConfig, context: Context) -> list[Change]:
     return found
 
 
-def hold_promises(gels: Sequence[Gel], superposed: Row) -> list[Promise]:
+def hold_promises(gels: Sequence[GelContacts], superposed: MethodErrors) -> list[PromiseCheck]:
     """The superposition's error and promise on every contact."""
     errors = iter(superposed.errors.tolist())
     found = []
     for gel, sensor in zip(gels, tangential_scenes.sensors(tuple(gel.name for gel in gels)), strict=True):
         pressures, moduli = np.asarray(gel.cases.ramp_mpa[:, -1]), np.asarray(gel.cases.modulus_mpa)
         for kind, pressure, modulus in zip(gel.kinds, pressures, moduli, strict=True):
-            radius = tangential_scenes.contact_radius_mm(pressure, float(gel.bench.spacing_mm))
+            radius = tangential_scenes.contact_radius_mm(pressure, float(gel.kernels.spacing_mm))
             found.append(tangential_checks.promise(sensor, kind, next(errors), float(modulus), radius))
     return found
 
 
 def requirements(
-    tasks: Mapping[str, Rows], promises: Sequence[Promise], mindlin: Mapping[str, float], torque: float
+    tasks: Mapping[str, Rows], promises: Sequence[PromiseCheck], mindlin: Mapping[str, float], torque: float
 ) -> tuple[Requirement, ...]:
     """The figures that must be kept."""
     kept, count = float(np.mean([p.kept for p in promises])), len(promises)
@@ -241,7 +254,7 @@ def requirements(
     )
 
 
-def verdict(tasks: Mapping[str, Rows], promises: Sequence[Promise]) -> tuple[str, ...]:
+def verdict(tasks: Mapping[str, Rows], promises: Sequence[PromiseCheck]) -> tuple[str, ...]:
     """The answer in sentences."""
     frame, solved, read = tasks[SEQUENCE][MAIN], tasks["force"][SUPERPOSED], tasks["force"][FROM_PRESS]
     ratios = {task: tangential_tables.at_equal_error(tasks[task])[0] for task in COMPARED}
@@ -258,36 +271,38 @@ def verdict(tasks: Mapping[str, Rows], promises: Sequence[Promise]) -> tuple[str
     )
 
 
-def _to_tolerance(solve: _Solve) -> list[Method]:
-    return [Method(kind=SOLVER, label=f"{t:g}", solve=solve, setting=t) for t in _TOLERANCES]
+def _to_tolerance(solve: _Solve) -> list[FrictionMethod]:
+    return [FrictionMethod(kind=SOLVER, label=f"{t:g}", solve=solve, setting=t) for t in _TOLERANCES]
 
 
-def _plain(solve: _Solve) -> list[Method]:
-    return [Method(kind=PLAIN, label=f"{count}", solve=solve, setting=count) for count in _ITERATIONS]
+def _plain(solve: _Solve) -> list[FrictionMethod]:
+    return [FrictionMethod(kind=PLAIN, label=f"{count}", solve=solve, setting=count) for count in _ITERATIONS]
 
 
-def _exact(task: str, gels: Sequence[Gel]) -> list[np.ndarray]:
+def _exact(task: str, gels: Sequence[GelContacts]) -> list[np.ndarray]:
     """Exact tractions: one array a gel, or a sequence."""
     if task == SEQUENCE:
-        return [ways.exact_sequence(motion, gel.bench) for gel in gels for motion in gel.sequences]
-    return [ways.exact(task, gel.cases, gel.bench) for gel in gels]
+        return [ways.exact_sequence(motion, gel.kernels) for gel in gels for motion in gel.sequences]
+    return [ways.exact(task, gel.cases, gel.kernels) for gel in gels]
 
 
-def _call(task: str, method: Method, gels: Sequence[Gel]) -> Callable[[], list[Any]]:
+def _call(task: str, method: FrictionMethod, gels: Sequence[GelContacts]) -> Callable[[], list[Any]]:
     """All contacts, or all sequences, of a method, one after the other: tractions, one array a gel or a sequence."""
     setting = jnp.asarray(method.setting)
     if task == SEQUENCE:
-        runs = [(motion, gel.bench) for gel in gels for motion in gel.sequences]
+        runs = [(motion, gel.kernels) for gel in gels for motion in gel.sequences]
         return lambda: [ways.sequence(method.solve, *each, setting)[0] for each in runs]
-    return lambda: [ways.every(method.solve, gel.cases, gel.bench, setting) for gel in gels]
+    return lambda: [ways.every(method.solve, gel.cases, gel.kernels, setting) for gel in gels]
 
 
-def _errors(task: str, found: list[Any], true: list[np.ndarray], gels: Sequence[Gel]) -> np.ndarray:
+def _errors(task: str, found: list[Any], true: list[np.ndarray], gels: Sequence[GelContacts]) -> np.ndarray:
     """Relative L₂ error of the marker displacement of every contact, or frame of a sequence in units of its rms."""
-    benches = [gel.bench for gel in gels for _ in (gel.sequences if task == SEQUENCE else (None,))]
+    benches = [gel.kernels for gel in gels for _ in (gel.sequences if task == SEQUENCE else (None,))]
     errors = []
-    for tractions, exact, bench in zip(found, true, benches, strict=True):
-        ours, seen = (np.asarray(ways.marker_motion(jnp.asarray(t, jnp.complex64), bench)) for t in (tractions, exact))
+    for tractions, exact, kernels in zip(found, true, benches, strict=True):
+        ours, seen = (
+            np.asarray(ways.marker_motion(jnp.asarray(t, jnp.complex64), kernels)) for t in (tractions, exact)
+        )
         size = np.linalg.norm(seen, axis=(1, 2))
         moved = size > 0
         scale = np.sqrt(np.mean(size[moved] ** 2)) if task == SEQUENCE else size[moved]

@@ -25,9 +25,9 @@ from experiments.core.runner import Experiment
 from experiments.mechanics import adhesion as contact_adhesion
 from experiments.mechanics import contact_charts
 from experiments.mechanics.contact_checks import rough_sphere
-from experiments.mechanics.contact_failures import SIDE_MM, Case, suite
+from experiments.mechanics.contact_failures import SIDE_MM, FailureCase, suite
 from experiments.mechanics.contact_methods import polonsky_keer, spg_plain, winkler_and_response
-from experiments.mechanics.contact_scenes import Scenes, displacement_error, exact, make_bench, sample
+from experiments.mechanics.contact_scenes import ContactScenes, displacement_error, exact, gel_kernels, sample
 from sensors_io.layer import Layer
 from sensors_io.scenes import contact
 from sensors_io.scenes.sensors import GELSIGHT_MINI
@@ -43,7 +43,7 @@ OTHERS = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StabilityConfig:
+class StabilityContactConfig:
     """What to try.
 
     Args:
@@ -64,7 +64,7 @@ class StabilityConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Outcome:
+class FailureOutcome:
     """Error of every method on one scene; what the package's solver says of itself."""
 
     errors: Mapping[str, float]
@@ -76,7 +76,7 @@ class Outcome:
     strain: float
 
 
-def run(config: StabilityConfig, context: Context) -> Results:
+def run(config: StabilityContactConfig, context: Context) -> Results:
     """Suite, maps, ordinary scenes."""
     cases = suite(config.grid)
     outcomes = {case.name: attempt(case) for case in context.each("cases", cases)}
@@ -112,23 +112,23 @@ def run(config: StabilityConfig, context: Context) -> Results:
     )
 
 
-def attempt(case: Case) -> Outcome:
+def attempt(case: FailureCase) -> FailureOutcome:
     """Solve one case by every method."""
-    bench = case.bench()
-    scenes = Scenes(
+    kernels = case.kernels()
+    scenes = ContactScenes(
         gap_mm=case.gap_mm[None].astype(np.float32),
         force_n=np.array([case.force_n], np.float32),
         modulus_mpa=np.ones(1, np.float32),
     )
-    true = exact(scenes, bench)[0]
-    gap, gel = jnp.asarray(scenes.gap_mm[0]), jnp.asarray(bench.gel, jnp.float32)
-    found = jax.device_get(_solve(gap, scenes.force_n[0], gel, 0 * gel, bench.spacing_mm, bench.thickness_mm))
-    fields = {name: _OTHERS[name](gap, scenes.force_n[0], gel, gel, bench.spacing_mm)[0] for name in OTHERS}
+    true = exact(scenes, kernels)[0]
+    gap, gel = jnp.asarray(scenes.gap_mm[0]), jnp.asarray(kernels.gel, jnp.float32)
+    found = jax.device_get(_solve(gap, scenes.force_n[0], gel, 0 * gel, kernels.spacing_mm, kernels.thickness_mm))
+    fields = {name: _OTHERS[name](gap, scenes.force_n[0], gel, gel, kernels.spacing_mm)[0] for name in OTHERS}
     errors = {
         name: float(displacement_error(np.asarray(u)[None], true[None])[0])
         for name, u in {**fields, NESTED: found.displacement_mm}.items()
     }
-    return Outcome(
+    return FailureOutcome(
         errors=errors,
         finite=all(bool(np.all(np.isfinite(leaf))) for leaf in jax.tree.leaves(found)),
         flagged=not bool(found.validity.all),
@@ -140,8 +140,12 @@ def attempt(case: Case) -> Outcome:
 
 
 def sweep(
-    title: str, rows: Sequence[float], make: Callable[[float], Case], config: StabilityConfig, context: Context
-) -> dict[tuple[int, int], Outcome]:
+    title: str,
+    rows: Sequence[float],
+    make: Callable[[float], FailureCase],
+    config: StabilityContactConfig,
+    context: Context,
+) -> dict[tuple[int, int], FailureOutcome]:
     """Outcomes over rows × forces; `make` turns a row's value into a case."""
     cells = itertools.product(enumerate(rows), enumerate(config.forces_n))
     return {
@@ -150,15 +154,15 @@ def sweep(
     }
 
 
-def ordinary_scenes(config: StabilityConfig, context: Context) -> dict[str, float]:
+def ordinary_scenes(config: StabilityContactConfig, context: Context) -> dict[str, float]:
     """Of random scenes, how many are flagged though the oracle calls them good, and how many are wrong in silence."""
-    scenes, bench = sample(SENSOR, config.scenes, config.grid, config.seed), make_bench(SENSOR, config.grid)
-    true = exact(context.each("ordinary scenes", scenes), bench)
-    gel, body = jnp.asarray(bench.gel, jnp.float32), jnp.asarray(bench.body, jnp.float32)
+    scenes, kernels = sample(SENSOR, config.scenes, config.grid, config.seed), gel_kernels(SENSOR, config.grid)
+    true = exact(context.each("ordinary scenes", scenes), kernels)
+    gel, body = jnp.asarray(kernels.gel, jnp.float32), jnp.asarray(kernels.body, jnp.float32)
 
     def solve(scene: tuple[jax.Array, jax.Array, jax.Array]) -> contact.Contact:
         gap, force, modulus = scene
-        return _solve(gap, force, gel, body / modulus, bench.spacing_mm, bench.thickness_mm)
+        return _solve(gap, force, gel, body / modulus, kernels.spacing_mm, kernels.thickness_mm)
 
     inputs = tuple(map(jnp.asarray, (scenes.gap_mm, scenes.force_n, scenes.modulus_mpa)))
     with context.progress("solving ordinary scenes", 1) as advance:
@@ -166,7 +170,7 @@ def ordinary_scenes(config: StabilityConfig, context: Context) -> dict[str, floa
         advance()
     error = displacement_error(found.displacement_mm, true)
     flagged = ~np.asarray(found.validity.all)
-    good = true.max((1, 2)) / bench.thickness_mm <= STRAIN_LIMIT
+    good = true.max((1, 2)) / kernels.thickness_mm <= STRAIN_LIMIT
     return {
         "good scenes": int(good.sum()),
         "flagged share": float(flagged[good].mean()),
@@ -185,7 +189,7 @@ def _reason(found: contact.Contact) -> str:
     return ", ".join(name for name, ok in failed.items() if not ok) or "–"
 
 
-def _silent(outcomes: Sequence[Outcome]) -> int:
+def _silent(outcomes: Sequence[FailureOutcome]) -> int:
     return sum(o.errors[NESTED] > 2 * contact.TOLERANCE and not o.flagged for o in outcomes)
 
 
@@ -193,21 +197,25 @@ def _count(name: str, count: float) -> Requirement:
     return Requirement(name=name, measured=float(count), bound=0, better="lower")
 
 
-def _rough_case(factor: float, config: StabilityConfig) -> Case:
+def _rough_case(factor: float, config: StabilityContactConfig) -> FailureCase:
     x = (np.arange(config.grid) + 0.5) * SIDE_MM / config.grid - SIDE_MM / 2
     smooth = (x[None] ** 2 + x[:, None] ** 2) / 40
     rough = rough_sphere(np.random.default_rng(config.seed), config.grid)
-    return Case(name=f"roughness × {factor}", gap_mm=smooth + factor * (rough - smooth), force_n=1.0)
+    return FailureCase(name=f"roughness × {factor}", gap_mm=smooth + factor * (rough - smooth), force_n=1.0)
 
 
-def _thin_case(thickness_mm: float, config: StabilityConfig) -> Case:
+def _thin_case(thickness_mm: float, config: StabilityContactConfig) -> FailureCase:
     gel = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=thickness_mm)
     gap = rough_sphere(np.random.default_rng(config.seed), config.grid)
-    return Case(name=f"h = {thickness_mm} mm", gap_mm=gap, force_n=1.0, gel=gel)
+    return FailureCase(name=f"h = {thickness_mm} mm", gap_mm=gap, force_n=1.0, gel=gel)
 
 
 def _map(
-    name: str, label: str, rows: Sequence[float], forces: Sequence[float], outcomes: Mapping[tuple[int, int], Outcome]
+    name: str,
+    label: str,
+    rows: Sequence[float],
+    forces: Sequence[float],
+    outcomes: Mapping[tuple[int, int], FailureOutcome],
 ) -> Picture:
     shape = (len(rows), len(forces))
     errors = {
@@ -231,7 +239,7 @@ def _map(
     )
 
 
-def _suite_table(cases: Sequence[Case], outcomes: Mapping[str, Outcome]) -> Table:
+def _suite_table(cases: Sequence[FailureCase], outcomes: Mapping[str, FailureOutcome]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for case in cases:
         o = outcomes[case.name]
@@ -253,7 +261,7 @@ def _suite_table(cases: Sequence[Case], outcomes: Mapping[str, Outcome]) -> Tabl
     )
 
 
-def _verdict(outcomes: Mapping[str, Outcome], ordinary: Mapping[str, float]) -> tuple[str, ...]:
+def _verdict(outcomes: Mapping[str, FailureOutcome], ordinary: Mapping[str, float]) -> tuple[str, ...]:
     worst = max(outcomes, key=lambda name: outcomes[name].errors[NESTED])
     broken = {name: sum(o.errors[name] > 2 * contact.TOLERANCE for o in outcomes.values()) for name in OTHERS}
     most = max(o.iterations for o in outcomes.values())
@@ -277,8 +285,8 @@ def _solve(
     return contact.solve(gap, force, gel, body, spacing_mm, thickness_mm=thickness_mm)
 
 
-DEFAULT = StabilityConfig()
-SMOKE = StabilityConfig(
+DEFAULT = StabilityContactConfig()
+SMOKE = StabilityContactConfig(
     grid=32,
     adhesion_grid=64,
     scenes=40,

@@ -25,7 +25,7 @@ ACCEPTED_AT = (0.02, 0.05, 0.1, 0.2)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Promise:
+class PromiseCheck:
     """One contact: kind of body, sensor, error of the superposition, and the error that it was promised to keep to."""
 
     kind: str
@@ -81,17 +81,17 @@ def lubkin(grid: int, context: Context) -> float:
     return max(off)
 
 
-def promise(sensor: SensorModel, kind: str, error: float, modulus_mpa: float, radius_mm: float) -> Promise:
+def promise(sensor: SensorModel, kind: str, error: float, modulus_mpa: float, radius_mm: float) -> PromiseCheck:
     """What the superposition was promised to keep to on one contact, and its error."""
     body = dataclasses.replace(BODY, modulus_mpa=modulus_mpa)
     promised = partial_slip.promised_error(sensor.gel, body, radius_mm)
-    return Promise(kind=kind, sensor=sensor.name, error=error, promised=promised)
+    return PromiseCheck(kind=kind, sensor=sensor.name, error=error, promised=promised)
 
 
-def promise_table(promises: Iterable[Promise]) -> Table:
+def promise_table(promises: Iterable[PromiseCheck]) -> Table:
     """By kind of body, by sensor, and of all."""
     found = list(promises)
-    groups: dict[str, list[Promise]] = {}
+    groups: dict[str, list[PromiseCheck]] = {}
     for p in found:
         groups.setdefault(p.kind, []).append(p)
     for p in found:
@@ -111,7 +111,7 @@ def promise_table(promises: Iterable[Promise]) -> Table:
     )
 
 
-def decision_table(promises: Iterable[Promise]) -> Table:
+def decision_table(promises: Iterable[PromiseCheck]) -> Table:
     """Where the superposition is taken at a tolerance, and whether it was right to."""
     found = list(promises)
     rows: list[tuple[Cell, ...]] = []
@@ -150,7 +150,7 @@ def closed_form_table(mindlin: Mapping[str, float], torque: float, grid: int) ->
     )
 
 
-def _promise_row(name: str, group: list[Promise]) -> tuple[Cell, ...]:
+def _promise_row(name: str, group: list[PromiseCheck]) -> tuple[Cell, ...]:
     errors = 100 * np.array([p.error for p in group])
     promised = 100 * float(np.median([p.promised for p in group]))
     kept = 100 * float(np.mean([p.kept for p in group]))

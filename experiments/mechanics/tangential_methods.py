@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.mechanics.tangential_scenes import Bench, Case, Motion
+from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
 from sensors_io.scenes import contact, drag, partial_slip, tangential
 from sensors_io.scenes.traction import Compliance, displacement, in_series, rigid_field, shear_displacement
 
-Solver = Callable[[Case, Bench, Array], Any]
-SequenceSolver = Callable[[Motion, Bench, Array], tuple[Array, Any]]
+Solver = Callable[[FrictionContact, FrictionKernels, Array], Any]
+SequenceSolver = Callable[[FrictionSequence, FrictionKernels, Array], tuple[Array, Any]]
 FrameSolver = Callable[[Array, Array, Compliance, Array], tuple[Array, Any]]
 """μp, target, compliance and the traction before → the traction, and what else is to be kept."""
 
@@ -30,12 +30,12 @@ _SHORTEST = 1e-12  # MPa; below it a traction has no direction
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Method:
+class FrictionMethod:
     """A solver at one setting; `kind` groups the chart, `label` is its mark there."""
 
     kind: str
     label: str = ""
-    solve: Callable[[Any, Bench, Array], Any]
+    solve: Callable[[Any, FrictionKernels, Array], Any]
     setting: float | int = 0.0
 
     @property
@@ -45,102 +45,104 @@ class Method:
 
 
 @functools.partial(jax.jit, static_argnames="solve")
-def every(solve: Solver, cases: Case, bench: Bench, setting: Array) -> Any:
+def every(solve: Solver, cases: FrictionContact, kernels: FrictionKernels, setting: Array) -> Any:
     """What a solver finds of S contacts, one after the other, so that each stops on its own."""
-    return jax.lax.map(lambda case: solve(case, bench, setting), cases)
+    return jax.lax.map(lambda case: solve(case, kernels, setting), cases)
 
 
 @functools.partial(jax.jit, static_argnames="solve")
-def sequence(solve: SequenceSolver, motion: Motion, bench: Bench, setting: Array) -> tuple[Array, Any]:
+def sequence(
+    solve: SequenceSolver, motion: FrictionSequence, kernels: FrictionKernels, setting: Array
+) -> tuple[Array, Any]:
     """Tractions [F, N, N] of a sequence, and what its markers show."""
-    return solve(motion, bench, setting)
+    return solve(motion, kernels, setting)
 
 
-def exact(task: str, cases: Case, bench: Bench) -> np.ndarray:
+def exact(task: str, cases: FrictionContact, kernels: FrictionKernels) -> np.ndarray:
     """Tractions [S, N, N] of a task of `TASKS` in float64, whose duality gap of 1e-8 proves them, whatever found them.
 
     Raises:
       RuntimeError: a gap that stays wider.
     """
     with jax.enable_x64(True):
-        found = every(_SOLVED[task], _double(cases), _double(bench), jnp.asarray(EXACT_TOLERANCE))
+        found = every(_SOLVED[task], _double(cases), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
         return _proven(found.traction_mpa, found.residual)
 
 
-def exact_sequence(motion: Motion, bench: Bench) -> np.ndarray:
+def exact_sequence(motion: FrictionSequence, kernels: FrictionKernels) -> np.ndarray:
     """The same of all frames of a sequence."""
     with jax.enable_x64(True):
-        found, (_, gap) = sequence(_tight_frames, _double(motion), _double(bench), jnp.asarray(EXACT_TOLERANCE))
+        found, (_, gap) = sequence(_tight_frames, _double(motion), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
         return _proven(found, gap)
 
 
 @jax.jit
-def marker_motion(tractions: Array, bench: Bench) -> Array:
+def marker_motion(tractions: Array, kernels: FrictionKernels) -> Array:
     """Displacement along the gel at the depth of its markers by tractions [S, N, N], mm."""
-    return jax.lax.map(lambda each: shear_displacement(each, bench.markers.shear), tractions)
+    return jax.lax.map(lambda each: shear_displacement(each, kernels.markers.shear), tractions)
 
 
-def spg_pull(case: Case, bench: Bench, tolerance: Array) -> Array:
+def spg_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
     """A prescribed force by the package's solver."""
-    return _solved_pull(case, bench, tolerance).traction_mpa
+    return _solved_pull(case, kernels, tolerance).traction_mpa
 
 
-def spg_slide(case: Case, bench: Bench, tolerance: Array) -> Array:
+def spg_slide(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
     """A prescribed slide by the package's solver."""
-    return _solved_slide(case, bench, tolerance).traction_mpa
+    return _solved_slide(case, kernels, tolerance).traction_mpa
 
 
-def spg_twist(case: Case, bench: Bench, tolerance: Array) -> Array:
+def spg_twist(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
     """A prescribed twist by the package's solver."""
-    return _solved_twist(case, bench, tolerance).traction_mpa
+    return _solved_twist(case, kernels, tolerance).traction_mpa
 
 
-def superposed_pull(case: Case, bench: Bench, tolerance: Array) -> Array:
+def superposed_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
     """Ciavarella and Jäger's superposition, the smaller contact solved to a tolerance."""
     force = case.ramp_n[-1] * (1 - case.pull_share)
-    body = bench.normal_body / case.modulus_mpa
-    stuck = contact.solve(case.gap_mm, force, bench.normal_gel, body, bench.spacing_mm, tolerance).pressure_mpa
+    body = kernels.normal_body / case.modulus_mpa
+    stuck = contact.solve(case.gap_mm, force, kernels.normal_gel, body, kernels.spacing_mm, tolerance).pressure_mpa
     return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
 
 
-def ramp_pull(case: Case, bench: Bench, _: Array) -> Array:
+def ramp_pull(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """The same, the smaller contact read off the press that went before."""
     stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, case.ramp_n[-1] * (1 - case.pull_share))
     return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
 
 
-def ramp_slide(case: Case, bench: Bench, _: Array) -> Array:
+def ramp_slide(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """The same for a prescribed slide, whose force the press tells."""
-    slides = partial_slip.core_slide(case.ramp_mpa, _series(case, bench), case.direction)
+    slides = partial_slip.core_slide(case.ramp_mpa, _series(case, kernels), case.direction)
     left = partial_slip.stuck_force(case.ramp_n, slides, case.ramp_n[-1], case.friction, case.slide_mm)
     stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, left)
     return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
 
 
-def scaled_pull(case: Case, bench: Bench, _: Array) -> Array:
+def scaled_pull(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """Traction in proportion to the pressure."""
     return case.pull_share * case.limit_mpa * case.direction
 
 
-def full_slip(case: Case, bench: Bench, _: Array) -> Array:
+def full_slip(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """A slide that slips everywhere: μp."""
     return case.limit_mpa * case.direction
 
 
-def full_twist(case: Case, bench: Bench, _: Array) -> Array:
+def full_twist(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """A twist that slips everywhere."""
-    target = _twist(case, bench)
+    target = _twist(case, kernels)
     return case.limit_mpa * target / jnp.maximum(jnp.abs(target), _TINY)
 
 
-def plain_slide(case: Case, bench: Bench, iterations: Array) -> Array:
+def plain_slide(case: FrictionContact, kernels: FrictionKernels, iterations: Array) -> Array:
     """A prescribed slide by the plain solver."""
-    return plain_spg(case.limit_mpa, _slide(case, bench), _series(case, bench), iterations)
+    return plain_spg(case.limit_mpa, _slide(case, kernels), _series(case, kernels), iterations)
 
 
-def plain_twist(case: Case, bench: Bench, iterations: Array) -> Array:
+def plain_twist(case: FrictionContact, kernels: FrictionKernels, iterations: Array) -> Array:
     """A prescribed twist by the plain solver."""
-    return plain_spg(case.limit_mpa, _twist(case, bench), _series(case, bench), iterations)
+    return plain_spg(case.limit_mpa, _twist(case, kernels), _series(case, kernels), iterations)
 
 
 def plain_spg(limit: Array, target: Array, compliance: Compliance, iterations: Array) -> Array:
@@ -174,57 +176,57 @@ def plain_spg(limit: Array, target: Array, compliance: Compliance, iterations: A
     return jax.lax.complex(x, y)
 
 
-def spg_frames(motion: Motion, bench: Bench, tolerance: Array) -> tuple[Array, Any]:
+def spg_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
     """A sequence as the generator makes it."""
-    bodies = drag.Bodies(compliance=_series(motion, bench), coupling=None, response=bench.markers)
+    bodies = drag.Bodies(compliance=_series(motion, kernels), coupling=None, response=kernels.markers)
 
     def go_on(history: drag.History, frame: tuple[Array, drag.Step]) -> tuple[drag.History, tuple[Array, Array]]:
         pressure, step = frame
         history, seen = drag.advance(
-            history, pressure, motion.friction, step, bodies, bench.x_mm, tolerance, MOST_ITERATIONS
+            history, pressure, motion.friction, step, bodies, kernels.x_mm, tolerance, MOST_ITERATIONS
         )
         return history, (seen.traction_mpa, seen.displacement_mm)
 
-    start = drag.at_rest(bench.x_mm.shape[0])
+    start = drag.at_rest(kernels.x_mm.shape[0])
     found: tuple[Array, Array] = jax.lax.scan(go_on, start, (motion.pressure_mpa, motion.step))[1]
     return found
 
 
-def plain_frames(motion: Motion, bench: Bench, iterations: Array) -> tuple[Array, Any]:
+def plain_frames(motion: FrictionSequence, kernels: FrictionKernels, iterations: Array) -> tuple[Array, Any]:
     """A sequence by the plain solver, which begins every frame anew."""
-    return _frames(motion, bench, lambda limit, target, c, _: (plain_spg(limit, target, c, iterations), None))
+    return _frames(motion, kernels, lambda limit, target, c, _: (plain_spg(limit, target, c, iterations), None))
 
 
-def full_slip_frames(motion: Motion, bench: Bench, _: Array) -> tuple[Array, Any]:
+def full_slip_frames(motion: FrictionSequence, kernels: FrictionKernels, _: Array) -> tuple[Array, Any]:
     """A sequence that slips everywhere against the motion of each frame."""
 
     def one(frame: tuple[Array, drag.Step]) -> tuple[Array, Any]:
         pressure, step = frame
-        moved = rigid_field(bench.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
+        moved = rigid_field(kernels.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
         found = motion.friction * pressure * moved / jnp.maximum(jnp.abs(moved), _TINY)
-        return found, displacement(pressure, found, bench.markers)
+        return found, displacement(pressure, found, kernels.markers)
 
     tractions: tuple[Array, Any] = jax.lax.map(one, (motion.pressure_mpa, motion.step))
     return tractions
 
 
-def _tight_frames(motion: Motion, bench: Bench, tolerance: Array) -> tuple[Array, Any]:
+def _tight_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
     def solve(limit: Array, target: Array, compliance: Compliance, before: Array) -> tuple[Array, Array]:
         solved = tangential.solve(limit, target, compliance, before, tolerance, EXACT_ITERATIONS)
         return solved.traction_mpa, solved.residual
 
-    return _frames(motion, bench, solve)
+    return _frames(motion, kernels, solve)
 
 
-def _frames(motion: Motion, bench: Bench, solve: FrameSolver) -> tuple[Array, Any]:
+def _frames(motion: FrictionSequence, kernels: FrictionKernels, solve: FrameSolver) -> tuple[Array, Any]:
     """What sticks carries its displacement on: every frame's target is what was carried and the motion since."""
-    compliance = _series(motion, bench)
+    compliance = _series(motion, kernels)
 
     def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.Step]) -> tuple[tuple[Array, Array], Any]:
         (before, carried), (pressure, step) = state, frame
-        target = carried + rigid_field(bench.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
+        target = carried + rigid_field(kernels.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
         found, more = solve(motion.friction * pressure, target, compliance, before)
-        seen = displacement(pressure, found, bench.markers)
+        seen = displacement(pressure, found, kernels.markers)
         return (found, shear_displacement(found, compliance)), (found, (seen, more))
 
     rest = jax.lax.complex(*[jnp.zeros_like(motion.pressure_mpa[0])] * 2)
@@ -232,20 +234,20 @@ def _frames(motion: Motion, bench: Bench, solve: FrameSolver) -> tuple[Array, An
     return found
 
 
-def _solved_pull(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
-    pull = case.pull_share * case.direction * jnp.sum(case.limit_mpa) * bench.spacing_mm**2
+def _solved_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
+    pull = case.pull_share * case.direction * jnp.sum(case.limit_mpa) * kernels.spacing_mm**2
     force, still = jnp.stack([pull.real, pull.imag]), jnp.zeros_like(case.limit_mpa * case.direction)
-    compliance, cap = _series(case, bench), _cap(tolerance)
-    return tangential.solve_force(case.limit_mpa, force, still, compliance, bench.spacing_mm, tolerance, cap)
+    compliance, cap = _series(case, kernels), _cap(tolerance)
+    return tangential.solve_force(case.limit_mpa, force, still, compliance, kernels.spacing_mm, tolerance, cap)
 
 
-def _solved_slide(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
-    target, compliance = _slide(case, bench), _series(case, bench)
+def _solved_slide(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
+    target, compliance = _slide(case, kernels), _series(case, kernels)
     return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
 
 
-def _solved_twist(case: Case, bench: Bench, tolerance: Array) -> tangential.Traction:
-    target, compliance = _twist(case, bench), _series(case, bench)
+def _solved_twist(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
+    target, compliance = _twist(case, kernels), _series(case, kernels)
     return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
 
 
@@ -254,17 +256,17 @@ def _cap(tolerance: Array) -> Array:
     return jnp.where(tolerance <= EXACT_TOLERANCE, EXACT_ITERATIONS, MOST_ITERATIONS)
 
 
-def _series(of: Case | Motion, bench: Bench) -> Compliance:
-    return in_series(bench.gel, bench.body, 1.0, of.modulus_mpa)
+def _series(of: FrictionContact | FrictionSequence, kernels: FrictionKernels) -> Compliance:
+    return in_series(kernels.gel, kernels.body, 1.0, of.modulus_mpa)
 
 
-def _slide(case: Case, bench: Bench) -> Array:
+def _slide(case: FrictionContact, kernels: FrictionKernels) -> Array:
     return jnp.broadcast_to(case.slide_mm * case.direction, case.gap_mm.shape)
 
 
-def _twist(case: Case, bench: Bench) -> Array:
-    still = jnp.zeros_like(bench.x_mm, shape=(2,))
-    return rigid_field(bench.x_mm, still, case.twist_rad, still)
+def _twist(case: FrictionContact, kernels: FrictionKernels) -> Array:
+    still = jnp.zeros_like(kernels.x_mm, shape=(2,))
+    return rigid_field(kernels.x_mm, still, case.twist_rad, still)
 
 
 def _tensor(compliance: Compliance) -> Array:

@@ -35,7 +35,7 @@ _PRESSURE_TOLERANCE, _PRESSURE_ITERATIONS = 1e-4, 400
 
 
 @struct.dataclass
-class Bench:
+class FrictionKernels:
     """The spectra of one gel on a padded grid: normal and tangential, of the gel and of a body of 1 MPa; markers."""
 
     x_mm: Float[Array, "N"]
@@ -52,7 +52,7 @@ class Bench:
 
 
 @struct.dataclass
-class Case:
+class FrictionContact:
     """One contact and what is done to it; of many contacts every array has a leading axis.
 
     The press went through the forces `ramp_n`, the last of which is the one that holds.  Either a tangential force of
@@ -76,7 +76,7 @@ class Case:
 
 
 @struct.dataclass
-class Motion:
+class FrictionSequence:
     """A sequence of F frames: the pressure of each and the motion since the frame before."""
 
     pressure_mpa: Float[Array, "F N N"]
@@ -86,7 +86,7 @@ class Motion:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Body:
+class FrictionBody:
     """A drawn object: its kind, skin, modulus and friction."""
 
     kind: str
@@ -108,12 +108,12 @@ def sensors(names: tuple[str, ...]) -> tuple[SensorModel, ...]:
     return tuple(by_name[name] for name in names)
 
 
-def make_bench(sensor: SensorModel, grid: int) -> Bench:
+def friction_kernels(sensor: SensorModel, grid: int) -> FrictionKernels:
     """A gel's spectra, on the padding that the widest-reaching gel needs, so that one program serves all."""
     spacing = sensor.window_mm / grid
     size = max(press.padded_size(grid, m.window_mm, m.gel.thickness_mm) for m in MODELS)
     q = np.hypot(*layer.wave_numbers(size, spacing))
-    return Bench(
+    return FrictionKernels(
         x_mm=jnp.asarray((np.arange(grid) + 0.5) * spacing - sensor.window_mm / 2, jnp.float32),
         normal_gel=jnp.asarray(layer.normal_compliance(q, sensor.gel), jnp.float32),
         normal_body=jnp.asarray(layer.normal_compliance(q, BODY), jnp.float32),
@@ -123,7 +123,7 @@ def make_bench(sensor: SensorModel, grid: int) -> Bench:
     )
 
 
-def draw(rng: np.random.Generator, kind: str) -> Body:
+def draw(rng: np.random.Generator, kind: str) -> FrictionBody:
     """An object of a kind of `KINDS`, with a modulus and a friction of any material."""
     solid = objects.sample(rng, 0.0, _SHORTEST_MM)
     radius = solid.radius_1_mm if kind == "sphere" else solid.radius_2_mm
@@ -134,24 +134,24 @@ def draw(rng: np.random.Generator, kind: str) -> Body:
         solid, radius_2_mm=radius, wave_amplitudes_mm=amplitudes, feature_height_mm=relief, rms_mm=rms
     )
     skin = surface.make_skin(shaped, rng.uniform(-2, 2, 2), 1.0)
-    return Body(kind=kind, skin=skin, modulus_mpa=solid.modulus_mpa, friction=solid.friction)
+    return FrictionBody(kind=kind, skin=skin, modulus_mpa=solid.modulus_mpa, friction=solid.friction)
 
 
-def sample(bench: Bench, count: int, seed: int, order: int) -> tuple[Case, tuple[str, ...]]:
+def sample(kernels: FrictionKernels, count: int, seed: int, order: int) -> tuple[FrictionContact, tuple[str, ...]]:
     """`count` contacts of every kind on one gel, stacked, and the kind of each.
 
     Args:
-      bench: the gel.
+      kernels: of the gel.
       count: contacts of a kind.
       seed, order: of the draws; `order` is the number of the gel.
     """
     kinds = tuple(kind for kind in KINDS for _ in range(count))
     rng = np.random.default_rng([seed, order])
-    cases = [_case(bench, draw(rng, kind), rng) for kind in kinds]
+    cases = [_case(kernels, draw(rng, kind), rng) for kind in kinds]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cases), kinds
 
 
-def make_motion(bench: Bench, body: Body, name: str, frames: int) -> Motion:
+def make_motion(kernels: FrictionKernels, body: FrictionBody, name: str, frames: int) -> FrictionSequence:
     """A motion of the protocol at 5 N by one object, with the pressure of every frame."""
     hand = motions.plan(name, SEQUENCE_FORCE_N, schedule.pace(frames))
     slide, twist = (jnp.asarray(a, jnp.float32) for a in (hand.slide_mm, hand.twist_rad))
@@ -161,8 +161,8 @@ def make_motion(bench: Bench, body: Body, name: str, frames: int) -> Motion:
     def since(path: Array) -> Array:
         return jnp.diff(path, axis=0, prepend=jnp.zeros_like(path[:1]))
 
-    return Motion(
-        pressure_mpa=_pressures(bench, body.skin, modulus, force, slide, twist),
+    return FrictionSequence(
+        pressure_mpa=_pressures(kernels, body.skin, modulus, force, slide, twist),
         step=drag.Step(slide_mm=since(slide), twist_rad=since(twist), centre_mm=still + slide),
         modulus_mpa=modulus,
         friction=jnp.float32(body.friction),
@@ -174,7 +174,7 @@ def contact_radius_mm(pressure_mpa: np.ndarray, spacing_mm: float) -> float:
     return float(np.sqrt((pressure_mpa > 0).sum() / np.pi) * spacing_mm)
 
 
-def _case(bench: Bench, body: Body, rng: np.random.Generator) -> Case:
+def _case(kernels: FrictionKernels, body: FrictionBody, rng: np.random.Generator) -> FrictionContact:
     pose = surface.Pose(
         offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
         turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
@@ -184,10 +184,10 @@ def _case(bench: Bench, body: Body, rng: np.random.Generator) -> Case:
     direction = jnp.complex64(np.exp(1j * rng.uniform(0, 2 * np.pi)))
     forces = jnp.asarray(force * (np.arange(1, _RAMP + 1) / _RAMP) ** _RISE, jnp.float32)
     modulus, friction = jnp.float32(body.modulus_mpa), jnp.float32(body.friction)
-    gap, ramp, slide = _press(bench, body.skin, pose, modulus, forces, direction)
+    gap, ramp, slide = _press(kernels, body.skin, pose, modulus, forces, direction)
     share = rng.uniform(*SLIDE_SHARES)
-    radius = contact_radius_mm(np.asarray(ramp[-1]), float(bench.spacing_mm))
-    return Case(
+    radius = contact_radius_mm(np.asarray(ramp[-1]), float(kernels.spacing_mm))
+    return FrictionContact(
         gap_mm=gap,
         ramp_mpa=ramp,
         ramp_n=forces,
@@ -202,31 +202,36 @@ def _case(bench: Bench, body: Body, rng: np.random.Generator) -> Case:
 
 @jax.jit
 def _press(
-    bench: Bench, skin: surface.Skin, pose: surface.Pose, modulus_mpa: Array, forces_n: Array, direction: Array
+    kernels: FrictionKernels,
+    skin: surface.Skin,
+    pose: surface.Pose,
+    modulus_mpa: Array,
+    forces_n: Array,
+    direction: Array,
 ) -> tuple[Array, Array, Array]:
     """Gap, pressure at every force, and the slide along `direction` at which a friction of 1 lets all of it slip."""
-    gap = surface.gap(skin, pose, bench.x_mm)
-    ramp = jax.lax.map(lambda force: _solved(bench, gap, modulus_mpa, force), forces_n)
-    compliance = in_series(bench.gel, bench.body, 1.0, modulus_mpa)
+    gap = surface.gap(skin, pose, kernels.x_mm)
+    ramp = jax.lax.map(lambda force: _solved(kernels, gap, modulus_mpa, force), forces_n)
+    compliance = in_series(kernels.gel, kernels.body, 1.0, modulus_mpa)
     return gap, ramp, partial_slip.core_slide(ramp, compliance, direction)[-1]
 
 
 @jax.jit
 def _pressures(
-    bench: Bench, skin: surface.Skin, modulus_mpa: Array, force_n: Array, slide_mm: Array, twist_rad: Array
+    kernels: FrictionKernels, skin: surface.Skin, modulus_mpa: Array, force_n: Array, slide_mm: Array, twist_rad: Array
 ) -> Array:
     """Pressure of every frame, [F, N, N]; zeros without force."""
     pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
 
     def frame(at: tuple[Array, Array, Array]) -> Array:
         force, slide, twist = at
-        gap = surface.gap(skin, motions.moved(pose, slide, twist, jnp.zeros(2)), bench.x_mm)
-        return jnp.where(force > 0, _solved(bench, gap, modulus_mpa, jnp.where(force > 0, force, 1.0)), 0)
+        gap = surface.gap(skin, motions.moved(pose, slide, twist, jnp.zeros(2)), kernels.x_mm)
+        return jnp.where(force > 0, _solved(kernels, gap, modulus_mpa, jnp.where(force > 0, force, 1.0)), 0)
 
     return jax.lax.map(frame, (force_n, slide_mm, twist_rad))
 
 
-def _solved(bench: Bench, gap: Array, modulus_mpa: Array, force_n: Array) -> Array:
-    body = bench.normal_body / modulus_mpa
+def _solved(kernels: FrictionKernels, gap: Array, modulus_mpa: Array, force_n: Array) -> Array:
+    body = kernels.normal_body / modulus_mpa
     limits = (_PRESSURE_TOLERANCE, _PRESSURE_ITERATIONS)
-    return contact.solve(gap, force_n, bench.normal_gel, body, bench.spacing_mm, *limits).pressure_mpa
+    return contact.solve(gap, force_n, kernels.normal_gel, body, kernels.spacing_mm, *limits).pressure_mpa

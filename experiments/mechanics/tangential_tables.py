@@ -8,7 +8,7 @@ import numpy as np
 from experiments.core.pareto import Point
 from experiments.core.results import Cell, Column, Picture, Table
 from experiments.mechanics import tangential_charts
-from experiments.mechanics.tangential_checks import Promise
+from experiments.mechanics.tangential_checks import PromiseCheck
 from sensors_io.scenes import tangential
 
 SOLVER, PLAIN, SUPERPOSED = "SPG to tolerance", "plain SPG", "superposition"
@@ -32,7 +32,7 @@ COMPARED = ("slide", "twist", SEQUENCE)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Row:
+class MethodErrors:
     """What was measured of one method: ms a contact or frame, and the error of each, relative [S]."""
 
     kind: str
@@ -51,7 +51,7 @@ class Row:
         return float(np.quantile(self.errors, 0.95))
 
 
-Rows = Mapping[str, Row]
+Rows = Mapping[str, MethodErrors]
 """Name of the method → what was measured, of one task."""
 
 
@@ -134,7 +134,7 @@ def speed_picture(tasks: Mapping[str, Rows]) -> Picture:
     )
 
 
-def promise_picture(promises: Sequence[Promise]) -> Picture:
+def promise_picture(promises: Sequence[PromiseCheck]) -> Picture:
     """Promises against errors."""
     points: dict[str, list[tuple[float, float]]] = {}
     for p in promises:

@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from experiments.core.charts import LOOK, PALETTE, SHARED, svg
 
-Rate = tuple[str, float, float]
+RecordRate = tuple[str, float, float]
 """Name, records a second, records a second that are required."""
 
 
-def rates_and_stages(rates: Sequence[Rate], stages: Mapping[str, Mapping[str, float]]) -> bytes:
+def rates_and_stages(rates: Sequence[RecordRate], stages: Mapping[str, Mapping[str, float]]) -> bytes:
     """Bars of rates with a tick at what is required; stacked bars of the milliseconds of a record by sensor.
 
     Args:

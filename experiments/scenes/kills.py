@@ -20,7 +20,7 @@ _SIGKILL = -int(signal.SIGKILL)  # return code of a process that it ended
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Kept:
+class ResumedSet:
     """What is left of a set after kills, against one that was written undisturbed.
 
     `records` that can be read; contacts that are missing, there more than once, or damaged by their checksums; contacts
@@ -84,7 +84,7 @@ def killed_and_resumed(
     return killed
 
 
-def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> Kept:
+def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> ResumedSet:
     """Read every entry of both sets; `advance` is called before each."""
     left, right = RecordStore(whole), RecordStore(killed)
     records = damaged = differing = 0
@@ -97,7 +97,7 @@ def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: Non
             continue
         records += sum(len(sequence) for sequence in contact.values())
         differing += i >= len(left) or key != left.contacts[i] or not _same(contact, left.contact(i))
-    return Kept(
+    return ResumedSet(
         records=records,
         missing=len(set(left.contacts) - set(right.contacts)),
         repeated=len(right) - len(set(right.contacts)),

@@ -30,10 +30,10 @@ from experiments.scenes.storage_charts import size_against_rates
 from experiments.scenes.storage_clips import GENERATED, IMPORTED, generated_clips, recorded_clips
 from experiments.scenes.storage_codecs import OWN, PLAIN, Codec, all_codecs
 from experiments.scenes.storage_feed import FeedConfig, feed_rates, make_store, stage_ms
-from experiments.scenes.storage_measure import Measured, chosen_filters, measure
+from experiments.scenes.storage_measure import CodecMeasurement, chosen_filters, measure
 from sensors_io.scenes.config import SceneConfig
 
-Rows = Mapping[str, Sequence[Measured]]
+Rows = Mapping[str, Sequence[CodecMeasurement]]
 """Kind of clips → codecs measured on them."""
 
 
@@ -69,7 +69,7 @@ def run(config: StorageConfig, context: Context) -> Results:
     clips = {GENERATED: generated_clips(config.scenes, context.each("making scenes", range(config.contacts)))}
     if config.data_dir is not None:
         clips |= recorded_clips(config.data_dir, config.videos, config.frames, context)
-    rows: dict[str, list[Measured]] = {}
+    rows: dict[str, list[CodecMeasurement]] = {}
     missing: dict[str, str] = {}
     for kind, group in clips.items():
         context.say(f"{kind}: {len(group)} clips, {sum(map(len, group))} frames")
@@ -147,15 +147,15 @@ def verdict(
     )
 
 
-def _of(rows: Sequence[Measured], name: str) -> Measured:
+def _of(rows: Sequence[CodecMeasurement], name: str) -> CodecMeasurement:
     return next(row for row in rows if row.codec.name == name)
 
 
-def _ratio(rows: Sequence[Measured]) -> float:
+def _ratio(rows: Sequence[CodecMeasurement]) -> float:
     return _of(rows, PLAIN).bytes / _of(rows, "raw").bytes
 
 
-def _table(kind: str, rows: Sequence[Measured]) -> Table:
+def _table(kind: str, rows: Sequence[CodecMeasurement]) -> Table:
     raw = _of(rows, "raw").bytes
     return Table(
         title=f"Codecs: {kind}",
@@ -201,7 +201,7 @@ def _rates(rates: Mapping[tuple[int, str], float]) -> Table:
     )
 
 
-def _picture(number: int, kind: str, rows: Sequence[Measured], need_fps: float) -> Picture:
+def _picture(number: int, kind: str, rows: Sequence[CodecMeasurement], need_fps: float) -> Picture:
     return Picture(
         name=f"pareto_storage_{number}",
         title=f"Size against rate: {kind}",

@@ -17,7 +17,7 @@ _FOLDS = 5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Leak:
+class ForceLeak:
     """Balanced accuracy, percent, of each ordinal label from the peak force of a press alone; chance is 33.3."""
 
     design: str
@@ -26,7 +26,7 @@ class Leak:
     full_share: float
 
 
-def leaks(config: SceneConfig) -> list[Leak]:
+def leaks(config: SceneConfig) -> list[ForceLeak]:
     """Frames past the limit left out where they fail, by shape alone, not at all, and matched, which is the default."""
     labels = _labels(config)
     made = plan(config)
@@ -63,10 +63,10 @@ def _labels(config: SceneConfig) -> np.ndarray:
     return np.array([[card.labels[name] for name in ORDINAL] for card in object_cards(config)])
 
 
-def _leak(name: str, seen: np.ndarray, peak: np.ndarray, labels: np.ndarray) -> Leak:
+def _leak(name: str, seen: np.ndarray, peak: np.ndarray, labels: np.ndarray) -> ForceLeak:
     accuracy = tuple(100 * _guess(np.log(seen), labels[:, a]) for a in range(len(ORDINAL)))
     full = float(np.mean(peak >= PRESS_FORCE_N - 1e-6))
-    return Leak(design=name, accuracy=accuracy, median_n=float(np.median(peak)), full_share=full)
+    return ForceLeak(design=name, accuracy=accuracy, median_n=float(np.median(peak)), full_share=full)
 
 
 def _guess(value: np.ndarray, label: np.ndarray) -> float:

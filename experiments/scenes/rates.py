@@ -16,7 +16,7 @@ from sensors_io.schema import SENSORS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rate:
+class RecordRate:
     """So many records in so many seconds of the clock and of the processors."""
 
     records: int
@@ -40,13 +40,13 @@ class Stopwatch:
     def __init__(self) -> None:
         self._begin = (time.perf_counter(), time.process_time())
 
-    def rate(self, records: int) -> Rate:
+    def rate(self, records: int) -> RecordRate:
         """The rate of `records` made meanwhile."""
         wall, cpu = time.perf_counter() - self._begin[0], time.process_time() - self._begin[1]
-        return Rate(records=records, seconds=wall, cpu_seconds=cpu)
+        return RecordRate(records=records, seconds=wall, cpu_seconds=cpu)
 
 
-def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callable[[int], None]) -> Rate:
+def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callable[[int], None]) -> RecordRate:
     """Rate of a feed without disk whose clips hold every frame; compiling and looking at objects are left out."""
     clip = ClipConfig(frames=config.frame_count, image_px=config.image_px, view_px=config.view_px)
     scenes = LiveScenes(config)
@@ -60,7 +60,7 @@ def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callabl
     return watch.rate(contacts * len(SENSORS) * config.frame_count)
 
 
-def write_rate(config: SceneConfig, out: Path, advance: Callable[[int], None]) -> tuple[Rate, float]:
+def write_rate(config: SceneConfig, out: Path, advance: Callable[[int], None]) -> tuple[RecordRate, float]:
     """Rate of a written set and its bytes per record; compiling and looking at objects are left out."""
     for row in _one_of_each_program(config):
         make_contact(config, row)

@@ -29,7 +29,7 @@ BY_EYE_NOISE = Noise(read=(0.004,) * 3, shot=(0.008,) * 3, grain=(0.0,) * 3, sha
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Candidate:
+class RenderCandidate:
     """One way to make pictures: a renderer and its noise."""
 
     render: Renderer
@@ -37,7 +37,7 @@ class Candidate:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Study:
+class PressFit:
     """The held-out presses and what was fitted to the others."""
 
     presses: BallPresses
@@ -77,7 +77,7 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
     )
 
 
-def fit(presses: BallPresses, context: Context) -> Study:
+def fit(presses: BallPresses, context: Context) -> PressFit:
     """Fit to the even presses, align the odd ones."""
     with context.progress("fitting", 2 + fitting.ROUNDS + 1) as advance:
         profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
@@ -87,7 +87,7 @@ def fit(presses: BallPresses, context: Context) -> Study:
         advance(note="circles are found")
         fitted, touches = fitting.fit_jointly(presses, profiles, begun, train, lambda done, total: advance())
     chosen = dataclasses.replace(presses, pictures=presses.pictures[train])
-    return Study(
+    return PressFit(
         presses=presses,
         profiles=profiles,
         touches=touches,
@@ -112,7 +112,7 @@ def located(presses: BallPresses, train: np.ndarray) -> np.ndarray:
     return rows * presses.mm_per_px
 
 
-def candidates(study: Study) -> dict[str, Candidate]:
+def candidates(study: PressFit) -> dict[str, RenderCandidate]:
     """What is compared, from the first optics to the fit of this run."""
     stored = Noise(
         read=GELSIGHT_MINI.read_noise,
@@ -123,18 +123,20 @@ def candidates(study: Study) -> dict[str, Candidate]:
     by_eye = lambda gel, light: optics.shade(gel, light, BY_EYE, slope_gain=2.0)
     fitted = lambda gel, light: photometric.shade(gel, light, study.fitted)
     return {
-        "lamps by eye": Candidate(render=by_eye, noise=BY_EYE_NOISE),
-        "fitted optics, old noise": Candidate(render=fitted, noise=BY_EYE_NOISE),
-        "fitted optics and noise": Candidate(render=fitted, noise=dataclasses.replace(study.noise, grain=(0.0,) * 3)),
-        "fitted, with grain": Candidate(render=fitted, noise=study.noise),
-        "as stored in the generator": Candidate(
+        "lamps by eye": RenderCandidate(render=by_eye, noise=BY_EYE_NOISE),
+        "fitted optics, old noise": RenderCandidate(render=fitted, noise=BY_EYE_NOISE),
+        "fitted optics and noise": RenderCandidate(
+            render=fitted, noise=dataclasses.replace(study.noise, grain=(0.0,) * 3)
+        ),
+        "fitted, with grain": RenderCandidate(render=fitted, noise=study.noise),
+        "as stored in the generator": RenderCandidate(
             render=photometric.gelsight_mini,
             noise=stored,
         ),
     }
 
 
-def render(study: Study, candidate: Candidate, seed: int) -> np.ndarray:
+def render(study: PressFit, candidate: RenderCandidate, seed: int) -> np.ndarray:
     """The held-out presses by one candidate, uint8 [P, N, N, 3]; one unit, whose grain they share."""
     rng, n = np.random.default_rng(seed), study.presses.pictures.shape[1]
     light = _light(photometric.grain(rng, n, candidate.noise.grain, candidate.noise.shared))
@@ -146,7 +148,7 @@ def render(study: Study, candidate: Candidate, seed: int) -> np.ndarray:
     return np.stack(made)
 
 
-def gel(study: Study, touch: np.ndarray) -> DeformedGel:
+def gel(study: PressFit, touch: np.ndarray) -> DeformedGel:
     """The gel under the ball at one touch."""
     axis = study.presses.axis_mm
     depth, _, _ = study.profiles.field(touch, axis[None, :], axis[:, None])
@@ -160,7 +162,7 @@ def gel(study: Study, touch: np.ndarray) -> DeformedGel:
     )
 
 
-def clean(study: Study, model: PhotometricOptics) -> np.ndarray:
+def clean(study: PressFit, model: PhotometricOptics) -> np.ndarray:
     """Held-out presses without noise or grain."""
     light = _light(np.zeros((2, 2), np.float32))
     return np.stack([photometric.shade(gel(study, t), light, model) for t in study.touches[study.held_out]])

@@ -28,7 +28,7 @@ from experiments.core.runner import Experiment
 from experiments.scenes import realism
 from experiments.scenes.shadows import shadow_gain
 from experiments.scenes.sheets import picture_rows
-from experiments.scenes.two_sample import Distances, Judge, accuracy, distances
+from experiments.scenes.two_sample import PatchClassifier, PictureDistances, accuracy, distances
 from sensors_io.scenes import fitting, photometric
 
 SHOWN = 6
@@ -54,7 +54,7 @@ class RealismConfig:
     ball_diameter_mm: float = 6.31
     mm_per_px: float = 0.0634
     image_px: int = 112
-    judge: Judge = Judge()
+    judge: PatchClassifier = PatchClassifier()
     seed: int = 0
 
 
@@ -95,7 +95,9 @@ def run(config: RealismConfig, context: Context) -> Results:
     )
 
 
-def compare(real: np.ndarray, made: np.ndarray, study: realism.Study, judge: Judge) -> tuple[Distances, float, float]:
+def compare(
+    real: np.ndarray, made: np.ndarray, study: realism.PressFit, judge: PatchClassifier
+) -> tuple[PictureDistances, float, float]:
     """Distances, accuracy of the classifier and its standard error, both in %."""
     axis = study.presses.axis_mm
     x, y, _ = study.touches[study.held_out].T
@@ -104,7 +106,7 @@ def compare(real: np.ndarray, made: np.ndarray, study: realism.Study, judge: Jud
     return distances(real, made), 100 * mean, 100 * error
 
 
-def distance_table(rows: Mapping[str, tuple[Distances, float, float]]) -> Table:
+def distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) -> Table:
     """All candidates against the real pictures."""
     return Table(
         title="Distance of generated from real held-out presses",
@@ -126,7 +128,7 @@ def distance_table(rows: Mapping[str, tuple[Distances, float, float]]) -> Table:
     )
 
 
-def fit_table(study: realism.Study) -> Table:
+def fit_table(study: realism.PressFit) -> Table:
     """How much of what the ball changes the fit explains, near the contact."""
     axis, rows = study.presses.axis_mm, []
     for name, held_out in (("fitted", False), ("held out", True)):
@@ -164,7 +166,7 @@ def side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictur
     )
 
 
-def verdict(rows: Mapping[str, tuple[Distances, float, float]], shadows: Mapping[str, float]) -> tuple[str, ...]:
+def verdict(rows: Mapping[str, tuple[PictureDistances, float, float]], shadows: Mapping[str, float]) -> tuple[str, ...]:
     """What the figures say."""
     (before, told_before, _), (after, told_after, error) = rows["lamps by eye"], rows["fitted, with grain"]
     return (
@@ -182,6 +184,6 @@ def _bytes(pictures: np.ndarray) -> np.ndarray:
 
 
 DEFAULT = RealismConfig()
-SMOKE = dataclasses.replace(DEFAULT, judge=Judge(patches=8))
+SMOKE = dataclasses.replace(DEFAULT, judge=PatchClassifier(patches=8))
 
 EXPERIMENT = Experiment(name="scene_realism", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

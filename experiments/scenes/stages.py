@@ -46,7 +46,7 @@ def stage_costs(config: SceneConfig, order: int, objects: int) -> StageCosts:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Machine:
+class MachineRates:
     """Measured rates of one core: float32 operations of matrix products, bytes copied, a pair of padded transforms."""
 
     flops_per_s: float
@@ -54,14 +54,14 @@ class Machine:
     transform_s: float
 
 
-def measure_machine(padded: int, grid: int, image_px: int) -> Machine:
+def measure_machine(padded: int, grid: int, image_px: int) -> MachineRates:
     """Rates at the sizes that records have: cubic resampling products, copies of a picture in floats, transforms."""
     left, field = jnp.ones((image_px, grid)), jnp.ones((grid, grid))
     product = jax.jit(lambda a, b: a @ b @ a.T)
     flops = 2 * (image_px * grid * grid + image_px * grid * image_px)
     picture = np.ones((image_px, image_px, 3), np.float32)
     forth = jax.jit(lambda p: jnp.fft.irfft2(jnp.fft.rfft2(p, s=(padded, padded)), s=(padded, padded))[:grid, :grid])
-    return Machine(
+    return MachineRates(
         flops_per_s=flops / _seconds(lambda: product(left, field)),
         bytes_per_s=2 * picture.nbytes / _seconds(picture.copy),
         transform_s=_seconds(lambda: forth(field)),

@@ -9,10 +9,10 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from experiments.core.charts import LOOK, MARKERS, PALETTE, SHARED, svg
 from experiments.core.names import Named, name_points
-from experiments.scenes.storage_measure import Measured, front
+from experiments.scenes.storage_measure import CodecMeasurement, front
 
 
-def size_against_rates(rows: Sequence[Measured], own: str, need_fps: float) -> bytes:
+def size_against_rates(rows: Sequence[CodecMeasurement], own: str, need_fps: float) -> bytes:
     """Bytes a frame over the read rate and over the write rate; a line joins those that no other one beats.
 
     Args:
@@ -42,7 +42,7 @@ def size_against_rates(rows: Sequence[Measured], own: str, need_fps: float) -> b
         return svg(figure)
 
 
-def _draw(axes: Axes, rows: Sequence[Measured], rate: str, style: dict[str, tuple[str, str]], own: str) -> None:
+def _draw(axes: Axes, rows: Sequence[CodecMeasurement], rate: str, style: dict[str, tuple[str, str]], own: str) -> None:
     seen: set[str] = set()
     for row in rows:
         colour, marker = style[row.codec.kind]
@@ -53,6 +53,6 @@ def _draw(axes: Axes, rows: Sequence[Measured], rate: str, style: dict[str, tupl
             axes.plot(x, y, "o", mfc="none", mec="black", ms=13)
 
 
-def _named(row: Measured, rate: str, style: dict[str, tuple[str, str]]) -> Named:
+def _named(row: CodecMeasurement, rate: str, style: dict[str, tuple[str, str]]) -> Named:
     name = row.codec.name.removesuffix(" zstd-1")
     return Named(name=name, x=vars(row)[rate], y=row.bytes, colour=style[row.codec.kind][0])

@@ -15,7 +15,7 @@ from sensors_io.deltas import FILTERS, choose_filter
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Measured:
+class CodecMeasurement:
     """One codec on some clips: bytes a frame, frames a second written and read, whether all bits came back."""
 
     codec: Codec
@@ -27,7 +27,7 @@ class Measured:
 
 def measure(
     codecs: Sequence[Codec], clips: Clips, rounds: int, context: Context
-) -> tuple[list[Measured], dict[str, str]]:
+) -> tuple[list[CodecMeasurement], dict[str, str]]:
     """Every codec over the same clips, in turn within each round; and why a codec is missing, by name.
 
     Args:
@@ -56,7 +56,7 @@ def measure(
         timed = interleaved(calls, context.rounds("timing codecs", rounds))
         seconds = {name: float(np.median(s)) for name, s in timed.items()}
         rows = [
-            Measured(
+            CodecMeasurement(
                 codec=codec,
                 bytes=stored_bytes(folders[codec.name]) / frames,
                 write_fps=frames / seconds[f"write {codec.name}"],
@@ -68,7 +68,7 @@ def measure(
     return rows, missing
 
 
-def front(rows: Sequence[Measured]) -> list[Measured]:
+def front(rows: Sequence[CodecMeasurement]) -> list[CodecMeasurement]:
     """Those that no other one beats in size and in read rate, by size."""
     ordered = sorted(rows, key=lambda row: (row.bytes, -row.read_fps))
     best, kept = 0.0, []

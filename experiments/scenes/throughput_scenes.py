@@ -30,8 +30,8 @@ from experiments.scenes import kills as scene_kills
 from experiments.scenes import protocol as scene_protocol
 from experiments.scenes import rates as scene_rates
 from experiments.scenes import stages as scene_stages
-from experiments.scenes.kills import Kept
-from experiments.scenes.rates import Rate
+from experiments.scenes.kills import ResumedSet
+from experiments.scenes.rates import RecordRate
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import padded_size
@@ -97,24 +97,26 @@ class ThroughputConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Written:
+class WrittenSet:
     """The written set: its rate, bytes per record, frames past the strain limit; kills of its second writer, and what
     they left.
     """
 
-    rate: Rate
+    rate: RecordRate
     bytes: float
     past_limit: int
     kills: int
-    kept: Kept
+    kept: ResumedSet
 
 
 def run(config: ThroughputConfig, context: Context) -> Results:
     """Feed, write, kill, take apart; what was measured before an interruption is not measured again."""
-    feed = Rate(**_once(context, "feed/0", lambda: _feed(config, context, config.feed_contacts, config.image_px)))
-    large = Rate(**_once(context, "large/0", lambda: _feed(config, context, config.large_contacts, config.large_px)))
+    feed = RecordRate(**_once(context, "feed/0", lambda: _feed(config, context, config.feed_contacts, config.image_px)))
+    large = RecordRate(
+        **_once(context, "large/0", lambda: _feed(config, context, config.large_contacts, config.large_px))
+    )
     found = _once(context, "written/0", lambda: _written(config, context))
-    written = Written(**found | {"rate": Rate(**found["rate"]), "kept": Kept(**found["kept"])})
+    written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": ResumedSet(**found["kept"])})
     stages = _stages(config, context)
     floor = _floor_table(config)
     paper = SceneConfig(
@@ -141,7 +143,7 @@ def run(config: ThroughputConfig, context: Context) -> Results:
     )
 
 
-def _once(context: Context, stage: str, measure: Callable[[], Rate | Written]) -> dict[str, Any]:
+def _once(context: Context, stage: str, measure: Callable[[], RecordRate | WrittenSet]) -> dict[str, Any]:
     """The fields of a measurement, from the run's directory where it was made before."""
     if not context.done(stage):
         context.save_stage(stage, dataclasses.asdict(measure()))
@@ -149,12 +151,12 @@ def _once(context: Context, stage: str, measure: Callable[[], Rate | Written]) -
     return found
 
 
-def _feed(config: ThroughputConfig, context: Context, contacts: int, image_px: int) -> Rate:
+def _feed(config: ThroughputConfig, context: Context, contacts: int, image_px: int) -> RecordRate:
     with context.progress(f"feeding {image_px}²", contacts) as advance:
         return scene_rates.feed_rate(config.scenes(contacts, image_px), contacts, config.threads, advance)
 
 
-def _written(config: ThroughputConfig, context: Context) -> Written:
+def _written(config: ThroughputConfig, context: Context) -> WrittenSet:
     """Write the set once undisturbed and once with kills; the copies are removed after the comparison."""
     scenes = config.scenes(config.written_contacts, config.image_px)
     home = context.directory / "written"
@@ -177,7 +179,7 @@ def _written(config: ThroughputConfig, context: Context) -> Written:
         kept = scene_kills.compare(whole, killed, advance)
     past = _past_limit(whole, context)
     shutil.rmtree(home)
-    return Written(rate=rate, bytes=size, past_limit=past, kills=kills, kept=kept)
+    return WrittenSet(rate=rate, bytes=size, past_limit=past, kills=kills, kept=kept)
 
 
 def _arguments(scenes: SceneConfig) -> list[str]:
@@ -193,7 +195,7 @@ def _past_limit(path: Path, context: Context) -> int:
     return int((np.concatenate(flags) & np.uint32(Flag.STRAIN_LIMIT) > 0).sum())
 
 
-def _verdict(feed: Rate, large: Rate, written: Written) -> tuple[str, ...]:
+def _verdict(feed: RecordRate, large: RecordRate, written: WrittenSet) -> tuple[str, ...]:
     hours = PAPER_RECORDS / feed.per_second / 3600
     write_hours, size = PAPER_RECORDS / written.rate.per_second / 3600, PAPER_RECORDS * written.bytes / 1e9
     return (
@@ -206,7 +208,7 @@ def _verdict(feed: Rate, large: Rate, written: Written) -> tuple[str, ...]:
 
 
 def _requirements(
-    feed: Rate, large: Rate, written: Written, leaks: list[scene_protocol.Leak]
+    feed: RecordRate, large: RecordRate, written: WrittenSet, leaks: list[scene_protocol.ForceLeak]
 ) -> tuple[Requirement, ...]:
     def needs(name: str, measured: float, bound: float, better: Literal["lower", "higher"], unit: str) -> Requirement:
         return Requirement(name=name, measured=measured, bound=bound, better=better, unit=unit)
@@ -230,12 +232,12 @@ def _requirements(
     )
 
 
-def _lost(kept: Kept) -> int:
+def _lost(kept: ResumedSet) -> int:
     return kept.missing + kept.repeated + kept.damaged + kept.differing
 
 
-def _rate_table(config: ThroughputConfig, feed: Rate, large: Rate, written: Written) -> Table:
-    def row(name: str, rate: Rate, size: float | None) -> tuple[Cell, ...]:
+def _rate_table(config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: WrittenSet) -> Table:
+    def row(name: str, rate: RecordRate, size: float | None) -> tuple[Cell, ...]:
         hours = PAPER_RECORDS / rate.per_second / 3600
         return (name, rate.records, rate.per_second, rate.cpu_ms, 2000 / rate.cpu_ms, hours, size)
 
@@ -259,7 +261,9 @@ def _rate_table(config: ThroughputConfig, feed: Rate, large: Rate, written: Writ
     )
 
 
-def _picture(config: ThroughputConfig, feed: Rate, large: Rate, written: Written, stages: Stages) -> Picture:
+def _picture(
+    config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: WrittenSet, stages: Stages
+) -> Picture:
     rates = (
         (f"feed {config.image_px}²", feed.per_second, FEED_RATE),
         (f"feed {config.large_px}²", large.per_second, LARGE_RATE),
@@ -336,7 +340,7 @@ def _left_out_table(paper: SceneConfig) -> Table:
     )
 
 
-def _leak_table(leaks: list[scene_protocol.Leak]) -> Table:
+def _leak_table(leaks: list[scene_protocol.ForceLeak]) -> Table:
     return Table(
         title="What the peak force of a press tells",
         columns=(

@@ -14,7 +14,7 @@ BANDS = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 10), (11, 13), (14, 16))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Distances:
+class PictureDistances:
     """Between two sets of pictures, in grey levels but for the spectrum.
 
     Args:
@@ -31,7 +31,7 @@ class Distances:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Judge:
+class PatchClassifier:
     """A logistic regression on statistics of patches: levels, contrast, spectrum, steps, channels' correlation, peaks.
 
     Stronger here than a small convolutional network, which a few dozen pictures cannot teach fine texture.
@@ -45,11 +45,11 @@ class Judge:
     ridge: float = 1e-3
 
 
-def distances(real: np.ndarray, made: np.ndarray) -> Distances:
+def distances(real: np.ndarray, made: np.ndarray) -> PictureDistances:
     """Statistics of `made` against `real`, both [P, N, N, 3] of the same scenes."""
     a, b = (pictures.astype(np.float64) for pictures in (real, made))
     spectra = 10 * np.log10(_ring_power(a) / _ring_power(b))
-    return Distances(
+    return PictureDistances(
         pixel=float(np.sqrt(np.mean((a - b) ** 2))),
         intensity=_wasserstein(a, b),
         gradient=_wasserstein(_gradient(a), _gradient(b)),
@@ -57,7 +57,7 @@ def distances(real: np.ndarray, made: np.ndarray) -> Distances:
     )
 
 
-def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, judge: Judge) -> tuple[float, float]:
+def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, judge: PatchClassifier) -> tuple[float, float]:
     """Share of held-out patches that a classifier assigns to the right set, and its standard error over pictures.
 
     Two folds: trained on the patches of half of the pictures, asked about those of the other half; 0.5 means that the
@@ -116,7 +116,7 @@ def _statistics(patches: np.ndarray) -> np.ndarray:
     return found.reshape(*patches.shape[:-3], -1)
 
 
-def _cut(sets: np.ndarray, centres: np.ndarray, judge: Judge) -> np.ndarray:
+def _cut(sets: np.ndarray, centres: np.ndarray, judge: PatchClassifier) -> np.ndarray:
     """Patches [2, P, K, n, n, 3] within a half patch of the centres, at the same places of both sets."""
     rng, side, size = np.random.default_rng(1), PATCH_PX, sets.shape[2]
     found = []

@@ -9,7 +9,7 @@ import pytest
 from experiments.bench import vtv150k
 from experiments.bench.vtv import ATTRIBUTES
 from experiments.core.artifacts import read_json
-from experiments.mechanics.identify_motions import Moved
+from experiments.mechanics.identify_motions import MotionData
 from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.training.evidence import ProbeConfig
@@ -17,9 +17,9 @@ from touchr1_jax.training.evidence import ProbeConfig
 TINY = dataclasses.replace(vtv150k.EXPERIMENT.scales["smoke"], probe=ProbeConfig(folds=3, iterations=4), questions=24)
 
 
-def moved(objects: list[int], levels: list[int], shift: float) -> Moved:
+def moved(objects: list[int], levels: list[int], shift: float) -> MotionData:
     n = len(objects)
-    return Moved(
+    return MotionData(
         touch=tuple(np.full((n, 2), s + shift) + np.arange(n)[:, None] for s in range(len(SENSORS))),
         force=np.zeros((n, len(SENSORS), 3)),
         shape=np.zeros((n, 2)),

@@ -16,10 +16,10 @@ from experiments.mechanics import (
     identify_presses,
     identify_probes,
 )
-from experiments.mechanics.identify_motions import Moved
+from experiments.mechanics.identify_motions import MotionData
 from experiments.mechanics.identify_studies import SOURCES, STATIC
 from experiments.mechanics.identify_threads import in_threads
-from experiments.mechanics.identify_touch import Felt, Tier, feel, means, see
+from experiments.mechanics.identify_touch import ContactTier, PressFeatures, feel, means, see
 from sensors_io.scenes import schedule, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import make_kernels
@@ -71,7 +71,7 @@ def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
 
     def felt(config, tier, order, draws, factors, batch):
         n, frames = len(draws), config.frame_count
-        return Felt(
+        return PressFeatures(
             features=rng.normal(size=(n, len(factors), 6)),
             strain=np.zeros((n, frames)),
             converged=np.ones((n, frames), bool),
@@ -79,7 +79,7 @@ def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
 
     def moved(config, motion, moments, advance):
         advance()
-        return Moved(
+        return MotionData(
             touch=tuple(rng.normal(size=(8, 6)) for _ in SENSORS),
             force=rng.normal(size=(8, 4, 15)),
             shape=rng.normal(size=(8, 14)),
@@ -94,7 +94,7 @@ def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
 
 
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
-    order, tier = SENSORS.index("tac3d"), Tier(name="", grid=24)
+    order, tier = SENSORS.index("tac3d"), ContactTier(name="", grid=24)
     draws = identify_draw.touches(SCENES, order)[:3]
     two, one = (feel(SCENES, tier, order, draws, (0.0, 4.0), batch) for batch in (2, 1))
     assert two.features.shape[:2] == (3, 2)
@@ -111,7 +111,7 @@ def test_a_whole_study_runs(tmp_path):
 
 @pytest.mark.parametrize("order", [SENSORS.index("gelsight_mini"), SENSORS.index("tac3d")])
 def test_a_press_is_the_generators_own(order):
-    tier = Tier(name="", grid=SCENES.contact_grid, tolerance=SCENES.solver_tolerance)
+    tier = ContactTier(name="", grid=SCENES.contact_grid, tolerance=SCENES.solver_tolerance)
     by = means(SCENES, tier, order, (1.0,))
     drawn = identify_draw.touches(SCENES, order)[2]
     kernels = make_kernels(MODELS[order], by.grid)
@@ -223,7 +223,7 @@ def test_fused_answers_multiply():
     labels = np.array([0, 1])
     first = np.log([[0.6, 0.3, 0.1], [0.4, 0.5, 0.1]])
     second = np.log([[0.2, 0.1, 0.7], [0.3, 0.6, 0.1]])
-    one, two = (identify_probes.Answers(p, labels) for p in (first, second))
+    one, two = (identify_probes.ProbePredictions(p, labels) for p in (first, second))
     both = identify_probes.fuse([one, two])
     np.testing.assert_allclose(np.exp(both.log_probs[0]), [0.12, 0.03, 0.07])
     assert (two.right.tolist(), both.right.tolist()) == ([0, 1], [1, 1])

@@ -9,14 +9,14 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.mechanics import chooser_fit as fit
-from experiments.mechanics import chooser_measure as bench
+from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_sequences as sequences
 from experiments.mechanics import chooser_trial as trial
 from experiments.mechanics import pareto_chooser
 from experiments.mechanics.chooser_draw import FAMILIES, draw
-from experiments.mechanics.chooser_measure import Outcomes
-from experiments.mechanics.chooser_sequences import Kept
-from experiments.mechanics.chooser_trial import Trial
+from experiments.mechanics.chooser_measure import MenuMeasurements
+from experiments.mechanics.chooser_sequences import SequenceTrial
+from experiments.mechanics.chooser_trial import ChooserTrial
 from sensors_io.scenes import chooser_law
 from sensors_io.scenes.chooser_law import LAW, MENU
 from sensors_io.scenes.chooser_survey import FEATURES
@@ -65,7 +65,7 @@ def test_hindsight_takes_the_cheapest_setting_that_meets_the_error():
 
 
 def test_a_summary_counts_shares_and_times():
-    made = Trial(
+    made = ChooserTrial(
         asked=0.1,
         index=np.array([1, 0, 2]),
         met=np.array([True, True, False]),
@@ -119,7 +119,7 @@ def test_the_fit_finds_the_law_that_made_the_errors():
 
 
 def test_frames_count_only_where_they_were_promised():
-    made = Kept(
+    made = SequenceTrial(
         asked=0.1,
         grid=np.array([64, 128]),
         met=np.array([True, False]),
@@ -134,7 +134,7 @@ def test_frames_count_only_where_they_were_promised():
 
 def test_batches_survive_a_round_trip():
     made = _outcomes(ERROR)
-    again = bench.join([made.to_json(), made.to_json()])
+    again = measured.join([made.to_json(), made.to_json()])
     np.testing.assert_array_equal(again.errors, np.concatenate([made.errors, made.errors]))
     assert again.family == (*made.family, *made.family)
 
@@ -153,9 +153,9 @@ def test_families_are_what_they_say():
     assert np.diff(ball, 2, axis=0).std() < 0.05 * np.diff(ball, 2, axis=0).mean()  # one curvature everywhere
 
 
-def _outcomes(error: np.ndarray) -> Outcomes:
+def _outcomes(error: np.ndarray) -> MenuMeasurements:
     count, settings = error.shape
-    return Outcomes(
+    return MenuMeasurements(
         features=np.ones((count, len(FEATURES))),
         radius_mm=np.full(count, 3.0),
         slope_share=np.zeros(count),

@@ -9,11 +9,13 @@ from experiments.core.artifacts import read_json
 from experiments.mechanics import contact_checks, pareto_contact
 from experiments.mechanics import oracles as contact_oracles
 from experiments.mechanics.contact_methods import blur, polonsky_keer, spg_plain, winkler_and_response, winkler_only
-from experiments.mechanics.contact_scenes import displacement_error, exact, make_bench, sample, slope_error
+from experiments.mechanics.contact_scenes import displacement_error, exact, gel_kernels, sample, slope_error
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 from tests.experiments.shrunk import run_shrunk
 
-TINY = pareto_contact.ParetoConfig(scenes=3, grid=32, ladder=(24, 32), ladder_scenes=2, rounds=2, oracle_scenes=1)
+TINY = pareto_contact.ParetoContactConfig(
+    scenes=3, grid=32, ladder=(24, 32), ladder_scenes=2, rounds=2, oracle_scenes=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,20 +52,20 @@ def test_same_seed_same_scene_on_every_grid():
 
 @pytest.mark.parametrize("solve", [spg_plain(1e-5, False), polonsky_keer(40)], ids=["plain", "Polonsky-Keer"])
 def test_baselines_reach_the_reference(solve):
-    scenes, bench = sample(GELSIGHT_MINI, 1, 32, 1), make_bench(GELSIGHT_MINI, 32)
-    gel = jnp.asarray(bench.gel, jnp.float32)
-    total = gel + jnp.asarray(bench.body, jnp.float32) / scenes.modulus_mpa[0]
-    found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, bench.spacing_mm)
-    assert displacement_error(np.asarray(found)[None], exact(scenes, bench))[0] < 1e-4
+    scenes, kernels = sample(GELSIGHT_MINI, 1, 32, 1), gel_kernels(GELSIGHT_MINI, 32)
+    gel = jnp.asarray(kernels.gel, jnp.float32)
+    total = gel + jnp.asarray(kernels.body, jnp.float32) / scenes.modulus_mpa[0]
+    found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, kernels.spacing_mm)
+    assert displacement_error(np.asarray(found)[None], exact(scenes, kernels))[0] < 1e-4
 
 
 @pytest.mark.parametrize("solve", [winkler_only, winkler_and_response, blur])
 def test_cheap_tiers_give_something_near(solve):
-    scenes, bench = sample(GELSIGHT_MINI, 1, 32, 1), make_bench(GELSIGHT_MINI, 32)
-    gel = jnp.asarray(bench.gel, jnp.float32)
-    total = gel + jnp.asarray(bench.body, jnp.float32) / scenes.modulus_mpa[0]
-    found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, bench.spacing_mm)
-    assert 0.01 < displacement_error(np.asarray(found)[None], exact(scenes, bench))[0] < 1
+    scenes, kernels = sample(GELSIGHT_MINI, 1, 32, 1), gel_kernels(GELSIGHT_MINI, 32)
+    gel = jnp.asarray(kernels.gel, jnp.float32)
+    total = gel + jnp.asarray(kernels.body, jnp.float32) / scenes.modulus_mpa[0]
+    found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, kernels.spacing_mm)
+    assert 0.01 < displacement_error(np.asarray(found)[None], exact(scenes, kernels))[0] < 1
 
 
 def test_errors_are_relative():

@@ -16,8 +16,8 @@ from experiments.mechanics import (
     tangential_tables,
 )
 from experiments.mechanics import tangential_methods as ways
-from experiments.mechanics.tangential_checks import Promise
-from experiments.mechanics.tangential_tables import MAIN, PLAIN, SOLVER, Row
+from experiments.mechanics.tangential_checks import PromiseCheck
+from experiments.mechanics.tangential_tables import MAIN, PLAIN, SOLVER, MethodErrors
 from sensors_io.scenes.sensors import XENSE
 from tests.experiments.shrunk import run_shrunk
 
@@ -34,8 +34,8 @@ def directory(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def contacts():
-    bench = tangential_scenes.make_bench(XENSE, 24)
-    return bench, *tangential_scenes.sample(bench, 1, 0, 0)
+    kernels = tangential_scenes.friction_kernels(XENSE, 24)
+    return kernels, *tangential_scenes.sample(kernels, 1, 0, 0)
 
 
 @pytest.mark.slow
@@ -72,23 +72,23 @@ def test_closed_forms_are_kept(directory, context):
 
 @pytest.mark.parametrize("task", ["slide", "twist"])
 def test_two_solvers_meet_at_the_exact_traction(contacts, task):
-    bench, cases, _ = contacts
-    true = ways.exact(task, cases, bench)
+    kernels, cases, _ = contacts
+    true = ways.exact(task, cases, kernels)
     assert true.dtype == np.complex128
     tight, plain = {"slide": (ways.spg_slide, ways.plain_slide), "twist": (ways.spg_twist, ways.plain_twist)}[task]
     for solve, setting in ((tight, 1e-5), (plain, 300)):
-        found = ways.every(solve, cases, bench, jnp.asarray(setting))
+        found = ways.every(solve, cases, kernels, jnp.asarray(setting))
         off = np.linalg.norm(found - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
         assert off.max() < 0.02
 
 
 def test_a_force_is_carried_by_every_method(contacts):
-    bench, cases, _ = contacts
-    most = np.asarray(cases.friction * cases.ramp_mpa[:, -1].sum((1, 2))) * float(bench.spacing_mm) ** 2
+    kernels, cases, _ = contacts
+    most = np.asarray(cases.friction * cases.ramp_mpa[:, -1].sum((1, 2))) * float(kernels.spacing_mm) ** 2
     pull = most * np.asarray(cases.pull_share * cases.direction)
     for solve in (ways.scaled_pull, ways.ramp_pull, ways.superposed_pull, ways.spg_pull):
-        found = np.asarray(ways.every(solve, cases, bench, jnp.asarray(1e-3)))
-        np.testing.assert_allclose(found.sum((1, 2)) * float(bench.spacing_mm) ** 2, pull, rtol=0.03)
+        found = np.asarray(ways.every(solve, cases, kernels, jnp.asarray(1e-3)))
+        np.testing.assert_allclose(found.sum((1, 2)) * float(kernels.spacing_mm) ** 2, pull, rtol=0.03)
         assert np.all(np.abs(found) <= np.asarray(cases.limit_mpa) * (1 + 1e-4) + 1e-9)
 
 
@@ -111,7 +111,7 @@ def test_unknown_sensors_are_refused():
 
 def _rows(**ladders):
     return {
-        name if kind == SOLVER else f"{kind} {i}": Row(kind=kind, label="", ms=ms, errors=np.full(3, error))
+        name if kind == SOLVER else f"{kind} {i}": MethodErrors(kind=kind, label="", ms=ms, errors=np.full(3, error))
         for kind, ladder in ladders.items()
         for i, (name, ms, error) in enumerate(ladder)
     }
@@ -134,7 +134,7 @@ def test_times_at_equal_error_by_hand():
 
 def test_promises_are_counted():
     found = [
-        Promise(kind="sphere", sensor="xense", error=e, promised=p)
+        PromiseCheck(kind="sphere", sensor="xense", error=e, promised=p)
         for e, p in ((0.01, 0.02), (0.03, 0.02), (0.04, 0.09), (0.12, 0.09))
     ]
     (*_, everything) = tangential_checks.promise_table(found).rows

@@ -11,7 +11,7 @@ from experiments.scenes import pareto_storage
 from experiments.scenes.storage_clips import GENERATED, IMPORTED, STILLS, WHOLE, recorded_clips
 from experiments.scenes.storage_codecs import OWN, all_codecs, stored_bytes
 from experiments.scenes.storage_feed import CHANGES, FeedConfig
-from experiments.scenes.storage_measure import Measured, chosen_filters, front
+from experiments.scenes.storage_measure import CodecMeasurement, chosen_filters, front
 from tests.experiments import tiny
 from tests.sensors_io.importers.films import film, picture
 
@@ -86,7 +86,7 @@ def test_kinds_that_are_not_there_are_left_out(recordings, tmp_path, context):
 
 def measured(name, size, read):
     codec = dataclasses.replace(all_codecs()[0], name=name)
-    return Measured(codec=codec, bytes=size, write_fps=1.0, read_fps=read, exact=True)
+    return CodecMeasurement(codec=codec, bytes=size, write_fps=1.0, read_fps=read, exact=True)
 
 
 def test_the_front_and_the_rule_by_hand():

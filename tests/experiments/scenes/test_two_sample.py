@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.scenes.two_sample import Judge, accuracy, distances
+from experiments.scenes.two_sample import PatchClassifier, accuracy, distances
 
 P, N = 8, 48
 CENTRES = np.full((P, 2), N / 2)
@@ -36,15 +36,15 @@ def test_twice_the_contrast_is_six_decibels() -> None:
 
 
 def test_the_judge_is_at_chance_where_nothing_differs() -> None:
-    mean, error = accuracy(_pictures(0), _pictures(1), CENTRES, Judge(patches=16))
+    mean, error = accuracy(_pictures(0), _pictures(1), CENTRES, PatchClassifier(patches=16))
     assert mean == pytest.approx(0.5, abs=4 * error + 0.02)
 
 
 def test_the_judge_sees_a_fifth_more_noise() -> None:
-    mean, _ = accuracy(_pictures(0), _pictures(1, 3.6), CENTRES, Judge(patches=16))
+    mean, _ = accuracy(_pictures(0), _pictures(1, 3.6), CENTRES, PatchClassifier(patches=16))
     assert mean > 0.9
 
 
 def test_the_judge_needs_two_folds() -> None:
     with pytest.raises(ValueError, match="real holds 3 pictures: must be ≥ 4"):
-        accuracy(_pictures(0)[:3], _pictures(1)[:3], CENTRES[:3], Judge())
+        accuracy(_pictures(0)[:3], _pictures(1)[:3], CENTRES[:3], PatchClassifier())
