@@ -21,7 +21,7 @@ from experiments.core.history import Past, runs_of, summary
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
-from experiments.fields import motion_dense, motion_markers
+from experiments.fields import dense_accuracy, marker_accuracy
 from experiments.mechanics.tangential_tables import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
@@ -69,14 +69,14 @@ DEFAULTS: tuple[Judged, ...] = (
         what="markers",
         experiment="pareto_fields",
         table="Markers under known motion",
-        default=motion_markers.MAIN,
+        default=marker_accuracy.MAIN,
         axes=(Axis(column="time", better="lower"), Axis(column="95 %", better="lower")),
     ),
     Judged(
         what="dense field",
         experiment="pareto_fields",
         table="Dense displacement",
-        default=motion_dense.MAIN,
+        default=dense_accuracy.MAIN,
         axes=(TIME, Axis(column="95 %", better="lower")),
     ),
     Judged(

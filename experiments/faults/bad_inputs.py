@@ -10,8 +10,8 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from experiments.core import runs
-from experiments.faults.cases import Case, Kind
-from experiments.faults.inputs import (
+from experiments.faults.bad_input import BadInput, Kind
+from experiments.faults.fixtures import (
     counting_paths,
     cut,
     emptied,
@@ -29,7 +29,7 @@ FULL_BYTES = 6_000
 """The counting run's small files fit into so many; its report, which grows with its log, does not."""
 
 
-def cases(unfinished: Path) -> tuple[Case, ...]:
+def cases(unfinished: Path) -> tuple[BadInput, ...]:
     """All cases.
 
     Args:
@@ -38,11 +38,11 @@ def cases(unfinished: Path) -> tuple[Case, ...]:
     return (*command_lines(), *configurations(), *records(), *recordings(), *answers(), *run_files(unfinished))
 
 
-def command_lines() -> tuple[Case, ...]:
+def command_lines() -> tuple[BadInput, ...]:
     """What is typed wrong."""
     study = ["ablation_ordinal"]
     return (
-        Case(
+        BadInput(
             kind="command line",
             name="an experiment that there is not",
             program="experiments",
@@ -51,7 +51,7 @@ def command_lines() -> tuple[Case, ...]:
             where="'ablation_ordinl'",
             fix="Did you mean ablation_ordinal",
         ),
-        Case(
+        BadInput(
             kind="command line",
             name="an option that there is not",
             program="experiments",
@@ -60,7 +60,7 @@ def command_lines() -> tuple[Case, ...]:
             where="--grpo-stepz",
             fix="--grpo-steps",
         ),
-        Case(
+        BadInput(
             kind="command line",
             name="a number that is none",
             program="experiments",
@@ -69,7 +69,7 @@ def command_lines() -> tuple[Case, ...]:
             where="--seeds",
             fix="INT",
         ),
-        Case(
+        BadInput(
             kind="command line",
             name="a scale that there is not",
             program="experiments",
@@ -78,7 +78,7 @@ def command_lines() -> tuple[Case, ...]:
             where="'huge'",
             fix="smoke",
         ),
-        Case(
+        BadInput(
             kind="command line",
             name="a run that there is not",
             program="experiments",
@@ -87,7 +87,7 @@ def command_lines() -> tuple[Case, ...]:
             where="'nothing'",
             fix="must be a directory with config.json",
         ),
-        Case(
+        BadInput(
             kind="command line",
             name="a label that no object has",
             program="rewards",
@@ -99,11 +99,11 @@ def command_lines() -> tuple[Case, ...]:
     )
 
 
-def configurations() -> tuple[Case, ...]:
+def configurations() -> tuple[BadInput, ...]:
     """Values that contradict each other or mean nothing."""
     study = ["ablation_ordinal"]
     return (
-        Case(
+        BadInput(
             kind="configuration",
             name="micro-batches that do not divide the batch",
             program="experiments",
@@ -112,7 +112,7 @@ def configurations() -> tuple[Case, ...]:
             where="micro_contacts is 5",
             fix="must divide batch_size",
         ),
-        Case(
+        BadInput(
             kind="configuration",
             name="answers of two lengths",
             program="experiments",
@@ -121,7 +121,7 @@ def configurations() -> tuple[Case, ...]:
             where="grpo.length is 9",
             fix="set both",
         ),
-        Case(
+        BadInput(
             kind="configuration",
             name="a negative weight",
             program="experiments",
@@ -130,7 +130,7 @@ def configurations() -> tuple[Case, ...]:
             where="beta is -1.0",
             fix="must be ≥ 0",
         ),
-        Case(
+        BadInput(
             kind="configuration",
             name="a checkpoint every zero steps",
             program="faults",
@@ -139,7 +139,7 @@ def configurations() -> tuple[Case, ...]:
             where="save_every is 0",
             fix="must be at least 1",
         ),
-        Case(
+        BadInput(
             kind="configuration",
             name="recordings without a folder",
             program="experiments",
@@ -148,7 +148,7 @@ def configurations() -> tuple[Case, ...]:
             where="data_dir is None",
             fix="needs data_dir",
         ),
-        Case(
+        BadInput(
             kind="configuration",
             name="scenes without an object",
             program="sensors_io",
@@ -160,7 +160,7 @@ def configurations() -> tuple[Case, ...]:
     )
 
 
-def records() -> tuple[Case, ...]:
+def records() -> tuple[BadInput, ...]:
     """Records that are damaged, each met by `check`."""
     return (
         _checked("no index", lambda r: (r / "index.json").unlink(), "MissingIndexError", "give the directory"),
@@ -178,7 +178,7 @@ def records() -> tuple[Case, ...]:
         _checked("an empty shard", lambda r: emptied(_shard(r)), _CORRUPT, "copy it again", "has 0 bytes"),
         _checked("a flipped byte in a shard", lambda r: flipped(_shard(r)), _CORRUPT, "copy the file again"),
         _checked("a flipped byte in the objects", lambda r: flipped(_shard(r, "objects")), _CORRUPT, "copy"),
-        Case(
+        BadInput(
             kind="records",
             name="records whose writing has not ended",
             program="sensors_io",
@@ -188,7 +188,7 @@ def records() -> tuple[Case, ...]:
             where="records",
             fix="run its command again",
         ),
-        Case(
+        BadInput(
             kind="records",
             name="records of another making in the way",
             program="sensors_io",
@@ -198,7 +198,7 @@ def records() -> tuple[Case, ...]:
             where="made by config 'made up'",
             fix="choose another directory",
         ),
-        Case(
+        BadInput(
             kind="records",
             name="a file where records should go",
             program="sensors_io",
@@ -211,7 +211,7 @@ def records() -> tuple[Case, ...]:
     )
 
 
-def recordings() -> tuple[Case, ...]:
+def recordings() -> tuple[BadInput, ...]:
     """Pictures and folders that are not what a command needs."""
     rest = lambda folder: ["--background", folder / "rest.png", "--out", folder / "out.npz", "--mm-per-px", "0.06"]
     return (
@@ -220,7 +220,7 @@ def recordings() -> tuple[Case, ...]:
         ),
         _extract("a picture that is none", lambda folder: [folder / "none.png", *rest(folder)], "none.png", "picture"),
         _extract("sizes that differ", lambda folder: [folder / "press.png", *rest(folder)], "(120, 160)", "crop them"),
-        Case(
+        BadInput(
             kind="recordings",
             name="a folder to import that there is not",
             program="sensors_io",
@@ -229,7 +229,7 @@ def recordings() -> tuple[Case, ...]:
             where="nowhere",
             fix="give",
         ),
-        Case(
+        BadInput(
             kind="recordings",
             name="a folder to import that holds nothing",
             program="sensors_io",
@@ -242,10 +242,10 @@ def recordings() -> tuple[Case, ...]:
     )
 
 
-def answers() -> tuple[Case, ...]:
+def answers() -> tuple[BadInput, ...]:
     """Files of questions and answers."""
     return (
-        Case(
+        BadInput(
             kind="answers",
             name="a line that is no JSON",
             program="bench",
@@ -258,7 +258,7 @@ def answers() -> tuple[Case, ...]:
     )
 
 
-def run_files(unfinished: Path) -> tuple[Case, ...]:
+def run_files(unfinished: Path) -> tuple[BadInput, ...]:
     """Files of a run that is about to go on, its data, and its disk."""
     struck = functools.partial(_struck, unfinished)
     held = struck("run", "another process in the run", _nothing, ("RunInUse", "runs/counting", "--fresh"))
@@ -275,7 +275,7 @@ def run_files(unfinished: Path) -> tuple[Case, ...]:
         struck("checkpoint", "a changed iterator", _changed_data, (_NO_CHECKPOINT, "its data does not hold", "copies")),
         struck("checkpoint", "other shapes", _other_shapes, ("CheckpointError", "holds another state", "go back to")),
         struck("checkpoint", "a file in their place", _file_for_folder, ("UnwrittenError", "count/0", "move away")),
-        Case(
+        BadInput(
             kind="run",
             name="targets that are NaN from step 5 on",
             program="faults",
@@ -294,7 +294,7 @@ Says = tuple[str, str, str]
 """Error, place and way out that a message must name."""
 
 
-def _checked(name: str, spoil: Callable[[Path], None], error: str, fix: str, where: str = "records") -> Case:
+def _checked(name: str, spoil: Callable[[Path], None], error: str, fix: str, where: str = "records") -> BadInput:
     """Records that `check` meets after `spoil` had them."""
 
     def prepare(folder: Path) -> None:
@@ -302,7 +302,7 @@ def _checked(name: str, spoil: Callable[[Path], None], error: str, fix: str, whe
         spoil(folder / "records")
 
     check = lambda folder: ["check", folder / "records"]
-    return Case(
+    return BadInput(
         kind="records", name=name, program="sensors_io", arguments=check, prepare=prepare, error=error, where=where,
         fix=fix,
     )  # fmt: skip
@@ -327,15 +327,15 @@ def _unreadable(records: Path) -> None:
     (records / "index.json").symlink_to("/proc/self/mem")
 
 
-def _extract(name: str, arguments: Callable[[Path], list[Path | str]], where: str, fix: str) -> Case:
+def _extract(name: str, arguments: Callable[[Path], list[Path | str]], where: str, fix: str) -> BadInput:
     command = lambda folder: ["extract", *arguments(folder)]
-    return Case(
+    return BadInput(
         kind="recordings", name=name, program="sensors_io", arguments=command, prepare=write_pictures, error="Error",
         where=where, fix=fix,
     )  # fmt: skip
 
 
-def _struck(unfinished: Path, kind: Kind, name: str, spoil: Callable[[Path], None], says: Says) -> Case:
+def _struck(unfinished: Path, kind: Kind, name: str, spoil: Callable[[Path], None], says: Says) -> BadInput:
     """A run of `counting` that goes on after `spoil` had its folder."""
 
     def prepare(folder: Path) -> None:
@@ -344,7 +344,7 @@ def _struck(unfinished: Path, kind: Kind, name: str, spoil: Callable[[Path], Non
 
     error, where, fix = says
     command = lambda folder: ["counting", *counting_paths(folder)]
-    return Case(
+    return BadInput(
         kind=kind, name=name, program="faults", arguments=command, prepare=prepare, error=error, where=where, fix=fix
     )
 

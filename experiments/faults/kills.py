@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.core import runs
-from experiments.faults.evidence import evidence
-from experiments.faults.watched import START, Kill, Session, Victim, look, only
+from experiments.faults.digests import digests
+from experiments.faults.killable_session import START, Kill, KillableTraining, Session, look, only
 
 ALONE = "alone"
 """Name of the run that is not killed."""
@@ -24,7 +24,7 @@ class KillConfig:
     """How many kills strike, and when.
 
     A share of them strikes uniformly within the time that the last start-up took, the others within
-    `Pace.most_life_s` of the first thing that a session adds to its run.
+    `KillSchedule.most_life_s` of the first thing that a session adds to its run.
 
     Args:
       kills: how many.
@@ -44,7 +44,7 @@ class KillConfig:
             )
 
 
-class Pace:
+class KillSchedule:
     """What the lives of sessions so far say about the next: shares of the run a second, and a share lost by each kill.
 
     Args:
@@ -82,10 +82,10 @@ class Pace:
 _ALONE_WEIGHS = 0.05  # share of a run that counts from the one that was left alone
 
 
-class Alone(NamedTuple):
+class UndisturbedRun(NamedTuple):
     """A run that nobody killed: what it came to, lines of its log, seconds from its first line to its end."""
 
-    evidence: Mapping[str, str]
+    digests: Mapping[str, str]
     lines: int
     work_s: float
 
@@ -102,11 +102,11 @@ class Campaign:
       config: when kills strike.
     """
 
-    def __init__(self, home: Path, programs: Path, victim: Victim, config: KillConfig) -> None:
+    def __init__(self, home: Path, programs: Path, victim: KillableTraining, config: KillConfig) -> None:
         self._home, self._programs, self._victim, self._config = home, programs, victim, config
         self._startup_s = 1.0  # until one was measured
 
-    def left_alone(self) -> Alone:
+    def left_alone(self) -> UndisturbedRun:
         """A run that nobody kills, from its beginning; it makes the records and compiles."""
         shutil.rmtree(self._home / ALONE, ignore_errors=True)  # one that was broken off tells no time
         session = self._session(ALONE)
@@ -114,13 +114,13 @@ class Campaign:
         began_s = session.age_s
         session.finish()
         directory = self.directory(ALONE)
-        return Alone(evidence(directory), look(directory).lines, session.age_s - began_s)
+        return UndisturbedRun(digests(directory), look(directory).lines, session.age_s - began_s)
 
     def killed(
         self,
         number: int,
         kills: int,
-        alone: Alone,
+        alone: UndisturbedRun,
         *,
         before: Sequence[Kill] = (),
         keep: Callable[[tuple[Kill, ...]], None] = lambda struck: None,
@@ -134,7 +134,7 @@ class Campaign:
           before: those that have struck already, in an earlier session of the caller.
           keep: told after each kill of all that have struck.
         """
-        struck, pace = tuple(before), Pace(alone.work_s)
+        struck, pace = tuple(before), KillSchedule(alone.work_s)
         while not self._ended(number):
             session = self._session(str(number))
             left = kills - len(struck)
@@ -164,7 +164,9 @@ class Campaign:
                 shutil.copytree(records, own / records.name)
         return Session(self._victim, self._home / name, self._programs)
 
-    def _wait(self, session: Session, alone: Alone, number: int, left: int, pace: Pace, reached: float) -> bool:
+    def _wait(
+        self, session: Session, alone: UndisturbedRun, number: int, left: int, pace: KillSchedule, reached: float
+    ) -> bool:
         """Sleep until a random moment of the session's life; whether it lives then.  Earlier ones reached a share."""
         rng = np.random.default_rng((self._config.seed, number, left))
         if rng.random() < self._config.startup_share:
@@ -177,5 +179,5 @@ class Campaign:
         pace.lived(self._done(session, alone) - done, session.age_s - self._startup_s)
         return lives
 
-    def _done(self, session: Session, alone: Alone) -> float:
+    def _done(self, session: Session, alone: UndisturbedRun) -> float:
         return min(session.seen().lines / alone.lines, 1.0)

@@ -27,10 +27,10 @@ from experiments.core.charts import LOOK, PALETTE, svg
 from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.faults import device_vendor as vendor
-from experiments.faults import device_watching as watching
-from experiments.faults import device_watching_tables as watching_tables
-from experiments.faults.device_endurance import Loop, Outcome, endure
+from experiments.faults import live_viewing as watching
+from experiments.faults import live_viewing_tables as watching_tables
+from experiments.faults import tac3d_recordings as vendor
+from experiments.faults.replayed_camera import NoiseCamera, ReplayOutcome, endure
 from sensors_io.devices.errors import OverloadWarning
 from sensors_io.devices.replay import Disconnect, Faults
 
@@ -39,7 +39,7 @@ BY_COUNTER, BY_STAMPS, SLOW = "with a counter", "without a counter", "slow consu
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StabilityConfig:
+class DeviceStabilityConfig:
     """Length, rate and faults of the replay; rounds of timing.
 
     Args:
@@ -77,7 +77,7 @@ class StabilityConfig:
     seed: int = 0
 
 
-def run(config: StabilityConfig, context: Context) -> Results:
+def run(config: DeviceStabilityConfig, context: Context) -> Results:
     """Replay, check the vendor's recordings, time the decoders."""
     outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
     short = dataclasses.replace(config, seconds=config.traced_seconds)
@@ -133,7 +133,7 @@ def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     return found
 
 
-def over_jitter(config: StabilityConfig, context: Context) -> dict[str, np.ndarray]:
+def over_jitter(config: DeviceStabilityConfig, context: Context) -> dict[str, np.ndarray]:
     """Share of the losses by which the count is off, with a counter and without one, for every jitter, [J] each."""
     short = dataclasses.replace(config, seconds=config.sweep_seconds)
     found: dict[str, list[float]] = {BY_COUNTER: [], BY_STAMPS: []}
@@ -146,9 +146,9 @@ def over_jitter(config: StabilityConfig, context: Context) -> dict[str, np.ndarr
 
 
 def requirements(
-    outcomes: Mapping[str, Outcome],
-    traced: Outcome,
-    checked: Sequence[vendor.Checked],
+    outcomes: Mapping[str, ReplayOutcome],
+    traced: ReplayOutcome,
+    checked: Sequence[vendor.RecordingCheck],
     decode: Mapping[str, np.ndarray],
 ) -> tuple[Requirement, ...]:
     """The figures that must be kept."""
@@ -172,7 +172,7 @@ def requirements(
 
 
 def verdict(
-    outcomes: Mapping[str, Outcome], checked: Sequence[vendor.Checked], decode: Mapping[str, np.ndarray]
+    outcomes: Mapping[str, ReplayOutcome], checked: Sequence[vendor.RecordingCheck], decode: Mapping[str, np.ndarray]
 ) -> tuple[str, ...]:
     """The answer in sentences."""
     counter, stamps, slow = (outcomes[name] for name in (BY_COUNTER, BY_STAMPS, SLOW))
@@ -200,7 +200,7 @@ def verdict(
     return tuple(said)
 
 
-def _watched(seen: Sequence[watching.Watched], carried: watching.Bridged) -> str:
+def _watched(seen: Sequence[watching.ViewedRecording], carried: watching.BridgeTransfer) -> str:
     most = seen[-1]
     age = 1e3 * float(np.median(most.ages_s))
     return (
@@ -210,7 +210,7 @@ def _watched(seen: Sequence[watching.Watched], carried: watching.Bridged) -> str
     )
 
 
-def _replay(name: str, config: StabilityConfig, context: Context) -> Outcome:
+def _replay(name: str, config: DeviceStabilityConfig, context: Context) -> ReplayOutcome:
     capacity, every = (16, 24) if name == SLOW else (256, 1)
     faults = _faults(config, hidden=name == BY_STAMPS)
     shown = context.told(f"device time {name}, s")
@@ -219,11 +219,11 @@ def _replay(name: str, config: StabilityConfig, context: Context) -> Outcome:
         return endure(_source(config), config.seconds, faults, capacity=capacity, every=every, tell=tell)
 
 
-def _source(config: StabilityConfig) -> Loop:
-    return Loop(rate_hz=config.rate_hz, size_px=config.size_px)
+def _source(config: DeviceStabilityConfig) -> NoiseCamera:
+    return NoiseCamera(rate_hz=config.rate_hz, size_px=config.size_px)
 
 
-def _faults(config: StabilityConfig, *, hidden: bool) -> Faults:
+def _faults(config: DeviceStabilityConfig, *, hidden: bool) -> Faults:
     at = [config.seconds * share for share in (0.25, 0.5, 0.75)]
     scale = min(1.0, config.seconds / 200)  # so that a shrunken run is not away most of its time
     return Faults(
@@ -242,7 +242,7 @@ def _most(name: str, measured: float, bound: float, unit: str = "") -> Requireme
     return Requirement(name=name, measured=float(measured), bound=bound, better="lower", unit=unit)
 
 
-def _accounts(outcomes: Mapping[str, Outcome]) -> Table:
+def _accounts(outcomes: Mapping[str, ReplayOutcome]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, o in outcomes.items():
         t, c = o.truth, o.counts
@@ -269,7 +269,7 @@ def _accounts(outcomes: Mapping[str, Outcome]) -> Table:
     )
 
 
-def _recorded(checked: Sequence[vendor.Checked]) -> Table:
+def _recorded(checked: Sequence[vendor.RecordingCheck]) -> Table:
     return Table(
         title="The vendor's Tac3D recordings",
         columns=(
@@ -286,7 +286,7 @@ def _recorded(checked: Sequence[vendor.Checked]) -> Table:
     )
 
 
-def _recording_row(c: vendor.Checked) -> tuple[Cell, ...]:
+def _recording_row(c: vendor.RecordingCheck) -> tuple[Cell, ...]:
     late = [None if np.isnan(s) else 1e3 * float(s) for s in c.late_s]
     return (c.name, c.frames, c.missing, c.counts.missing, 1e3 * c.gap_s, 1e3 * c.seen_gap_s, *late)
 
@@ -308,7 +308,7 @@ def _decoders(decode: Mapping[str, np.ndarray]) -> Table:
     )
 
 
-def _jitter_picture(sweep: Mapping[str, np.ndarray], config: StabilityConfig) -> Picture:
+def _jitter_picture(sweep: Mapping[str, np.ndarray], config: DeviceStabilityConfig) -> Picture:
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(6.6, 3.2), layout="constrained")
         axes = figure.subplots()
@@ -325,7 +325,7 @@ def _jitter_picture(sweep: Mapping[str, np.ndarray], config: StabilityConfig) ->
     return Picture(name="jitter", title="Where counting without a counter breaks", caption=caption, content=content)
 
 
-def _memory_picture(outcomes: Mapping[str, Outcome], config: StabilityConfig) -> Picture:
+def _memory_picture(outcomes: Mapping[str, ReplayOutcome], config: DeviceStabilityConfig) -> Picture:
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(6.6, 3.2), layout="constrained")
         axes = figure.subplots()
@@ -342,8 +342,8 @@ def _memory_picture(outcomes: Mapping[str, Outcome], config: StabilityConfig) ->
     return Picture(name="memory", title="Memory stays flat", caption=caption, content=content)
 
 
-DEFAULT = StabilityConfig()
-SMOKE = StabilityConfig(
+DEFAULT = DeviceStabilityConfig()
+SMOKE = DeviceStabilityConfig(
     seconds=60.0,
     size_px=(24, 32),
     traced_seconds=20.0,

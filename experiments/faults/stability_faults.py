@@ -25,17 +25,17 @@ from experiments.core.context import Context
 from experiments.core.progress import Advance
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
+from experiments.faults.bad_input import provoke
 from experiments.faults.bad_inputs import cases
-from experiments.faults.cases import provoke
-from experiments.faults.charts import where_kills_struck
-from experiments.faults.damage import OUTCOMES, WRONG, strike
-from experiments.faults.evidence import differences, evidence
-from experiments.faults.inputs import unfinished_run
-from experiments.faults.kills import ALONE, Alone, Campaign, KillConfig
-from experiments.faults.reinforcing import EXPERIMENT as REINFORCING
-from experiments.faults.victim import EXPERIMENT as STUDY
-from experiments.faults.waiting import WaitingConfig, Waits, waits
-from experiments.faults.watched import PHASES, START, Kill, Victim
+from experiments.faults.damaged_files import OUTCOMES, WRONG, strike
+from experiments.faults.data_waits import WaitingConfig, Waits, waits
+from experiments.faults.digests import differences, digests
+from experiments.faults.fixtures import unfinished_run
+from experiments.faults.kill_charts import where_kills_struck
+from experiments.faults.killable_session import PHASES, START, Kill, KillableTraining
+from experiments.faults.kills import ALONE, Campaign, KillConfig, UndisturbedRun
+from experiments.faults.trainings.small_grpo import EXPERIMENT as REINFORCING
+from experiments.faults.trainings.small_study import EXPERIMENT as STUDY
 
 MOST_WAITING = 0.02
 """Share of a step that may wait for data."""
@@ -66,7 +66,7 @@ class FaultsConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Killed:
+class KilledRuns:
     """What became of one victim: its kills, the runs that they were spread over, and what differed at their ends."""
 
     kills: tuple[Kill, ...]
@@ -98,17 +98,17 @@ def run(config: FaultsConfig, context: Context) -> Results:
     )
 
 
-def _grpo(steps: int) -> Victim:
-    return Victim(name=REINFORCING.name, options=("--steps", str(steps)), steps={"grpo": steps})
+def _grpo(steps: int) -> KillableTraining:
+    return KillableTraining(name=REINFORCING.name, options=("--steps", str(steps)), steps={"grpo": steps})
 
 
-def _study(scale: str) -> Victim:
+def _study(scale: str) -> KillableTraining:
     study = STUDY.configs()[scale]
     steps = {"sft": study.sft.steps, "grpo": study.grpo_steps, "blind": study.blind.steps}
-    return Victim(name=STUDY.name, options=("--scale", scale), steps=steps)
+    return KillableTraining(name=STUDY.name, options=("--scale", scale), steps=steps)
 
 
-def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> Killed:
+def _killed(name: str, victim: KillableTraining, config: KillConfig, context: Context) -> KilledRuns:
     """Runs of a victim until all kills have struck; a stopped session of this experiment goes on behind the last."""
     stage = f"kill/{victim.name}"
     campaign = Campaign(context.directory / "victims" / victim.name, context.cache_dir / "programs", victim, config)
@@ -118,18 +118,18 @@ def _killed(name: str, victim: Victim, config: KillConfig, context: Context) -> 
     with context.progress(f"killing the {name}", config.kills, _struck_before(stage, context)) as advance:
         if not context.done(f"{stage}/{ALONE}"):
             context.save_stage(f"{stage}/{ALONE}", campaign.left_alone()._asdict())
-        alone = Alone(**context.load_stage(f"{stage}/{ALONE}"))
+        alone = UndisturbedRun(**context.load_stage(f"{stage}/{ALONE}"))
         while len(kills) < config.kills:
             here = f"{stage}/{number}"
             if not context.done(here):
                 struck = _one_run(campaign, here, number, config.kills - len(kills), alone, context, advance)
-                found = differences(alone.evidence, evidence(campaign.directory(str(number))))
+                found = differences(alone.digests, digests(campaign.directory(str(number))))
                 context.save_stage(here, {"kills": struck, "differs": found})
             kept = context.load_stage(here)
             kills += [Kill(**kill) for kill in kept["kills"]]
             differs += [f"run {number}: {what}" for what in kept["differs"]]
             number += 1
-    return Killed(kills=tuple(kills), runs=number, differs=tuple(differs))
+    return KilledRuns(kills=tuple(kills), runs=number, differs=tuple(differs))
 
 
 def _struck_before(stage: str, context: Context) -> int:
@@ -141,7 +141,7 @@ def _struck_before(stage: str, context: Context) -> int:
 
 
 def _one_run(
-    campaign: Campaign, here: str, number: int, kills: int, alone: Alone, context: Context, advance: Advance
+    campaign: Campaign, here: str, number: int, kills: int, alone: UndisturbedRun, context: Context, advance: Advance
 ) -> tuple[Kill, ...]:
     """Kills of one run, each of which is kept at once."""
     stage = f"{here}-struck"
@@ -199,7 +199,7 @@ Inputs = Sequence[tuple[str, str, int, str, str]]
 
 
 def _requirements(
-    killed: Mapping[str, Killed], damage: Damages, inputs: Inputs, waited: Waits
+    killed: Mapping[str, KilledRuns], damage: Damages, inputs: Inputs, waited: Waits
 ) -> tuple[Requirement, ...]:
     """Kills survived, ends that are wrong, inputs that are answered, waits."""
     differ = sum(len(k.differs) for k in killed.values())
@@ -228,7 +228,7 @@ def _requirements(
     )  # fmt: skip
 
 
-def _verdict(killed: Mapping[str, Killed], damage: Damages, inputs: Inputs, waited: Waits) -> tuple[str, ...]:
+def _verdict(killed: Mapping[str, KilledRuns], damage: Damages, inputs: Inputs, waited: Waits) -> tuple[str, ...]:
     ends = [
         f"the {name} was killed {len(k.kills)} times in {k.runs} run{'s' if k.runs > 1 else ''} and "
         + ("ended in the same bits" if not k.differs else f"differs in {', '.join(k.differs)}")
@@ -245,7 +245,7 @@ def _verdict(killed: Mapping[str, Killed], damage: Damages, inputs: Inputs, wait
     )
 
 
-def _kill_table(killed: Mapping[str, Killed]) -> Table:
+def _kill_table(killed: Mapping[str, KilledRuns]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, each in killed.items():
         counts = [sum(k.phase == phase for k in each.kills) for phase in PHASES]

@@ -11,7 +11,7 @@ from experiments.core.pareto import speed_against_error
 from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.depth_methods import MAPS, Slopes
-from experiments.fields.panel import Panel
+from experiments.fields.sections import FieldSection
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.fit import fit_map
 from sensors_io.calibration.presses import BallPresses, Touches
@@ -41,7 +41,7 @@ OTHER_BALLS_MM = (4.0, 9.5)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fold:
+class CalibrationFold:
     """Presses left out of one calibration, its training presses and all their touches."""
 
     train: BallPresses
@@ -51,7 +51,7 @@ class Fold:
     rest_index: np.ndarray
 
 
-def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> list[Fold]:
+def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> list[CalibrationFold]:
     """Circles of each fold's training presses, and those of the rest by the optics of the training presses alone."""
     order, found = np.random.default_rng(seed).permutation(len(presses)), []
     for k in context.each("finding circles", range(folds)):
@@ -59,11 +59,15 @@ def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> l
         train, rest = presses.chosen(np.setdiff1d(order, out)), presses.chosen(out)
         circles = find_circles(train)
         touches = align_circles(rest, circles.optics).touches.stacked()
-        found.append(Fold(train=train, train_touches=circles.touches, rest=rest, rest_touches=touches, rest_index=out))
+        found.append(
+            CalibrationFold(train=train, train_touches=circles.touches, rest=rest, rest_touches=touches, rest_index=out)
+        )
     return found
 
 
-def held_out(folds: list[Fold], make: Callable[[BallPresses, Touches, int], Slopes], seed: int) -> BallErrors:
+def held_out(
+    folds: list[CalibrationFold], make: Callable[[BallPresses, Touches, int], Slopes], seed: int
+) -> BallErrors:
     """Errors of every press by maps made without it."""
     count = sum(len(fold.rest_index) for fold in folds)
     rows = np.full((3, count), np.nan)
@@ -82,7 +86,7 @@ def depth_by(read: Slopes, picture: np.ndarray, mm_per_px: float) -> np.ndarray:
     return depth - zero_level(depth, np.hypot(slope_x, slope_y), mm_per_px, ZeroConfig())
 
 
-def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context) -> Panel:
+def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context) -> FieldSection:
     """All maps on the presses of one real sensor: table, chart of speed against error, requirements."""
     parts = folds_of(presses, folds, seed, context)
     errors = {kind: held_out(parts, make, seed) for kind, make in context.each("maps", MAPS.items())}
@@ -98,7 +102,7 @@ def real_panel(presses: BallPresses, name: str, folds: int, rounds: int, seed: i
         kind: 1e3 * float(np.median(s)) for kind, s in interleaved(calls, context.rounds("timing maps", rounds)).items()
     }
     figures = errors[PACKAGE].figures()
-    return Panel(
+    return FieldSection(
         verdict=(
             f"On {int(figures['presses'])} real presses ({name}), circles found without labels and {folds}-fold by "
             f"press, depth is off by {figures['depth rmse median, um']:.1f} µm and the radius by "
@@ -175,7 +179,7 @@ def map_picture(errors: dict[str, BallErrors], ms: dict[str, float], name: str) 
     )
 
 
-def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: str, context: Context) -> Panel:
+def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: str, context: Context) -> FieldSection:
     """A calibration made with one ball, scored on balls of other diameters."""
     rows: list[tuple[Cell, ...]] = []
     requirements: list[Requirement] = []
@@ -196,7 +200,7 @@ def other_ball_panel(made: Calibration, others: dict[str, BallPresses], source: 
         ),
         rows=tuple(rows),
     )
-    return Panel(requirements=tuple(requirements), tables=(table,))
+    return FieldSection(requirements=tuple(requirements), tables=(table,))
 
 
 def calibrated(presses: BallPresses, seed: int) -> Calibration:

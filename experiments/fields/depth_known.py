@@ -8,10 +8,10 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.core.timing import interleaved
-from experiments.fields import depth_data
+from experiments.fields import ball_recordings
 from experiments.fields.depth_balls import calibrated
 from experiments.fields.depth_methods import one_sided_dirichlet, published_poisson
-from experiments.fields.panel import Panel
+from experiments.fields.sections import FieldSection
 from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader
@@ -60,7 +60,7 @@ def scale_error(
     return 100 * (scale - 1), 1e3 * float(np.sqrt(np.mean((depth - truth)[deep] ** 2)))
 
 
-def poisson_panel(rounds: Iterable[object]) -> Panel:
+def poisson_panel(rounds: Iterable[object]) -> FieldSection:
     """Every integrator on every analytic surface, and its time."""
     surfaces = analytic()
     slopes = [a.astype(np.float32) for a in surfaces["ball, centre"][1:]]
@@ -77,7 +77,7 @@ def poisson_panel(rounds: Iterable[object]) -> Panel:
     rows: list[tuple[Cell, ...]] = []
     for name, pairs in errors.items():
         rows.append((name, *(value for pair in pairs for value in pair), ms[name]))
-    return Panel(
+    return FieldSection(
         verdict=(f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.",),
         requirements=(
             Requirement(
@@ -99,14 +99,14 @@ def poisson_panel(rounds: Iterable[object]) -> Panel:
     )
 
 
-def known_panel(root: pathlib.Path, seed: int, context: Context) -> Panel:
+def known_panel(root: pathlib.Path, seed: int, context: Context) -> FieldSection:
     """Presses at known depth under a calibration made with the ball presses of the same sensor."""
-    presses = depth_data.sim2real(root)
+    presses = ball_recordings.sim2real(root)
     read = SlopeReader(calibrated(presses, seed).colours, presses.background)
     found: dict[str, dict[str, list[tuple[float, float]]]] = {"Neumann": {}, "Dirichlet": {}}
-    for (shape, depth_mm), picture in context.each("presses", depth_data.known_depths(root).items()):
+    for (shape, depth_mm), picture in context.each("presses", ball_recordings.known_depths(root).items()):
         slope_x, slope_y = read(picture)
-        truth, mask = depth_data.known_truth(shape, depth_mm, presses.shape)
+        truth, mask = ball_recordings.known_truth(shape, depth_mm, presses.shape)
         for name, integrate in (("Neumann", neumann), ("Dirichlet", dirichlet)):
             depth = integrate(slope_x, slope_y, presses.mm_per_px)
             depth -= zero_level(depth, np.hypot(slope_x, slope_y), presses.mm_per_px, ZeroConfig())
@@ -117,7 +117,7 @@ def known_panel(root: pathlib.Path, seed: int, context: Context) -> Panel:
     for name, by in found.items():
         rows += [(f"{name}, {shape}", len(pairs), *np.mean(pairs, axis=0).tolist()) for shape, pairs in by.items()]
         rows.append((f"{name}, all", sum(map(len, by.values())), *means[name].tolist()))
-    return Panel(
+    return FieldSection(
         verdict=(
             f"At known press depth the mean rmse is {means['Neumann'][0]:.0f} µm, {means['Neumann'][1]:.1f} µm with "
             f"the offset removed ({means['Dirichlet'][0]:.0f} and {means['Dirichlet'][1]:.0f} µm with a fixed border).",

@@ -33,7 +33,7 @@ _STEPS, _BATCH, _RATE = 1500, 4096, 3e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pixels:
+class TrainingPixels:
     """Pixels that maps are trained on: changes [n, 3], positions in −1 … 1 [n, 2], in-plane normals [n, 2]."""
 
     change: np.ndarray
@@ -41,7 +41,7 @@ class Pixels:
     normal: np.ndarray
 
 
-def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> Pixels:
+def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> TrainingPixels:
     """Up to 1500 pixels of each contact and 500 of the flat gel far from it."""
     rng = np.random.default_rng(seed)
     height, width = presses.shape
@@ -57,7 +57,7 @@ def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> Pixels:
         index = np.concatenate([rng.permutation(ball)[:1500], rng.permutation(flat)[:500]])
         parts.append([a.reshape(-1, a.shape[-1])[index] for a in (seen, place, normal)])
     seen, position, normal = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Pixels(change=seen, position=position, normal=normal)
+    return TrainingPixels(change=seen, position=position, normal=normal)
 
 
 def package_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:

@@ -25,21 +25,21 @@ from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.fields import (
+    ball_recordings,
+    contact_filters,
+    dense_accuracy,
     depth_balls,
-    depth_contact,
-    depth_data,
     depth_known,
-    depth_presses,
-    motion_dense,
-    motion_drift,
-    motion_evidence,
-    motion_frames,
-    motion_layers,
-    motion_markers,
-    motion_shear,
-    motion_subjects,
+    gel_patterns,
+    gels_at_rest,
+    generated_presses,
+    marker_accuracy,
+    marker_drift,
+    shear_accuracy,
+    tracked_gels,
+    wrong_layers,
 )
-from experiments.fields.panel import Panel
+from experiments.fields.sections import FieldSection
 from sensors_io.fields.sources import read_pictures
 from sensors_io.fields.types import Calibration
 
@@ -68,17 +68,17 @@ class FieldsConfig:
     generated_presses: int = 24
     strange_lamps: bool = True
     motion: bool = True
-    markers: motion_markers.MarkerConfig = dataclasses.field(default_factory=motion_markers.MarkerConfig)
-    drift: motion_drift.DriftConfig = dataclasses.field(default_factory=motion_drift.DriftConfig)
+    markers: marker_accuracy.MarkerConfig = dataclasses.field(default_factory=marker_accuracy.MarkerConfig)
+    drift: marker_drift.DriftConfig = dataclasses.field(default_factory=marker_drift.DriftConfig)
     dense_motions: int = 4
-    shear: motion_shear.ShearConfig = dataclasses.field(default_factory=motion_shear.ShearConfig)
+    shear: shear_accuracy.ShearConfig = dataclasses.field(default_factory=shear_accuracy.ShearConfig)
     judged: int = 20
     seed: int = 0
 
 
 def run(config: FieldsConfig, context: Context) -> Results:
     """Measure field by field, gather."""
-    panels: list[Panel] = []
+    panels: list[FieldSection] = []
     for name, make in context.each("panels", panels_of(config, context).items()):
         context.say(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
@@ -92,10 +92,10 @@ def run(config: FieldsConfig, context: Context) -> Results:
     )
 
 
-def panels_of(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[Panel]]]:
+def panels_of(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[FieldSection]]]:
     """What is measured, in the order of the report: name → how to make its panels."""
     root = config.data_dir
-    makes: dict[str, Callable[[], list[Panel]]] = {
+    makes: dict[str, Callable[[], list[FieldSection]]] = {
         "integrators": lambda: [depth_known.poisson_panel(context.rounds("timing integrators", config.rounds))],
         "generated balls": lambda: generated_panels(config, context),
     }
@@ -103,40 +103,40 @@ def panels_of(config: FieldsConfig, context: Context) -> dict[str, Callable[[], 
         makes |= {
             "real balls": lambda: real_balls(config, root, context),
             "known depth": lambda: [depth_known.known_panel(root, config.seed, context)],
-            "failed contact": lambda: [depth_contact.contact_panel(root, config.seed)],
+            "failed contact": lambda: [contact_filters.contact_panel(root, config.seed)],
         }
     return makes | (motion_panels(config, context) if config.motion else {})
 
 
-def generated_panels(config: FieldsConfig, context: Context) -> list[Panel]:
+def generated_panels(config: FieldsConfig, context: Context) -> list[FieldSection]:
     """Balls of other diameters on generated pictures, and the speed."""
-    made, balls = other_balls(config, depth_presses.fitted_optics, "generated, supposed optics", context)
+    made, balls = other_balls(config, generated_presses.fitted_optics, "generated, supposed optics", context)
     strange = (
-        [other_balls(config, depth_presses.near_lamps, "generated, near lamps", context)[1]]
+        [other_balls(config, generated_presses.near_lamps, "generated, near lamps", context)[1]]
         if config.strange_lamps
         else []
     )
     return [balls, *strange, speed_panel(config, made, "generated balls")]
 
 
-def speed_panel(config: FieldsConfig, made: Calibration, source: str) -> Panel:
+def speed_panel(config: FieldsConfig, made: Calibration, source: str) -> FieldSection:
     """How fast a map makes depth of a picture of 320 × 240."""
     speed = depth_balls.speed_requirement(made, depth_known.SHAPE, config.rounds, source)
     sentence = (
         f"A picture of 320 × 240 becomes depth and contact at {speed.measured:.0f} Hz on one core, by the map of "
     )
-    return Panel(verdict=(f"{sentence}{source}.",), requirements=(speed,))
+    return FieldSection(verdict=(f"{sentence}{source}.",), requirements=(speed,))
 
 
 def other_balls(
-    config: FieldsConfig, optics: depth_presses.Optics, source: str, context: Context
-) -> tuple[Calibration, Panel]:
+    config: FieldsConfig, optics: generated_presses.Optics, source: str, context: Context
+) -> tuple[Calibration, FieldSection]:
     """A calibration with one generated ball, and its errors on others."""
     made = depth_balls.calibrated(
-        depth_presses.generated_presses(6.31, config.generated_presses, config.seed, optics), config.seed
+        generated_presses.generated_presses(6.31, config.generated_presses, config.seed, optics), config.seed
     )
     others = {
-        f"{diameter:g} mm": depth_presses.generated_presses(
+        f"{diameter:g} mm": generated_presses.generated_presses(
             diameter, max(2, config.generated_presses // 2), config.seed + 1, optics
         )
         for diameter in depth_balls.OTHER_BALLS_MM
@@ -144,9 +144,9 @@ def other_balls(
     return made, depth_balls.other_ball_panel(made, others, source, context)
 
 
-def real_balls(config: FieldsConfig, root: pathlib.Path, context: Context) -> list[Panel]:
+def real_balls(config: FieldsConfig, root: pathlib.Path, context: Context) -> list[FieldSection]:
     """Recorded presses of the calibration's ball, and of another where there are any."""
-    gelslam = depth_data.gelslam(root)
+    gelslam = ball_recordings.gelslam(root)
     made = depth_balls.calibrated(gelslam, config.seed)
     panels = [
         depth_balls.real_panel(gelslam, "gelslam", config.folds, config.rounds, config.seed, context),
@@ -161,20 +161,20 @@ def real_balls(config: FieldsConfig, root: pathlib.Path, context: Context) -> li
     return panels
 
 
-def motion_panels(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[Panel]]]:
+def motion_panels(config: FieldsConfig, context: Context) -> dict[str, Callable[[], list[FieldSection]]]:
     """Markers and their drift, dense fields, shear and force, and what tells a marker gel from a bare one."""
-    root, rests = config.data_dir, motion_frames.gels(config.data_dir)
-    subjects = [motion_subjects.subject(rest) for rest in rests]
+    root, rests = config.data_dir, gels_at_rest.gels(config.data_dir)
+    subjects = [tracked_gels.subject(rest) for rest in rests]
     real = [s for s in subjects if s.rest.real] or subjects[:1]
-    makes: dict[str, Callable[[], list[Panel]]] = {
-        "markers": lambda: [motion_markers.panel(config.markers, subjects, context)],
-        "drift": lambda: [motion_drift.panel(config.drift, real)],
-        "dense fields": lambda: [motion_dense.panel(config.dense_motions, config.rounds, rests, context)],
-        "shear": lambda: [motion_shear.panel(config.shear, root, context)],
-        "wrong layers": lambda: [motion_layers.panel(config.shear)],
+    makes: dict[str, Callable[[], list[FieldSection]]] = {
+        "markers": lambda: [marker_accuracy.panel(config.markers, subjects, context)],
+        "drift": lambda: [marker_drift.panel(config.drift, real)],
+        "dense fields": lambda: [dense_accuracy.panel(config.dense_motions, config.rounds, rests, context)],
+        "shear": lambda: [shear_accuracy.panel(config.shear, root, context)],
+        "wrong layers": lambda: [wrong_layers.panel(config.shear)],
     }
     if root is not None:
-        makes["patterns"] = lambda: [motion_evidence.panel(root, config.judged, context)]
+        makes["patterns"] = lambda: [gel_patterns.panel(root, config.judged, context)]
     return makes
 
 

@@ -19,8 +19,8 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Column, Picture, Results, Table
 from experiments.core.runner import Experiment
-from experiments.fields.real_folders import FOLDERS, Folder, read_folder
-from experiments.fields.real_pictures import Row, field_rows
+from experiments.fields.field_drawings import DrawnFields, field_rows
+from experiments.fields.recording_folders import FOLDERS, RecordingFolder, read_folder
 from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
 from sensors_io.calibration.presses import BallPresses
 from sensors_io.fields.extract import Extractor
@@ -70,7 +70,7 @@ def run(config: RealConfig, context: Context) -> Results:
     )
 
 
-def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple[Cell, ...], str, Picture]:
+def study(folder: RecordingFolder, root: pathlib.Path, config: RealConfig) -> tuple[tuple[Cell, ...], str, Picture]:
     """One folder: a row of figures, what there is to say, and a picture of fields."""
     frames, names, background = read_folder(folder, root)
     made, figures, note = _calibrated(folder, frames, names, background, config.folds)
@@ -96,7 +96,7 @@ def study(folder: Folder, root: pathlib.Path, config: RealConfig) -> tuple[tuple
 
 
 def _calibrated(
-    folder: Folder, frames: np.ndarray, names: tuple[str, ...], background: np.ndarray, folds: int
+    folder: RecordingFolder, frames: np.ndarray, names: tuple[str, ...], background: np.ndarray, folds: int
 ) -> tuple[Calibration | None, tuple[Cell, ...], str]:
     """The folder's own calibration, its held-out figures, and what there is to say."""
     nothing: tuple[Cell, ...] = (None, None, None)
@@ -114,9 +114,9 @@ def _calibrated(
     return made, tuple(figures[key] for key in keys), f"{len(report.left_out)} presses left out"
 
 
-def _row(fields: Fields, frames: np.ndarray, background: np.ndarray, i: int, name: str) -> Row:
+def _row(fields: Fields, frames: np.ndarray, background: np.ndarray, i: int, name: str) -> DrawnFields:
     arrays = {key: None if array is None else array[i] for key, array in fields.arrays().items()}
-    return Row(
+    return DrawnFields(
         name=name,
         change=np.clip(128 + (frames[i].astype(np.int16) - background), 0, 255).astype(np.uint8),
         depth_mm=arrays["depth_mm"],

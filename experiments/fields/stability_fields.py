@@ -26,13 +26,13 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.fields import motion_alarms, motion_evidence
-from experiments.fields.depth_breaks import BROKEN_DEPTH, DEPTH_STRESSES, attempt_depth
-from experiments.fields.motion_breaks import OFF_PX, STRESSES, Outcome, Stress, attempt
-from experiments.fields.motion_charts import Curve, break_curves
-from experiments.fields.motion_frames import gels
-from experiments.fields.motion_shear_breaks import BROKEN, SHEAR_STRESSES, attempt_shear
-from experiments.fields.panel import Panel
+from experiments.fields import gel_patterns, tracking_flags
+from experiments.fields.depth_stress import BROKEN_DEPTH, DEPTH_STRESSES, attempt_depth
+from experiments.fields.gels_at_rest import gels
+from experiments.fields.sections import FieldSection
+from experiments.fields.shear_stress import BROKEN, SHEAR_STRESSES, attempt_shear
+from experiments.fields.stress_curves import StressCurve, break_curves
+from experiments.fields.tracking_stress import OFF_PX, STRESSES, Stress, StressOutcome, attempt
 from sensors_io.schema import Flag
 
 METHODS = (
@@ -48,7 +48,7 @@ OURS = METHODS[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StabilityConfig:
+class FieldStabilityConfig:
     """Where the recordings lie; how many gels and motions; frames of a slide; presses of the ball that depth is
     calibrated with; pictures judged per folder.
     """
@@ -70,14 +70,14 @@ class StabilityConfig:
             raise ValueError(f"methods is {self.methods}: must hold {OURS!r}, which the rest is compared with; add it")
 
 
-Outcomes = Mapping[str, Mapping[tuple[str, float], Sequence[Outcome]]]
+StressOutcomes = Mapping[str, Mapping[tuple[str, float], Sequence[StressOutcome]]]
 """Method → (stress, level) → outcomes over gels and motions."""
 
 
-def run(config: StabilityConfig, context: Context) -> Results:
+def run(config: FieldStabilityConfig, context: Context) -> Results:
     """Break everything, draw it, judge the gels."""
     chosen = gels(config.data_dir)[: config.gels]
-    outcomes: dict[str, dict[tuple[str, float], list[Outcome]]] = {}
+    outcomes: dict[str, dict[tuple[str, float], list[StressOutcome]]] = {}
     seeds = range(config.seed, config.seed + config.seeds)
     for rest, seed in context.each("motions", itertools.product(chosen, seeds)):
         for method, stress, level, outcome in attempt(rest, config.methods, seed):
@@ -87,8 +87,8 @@ def run(config: StabilityConfig, context: Context) -> Results:
     panels = [_tracking(outcomes), _shear(shear), _depth(depth)]
     if config.data_dir is not None:
         panels += [
-            motion_alarms.panel(config.data_dir, context),
-            motion_evidence.panel(config.data_dir, config.pictures, context),
+            tracking_flags.panel(config.data_dir, context),
+            gel_patterns.panel(config.data_dir, config.pictures, context),
         ]
     return Results(
         verdict=tuple(v for p in panels for v in p.verdict),
@@ -104,11 +104,11 @@ def run(config: StabilityConfig, context: Context) -> Results:
     )
 
 
-def _tracking(outcomes: Outcomes) -> Panel:
+def _tracking(outcomes: StressOutcomes) -> FieldSection:
     said, none_silent = _silence(outcomes, "frames", "frames broken")
     mild = [o for s in STRESSES for o in outcomes[OURS][s.name, s.levels[0]] if not o.broken]
     alarms = sum(o.flagged for o in mild)
-    return Panel(
+    return FieldSection(
         verdict=(
             said,
             f"{OURS}: {alarms} of {len(mild)} frames under the mildest level of each stress are flagged.",
@@ -131,8 +131,8 @@ def _tracking(outcomes: Outcomes) -> Panel:
     )
 
 
-def _shear(outcomes: Outcomes) -> Panel:
-    return Panel(
+def _shear(outcomes: StressOutcomes) -> FieldSection:
+    return FieldSection(
         tables=(_break_table("Where shear breaks first", outcomes, SHEAR_STRESSES),),
         pictures=(
             _curves(
@@ -148,9 +148,9 @@ def _shear(outcomes: Outcomes) -> Panel:
     )
 
 
-def _depth(outcomes: Outcomes) -> Panel:
+def _depth(outcomes: StressOutcomes) -> FieldSection:
     said, none_silent = _silence(outcomes, "presses", "depth wrong")
-    return Panel(
+    return FieldSection(
         verdict=(said,),
         requirements=(none_silent,),
         tables=(_break_table("Where depth breaks first", outcomes, DEPTH_STRESSES),),
@@ -170,7 +170,7 @@ def _depth(outcomes: Outcomes) -> Panel:
     )
 
 
-def _silence(outcomes: Outcomes, things: str, fault: str) -> tuple[str, Requirement]:
+def _silence(outcomes: StressOutcomes, things: str, fault: str) -> tuple[str, Requirement]:
     """How often each method was at fault without a flag, in words, and that ours must never be."""
     silent = {name: _silent(by) for name, by in outcomes.items()}
     total = sum(len(o) for o in outcomes[OURS].values())
@@ -181,11 +181,11 @@ def _silence(outcomes: Outcomes, things: str, fault: str) -> tuple[str, Requirem
     )
 
 
-def _silent(by: Mapping[tuple[str, float], Sequence[Outcome]]) -> int:
+def _silent(by: Mapping[tuple[str, float], Sequence[StressOutcome]]) -> int:
     return sum(o.silent for many in by.values() for o in many)
 
 
-def _break_table(title: str, outcomes: Outcomes, stresses: Sequence[Stress]) -> Table:
+def _break_table(title: str, outcomes: StressOutcomes, stresses: Sequence[Stress]) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, by in outcomes.items():
         cells: list[Cell] = [name]
@@ -201,7 +201,7 @@ def _break_table(title: str, outcomes: Outcomes, stresses: Sequence[Stress]) -> 
     )
 
 
-def _said(broken: Sequence[Outcome], levels: Sequence[float]) -> str:
+def _said(broken: Sequence[StressOutcome], levels: Sequence[float]) -> str:
     """Where it breaks first, and the frames by flag: 24: marker_loss 3, silent 1."""
     if not broken:
         return "–"
@@ -215,7 +215,7 @@ def _curves(
     name: str,
     title: str,
     caption: str,
-    outcomes: Outcomes,
+    outcomes: StressOutcomes,
     stresses: Sequence[Stress],
     tolerance: float,
     unit: str,
@@ -228,8 +228,8 @@ def _curves(
     return Picture(name=name, title=title, caption=caption, content=break_curves(curves, labels, tolerance, unit))
 
 
-def _curve(levels: Sequence[Sequence[Outcome]]) -> Curve:
-    return Curve(
+def _curve(levels: Sequence[Sequence[StressOutcome]]) -> StressCurve:
+    return StressCurve(
         error=np.array([max(o.error_px for o in many) for many in levels]),
         flagged=np.array([all(o.flagged for o in many) for many in levels]),
         broken=np.array([any(o.broken for o in many) for many in levels]),
@@ -237,8 +237,8 @@ def _curve(levels: Sequence[Sequence[Outcome]]) -> Curve:
     )
 
 
-DEFAULT = StabilityConfig()
-SMOKE = StabilityConfig(
+DEFAULT = FieldStabilityConfig()
+SMOKE = FieldStabilityConfig(
     gels=1, seeds=1, methods=(OURS, "LK to rest", "dots, nearest"), slide_frames=18, ball_presses=10, pictures=4
 )
 

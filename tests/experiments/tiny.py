@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from experiments.faults.victim import MODEL, SCENES
+from experiments.faults.trainings.small_study import MODEL, SCENES
 from experiments.study.assembly import Assembly
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch

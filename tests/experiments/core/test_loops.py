@@ -9,13 +9,13 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.loops import run_loop
 from experiments.core.runner import main
-from experiments.faults import counting
-from experiments.faults.evidence import differences, evidence
-from experiments.faults.inputs import counting_paths, run_directory
+from experiments.faults.digests import differences, digests
+from experiments.faults.fixtures import counting_paths, run_directory
+from experiments.faults.trainings import PACKAGE, counting
 
 
 def run(folder, *options: str) -> int:
-    return main(["counting", *counting_paths(folder), *options], package="experiments.faults")
+    return main(["counting", *counting_paths(folder), *options], package=PACKAGE)
 
 
 def lines(folder) -> list[dict]:
@@ -69,7 +69,7 @@ def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_pat
     assert [line["step"] for line in lines(tmp_path)] == list(range(6))
     assert (run_directory(tmp_path) / "checkpoints" / "count" / "0" / "6").is_dir()
     assert run(tmp_path) == 0
-    assert not differences(evidence(run_directory(whole)), evidence(run_directory(tmp_path)))
+    assert not differences(digests(run_directory(whole)), digests(run_directory(tmp_path)))
 
 
 def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_path, capsys):
@@ -107,7 +107,7 @@ def test_damage_is_told_to_the_reader_and_costs_the_steps_since(whole, tmp_path,
     capsys.readouterr()
     assert run(tmp_path) == 0
     assert "is kept as damaged-12" in capsys.readouterr().out
-    assert not differences(evidence(run_directory(whole)), evidence(directory))
+    assert not differences(digests(run_directory(whole)), digests(directory))
 
 
 @pytest.mark.parametrize("kept", [0, 5], ids=["emptied", "cut"])

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from experiments.faults.bad_input import BadInput, contents, provoke
 from experiments.faults.bad_inputs import cases
-from experiments.faults.cases import Case, contents, provoke
-from experiments.faults.inputs import flipped, replaced, unfinished_run, write_records
+from experiments.faults.fixtures import flipped, replaced, unfinished_run, write_records
 from sensors_io.records import RecordStore
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed
@@ -40,7 +40,7 @@ def test_bad_input_is_answered(unfinished, tmp_path, name):
 
 def test_good_input_is_a_fault_of_its_case(tmp_path):
     """A case that spoils nothing is noticed: the command succeeds and says nothing of an error."""
-    case = Case(
+    case = BadInput(
         kind="records",
         name="good records",
         program="sensors_io",
@@ -66,7 +66,7 @@ def test_lost_and_half_written_files_are_seen(tmp_path):
         (folder / ".half.tmp").write_text("x")
         return ["nothing"]
 
-    case = Case(
+    case = BadInput(
         kind="run",
         name="a program that loses a file",
         program="faults",

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from experiments.faults.evidence import differences, evidence
-from experiments.faults.kills import ALONE, Campaign, KillConfig, Pace
-from experiments.faults.watched import PHASES, Victim, look
+from experiments.faults.digests import differences, digests
+from experiments.faults.killable_session import PHASES, KillableTraining, look
+from experiments.faults.kills import ALONE, Campaign, KillConfig, KillSchedule
 
 LINE = json.dumps({"stage": "sft/0", "step": 3, "loss": 1.0}) + "\n"
 
@@ -44,7 +44,7 @@ def test_kills_that_cannot_be_are_refused(changed):
 def struck_at(kills, steps, save_every, speed, *, seed=0):
     """Shares of a run at which kills strike that each lose what was done since the last checkpoint."""
     rng, step, reached, struck = np.random.default_rng(seed), 0, 0, []
-    pace = Pace(work_s=10.0)
+    pace = KillSchedule(work_s=10.0)
     while len(struck) < kills:
         pace.went_on(reached / steps, step / steps)
         life_s = rng.uniform(0, pace.most_life_s(step / steps, kills - len(struck)))
@@ -68,7 +68,7 @@ def test_kills_strike_the_whole_run_though_each_loses_work(speed, save_every):
 
 
 def test_a_last_life_ends_before_the_run_and_one_of_many_is_its_share():
-    pace = Pace(work_s=10.0)
+    pace = KillSchedule(work_s=10.0)
     assert pace.most_life_s(0.0, 1) == pytest.approx(9.0)
     assert pace.most_life_s(0.5, 49) == pytest.approx(0.2)
     pace.went_on(0.52, 0.5)
@@ -79,13 +79,13 @@ def test_a_last_life_ends_before_the_run_and_one_of_many_is_its_share():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "phase", "steps"), [("counting", "count", 60), ("reinforcing", "grpo", 40)])
+@pytest.mark.parametrize(("name", "phase", "steps"), [("counting", "count", 60), ("small_grpo", "grpo", 40)])
 def test_killed_training_ends_in_the_same_bits(tmp_path, name, phase, steps):
     """Though the kills are counted by two callers, of which the first is gone after one."""
-    victim = Victim(name=name, options=("--steps", str(steps)), steps={phase: steps})
+    victim = KillableTraining(name=name, options=("--steps", str(steps)), steps={phase: steps})
     campaign = Campaign(tmp_path / "home", tmp_path / "cache", victim, KillConfig(kills=3))
     alone = campaign.left_alone()
-    assert alone.evidence == evidence(campaign.directory(ALONE))
+    assert alone.digests == digests(campaign.directory(ALONE))
     assert alone.lines == steps
 
     class Gone(Exception):
@@ -102,6 +102,6 @@ def test_killed_training_ends_in_the_same_bits(tmp_path, name, phase, steps):
     assert len(kept) == 1
     kills = campaign.killed(0, 3, alone, before=kept)
     assert kills == campaign.killed(0, 3, alone, before=kills)  # it has ended, and is not begun anew
-    assert not differences(alone.evidence, evidence(campaign.directory("0")))
+    assert not differences(alone.digests, digests(campaign.directory("0")))
     assert 1 < len(kills) <= 3
     assert all(kill.phase in PHASES and 0 <= kill.done <= 1 for kill in kills)

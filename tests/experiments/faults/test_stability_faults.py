@@ -6,11 +6,11 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.faults import stability_faults
-from experiments.faults.charts import where_kills_struck
-from experiments.faults.damage import OLDER, SAME, WRONG, strike
-from experiments.faults.inputs import unfinished_run
-from experiments.faults.waiting import WaitingConfig
-from experiments.faults.watched import START, STEPPING, Kill
+from experiments.faults.damaged_files import OLDER, SAME, WRONG, strike
+from experiments.faults.data_waits import WaitingConfig
+from experiments.faults.fixtures import unfinished_run
+from experiments.faults.kill_charts import where_kills_struck
+from experiments.faults.killable_session import START, STEPPING, Kill
 from tests.experiments import tiny
 from tests.experiments.encoder.test_pretrain_encoder import PRETRAIN
 from tests.experiments.shrunk import run_shrunk
@@ -22,7 +22,7 @@ AT_START = dataclasses.replace(STRUCK, phase=START, torn=False)
 def findings(differs=(), damage=(), inputs=()):
     """Figures of the report from 150 kills in steps and 50 at start-up."""
     struck = (STRUCK,) * 150 + (AT_START,) * 50
-    killed = {stability_faults.GRPO: stability_faults.Killed(kills=struck, runs=1, differs=differs)}
+    killed = {stability_faults.GRPO: stability_faults.KilledRuns(kills=struck, runs=1, differs=differs)}
     waited = {"sft/0": (10.0, 0.1)}
     parts = (killed, damage, inputs, waited)
     met = {r.name: r.met for r in stability_faults._requirements(*parts)}

@@ -8,11 +8,19 @@ import pytest
 from experiments.core import pareto
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
-from experiments.fields import depth_balls, depth_known, motion_drift, motion_frames, motion_markers, pareto_fields
+from experiments.fields import (
+    ball_recordings,
+    depth_balls,
+    depth_known,
+    gels_at_rest,
+    marker_accuracy,
+    marker_drift,
+    pareto_fields,
+)
 from experiments.fields.depth_methods import MAPS
-from experiments.fields.depth_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
-from experiments.fields.motion_frames import Rest
-from experiments.fields.motion_subjects import Subject, subject
+from experiments.fields.gels_at_rest import GelAtRest
+from experiments.fields.generated_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
+from experiments.fields.tracked_gels import TrackedGel, subject
 from sensors_io.calibration.circles import find_circles
 
 TINY = dataclasses.replace(pareto_fields.EXPERIMENT.scales["smoke"], rounds=2)
@@ -87,48 +95,48 @@ def test_every_map_reads_a_press(name):
 
 
 def test_truth_at_known_depth_is_the_indenter():
-    depth, mask = depth_known.depth_data.known_truth("sphere", 0.5, (320, 320))
+    depth, mask = ball_recordings.known_truth("sphere", 0.5, (320, 320))
     assert depth.max() == pytest.approx(0.5, abs=1e-3)
     assert depth[mask].min() > 0.1
-    flat, inside = depth_known.depth_data.known_truth("prism", 0.25, (320, 320))
+    flat, inside = ball_recordings.known_truth("prism", 0.25, (320, 320))
     assert np.unique(flat).tolist() == [0.25]
     assert inside.sum() == 71 * 107
 
 
-def roof(slope: int = 2, half: int = 8) -> Subject:
+def roof(slope: int = 2, half: int = 8) -> TrackedGel:
     """A picture g (|x − c| + |y − c|) and one window about its centre c."""
     y, x = np.mgrid[:48, :320]
     grey = 40 + slope * (np.minimum(np.abs(x - 24), 20) + np.minimum(np.abs(y - 24), 20))
     picture = np.repeat(grey[..., None], 3, -1).astype(np.uint8)
-    rest = Rest(name="roof", picture=picture, real=False)
-    return Subject(rest=rest, points_px=np.array([[24.0, 24.0]]), half_px=half, dot_radius_px=8.0)
+    rest = GelAtRest(name="roof", picture=picture, real=False)
+    return TrackedGel(rest=rest, points_px=np.array([[24.0, 24.0]]), half_px=half, dot_radius_px=8.0)
 
 
 def test_the_least_error_of_a_window_is_that_of_its_gradient():
     """Σ I_x² = Σ I_y² = g² 2h (2h + 1), Σ I_x I_y = 0; the noise of both pictures counts."""
     slope, half = 2, 8
-    noise = (motion_drift.NOISE_GREY**2 + 1 / 12) * (0.299**2 + 0.587**2 + 0.114**2) + 1 / 12
+    noise = (marker_drift.NOISE_GREY**2 + 1 / 12) * (0.299**2 + 0.587**2 + 0.114**2) + 1 / 12
     expected = np.sqrt(np.log(2) * 2 * 2 * noise / (slope**2 * 2 * half * (2 * half + 1)))
-    assert motion_drift.bound_px(roof(slope, half), light_and_strain=False) == pytest.approx(expected, rel=1e-3)
-    assert motion_drift.bound_px(roof(slope, half), light_and_strain=True) > expected
+    assert marker_drift.bound_px(roof(slope, half), light_and_strain=False) == pytest.approx(expected, rel=1e-3)
+    assert marker_drift.bound_px(roof(slope, half), light_and_strain=True) > expected
 
 
 def test_what_a_method_calls_lost_has_no_error():
     error = np.append(np.linspace(0, 1, 19), [np.inf, np.inf])
-    assert motion_markers.known(error) == (pytest.approx(10 / 18), None)
+    assert marker_accuracy.known(error) == (pytest.approx(10 / 18), None)
 
 
 def test_what_is_anchored_does_not_drift(monkeypatch):
-    monkeypatch.setattr(motion_drift, "PERIOD", 6)
-    config = motion_drift.DriftConfig(cycles=(1, 10), pairs=3)
-    panel = motion_drift.panel(config, [subject(motion_frames.gels(None)[0])])
+    monkeypatch.setattr(marker_drift, "PERIOD", 6)
+    config = marker_drift.DriftConfig(cycles=(1, 10), pairs=3)
+    panel = marker_drift.panel(config, [subject(gels_at_rest.gels(None)[0])])
     growth = panel.requirements[1]
     assert growth.met, growth
     ours, alone, *_, peer = panel.tables[0].rows
     assert ours[2] < alone[2]
     assert peer[2] - peer[1] > 3 * abs(ours[2] - ours[1])
     with pytest.raises(ValueError, match="must hold 1 and 10"):
-        motion_drift.DriftConfig(cycles=(1, 2))
+        marker_drift.DriftConfig(cycles=(1, 2))
 
 
 def test_the_chart_of_maps_is_titled_by_its_sensor_and_names_the_package_s_map(monkeypatch):

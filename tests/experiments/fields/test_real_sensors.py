@@ -9,7 +9,7 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.fields import real_sensors
-from experiments.fields.real_folders import Folder, read_folder
+from experiments.fields.recording_folders import RecordingFolder, read_folder
 
 CLIPS = pathlib.Path(__file__).parents[2] / "data"
 
@@ -17,7 +17,7 @@ CLIPS = pathlib.Path(__file__).parents[2] / "data"
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     shutil.copytree(CLIPS / "gelslam", tmp_path / "data" / "clips")
-    found = Folder(
+    found = RecordingFolder(
         name="clips",
         path="clips",
         pattern="press_*.png",
@@ -41,7 +41,7 @@ def test_a_folder_becomes_a_row_and_a_picture(folder, tmp_path):
 
 
 def test_an_empty_folder_says_so(folder, tmp_path):
-    nothing = Folder(name="x", path="clips", pattern="*.bmp", background="background.png", mm_per_px=1)
+    nothing = RecordingFolder(name="x", path="clips", pattern="*.bmp", background="background.png", mm_per_px=1)
     with pytest.raises(FileNotFoundError, match="must hold the recording"):
         read_folder(nothing, tmp_path / "data")
     frames, names, background = read_folder(folder, tmp_path / "data")

@@ -1,0 +1,63 @@
+"""What a run came to, as hashes: two runs that ended in the same bits have the same."""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from experiments.core.artifacts import read_json
+
+
+def digests(directory: Path) -> dict[str, str]:
+    """SHA-256 of all that a run came to: log lines, answers, what every stage kept at its end, results."""
+    found = {"metrics.jsonl": _hash((directory / "metrics.jsonl").read_bytes())}
+    for path in sorted((directory / "answers").glob("*.npz")):
+        found[f"answers/{path.name}"] = _hash(path.read_bytes())
+    results = read_json(directory / "results.json")
+    found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
+    checkpoints = directory / "checkpoints"
+    for stage in sorted(path.parent for path in checkpoints.rglob("*") if path.name.isdigit() and _holds_state(path)):
+        kept = sorted((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+        found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
+    return found
+
+
+def differences(a: Mapping[str, str], b: Mapping[str, str]) -> tuple[str, ...]:
+    """What two runs came to differently."""
+    return tuple(sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name)))
+
+
+def _holds_state(path: Path) -> bool:
+    return (path / "state").is_dir()
+
+
+def _state_hash(checkpoint: Path) -> str:
+    """Of step, data iterator, score and every array of a checkpoint."""
+    digest = hashlib.sha256(checkpoint.name.encode() + (checkpoint / "data" / "metadata").read_bytes())
+    score = checkpoint / "metrics" / "metrics"  # beside it Orbax writes its own path
+    digest.update(score.read_bytes() if score.exists() else b"")
+    for path, array in jax.tree.leaves_with_path(_arrays(checkpoint / "state")):
+        digest.update(jax.tree_util.keystr(path).encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def _arrays(state: Path) -> Any:
+    """The arrays of a saved state on the host, without the file that says which devices held them: it may be damaged,
+    and training that names its own devices goes on all the same.
+    """
+    with tempfile.TemporaryDirectory() as home, ocp.PyTreeCheckpointer() as checkpointer:
+        path = shutil.copytree(state, Path(home) / "state", ignore=shutil.ignore_patterns("_sharding"))
+        tree = checkpointer.metadata(path).item_metadata.tree
+        as_array = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), tree)
+        return checkpointer.restore(path, restore_args=as_array)
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,122 @@
+"""The smallest good inputs, for cases to spoil."""
+
+import contextlib
+import io
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from experiments.core.runner import main
+from experiments.faults.trainings import PACKAGE
+from sensors_io.records import RecordsMeta, RecordWriter
+from sensors_io.schema import ContactKey, ObjectCard, Sequence
+
+META = RecordsMeta(source="made up", licence="that of this code", config_hash="made up", sensors=("xense",))
+
+
+def write_records(folder: Path, *, complete: bool = True) -> None:
+    """Records of two contacts by one sensor, each in a shard of its own, in `folder/records`."""
+    stop = contextlib.nullcontext() if complete else contextlib.suppress(_Enough)
+    with stop, RecordWriter(folder / "records", meta=META, contacts_per_shard=1) as writer:
+        for n in range(2):
+            writer.write_object(ObjectCard(object_id=f"object_{n}", split="train", labels={}, annotator="nobody"))
+            writer.write_contact([_press(n)])
+        if not complete:
+            raise _Enough
+
+
+def write_pictures(folder: Path) -> None:
+    """Two pictures of different sizes, and a file that is none."""
+    for name, shape in (("press", (120, 160, 3)), ("rest", (96, 128, 3))):
+        picture = np.random.default_rng(0).integers(80, 120, shape, np.uint8)
+        cv2.imwrite(str(folder / f"{name}.png"), cv2.GaussianBlur(picture, (5, 5), 2))
+    (folder / "none.png").write_bytes(b"a picture of nothing")
+
+
+def unfinished_run(folder: Path) -> None:
+    """A run of `counting` in `folder/runs` that has two checkpoints and no results."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        code = main(["counting", *counting_paths(folder)], package=PACKAGE)
+    if code:
+        raise RuntimeError(f"the run that faults should strike ended with exit code {code}")
+    run_directory(folder).joinpath("results.json").unlink()
+
+
+def counting_paths(folder: Path) -> tuple[str, ...]:
+    """Where `counting` keeps its runs and programs."""
+    return "--runs-dir", str(folder / "runs"), "--cache-dir", str(folder / "cache")
+
+
+def run_directory(folder: Path) -> Path:
+    """The one run of `counting`."""
+    runs = folder / "runs" / "counting"
+    (found,) = (path for path in runs.iterdir() if path.is_dir() and not path.is_symlink())
+    return found
+
+
+def newest_checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints of the run, the newest first."""
+    stage = run_directory(folder) / "checkpoints" / "count" / "0"
+    return sorted((p for p in stage.iterdir() if p.name.isdigit()), key=lambda p: -int(p.name))
+
+
+def flipped(path: Path) -> None:
+    """Flip all bits of one byte, the middle one of those that are not 0, which may be padding."""
+    content = bytearray(path.read_bytes())
+    told = np.flatnonzero(np.frombuffer(content, np.uint8))
+    content[told[len(told) // 2]] ^= 255
+    path.write_bytes(content)
+
+
+def cut(path: Path) -> None:
+    """Leave the first half of a file."""
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def emptied(path: Path) -> None:
+    """Leave nothing in a file."""
+    path.write_bytes(b"")
+
+
+def replaced(path: Path, old: str, new: str) -> None:
+    """Replace a text in a file, which must hold it."""
+    text = path.read_text(encoding="utf-8")
+    if old not in text:
+        raise ValueError(f"{path} holds no {old!r}: the case that would spoil it spoils nothing; correct the case")
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def full_disk(most_bytes: int) -> Callable[[Path], contextlib.AbstractContextManager[None]]:
+    """No file can grow past so many bytes, as on a disk without space; the error's number is another (EFBIG)."""
+
+    @contextlib.contextmanager
+    def limit(folder: Path) -> Iterator[None]:
+        del folder
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limit
+
+
+class _Enough(Exception):
+    """Stops a writer before its end."""
+
+
+def _press(n: int) -> Sequence:
+    frames = np.random.default_rng(n).integers(0, 256, (4, 8, 8, 3), np.uint8)
+    return Sequence(
+        key=ContactKey(object_id=f"object_{n}", site=0, motion="press", trial=0),
+        sensor="xense",
+        frames=frames,
+        host_time_ns=np.arange(4, dtype=np.int64) * 40_000_000,
+        phase=np.ones(4, np.uint8),
+        flags=np.zeros(4, np.uint32),
+    )

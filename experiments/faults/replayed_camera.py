@@ -1,0 +1,179 @@
+"""An hour of a camera in compressed time: what the reader's books say against what was injected."""
+
+import dataclasses
+import threading
+import tracemalloc
+from collections.abc import Iterator
+
+import numpy as np
+
+from experiments.core.progress import Tell
+from sensors_io.clock import NS_PER_S, JumpingClock
+from sensors_io.devices.base import Identity
+from sensors_io.devices.intake import Counts, Intake
+from sensors_io.devices.reader import Pump, ReaderConfig
+from sensors_io.devices.replay import Faults, Replay, Truth
+from sensors_io.devices.sources import Recorded
+
+_PAGE_BYTES = 4096  # of Linux, in which /proc tells a process's memory
+_MB = 1e6
+_PICTURES = 100_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class NoiseCamera:
+    """A source of pictures of noise, no two of 100,000 alike: each is the same noise, begun elsewhere.
+
+    Args:
+      rate_hz: of the pictures.
+      size_px: rows and columns.
+    """
+
+    rate_hz: float
+    size_px: tuple[int, int]
+
+    @property
+    def identity(self) -> Identity:
+        return Identity(sensor="gelsight_mini", serial="loop", where="loop", period_s=1 / self.rate_hz)
+
+    def samples(self) -> Iterator[Recorded]:
+        shape = (*self.size_px, 3)
+        size = int(np.prod(shape))
+        noise = np.random.default_rng(0).integers(0, 256, size + _PICTURES, dtype=np.uint8)
+        for i in range(_PICTURES):
+            frame = noise[i : i + size].reshape(shape)
+            yield Recorded(time_ns=round(i * NS_PER_S / self.rate_hz), index=i, frame=frame, arrays={})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReplayOutcome:
+    """One replay: what happened, what the books say, how late the stamps are, how memory went.
+
+    Args:
+      truth, counts: of the device, of the reader.
+      late_s: of the samples' host stamps behind the true times, [3]: median, 99th percentile, largest.
+      memory_mb: of the process at every tenth of the hour, [11].
+      traced_growth_kb: of Python's own memory from the first tenth to the end; NaN where it was not traced.
+    """
+
+    truth: Truth
+    counts: Counts
+    late_s: np.ndarray
+    memory_mb: np.ndarray
+    traced_growth_kb: float
+
+    @property
+    def wrong(self) -> dict[str, int]:
+        """Each account, less the truth: all 0 if every loss was found."""
+        t, c = self.truth, self.counts
+        return {
+            "missing": c.missing - (t.dropped + t.away - t.unseen),
+            "duplicates": c.duplicates - t.duplicated,
+            "arrived": c.arrived - (t.given + t.duplicated),
+            "disconnects": c.disconnects - t.disconnects,
+            "reconnects": c.reconnects - t.disconnects,
+            "produced": t.produced - (t.given + t.dropped + t.away),
+            "unaccounted": c.unaccounted,
+        }
+
+
+def endure(
+    source: NoiseCamera,
+    seconds: float,
+    faults: Faults,
+    *,
+    capacity: int,
+    every: int = 1,
+    traced: bool = False,
+    tell: Tell = lambda done_s, all_s: None,
+) -> ReplayOutcome:
+    """Replay for so long; the consumer reads `every`-th time only, so that a small ring overflows.
+
+    Args:
+      source: what is replayed.
+      seconds: of device time.
+      faults: what goes wrong.
+      capacity: of the ring.
+      every: samples between two visits of the consumer, which then reads half of the ring.
+      traced: whether Python's memory is traced, which takes twice the time.
+      tell: told of the seconds of device time, at every tenth.
+    """
+    clock = JumpingClock()
+    replay = Replay(source, seconds=seconds, faults=faults, clock=clock)
+    intake = Intake(capacity=capacity, clock=clock)
+    pump = Pump(replay, intake, ReaderConfig(capacity=capacity), clock, threading.Event())
+    late = _Late(source.rate_hz)
+    memory = _Memory(seconds, traced)
+    pump.open()
+    visits = 0
+    while pump.step():
+        visits += 1
+        if visits % every == 0:
+            for _ in range(min(intake.counts.waiting, max(1, capacity // 2))):
+                late.add(intake.next(0.0).host_time_ns)
+        if memory.look(clock.now_ns() / NS_PER_S):
+            tell(round(clock.now_ns() / NS_PER_S), round(seconds))
+    while intake.counts.waiting:
+        intake.next(0.0)
+    memory.look(seconds)
+    tell(round(seconds), round(seconds))
+    return ReplayOutcome(
+        truth=replay.truth,
+        counts=intake.counts,
+        late_s=late.quantiles(),
+        memory_mb=np.array(memory.seen_mb),
+        traced_growth_kb=memory.growth_kb(),
+    )
+
+
+class _Late:
+    """How far stamps lie behind the nearest tick of the device's true clock, in bounded memory."""
+
+    _BINS = np.linspace(0, 1, 2001)
+
+    def __init__(self, rate_hz: float):
+        self._period_ns = NS_PER_S / rate_hz
+        self._histogram = np.zeros(len(self._BINS), np.int64)
+
+    def add(self, stamp_ns: int) -> None:
+        phase = (stamp_ns / self._period_ns) % 1.0
+        self._histogram[int(phase * (len(self._BINS) - 1))] += 1
+
+    def quantiles(self) -> np.ndarray:
+        share = np.cumsum(self._histogram) / max(1, self._histogram.sum())
+        at = self._BINS[[int(np.searchsorted(share, q)) for q in (0.5, 0.99, 1.0 - 1e-12)]]
+        return at * self._period_ns / NS_PER_S
+
+
+class _Memory:
+    """Memory of the process at every tenth of the time, and of Python's objects from the first tenth on."""
+
+    def __init__(self, seconds: float, traced: bool):
+        self._every_s, self._next_s = seconds / 10, 0.0
+        self._traced, self._first_kb = traced, np.nan
+        self.seen_mb: list[float] = []
+        if traced:
+            tracemalloc.start()
+
+    def look(self, now_s: float) -> bool:
+        """Whether it was time to look."""
+        if now_s < self._next_s:
+            return False
+        self._next_s += self._every_s
+        self.seen_mb.append(resident_mb())
+        if self._traced and len(self.seen_mb) == 2:
+            self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
+        return True
+
+    def growth_kb(self) -> float:
+        if not self._traced:
+            return float("nan")
+        last_kb = tracemalloc.get_traced_memory()[0] / 1e3
+        tracemalloc.stop()
+        return last_kb - self._first_kb
+
+
+def resident_mb() -> float:
+    """Resident memory of this process, MB."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * _PAGE_BYTES / _MB

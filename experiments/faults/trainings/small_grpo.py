@@ -1,0 +1,138 @@
+"""Does reinforcement that is killed end as if it had not been?
+
+    main(["small_grpo"], package="experiments.faults.trainings")
+
+The GRPO stage of every study, shortened: its questions in Grain's order, the published objective with its reference and
+counterfactual pass, its log with alarms, a checkpoint every few steps, the newest and the best on held-out questions
+kept.  The policy is small and the contacts are drawn encoded, so that a session starts in seconds and can be killed by
+the hundred.
+"""
+
+import dataclasses
+import io
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
+from experiments.core.loops import run_loop
+from experiments.core.results import Results
+from experiments.core.runner import Experiment
+from experiments.faults.trainings.small_study import ARM, MODEL
+from experiments.study.arrays import flat, nested
+from experiments.study.assembly import Assembly, assemble, touch_shapes
+from experiments.study.feeds import QuestionFeed
+from experiments.study.reinforcement import grpo_program
+from experiments.study.scores import PUBLISHED
+from experiments.study.watching import watched_log
+from sensors_io.schema import SENSORS
+from touchr1_jax.models.policy import Features
+from touchr1_jax.rewards import uniform_prior
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import Fixed, start_state
+from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.types import Params
+
+STAGE = f"grpo/{ARM}/0"
+
+CONTACTS, HELD_OUT = 48, 8
+"""Contacts to learn from, and others that score a checkpoint."""
+
+NOISE = 16
+"""Draws in the bank of encoded noise."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReinforcingConfig:
+    """Steps, and every how many a checkpoint is saved and scored."""
+
+    steps: int = 2000
+    save_every: int = 5
+    grpo: GRPOConfig = GRPOConfig(prompts=2, group=3, length=MODEL.completion_tokens, micro_prompts=2)
+
+    def __post_init__(self) -> None:
+        self.loop()  # refuses its own values
+
+    def loop(self) -> LoopConfig:
+        """The loop's part."""
+        return LoopConfig(steps=self.steps, save_every=self.save_every)
+
+
+def run(config: ReinforcingConfig, context: Context) -> Results:
+    """Reinforce to the end."""
+    assembly = assemble(MODEL, SENSORS)
+    prior = uniform_prior(list(assembly.levels))
+    score, fns = assembly.score(PUBLISHED, prior), assembly.fns
+    optimizer, step = grpo_program(fns, score, config.grpo, config.steps, None)
+    decoder = {"decoder": _decoder(assembly, context.directory / "start.npz")}
+    rng = np.random.default_rng(1)
+    noise = _features(rng, NOISE).touch
+    fixed = Fixed(reference=decoder, noise=jnp.asarray(noise))
+    feed = _questions(assembly, rng, CONTACTS, config.grpo.drawn)
+    held = next(_questions(assembly, rng, HELD_OUT, HELD_OUT))
+    begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
+    state = begin(decoder, jax.random.key(0))
+    judge = jax.jit(lambda params: _certainty(assembly, params, held))
+    run_loop(
+        lambda s, batch: step(s, batch, fixed),
+        state,
+        feed,
+        config.loop(),
+        context,
+        STAGE,
+        make_log=watched_log,
+        held_out=lambda s: float(judge(s.params)),
+    )
+    return Results(verdict=("It came to its end.",))
+
+
+def _certainty(assembly: Assembly, params: Params, held: GRPOBatch) -> jax.Array:
+    """Mean largest log-probability of the first word about held-out contacts: cheap, and any score will do."""
+    first = jax.vmap(lambda f, i, m: assembly.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
+    return jnp.mean(jnp.max(jax.nn.log_softmax(first), -1))
+
+
+def _questions(assembly: Assembly, rng: np.random.Generator, contacts: int, batch_size: int) -> QuestionFeed:
+    """Questions about contacts whose features and labels are drawn."""
+    label = np.stack([rng.integers(0, levels, contacts) for levels in assembly.levels], 1).astype(np.int32)
+    return QuestionFeed(assembly, _features(rng, contacts), label, batch_size=batch_size, seed=0)
+
+
+def _features(rng: np.random.Generator, contacts: int) -> Features:
+    """Encoded contacts, all there, drawn from N(0, 1); on the host, as stages keep them."""
+    width, times = MODEL.decoder.hidden_size, MODEL.frames // MODEL.tactile.frames_per_step
+    time = np.repeat(np.arange(times, dtype=np.int32), MODEL.tactile.tokens_per_step)
+    normal = lambda *shape: rng.normal(size=(contacts, *shape, width)).astype(np.float32)
+    on_host: dict[str, Any] = {
+        "touch": normal(len(SENSORS), len(time)),
+        "touch_time": np.tile(time, (contacts, len(SENSORS), 1)),
+        "stream_mask": np.ones((contacts, len(SENSORS)), bool),
+        "view": normal(MODEL.vision.grid**2),
+        "view_mask": np.ones(contacts, bool),
+    }
+    return Features(**on_host)
+
+
+def _decoder(assembly: Assembly, path: Path) -> Params:
+    """A fresh policy's, drawn by the first session and found by the others, as GRPO finds what SFT left."""
+    if not path.exists():
+        arrays: dict[str, Any] = flat(_drawn(assembly)["decoder"])
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        write_bytes(path, buffer.getvalue())
+    with np.load(path) as file:
+        return nested(dict(file))
+
+
+def _drawn(assembly: Assembly) -> Params:
+    """Parameters of a fresh policy."""
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, MODEL.vision.image_px, SENSORS))
+    return assembly.init(0, nothing)
+
+
+EXPERIMENT = Experiment(name="small_grpo", config=ReinforcingConfig(), run=run)

@@ -1,0 +1,88 @@
+"""Does training that is killed end as if it had not been?
+
+    main(["small_study"], package="experiments.faults.trainings")
+
+The run that `stability_faults` kills: SFT, GRPO and a baseline without touch, as every study trains them, with networks
+so small that most of a step is the loop around it.  A checkpoint every few steps, so that many kills strike one being
+written.
+"""
+
+import dataclasses
+
+from experiments.core.context import Context
+from experiments.core.results import Results
+from experiments.core.runner import Experiment
+from experiments.study.assembly import ModelConfig
+from experiments.study.scores import PUBLISHED
+from experiments.study.stages import SFTConfig
+from experiments.study.study import StudyConfig, run_study
+from sensors_io.scenes.config import SceneConfig
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.training.evidence import ProbeConfig
+
+ARM = "paper"
+
+MODEL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=16, num_layers=0, num_heads=2, stem_width=4),
+    vision=VisionConfig(image_px=16, patch_px=8, width=8, num_layers=0),
+    decoder=DecoderConfig(
+        vocab_size=0,
+        hidden_size=24,
+        num_layers=1,
+        num_heads=2,
+        num_kv_heads=1,
+        head_dim=8,
+        intermediate_size=32,
+        mrope_section=(1, 1, 2),
+    ),
+    frames=4,
+    image_px=28,
+    completion_tokens=20,
+)
+"""So small that a step takes as long as the loop around it."""
+
+SCENES = SceneConfig(
+    objects=16,
+    sites=1,
+    frames=4,
+    image_px=28,
+    contact_grid=24,
+    view_px=16,
+    split_shares=(0.6, 0.1, 0.3),
+    solver_tolerance=1e-2,
+    solver_max_iterations=20,
+)
+
+STUDY = StudyConfig(
+    seeds=1,
+    scenes=SCENES,
+    model=MODEL,
+    probe=ProbeConfig(folds=2, iterations=4),
+    sft=SFTConfig(steps=60, batch_size=4, save_every=3),
+    blind=SFTConfig(steps=30, batch_size=4, save_every=3, micro_contacts=4),
+    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
+    grpo_steps=60,
+    grpo_save_every=3,
+)
+
+SHORT = dataclasses.replace(
+    STUDY,
+    sft=dataclasses.replace(STUDY.sft, steps=12),
+    blind=dataclasses.replace(STUDY.blind, steps=6),
+    grpo_steps=12,
+)
+
+
+def run(config: StudyConfig, context: Context) -> Results:
+    """Train and ask every policy; what matters lies in the run's directory."""
+    study = run_study(config, {ARM: PUBLISHED}, context)
+    return Results(
+        verdict=("It came to its end.",),
+        data={"questions": {name: len(said[0].contact) for name, said in study.answers.items()}},
+    )
+
+
+EXPERIMENT = Experiment(name="small_study", config=STUDY, scales={"short": SHORT}, run=run)
