@@ -15,7 +15,7 @@ PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
 MAX_FILE, MAX_FUNCTION = 400, 60
 
 TOUCHR1_LAYERS = (
-    {"types", "limits"},
+    {"types", "validation"},
     {"masked"},
     {"text"},
     {"models"},

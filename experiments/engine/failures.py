@@ -12,7 +12,7 @@ import numpy as np
 from experiments.engine.training import Dials, Variant, dials_of
 from experiments.engine.world import K, S, World
 from touchr1_jax.rl.config import GRPOConfig, Paper, Stable, TactileUse
-from touchr1_jax.rl.guard import ROUNDING_NAT
+from touchr1_jax.rl.stream_check import ROUNDING_NAT
 
 PAPER = Variant(name="paper", algorithm=Paper())
 STABLE = Variant(name="stable", algorithm=Stable(), accuracy="accuracy_debiased", consistency="consistency_gated")

@@ -138,8 +138,10 @@ class Learning:
 
     def memory(self) -> tuple[Compiled, int]:
         """Bytes that the compiler reserves for a step, and those counted by hand."""
-        state, batch, fixed = self._job.state, self._job.batch, self._job.fixed
-        return reserved_bytes(self._job.lowered().compile()), counted_peak(grpo_bytes(self._shape, state, batch, fixed))
+        state, batch, frozen = self._job.state, self._job.batch, self._job.frozen
+        return reserved_bytes(self._job.lowered().compile()), counted_peak(
+            grpo_bytes(self._shape, state, batch, frozen)
+        )
 
 
 def step_config(config: GpuConfig) -> GRPOConfig:

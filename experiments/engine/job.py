@@ -21,7 +21,7 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
@@ -67,12 +67,12 @@ class Job:
         self.fns, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
         self.batch = make_batch(size, prefix, config.drawn, seed)
         params = init_decoder(self.fns, self.batch)
-        self.fixed = Fixed(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
+        self.frozen = FrozenInputs(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
         self._state = start_state(params, optimizer, jax.random.key(seed), config)
 
     def step(self) -> dict[str, jax.Array]:
         """One iteration; the state moves on."""
-        self._state, metrics = self._step(self._state, self.batch, self.fixed)
+        self._state, metrics = self._step(self._state, self.batch, self.frozen)
         return metrics
 
     @property
@@ -87,7 +87,7 @@ class Job:
 
     def lowered(self) -> jax.stages.Lowered:
         """The step as it is handed to the compiler."""
-        return self._step.lower(self._state, self.batch, self.fixed)
+        return self._step.lower(self._state, self.batch, self.frozen)
 
 
 @functools.cache

@@ -129,7 +129,7 @@ def depth(config: ScaleConfig) -> int:
 def counted(training: Training, setup: Setup) -> dict[str, int]:
     """Bytes on each device, line by line."""
     step = training.step(setup)
-    return grpo_bytes(training.shape(setup), step.state, step.batch, step.fixed, step.base)
+    return grpo_bytes(training.shape(setup), step.state, step.batch, step.frozen, step.base)
 
 
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:

@@ -13,7 +13,7 @@ from experiments.engine.failures import Course, Place
 from experiments.engine.training import Effort, Variant, pretrain_program, reinforce_program
 from experiments.engine.world import S, World
 from touchr1_jax.rl.alarms import Watch
-from touchr1_jax.rl.guard import check_streams
+from touchr1_jax.rl.stream_check import check_streams
 from touchr1_jax.types import Params
 
 

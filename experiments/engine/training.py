@@ -34,7 +34,7 @@ from experiments.engine.world import (
 from touchr1_jax import masked
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.training.optimizer import falling_adamw
@@ -143,12 +143,12 @@ def reinforce(
     optimizer = falling_adamw(dials.learning_rate, effort.final_share, effort.steps, config.max_grad_norm)
     step = make_grpo_step(FNS, make_world_score(variant, dials), optimizer, config)
     noise_key, run_key, scene_key = jax.random.split(key, 3)
-    fixed = Fixed(reference=start, noise=noise_bank(world, noise_key))
+    frozen = FrozenInputs(reference=start, noise=noise_bank(world, noise_key))
     state = start_state(start, optimizer, run_key, config)
 
     def body(state, t: Array):
         scene = draw(world, jax.random.fold_in(scene_key, t), config.drawn)
-        return step(state, scene.batch, fixed)
+        return step(state, scene.batch, frozen)
 
     end, metrics = jax.lax.scan(body, state, jnp.arange(effort.steps))
     return end.params, metrics

@@ -40,7 +40,7 @@ def counted(config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, m
     text = layout.ids.shape[1] - streams * touch - view
     prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
     step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.grpo_lora)
-    lines = grpo_bytes(shape, step.state, step.batch, step.fixed, step.base)
+    lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
     of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)
     return {STEP: counted_peak(lines), WEIGHTS: _bytes(assembly), CONTACTS: contacts * of_contact}

@@ -18,7 +18,6 @@ from experiments.paper.released_policy import ReleasedAssembly, ReleasedModel, a
 from experiments.study.assembly import touch_shapes
 from experiments.study.feeds import random_streams
 from sensors_io.schema import SENSORS
-from touchr1_jax.limits import at_least, within
 from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.qwen.weights import SINGLE, save_params
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -26,6 +25,7 @@ from touchr1_jax.text.template import answer_text, encode_answer
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import TouchBatch
+from touchr1_jax.validation import at_least, within
 
 STAGE = "teach"
 

@@ -15,7 +15,7 @@ from experiments.recordings.policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS
 from touchr1_jax import masked
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import make_score
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
@@ -166,14 +166,14 @@ def reinforce(
     decoder = {"decoder": params["decoder"]}
     rng = np.random.default_rng(seed)
     noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
-    fixed = Fixed(reference=decoder, noise=policy.features(params, noise).touch)
+    frozen = FrozenInputs(reference=decoder, noise=policy.features(params, noise).touch)
     state = start_state(decoder, optimizer, jax.random.key(seed), config.grpo)
     weight = np.asarray(lesson.weight, np.float64)
     share = weight / weight.sum()
     log = []
     for _ in range(config.steps):
         rows = rng.choice(len(share), config.grpo.drawn, p=share)
-        state, metrics = step(state, _questions(policy, params, lesson, rows), fixed)
+        state, metrics = step(state, _questions(policy, params, lesson, rows), frozen)
         log.append(jax.device_get(metrics))
     return {**params, **state.params}, [{name: float(value) for name, value in row.items()} for row in log]
 

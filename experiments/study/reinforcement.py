@@ -23,10 +23,10 @@ from touchr1_jax.models.lora import LoraConfig, adapt
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import LEAN, Fixed, GRPOState, make_grpo_step, start_state
-from touchr1_jax.rl.guard import check_streams, stream_influence
+from touchr1_jax.rl.grpo import LEAN, FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import falling_adamw
@@ -104,7 +104,7 @@ def run_grpo(
     feed = new_feed(own=context.devices.rows(config.drawn))
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
     state = start_state(trained, optimizer, jax.random.key(seed), config)
-    shared = (Fixed(reference=trained, noise=asked.noise), *(() if lora is None else (decoder,)))
+    shared = (FrozenInputs(reference=trained, noise=asked.noise), *(() if lora is None else (decoder,)))
     step, state, batches = context.devices.spread(step, state, feed, config.drawn, *shared)
     end = run_loop(step, state, batches, arm.loop, context, stage, make_log=watched_log)
     found = context.devices.whole(end.params)
@@ -130,9 +130,11 @@ def grpo_program(
     # a jitted step inside another takes no options of the compiler: the outer one gets them
     inner = dataclasses.replace(config, lean_compilation=False)
 
-    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params) -> tuple[GRPOState, dict[str, Array]]:
-        adapted = adapt(fns, frozen, lora)
-        return make_grpo_step(adapted, score, optimizer, inner, constraint)(state, batch, fixed)
+    def step(
+        state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params
+    ) -> tuple[GRPOState, dict[str, Array]]:
+        adapted = adapt(fns, base, lora)
+        return make_grpo_step(adapted, score, optimizer, inner, constraint)(state, batch, frozen)
 
     return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 

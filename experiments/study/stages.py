@@ -23,7 +23,6 @@ from experiments.study.dataset import Dataset
 from experiments.study.feeds import AnswerFeed, touch_batch
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
-from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import Adapters, LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
@@ -35,6 +34,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
+from touchr1_jax.validation import above, at_least, within
 
 KEPT = "kept"
 """Stages whose results say how much of a stage's adapters is in the merged weights (see `lora.kept_share`)."""

@@ -14,13 +14,13 @@ from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
-from touchr1_jax.limits import at_least
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evidence import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
+from touchr1_jax.validation import at_least
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

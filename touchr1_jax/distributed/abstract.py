@@ -18,7 +18,7 @@ from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.types import Params, Target
@@ -45,7 +45,7 @@ class AbstractStep(NamedTuple):
     fns: PolicyFns
     state: GRPOState
     batch: GRPOBatch
-    fixed: Fixed
+    frozen: FrozenInputs
     base: Params | None = None
     """Frozen parameters, an argument too, where the state holds adapters."""
 
@@ -103,7 +103,7 @@ def abstract_grpo(
         params = Trainable(adapters=jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key), towers={})
         fns = adapt(fns, base, lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
-    return AbstractStep(fns, state, batch, Fixed(reference=params, noise=of((draws, s, n, d), kind)), base)
+    return AbstractStep(fns, state, batch, FrozenInputs(reference=params, noise=of((draws, s, n, d), kind)), base)
 
 
 def compile_grpo(
@@ -123,13 +123,13 @@ def compile_grpo(
       devices: those of a topology that is only compiled for; by default as many as needed of this process's.
     """
     mesh = shape.mesh.build((jax.devices() if devices is None else devices)[: shape.mesh.devices])
-    arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.fixed)
+    arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.frozen)
 
-    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, base: Params | None = None):
+    def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params | None = None):
         fns = abstract.fns
         if isinstance(fns, LoraFns):
             fns = dataclasses.replace(fns, base=base)
-        return make_grpo_step(fns, score, optimizer, shape.grpo)(state, batch, fixed)
+        return make_grpo_step(fns, score, optimizer, shape.grpo)(state, batch, frozen)
 
     if abstract.base is not None:
         arguments = (*arguments, abstract.base)

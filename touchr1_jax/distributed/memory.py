@@ -17,7 +17,7 @@ from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
-from touchr1_jax.rl.grpo import Fixed, GRPOState
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.types import Params
 
@@ -124,7 +124,7 @@ class GRPOShape:
 
 
 def grpo_bytes(
-    shape: GRPOShape, state: GRPOState, batch: GRPOBatch, fixed: Fixed, base: Params | None = None
+    shape: GRPOShape, state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params | None = None
 ) -> dict[str, int]:
     """Bytes of a GRPO step on each device, line by line; shapes in place of arrays will do.
 
@@ -135,7 +135,7 @@ def grpo_bytes(
 
     Args:
       shape: sizes of the step.
-      state, batch, fixed: its arguments.
+      state, batch, frozen: its arguments.
       base: frozen parameters under low-rank adapters, which are then what the state holds.
     """
     held = lambda tree: held_bytes(shape.mesh, tree)
@@ -147,8 +147,8 @@ def grpo_bytes(
         "frozen base": held(base),
         "parameters": held(state.params),
         "optimizer": held(state.opt_state),
-        "reference": held(fixed.reference),
-        "noise bank": held({"noise": fixed.noise}),
+        "reference": held(frozen.reference),
+        "noise bank": held({"noise": frozen.noise}),
         "batch": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(batch)) // rows,
         "gradients": 2 * held(state.params),
         "parameters in bfloat16": 2 * held(half) if shape.grpo.bfloat16 else 0,

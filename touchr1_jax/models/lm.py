@@ -15,7 +15,6 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.limits import above
 from touchr1_jax.models.layers import (
     MASKED,
     GatedMLP,
@@ -30,6 +29,7 @@ from touchr1_jax.models.layers import (
     rotate,
 )
 from touchr1_jax.models.vmappable_dense import Dense, Embed, product_with_weights
+from touchr1_jax.validation import above
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

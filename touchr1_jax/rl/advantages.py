@@ -9,7 +9,7 @@ SPREAD_FLOOR = 1e-5
 """Rewards closer than this are equal: 1, 0.4 and −0.1 are not exact in float32, so σ of a constant group is not 0."""
 
 
-def degenerate(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
+def zero_variance(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
     """Groups whose rewards are all equal and teach nothing, max R − min R < `SPREAD_FLOOR`."""
     return jnp.max(reward, -1) - jnp.min(reward, -1) < SPREAD_FLOOR
 
@@ -19,7 +19,7 @@ def group_advantage(
 ) -> Float[Array, "*p G"]:
     """Advantage within a group, A_i = (R_i − R̄)/(σ_R + ε), population σ (DeepSeekMath, arXiv 2402.03300, eq. 4).
 
-    A degenerate group gets exactly 0, where rounding noise over a tiny σ would otherwise give thousands.
+    A group of equal rewards gets exactly 0, where rounding noise over a tiny σ would otherwise give thousands.
 
     Args:
       reward: rewards of the group's rollouts.
@@ -29,13 +29,13 @@ def group_advantage(
     centred = reward - jnp.mean(reward, -1, keepdims=True)
     if normalise:
         centred = centred / (jnp.std(reward, -1, keepdims=True) + epsilon)
-    return jnp.where(degenerate(reward)[..., None], 0.0, centred)
+    return jnp.where(zero_variance(reward)[..., None], 0.0, centred)
 
 
 def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Float[Array, "P G"]:
     """Advantage within a group in units of the whole batch, A_i = (R_i − R̄_group)/(σ_batch + ε).
 
-    σ_batch² is the mean variance of the groups that are not degenerate.  A σ of each group's own weighs questions by
+    σ_batch² is the mean variance of the groups whose rewards differ.  A σ of each group's own weighs questions by
     how alike their rewards are, and so undoes a reward that is fair between answers: under ordinal credit debiased by
     the prior, a group whose label is the middle one spreads half as wide as others, so that over uniform labels and
     answers "middle" has an advantage of .23 on average and either end one of −.11.  After REINFORCE++ (arXiv
@@ -45,10 +45,10 @@ def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Fl
       reward: rewards of the rollouts of all groups.
       epsilon: added to σ.
     """
-    flat = degenerate(reward)
-    sigma = jnp.sqrt(masked.mean(jnp.var(reward, -1), ~flat))
+    no_signal = zero_variance(reward)
+    sigma = jnp.sqrt(masked.mean(jnp.var(reward, -1), ~no_signal))
     centred = reward - jnp.mean(reward, -1, keepdims=True)
-    return jnp.where(flat[:, None], 0.0, centred / (sigma + epsilon))
+    return jnp.where(no_signal[:, None], 0.0, centred / (sigma + epsilon))
 
 
 def added_after(bonus: Float[Array, "*p G"], weight: float) -> Float[Array, "*p G"]:
@@ -59,6 +59,6 @@ def added_after(bonus: Float[Array, "*p G"], weight: float) -> Float[Array, "*p 
     return weight * (bonus - jnp.mean(bonus, -1, keepdims=True))
 
 
-def livelier_first(flat: Bool[Array, "D"], keep: int) -> Array:
-    """Rows of the first `keep` groups that are not degenerate, filled up with degenerate ones: dynamic sampling."""
-    return jnp.argsort(flat, stable=True)[:keep]
+def dynamic_sampling_rows(no_signal: Bool[Array, "D"], keep: int) -> Array:
+    """Rows of the first `keep` groups whose rewards differ, filled up with groups of equal rewards."""
+    return jnp.argsort(no_signal, stable=True)[:keep]

@@ -8,9 +8,9 @@ import enum
 
 import jax
 
-from touchr1_jax.limits import above, at_least, within
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.rl.kl import KLEstimator
+from touchr1_jax.validation import above, at_least, within
 
 
 class Surrogate(enum.Enum):

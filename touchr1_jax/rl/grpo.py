@@ -23,7 +23,13 @@ from touchr1_jax import masked
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl import tactile_use
-from touchr1_jax.rl.advantages import added_after, batch_advantage, degenerate, group_advantage, livelier_first
+from touchr1_jax.rl.advantages import (
+    added_after,
+    batch_advantage,
+    dynamic_sampling_rows,
+    group_advantage,
+    zero_variance,
+)
 from touchr1_jax.rl.config import Algorithm, GRPOConfig, TactileUse
 from touchr1_jax.rl.counterfactual import drop_touch, mask_one_stream, noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.holding import held
@@ -31,7 +37,7 @@ from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metric
 from touchr1_jax.rl.objective import Experience, GRPOBatch, at_precision, objective_gradient
 from touchr1_jax.rl.rollout import SampleConfig, sample
 from touchr1_jax.rl.scoring import ScoreFn
-from touchr1_jax.rl.trust import within_trust
+from touchr1_jax.rl.trust_region import within_trust
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
@@ -40,7 +46,7 @@ from touchr1_jax.types import Params, Parsed, Rollout, Target
 class GRPOState:
     """What a step changes; `key` is the run's root key and the step is folded into it.
 
-    `reference` is there only where the algorithm refreshes it; otherwise that of `Fixed` counts.
+    `reference` is there only where the algorithm refreshes it; otherwise that of `FrozenInputs` counts.
     """
 
     params: Params
@@ -50,7 +56,7 @@ class GRPOState:
     reference: Params | None = None
 
 
-class Fixed(NamedTuple):
+class FrozenInputs(NamedTuple):
     """What a run never changes: the reference policy and encoded noise, K draws of every sensor's stream.
 
     With the encoder frozen, the encoding of a noise stream does not depend on the prompt, so a bank of K draws stands
@@ -108,8 +114,8 @@ def make_grpo_step(
     optimizer: optax.GradientTransformation,
     config: GRPOConfig,
     constraint: Constraint | None = None,
-) -> Callable[[GRPOState, GRPOBatch, Fixed], tuple[GRPOState, dict[str, Array]]]:
-    """Build the jitted step, (state, batch, fixed) → (state, metrics); the state's buffers are donated.
+) -> Callable[[GRPOState, GRPOBatch, FrozenInputs], tuple[GRPOState, dict[str, Array]]]:
+    """Build the jitted step, (state, batch, frozen) → (state, metrics); the state's buffers are donated.
 
     Args:
       fns: policy, prompts, vocabulary.
@@ -144,22 +150,22 @@ class _Engine:
     config: GRPOConfig
     constraint: Constraint | None
 
-    def step(self, state: GRPOState, batch: GRPOBatch, fixed: Fixed) -> tuple[GRPOState, dict[str, Array]]:
+    def step(self, state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs) -> tuple[GRPOState, dict[str, Array]]:
         """Rollouts, what they are worth, update."""
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
         control_key = jax.random.fold_in(key, 2)
         sampler = dataclasses.replace(self, fns=self.fns.with_context(held))
-        group, control_metrics = sampler.explore(state.params, batch, fixed, sample_key, control_key)
-        reference = fixed.reference if state.reference is None else state.reference
-        learn = self.experience(group, fixed, mask_key)
+        group, control_metrics = sampler.explore(state.params, batch, frozen, sample_key, control_key)
+        reference = frozen.reference if state.reference is None else state.reference
+        learn = self.experience(group, frozen, mask_key)
         params, opt_state, parts = self.update(state, reference, learn)
         metrics = parts | control_metrics | self.metrics(group, learn)
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
         return self.refreshed(after), metrics
 
     def explore(
-        self, params: Params, batch: GRPOBatch, fixed: Fixed, key: Array, control_key: Array
+        self, params: Params, batch: GRPOBatch, frozen: FrozenInputs, key: Array, control_key: Array
     ) -> tuple[Group, dict[str, Array]]:
         """Sample and score; with R_tu also under every control.  Of the candidates the lively groups are kept."""
         params = held(at_precision(self.config, params))
@@ -169,24 +175,24 @@ class _Engine:
         bonus = jnp.zeros_like(reward)
         metrics: dict[str, Array] = {}
         if self.config.algorithm.tactile_use is not TactileUse.OFF:
-            bonus, metrics = self.tactile_bonus(params, prompts, batch, parsed, fixed, control_key)
+            bonus, metrics = self.tactile_bonus(params, prompts, batch, parsed, frozen, control_key)
         if self.config.algorithm.tactile_use is TactileUse.LITERAL:
             reward = reward + self.config.algorithm.tactile_weight * bonus
         group = Group(batch, rollout, parsed, reward, terms, bonus)
         if self.config.algorithm.candidates > 1:
-            rows = livelier_first(self._flat(group), self.config.prompts)
+            rows = dynamic_sampling_rows(self._flat(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         return group, metrics
 
     def tactile_bonus(
-        self, params: Params, prompts: Prompts, batch: GRPOBatch, parsed: Parsed, fixed: Fixed, key: Array
+        self, params: Params, prompts: Prompts, batch: GRPOBatch, parsed: Parsed, frozen: FrozenInputs, key: Array
     ) -> tuple[Float[Array, "D G"], dict[str, Array]]:
         """m of R_tu, from rollouts of the same questions without touch, with noise, and shuffled or swapped."""
         algorithm, keys = self.config.algorithm, jax.random.split(key, 5)
         scored = jax.vmap(jax.vmap(tactile_use.score, in_axes=(0, None)))
         own = scored(parsed, batch.target)
         control, counts = [], []
-        for perturbed, draw_key in zip(controls(algorithm, batch, fixed.noise, keys), keys[2:], strict=True):
+        for perturbed, draw_key in zip(controls(algorithm, batch, frozen.noise, keys), keys[2:], strict=True):
             changed = dataclasses.replace(batch, features=perturbed.features)
             again = encode_prompts(self.fns, params, changed, prompts.prefix, self.fns.touch_start)
             said = sample_prompts(self.fns, params, again, draw_key, self._draw(algorithm.controls))
@@ -210,15 +216,15 @@ class _Engine:
             "credit_unearned_share": jnp.mean(jnp.any((bonus > 0) & (own <= 0), -1)),
         }
 
-    def experience(self, group: Group, fixed: Fixed, key: Array) -> Experience:
+    def experience(self, group: Group, frozen: FrozenInputs, key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
         advantage = self._advantage(group.reward)
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             advantage += added_after(group.bonus, algorithm.tactile_weight)
-        flat = self._flat(group)
-        even = jnp.full(flat.shape, 1 / self.config.prompts)
-        masked_touch, stream = mask_one_stream(batch.features, fixed.noise, key)
+        no_signal = self._flat(group)
+        even = jnp.full(no_signal.shape, 1 / self.config.prompts)
+        masked_touch, stream = mask_one_stream(batch.features, frozen.noise, key)
         return Experience(
             batch=batch,
             masked_touch=masked_touch,
@@ -226,7 +232,7 @@ class _Engine:
             rollout=group.rollout,
             old=group.rollout.log_prob,
             advantage=advantage,
-            weight=prompt_weights(~flat) if algorithm.drop_degenerate else even,
+            weight=prompt_weights(~no_signal) if algorithm.drop_degenerate else even,
         )
 
     def update(
@@ -311,14 +317,14 @@ class _Engine:
         if algorithm.tactile_use is TactileUse.LITERAL:
             reward = reward - algorithm.tactile_weight * group.bonus
         moved = jnp.max(jnp.abs(learn.advantage - self._advantage(reward)), -1)
-        tells = ~degenerate(group.bonus)
+        tells = ~zero_variance(group.bonus)
         return {"bonus_telling_share": jnp.mean(tells), "bonus_cancelled_share": jnp.mean(tells & (moved < NO_MOVE))}
 
     def _flat(self, group: Group) -> Bool[Array, "D"]:
         """Groups that teach nothing: the reward is constant, and the bonus where it counts by itself."""
-        flat = degenerate(group.reward)
+        no_signal = zero_variance(group.reward)
         counts = self.config.algorithm.tactile_use is TactileUse.RECOMMENDED
-        return flat & degenerate(group.bonus) if counts else flat
+        return no_signal & zero_variance(group.bonus) if counts else no_signal
 
     def _scored(self, rollout: Rollout, target: Target) -> tuple[Array, dict[str, Array], Parsed]:
         return jax.vmap(jax.vmap(self.score, in_axes=(0, None)))(rollout.tokens, target)

@@ -5,12 +5,12 @@ from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.advantages import degenerate
+from touchr1_jax.rl.advantages import zero_variance
 from touchr1_jax.types import Parsed, Rollout, Target
 
 
 def rollout_metrics(
-    rollout: Rollout, reward: Float[Array, "P G"], flat: Bool[Array, "P"], parsed: Parsed, target: Target
+    rollout: Rollout, reward: Float[Array, "P G"], no_signal: Bool[Array, "P"], parsed: Parsed, target: Target
 ) -> dict[str, Array]:
     """Means over all rollouts; `middle_rate` over ordinal questions, `agreement` over formatted answers."""
     asked = target.asked[:, None]
@@ -20,7 +20,7 @@ def rollout_metrics(
     return {
         "reward": jnp.mean(reward),
         "reward_std": jnp.mean(jnp.std(reward, -1)),
-        "degenerate_share": jnp.mean(flat),
+        "degenerate_share": jnp.mean(no_signal),
         "accuracy": masked.mean(right, jnp.broadcast_to(asked, right.shape)),
         "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(ordinal, right.shape)),
         "parse_rate": jnp.mean(parsed.formatted & jnp.all((parsed.conclude >= 0) | ~asked, -1)),
@@ -60,7 +60,7 @@ def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
 
 def group_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"], right: Bool[Array, "P G"]):
     """Size of the advantages, and how much of their spread separates right answers that earned the same."""
-    lively = ~degenerate(reward)
+    lively = ~zero_variance(reward)
     return {
         "advantage_abs": jnp.mean(jnp.abs(advantage)),
         "advantage_peak": jnp.max(jnp.abs(advantage)),

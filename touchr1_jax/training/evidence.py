@@ -14,8 +14,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, Shaped, UInt8
 
-from touchr1_jax.limits import above, at_least
 from touchr1_jax.models.tactile_vit import force_features
+from touchr1_jax.validation import above, at_least
 
 TINY = 1e-4  # keeps log(energy) of a constant image finite; energies are in units of full scale
 ROUNDING = 1e-5  # a spread below this share of the mean is that of a constant feature in float32

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int
 
-from touchr1_jax.limits import above, at_least, within
+from touchr1_jax.validation import above, at_least, within
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

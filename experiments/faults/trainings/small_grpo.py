@@ -33,7 +33,7 @@ from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
@@ -72,14 +72,14 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     decoder = {"decoder": _decoder(assembly, context.directory / "start.npz")}
     rng = np.random.default_rng(1)
     noise = _features(rng, NOISE).touch
-    fixed = Fixed(reference=decoder, noise=jnp.asarray(noise))
+    frozen = FrozenInputs(reference=decoder, noise=jnp.asarray(noise))
     feed = _questions(assembly, rng, CONTACTS, config.grpo.drawn)
     held = next(_questions(assembly, rng, HELD_OUT, HELD_OUT))
     begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
     state = begin(decoder, jax.random.key(0))
     judge = jax.jit(lambda params: _certainty(assembly, params, held))
     run_loop(
-        lambda s, batch: step(s, batch, fixed),
+        lambda s, batch: step(s, batch, frozen),
         state,
         feed,
         config.loop(),

@@ -17,7 +17,7 @@ from touchr1_jax.models.layers import GatedMLP, RMSNorm
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.training.dynamics import DynamicsConfig, make_dynamics_step, start_dynamics
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
@@ -32,7 +32,7 @@ GRPO = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algo
 OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), STEPS)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(base=True)
 class Problem:
     """A jitted step, its first state, what a run never changes, and the items that batches are made of."""
 
@@ -118,29 +118,29 @@ def packed() -> Problem:
 def adapters() -> Problem:
     """SFT whose decoder stands still under adapters of rank 2, beside encoders that are trained in full."""
     plain = sft()
-    frozen, towers = _apart(plain.state.params)
-    trained = Trainable(adapters=_adapters(frozen), towers=towers)
+    base, towers = _apart(plain.state.params)
+    trained = Trainable(adapters=_adapters(base), towers=towers)
     state = SFTState(params=trained, opt_state=OPTIMIZER.init(trained), step=jnp.int32(0))
 
-    def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, jax.Array]]:
-        return make_sft_step(adapt(FNS, frozen, LORA), OPTIMIZER)(state, batch)
+    def step(state: SFTState, batch: SFTBatch, base: Params) -> tuple[SFTState, dict[str, jax.Array]]:
+        return make_sft_step(adapt(FNS, base, LORA), OPTIMIZER)(state, batch)
 
-    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (frozen,))
+    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (base,))
 
 
 def adapters_grpo() -> Problem:
     """GRPO of adapters; others are the reference."""
     plain = grpo()
-    frozen, _ = _apart(plain.state.params)
-    trained = Trainable(adapters=_adapters(frozen), towers={})
+    base, _ = _apart(plain.state.params)
+    trained = Trainable(adapters=_adapters(base), towers={})
     optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
     state = start_state(trained, optimizer, jax.random.key(0), GRPO)
-    fixed = Fixed(reference=Trainable(adapters=_adapters(frozen, 1), towers={}), noise=plain.shared[0].noise)
+    frozen = FrozenInputs(reference=Trainable(adapters=_adapters(base, 1), towers={}), noise=plain.shared[0].noise)
 
-    def step(state: GRPOState, batch: GRPOBatch, fixed: Fixed, frozen: Params):
-        return make_grpo_step(adapt(FNS, frozen, LORA), score, optimizer, GRPO)(state, batch, fixed)
+    def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params):
+        return make_grpo_step(adapt(FNS, base, LORA), score, optimizer, GRPO)(state, batch, frozen)
 
-    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (fixed, frozen))
+    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (frozen, base))
 
 
 def _apart(params: Params) -> tuple[Params, Params]:
@@ -148,9 +148,9 @@ def _apart(params: Params) -> tuple[Params, Params]:
     return {"decoder": params["decoder"]}, {name: x for name, x in params.items() if name != "decoder"}
 
 
-def _adapters(frozen: Params, seed: int = 0) -> Any:
+def _adapters(base: Params, seed: int = 0) -> Any:
     """Drawn and loud: of fresh ones half have no gradient at first."""
-    shapes = jax.eval_shape(lambda key: init_adapters(key, frozen, LORA), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: init_adapters(key, base, LORA), jax.random.key(0))
     rng = np.random.default_rng(seed)
     return jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.2, x.shape), x.dtype), shapes)
 
@@ -176,10 +176,10 @@ def grpo() -> Problem:
     optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
     state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), GRPO)
     noise = np.random.default_rng(5).normal(size=(3, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size))
-    fixed = Fixed(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
+    frozen = FrozenInputs(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
     item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
     questions = tiny.question_batch(0, 16)
-    return Problem(make_grpo_step(FNS, score, optimizer, GRPO), state, item, (fixed,))
+    return Problem(make_grpo_step(FNS, score, optimizer, GRPO), state, item, (frozen,))
 
 
 def dynamics() -> Problem:

@@ -44,7 +44,7 @@ def main() -> None:
     found = {}
     for layers in (1, 2, 4):
         shape, step = tiny_step(layers, MeshConfig(fsdp=8, tensor=2))
-        lines = grpo_bytes(shape, step.state, step.batch, step.fixed)
+        lines = grpo_bytes(shape, step.state, step.batch, step.frozen)
         compiled = compile_grpo(step, shape, score, OPTIMIZER)
         found[layers] = {"counted": sum(lines[name] for name in ARGUMENTS), "compiled": compiled}
     print(json.dumps(found))  # noqa: T201

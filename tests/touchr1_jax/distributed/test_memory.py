@@ -30,7 +30,7 @@ H200_BYTES = 141e9
 def test_arguments_by_hand():
     """One layer of width 64 in float32 on one device: parameters, two moments and a counter, reference."""
     shape, step = tiny_step(1, MeshConfig())
-    lines = grpo_bytes(shape, step.state, step.batch, step.fixed)
+    lines = grpo_bytes(shape, step.state, step.batch, step.frozen)
     attention = 64 * 64 + 64 + 2 * (64 * 32 + 32) + 64 * 64
     numbers = 2 * 512 * 64 + attention + 3 * 64 * 256 + 3 * 64
     assert lines["parameters"] == lines["reference"] == 4 * numbers
@@ -42,8 +42,8 @@ def test_arguments_by_hand():
 def test_sampling_holds_all_weights_of_its_share_of_the_heads():
     """Split in halves along tensor, whole along fsdp, but for what both leave whole: norms and outer biases."""
     alone, step = tiny_step(1, MeshConfig())
-    lines = grpo_bytes(tiny_step(1, MeshConfig(fsdp=8, tensor=2))[0], step.state, step.batch, step.fixed)
-    whole = grpo_bytes(alone, step.state, step.batch, step.fixed)["parameters"]
+    lines = grpo_bytes(tiny_step(1, MeshConfig(fsdp=8, tensor=2))[0], step.state, step.batch, step.frozen)
+    whole = grpo_bytes(alone, step.state, step.batch, step.frozen)["parameters"]
     norms = 3 * 64
     assert lines["weights while sampling"] == whole / 2 + 4 * norms / 2
 
@@ -97,7 +97,7 @@ def test_the_7b_at_the_papers_shapes_fits_sixteen_h200_by_count():
     prompt = PromptShape(stream_tokens=1024)
     shape = GRPOShape(decoder=config.decoder, grpo=grpo, mesh=MeshConfig(fsdp=8, tensor=2), prompt_tokens=prompt.tokens)
     step = abstract_grpo(config, prompt, shape, optimizer)
-    lines = grpo_bytes(shape, step.state, step.batch, step.fixed)
+    lines = grpo_bytes(shape, step.state, step.batch, step.frozen)
     assert lines["parameters"] == pytest.approx(4 * 7.616e9 / 16, rel=1e-3)
     assert counted_peak(lines) < H200_BYTES / 2
 
@@ -106,8 +106,8 @@ def test_adapters_on_a_frozen_base_by_hand():
     """Of one layer of width 64: the base in bfloat16, and factors of rank 2 with two moments and a reference."""
     shape, plain = tiny_step(1, MeshConfig())
     step = tiny_step(1, MeshConfig(), LoraConfig(rank=2))[1]
-    lines = grpo_bytes(shape, step.state, step.batch, step.fixed, step.base)
-    whole = grpo_bytes(shape, plain.state, plain.batch, plain.fixed)
+    lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
+    whole = grpo_bytes(shape, plain.state, plain.batch, plain.frozen)
     factors = 2 * (2 * (64 + 64) + 2 * (64 + 32) + 3 * (64 + 256))
     assert lines["frozen base"] == whole["parameters"] / 2
     assert lines["parameters"] == lines["reference"] == 4 * factors

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchr1_jax.rl.advantages import batch_advantage, degenerate, group_advantage
+from touchr1_jax.rl.advantages import batch_advantage, group_advantage, zero_variance
 
 
 def test_advantages_by_hand():
@@ -36,19 +36,19 @@ def test_equal_rewards_give_exactly_zero(value, group, normalise):
     reward = jnp.full((3, group), 0.6 * value + 0.3 + 0.1, jnp.float32)
     for rewards in (reward, jnp.full((3, group), value, jnp.float32)):
         assert not group_advantage(rewards, epsilon=0.0 if normalise else 1e-4, normalise=normalise).any()
-        assert degenerate(rewards).all()
+        assert zero_variance(rewards).all()
 
 
-def test_rewards_of_equal_value_but_unequal_rounding_are_degenerate():
+def test_rewards_of_equal_value_but_unequal_rounding_have_zero_variance():
     reward = jnp.array([0.6 + 0.3 + 0.1, 1.0, 0.1 + 0.2 + 0.7, np.float32(1) + np.float32(2e-7)], jnp.float32)
-    assert degenerate(reward)
+    assert zero_variance(reward)
     assert not group_advantage(reward).any()
 
 
 def test_groups_are_normalised_apart():
     reward = jnp.array([[1.0, 0, 0, 1], [0.4, 0.4, 0.4, 0.4], [10, 0, 10, 0]])
     ours = group_advantage(reward)
-    np.testing.assert_array_equal(degenerate(reward), [False, True, False])
+    np.testing.assert_array_equal(zero_variance(reward), [False, True, False])
     np.testing.assert_allclose(ours[0], group_advantage(reward[0]), rtol=1e-6)
     assert not ours[1].any()
 
@@ -72,7 +72,7 @@ def test_one_sigma_for_all_groups_keeps_a_debiased_reward_fair():
     np.testing.assert_allclose(group_advantage(debiased).mean(0), [-0.113, 0.226, -0.113], atol=2e-3)
 
 
-def test_degenerate_groups_have_no_part_in_the_sigma_of_the_batch():
+def test_zero_variance_groups_have_no_part_in_the_sigma_of_the_batch():
     reward = jnp.array([[1.0, 0.0], [0.4, 0.4], [1.0, 0.5]])
     sigma = np.sqrt((0.25 + 0.0625) / 2)
     expected = np.array([[0.5, -0.5], [0, 0], [0.25, -0.25]]) / sigma

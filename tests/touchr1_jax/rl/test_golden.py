@@ -15,7 +15,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Parsed, Target
 
@@ -48,12 +48,12 @@ def trajectory() -> dict[str, list[float]]:
     params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
     shape = (3, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)
     noise = jnp.asarray(np.random.default_rng(5).normal(size=shape), jnp.float32)
-    fixed = Fixed(reference=tiny.shallow_params(1, loud=0.2), noise=noise)
+    frozen = FrozenInputs(reference=tiny.shallow_params(1, loud=0.2), noise=noise)
     start = jax.tree.leaves(tiny.shallow_params(0, loud=0.2))
     state = GRPOState(params=params, opt_state=optimizer.init(params), step=jnp.int32(0), key=jax.random.key(3))
     lines: dict[str, list[float]] = {}
     for seed in range(STEPS):
-        state, metrics = step(state, tiny.question_batch(seed, P), fixed)
+        state, metrics = step(state, tiny.question_batch(seed, P), frozen)
         leaves = jax.tree.leaves(state.params)
         metrics["moved"] = sum(jnp.sum(jnp.abs(a - b)) for a, b in zip(leaves, start, strict=True))
         for name, value in metrics.items():

@@ -10,7 +10,7 @@ from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl import reference
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.grpo import Fixed, GRPOState, make_grpo_step, prompt_weights, sample_group
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, prompt_weights, sample_group
 from touchr1_jax.rl.metrics import rollout_metrics
 from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.types import Parsed, Rollout, Target
@@ -20,7 +20,7 @@ FNS = tiny.SHALLOW
 ALGORITHM = Paper(beta=0.1, gamma=0.05, drop_degenerate=True)
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=ALGORITHM)
 DRAW = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
-FIXED = Fixed(
+FROZEN = FrozenInputs(
     reference=tiny.shallow_params(1),
     noise=jnp.asarray(
         np.random.default_rng(5).normal(size=(K, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)), jnp.float32
@@ -69,7 +69,7 @@ class Run:
         now = state()
         for batch in self.batches:
             self.before.append(jax.tree.map(jnp.copy, now))
-            now, metrics = self.step(now, batch, FIXED)
+            now, metrics = self.step(now, batch, FROZEN)
             self.metrics.append(metrics)
         self.end = now
 
@@ -83,7 +83,7 @@ def run() -> Run:
 def test_no_nan_under_debug_nans(run):
     """`debug_nans` looks at every array that leaves the program."""
     with jax.debug_nans(True):
-        run.step(jax.tree.map(jnp.copy, run.before[0]), run.batches[0], FIXED)
+        run.step(jax.tree.map(jnp.copy, run.before[0]), run.batches[0], FROZEN)
 
 
 draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
@@ -92,7 +92,7 @@ draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
 def experience_of(before: GRPOState, batch):
     """What the step must have drawn, by the documented use of its key: fold in the step, split for sample and mask."""
     sample_key, mask_key = jax.random.split(jax.random.fold_in(before.key, before.step))
-    return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FIXED.noise, mask_key)[0]
+    return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FROZEN.noise, mask_key)[0]
 
 
 group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
@@ -108,7 +108,7 @@ def test_loss_equals_a_float64_reference(run, i):
         np.asarray(group_logits(p, f, batch.ids, batch.mask, rollout.tokens))
         for p, f in [
             (before.params, batch.features),
-            (FIXED.reference, batch.features),
+            (FROZEN.reference, batch.features),
             (before.params, batch.features.replace(touch=masked_touch)),
         ]
     ]
@@ -140,7 +140,7 @@ def test_update_is_the_gradient_of_the_written_out_objective(run):
         log_p = jax.nn.log_softmax(group_logits(params, batch.features, batch.ids, batch.mask, tokens))
         perturbed = batch.features.replace(touch=masked_touch)
         log_masked = jax.nn.log_softmax(group_logits(params, perturbed, batch.ids, batch.mask, tokens))
-        log_ref = jax.nn.log_softmax(group_logits(FIXED.reference, batch.features, batch.ids, batch.mask, tokens))
+        log_ref = jax.nn.log_softmax(group_logits(FROZEN.reference, batch.features, batch.ids, batch.mask, tokens))
         here, there = (jnp.take_along_axis(x, tokens[..., None], -1)[..., 0] for x in (log_p, log_ref))
         log_r = jnp.where(mask, there - here, 0)
         learn = jnp.sum(per_prompt(advantage * here) * lively) / lively.sum()
@@ -161,12 +161,12 @@ def test_one_trace_serves_all_batches(run):
 def test_nothing_leaves_the_device_inside_a_step(run):
     batch = jax.tree.map(jnp.asarray, tiny.question_batch(4, P))
     with jax.transfer_guard("disallow"):
-        now, metrics = run.step(jax.tree.map(jnp.copy, run.end), batch, FIXED)
+        now, metrics = run.step(jax.tree.map(jnp.copy, run.end), batch, FROZEN)
     assert int(now.step) == 4
     assert all(isinstance(value, jax.Array) for value in metrics.values())
     host = jax.tree.map(np.asarray, batch)
     with jax.transfer_guard("disallow"), pytest.raises(Exception, match="Disallowed host-to-device transfer"):
-        run.step(jax.tree.map(lambda x: x, now), host, FIXED)  # the guard has teeth
+        run.step(jax.tree.map(lambda x: x, now), host, FROZEN)  # the guard has teeth
 
 
 def test_state_advances_and_its_key_stays(run):
@@ -186,9 +186,9 @@ def test_steps_draw_afresh(run):
 
 def test_state_is_donated_and_nothing_else(run):
     now = jax.tree.map(jnp.copy, run.before[0])
-    run.step(now, run.batches[0], FIXED)
+    run.step(now, run.batches[0], FROZEN)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(now))
-    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves((run.batches[0], FIXED)))
+    assert not any(leaf.is_deleted() for leaf in jax.tree.leaves((run.batches[0], FROZEN)))
 
 
 def test_metrics_are_finite_scalars(run):
@@ -216,14 +216,14 @@ def assert_first_step(run, end: GRPOState, metrics: dict[str, jax.Array]) -> Non
 def test_step_outside_jit_is_the_compiled_one(run):
     """The Python function itself; its loops are compiled one by one."""
     plain = make_grpo_step(FNS, score, OPTIMIZER, CONFIG).__wrapped__
-    assert_first_step(run, *plain(state(), run.batches[0], FIXED))
+    assert_first_step(run, *plain(state(), run.batches[0], FROZEN))
 
 
 @pytest.mark.slow
 def test_uncompiled_step_is_the_compiled_one(run):
     """Operation by operation, loops in Python, and no operation anywhere gives NaN."""
     with jax.disable_jit(), jax.debug_nans(True):
-        end, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG)(state(), run.batches[0], FIXED)
+        end, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG)(state(), run.batches[0], FROZEN)
     assert_first_step(run, end, metrics)
 
 
@@ -237,7 +237,7 @@ def test_one_present_stream_is_masked_uniformly():
     features = tiny.features(0, 3)
     present = jnp.array([[True, True], [False, True], [False, False]])
     features = jax.tree.map(lambda x: jnp.repeat(x, p, 0), features.replace(stream_mask=present))
-    masked, stream = mask_one_stream(features, FIXED.noise, jax.random.key(0))
+    masked, stream = mask_one_stream(features, FROZEN.noise, jax.random.key(0))
     changed = np.asarray(jnp.any(masked != features.touch, (-1, -2))).reshape(3, p, tiny.S)
     np.testing.assert_array_equal(changed[0].sum(-1), 1)
     np.testing.assert_array_equal(changed[0].argmax(-1), np.asarray(stream)[:p])
@@ -245,7 +245,7 @@ def test_one_present_stream_is_masked_uniformly():
     np.testing.assert_array_equal(changed[1], [[False, True]] * p)
     assert not changed[2].any()
     replaced = np.asarray(masked).reshape(3, p, tiny.S, -1)[1, :, 1]
-    bank = np.asarray(FIXED.noise).reshape(K, tiny.S, -1)
+    bank = np.asarray(FROZEN.noise).reshape(K, tiny.S, -1)
     count = [(replaced == bank[k, 1]).all(-1).sum() for k in range(K)]  # a draw of this sensor's noise
     assert sum(count) == p
     assert min(count) > p / K - 5 * (p / K) ** 0.5

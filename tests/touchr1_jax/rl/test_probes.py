@@ -10,7 +10,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Parsed, Target
 
@@ -59,9 +59,9 @@ def train(step, batch, steps: int) -> jax.Array:
     """Probability [P] of the paid token after some steps."""
     params = tiny.shallow_params(0, loud=0.2)
     state = start_state(params, OPTIMIZER, jax.random.key(0), CONFIG)
-    fixed = Fixed(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
+    frozen = FrozenInputs(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
     for _ in range(steps):
-        state, _ = step(state, batch, fixed)
+        state, _ = step(state, batch, frozen)
     first, _ = prefill(state.params, batch.features, batch.ids, batch.mask)
     return jax.nn.softmax(first)[jnp.arange(P), PAYS[jnp.max(batch.target.label, -1)]]
 
@@ -101,9 +101,9 @@ def test_credit_reaches_the_first_of_two_steps():
     batch = batch_of(np.zeros(P, int), np.zeros(P, int))
     params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
     state = start_state(params, OPTIMIZER, jax.random.key(0), CONFIG)
-    fixed = Fixed(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
+    frozen = FrozenInputs(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
     for _ in range(200):
-        state, _ = step(state, batch, fixed)
+        state, _ = step(state, batch, frozen)
     best = jnp.tile(jnp.asarray(WORDS[:2], jnp.int32), (1, 1))
     one = jax.tree.map(lambda x: x[0], batch)
     log_p = jax.nn.log_softmax(FEW.group_logits(state.params, one.features, one.ids, one.mask, best))

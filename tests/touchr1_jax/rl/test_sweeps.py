@@ -8,7 +8,7 @@ import optax
 import pytest
 
 from tests.touchr1_jax import tiny
-from tests.touchr1_jax.rl.test_grpo import FIXED, FNS, P, score
+from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
 from touchr1_jax.rl.config import GRPOConfig, Paper, left_out
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 
@@ -21,7 +21,7 @@ def one_step(key: jax.Array, weights: dict):
     """Metrics and parameters after a step of one run."""
     config = dataclasses.replace(SIZES, algorithm=Paper(**weights))
     state = start_state(tiny.shallow_params(0), OPTIMIZER, key, config)
-    after, metrics = make_grpo_step(FNS, score, OPTIMIZER, config)(state, tiny.question_batch(1, P), FIXED)
+    after, metrics = make_grpo_step(FNS, score, OPTIMIZER, config)(state, tiny.question_batch(1, P), FROZEN)
     return after.params, metrics
 
 

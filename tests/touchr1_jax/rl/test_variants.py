@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from tests.touchr1_jax import tiny
-from tests.touchr1_jax.rl.test_grpo import FIXED, FNS, P, score
+from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
 from touchr1_jax.rl.config import Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable, TactileUse
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 
@@ -24,7 +24,7 @@ def take(config: GRPOConfig, steps: int = 1, prompts: int = P, **kwargs):
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config)
     batch = tiny.question_batch(1, prompts).replace(ordered=jnp.arange(prompts) % 2 == 0)
     for _ in range(steps):
-        state, metrics = step(state, batch, FIXED)
+        state, metrics = step(state, batch, FROZEN)
     return state, jax.device_get(metrics)
 
 
@@ -108,7 +108,7 @@ def test_a_state_without_a_reference_cannot_refresh_it():
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), of(Paper()))
     step = make_grpo_step(FNS, score, OPTIMIZER, config)
     with pytest.raises(ValueError, match="the state has no reference; make it with `start_state`"):
-        step(state, tiny.question_batch(1, P), FIXED)
+        step(state, tiny.question_batch(1, P), FROZEN)
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_buckets_change_nothing_but_the_time(buckets):
     for config in (of(Paper()), of(Paper(), buckets=buckets)):
         step = make_grpo_step(fns, score, OPTIMIZER, config)
         state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(2), config)
-        found.append(step(state, tiny.question_batch(1, P), FIXED))
+        found.append(step(state, tiny.question_batch(1, P), FROZEN))
     (whole, a), (cut, b) = found
     for name in a:
         np.testing.assert_allclose(a[name], b[name], rtol=1e-4, atol=1e-6, err_msg=name)

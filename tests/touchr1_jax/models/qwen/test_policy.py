@@ -19,7 +19,7 @@ from touchr1_jax.models.qwen.pictures import PixelBudget, patchify, resize
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns
 from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
 from touchr1_jax.rl.config import Algorithm, GRPOConfig
-from touchr1_jax.rl.grpo import Fixed, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Parsed, Target
@@ -135,7 +135,7 @@ def test_one_grpo_step(batch):
     noise = jax.random.normal(jax.random.key(1), (3, *batch.features.touch.shape[1:]))
     state = start_state(start, optimizer, jax.random.key(0), config)
     step = over_base(adapt(FNS, base, LORA), lambda fns: make_grpo_step(fns, score, optimizer, config))
-    after, metrics = step(base, state, batch, Fixed(start, noise))
+    after, metrics = step(base, state, batch, FrozenInputs(start, noise))
     assert all(np.isfinite(x) for x in metrics.values())
     assert metrics["clip_share"] == 0
     assert metrics["kl"] == pytest.approx(0, abs=1e-6)

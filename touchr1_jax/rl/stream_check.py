@@ -31,7 +31,7 @@ def stream_influence(
       fns: policy, prompts, vocabulary.
       params: the policy's.
       batch: P prompts.
-      noise: encoded noise as in `grpo.Fixed`.
+      noise: encoded noise as in `grpo.FrozenInputs`.
       key: randomness of the answers and of the noise.
       length: most tokens of an answer.
     """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.guard import ROUNDING_NAT, check_streams, stream_influence
+from touchr1_jax.rl.stream_check import ROUNDING_NAT, check_streams, stream_influence
 
 P, LENGTH = 3, 3
 BATCH = tiny.question_batch(0, P)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.greedy import make_answer
+from touchr1_jax.rl.evaluate import make_answer
 from touchr1_jax.text.parser import compile_parser
 
 T = 3

@@ -14,7 +14,7 @@ from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.losses import grounding_bonus
 from touchr1_jax.rl.objective import Experience
 from touchr1_jax.rl.rollout import SampleConfig
-from touchr1_jax.rl.trust import NEAR, log_probs, within_trust
+from touchr1_jax.rl.trust_region import NEAR, log_probs, within_trust
 
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from touchr1_jax.limits import above, at_least, within
+from touchr1_jax.validation import above, at_least, within
 
 
 @dataclasses.dataclass(frozen=True)
