@@ -32,7 +32,7 @@ GRPO = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algo
 OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), STEPS)
 
 
-@dataclasses.dataclass(base=True)
+@dataclasses.dataclass(frozen=True)
 class Problem:
     """A jitted step, its first state, what a run never changes, and the items that batches are made of."""
 
