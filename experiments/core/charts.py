@@ -1,160 +1,392 @@
-"""The charts of a report as SVG: training curves, and accuracy against the rate of middle answers."""
+"""Charts as SVG in one look; a caller describes the data and never touches matplotlib.
 
-import io
+A chart is a sequence of `Panel`s, a panel a sequence of `Series`:
+
+    draw([
+        Panel(
+            [Series("ours", x=ms, y=error, high=p95, labels=names), Series("published", x=ms_2, y=error_2)],
+            x_label="time a frame, ms", y_label="error", x_scale="log", y_scale="log", rules=[Rule(y=0.05)],
+        )
+    ])
+
+- Lines, points and both: `Series.line` and `Series.marker`.  `low` and `high` add intervals, with `band=True` a band.
+- Series of one name have one colour, one marker and one entry in the legend in all panels; unnamed ones have no entry.
+- `Panel.rows` names rows from the top in place of a y axis: for bars (`Series.bar`) and for intervals of named things.
+- `Series.labels` writes a name at each point where it hides neither points nor other names.
+- `Rule` draws a bound: a line across the panel, or a corner where x and y must both be kept.
+
+`bars` and `speed_against_error` are charts that many experiments share.  `experiments.core.pictures` draws matrices and
+grids of pictures.
+"""
+
+import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
+from adjustText import adjust_text
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import Normal, Stroke
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from experiments.core.results import Estimate
-from touchr1_jax.bench.metrics import METRICS
+from experiments.core.look import LOOK, MARKERS, PALETTE, SHARED, colours, svg
+from experiments.core.text import number
 
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which stay apart for colour-blind eyes (Wong, Nature Methods 8, 441, 2011)."""
+LONG_AXIS = 300.0
+"""Ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone."""
 
-SHARED = "#4d5560"
-"""Colour of whatever belongs to no single arm."""
+ITERATIONS = 200
+"""Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
 
-MARKERS = "Ds^vXph"
+BEHIND: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+"""Ground of a label, which keeps it legible on lines that it crosses."""
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Steps and values of one logged scalar of one stage."""
+Values = Sequence[float] | np.ndarray
+"""Numbers [N]."""
 
-LOOK: dict[Any, Any] = {
-    "svg.hashsalt": "touchr1-jax",  # the same data give the same file
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#8a929c",
-    "axes.grid": True,
-    "grid.color": "#eceff2",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-}
-"""Settings of every chart, for `matplotlib.rc_context`."""
+Scale = Literal["linear", "log", "symlog"]
 
 
-def colours(arms: Iterable[str]) -> dict[str, str]:
-    """The colour of every arm, the same in every chart and table."""
-    return dict(zip(arms, itertools.cycle(PALETTE), strict=False))
-
-
-def svg(figure: Figure) -> bytes:
-    """The figure as SVG; the same figure gives the same bytes, made within `LOOK`."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
-
-
-def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:
-    """Sort logged lines into phase → scalar → (arm, seed) → curve; the arm is empty where the stage names none."""
-    points: dict[str, dict[str, dict[tuple[str, str], list[tuple[int, float]]]]] = {}
-    for line in rows:
-        phase, *middle = line["stage"].split("/")
-        seed = middle.pop() if middle else "0"
-        for name, value in line.items():
-            if name not in ("stage", "step") and isinstance(value, int | float):
-                series = points.setdefault(phase, {}).setdefault(name, {})
-                series.setdefault(("/".join(middle), seed), []).append((line["step"], float(value)))
-    return {
-        phase: {name: {key: _curve(p) for key, p in series.items()} for name, series in scalars.items()}
-        for phase, scalars in points.items()
-    }
-
-
-def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:
-    """One panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rule:
+    """A bound: a vertical line at `x`, a level line at `y`; with both, the corner that must be kept.
 
     Args:
-      scalars: scalar → (arm, seed) → curve, of one phase.
-      colour: that of each arm; a curve of no arm is grey.
+      x, y: in data coordinates.
+      name: in the legend; none by default.
+      line, colour, width: of the line; width in points.
+      keep: with x and y, the side of the level line that is inside.
     """
-    columns = min(3, len(scalars))
-    rows = math.ceil(len(scalars) / columns)
+
+    x: float | None = None
+    y: float | None = None
+    name: str = ""
+    line: str = ":"
+    colour: str = "black"
+    width: float = 1.0
+    keep: Literal["below", "above"] = "below"
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Points of a panel; a number that is missing is NaN.
+
+    Args:
+      name: in the legend; none by default.
+      x, y: positions [N]; in a panel of rows, `y` defaults to the rows from the top.
+      low, high: ends of the interval of each y, in a panel of rows of each x; one alone reaches from the point.
+      band: whether the intervals are one filled band.
+      bar: in a panel of rows, bars from 0 to `x`; several such series lie beside each other, or on a `stacked` panel
+        end to end.
+      line: matplotlib's style; "" for points alone, which panels of rows always have.
+      marker: matplotlib's; `None` for the name's own, "" for none.
+      colour: one, or one per point; `None` for the name's own.
+      size: area of a marker in points², one or one per point.
+      hollow: whether markers are outlines.
+      width, alpha: of the line (points) and its opacity.
+      shift: of all points across their rows, or along x, so that intervals do not cover each other.
+      labels: a name to write at each point.
+    """
+
+    name: str = ""
+    _: dataclasses.KW_ONLY
+    x: Values
+    y: Values = ()
+    low: Values = ()
+    high: Values = ()
+    band: bool = False
+    bar: bool = False
+    line: str = "-"
+    marker: str | None = None
+    colour: Any = None
+    size: float | Values = 28.0
+    hollow: bool = False
+    width: float = 1.5
+    alpha: float = 1.0
+    shift: float = 0.0
+    labels: Sequence[str] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+      series: drawn in order.
+      title: above the panel.
+      x_label, y_label: with units.
+      x_scale, y_scale: "symlog" is linear up to `linear_to`, logarithmic beyond.
+      x_limits, y_limits: ends of the axes; an end that is `None` follows the data.
+      x_ticks, y_ticks: position → text; by default matplotlib's choice.
+      x_format, y_format: of the ticks, such as "{x:.0%}".
+      rules: bounds.
+      rows: names of rows from the top, in place of a y axis.
+      stacked: whether bars of several series are put end to end.
+      written: format of the figure at the end of each bar, such as ".2g"; none by default.
+      linear_to: see `x_scale`.
+    """
+
+    series: Sequence[Series]
+    _: dataclasses.KW_ONLY
+    title: str = ""
+    x_label: str = ""
+    y_label: str = ""
+    x_scale: Scale = "linear"
+    y_scale: Scale = "linear"
+    x_limits: tuple[float | None, float | None] = (None, None)
+    y_limits: tuple[float | None, float | None] = (None, None)
+    x_ticks: Mapping[float, str] | None = None
+    y_ticks: Mapping[float, str] | None = None
+    x_format: str = ""
+    y_format: str = ""
+    rules: Sequence[Rule] = ()
+    rows: Sequence[str] = ()
+    stacked: bool = False
+    written: str = ""
+    linear_to: float = 1.0
+
+
+def draw(
+    panels: Sequence[Panel],
+    *,
+    columns: int = 3,
+    size: tuple[float, float] | None = None,
+    share_x: bool = False,
+    share_y: bool = False,
+    legend: bool = True,
+) -> bytes:
+    """Draw the panels in rows of `columns`, with one legend above them, as SVG.
+
+    Args:
+      panels: one at least.
+      columns: of panels, at most.
+      size: of the figure in inches; by default it grows with panels and rows.
+      share_x, share_y: whether all panels have the same axis.
+      legend: of the named series and rules.
+    """
+    columns = min(columns, len(panels))
+    lines = math.ceil(len(panels) / columns)
+    panels = _resolved(panels)
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(3.35 * columns, 0.35 + 2.15 * rows), layout="constrained")
-        for i, (name, series) in enumerate(scalars.items()):
-            axes = figure.add_subplot(rows, columns, i + 1)
-            _draw_series(axes, series, colour)
-            axes.set_title(name, fontsize=9.5, loc="left")
-            if i >= len(scalars) - columns:
-                axes.set_xlabel("step")
-        arms = {arm: None for series in scalars.values() for arm, _ in series if arm}
-        if arms:
-            lines = [Line2D([], [], color=colour.get(arm, SHARED), lw=2) for arm in arms]
-            figure.legend(lines, list(arms), loc="outside upper left", ncols=len(arms))
+        figure = Figure(figsize=size or _size(panels, columns, lines), layout="constrained")
+        grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x, sharey=share_y).ravel()
+        for axes, panel in zip(grid, panels, strict=False):
+            _draw_panel(axes, panel)
+        for axes in grid[len(panels) :]:
+            axes.set_visible(False)
+        entries = _entries(panels) if legend else {}
+        if entries:
+            wide = int(figure.get_figwidth() * 13) // (max(map(len, entries)) + 6)  # some 13 letters an inch
+            figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=max(1, wide))
+        if any(series.labels for panel in panels for series in panel.series):
+            figure.draw_without_rendering()  # settles the layout, in which labels have no say
+            figure.set_layout_engine("none")
+            for axes, panel in zip(grid, panels, strict=False):
+                _write_labels(axes, panel)
         return svg(figure)
 
 
-def accuracy_against_middle(
-    arms: Mapping[str, Mapping[str, Estimate]],
-    baselines: Mapping[str, Mapping[str, Estimate]],
-    colour: Mapping[str, str],
-) -> bytes | None:
-    """Accuracy over the rate of middle answers: small dots are seeds, large ones their mean; `None` if not measured."""
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(6.6, 3.7), layout="constrained")
-        axes = figure.add_subplot()
-        drawn = [_draw_point(axes, name, row, colour[name], "o") for name, row in arms.items()]
-        for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS), strict=False):
-            drawn.append(_draw_point(axes, name, row, SHARED, marker))
-        axes.set(xlabel=f"{METRICS['middle_rate'].meaning} (%)", ylabel=f"{METRICS['acc'].title} (%)")
-        axes.margins(0.08)
-        if not any(drawn):
-            return None
-        figure.legend(loc="outside right upper")
-        return svg(figure)
-
-
-def _draw_series(axes: Axes, series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str]) -> None:
-    """All thin lines first, so that no seed covers a mean."""
-    arms = {arm: [curve for (a, _), curve in series.items() if a == arm] for arm, _ in series}
-    for arm, curves in arms.items():
-        for steps, values in curves:
-            axes.plot(steps, values, color=colour.get(arm, SHARED), lw=0.6, alpha=0.25, zorder=2)
-    halo = [Stroke(linewidth=3.4, foreground="white"), Normal()]
-    for arm, curves in arms.items():
-        common = sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves)))
-        if common:
-            mean = np.mean([values[np.isin(steps, common)] for steps, values in curves], axis=0)
-            mark = "o" if len(common) == 1 else ""
-            colour_a = colour.get(arm, SHARED)
-            axes.plot(common, running_mean(mean), color=colour_a, lw=1.8, marker=mark, zorder=3, path_effects=halo)
-
-
-def _draw_point(axes: Axes, name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> bool:
-    if "acc" not in row or "middle_rate" not in row:
-        return False
-    middle, acc = row["middle_rate"], row["acc"]
-    if len(acc.per_seed) > 1:
-        axes.scatter(middle.per_seed, acc.per_seed, s=14, color=colour, alpha=0.4, linewidths=0, marker=marker)
-    axes.vlines(middle.mean, *acc.ci95, color=colour, lw=1)
-    axes.scatter(middle.mean, acc.mean, s=62, color=colour, edgecolors="white", marker=marker, label=name, zorder=3)
-    return True
-
-
-def running_mean(values: np.ndarray) -> np.ndarray:
-    """Centred mean over a twentieth of the points, the window cut off at the ends.
+def bars(
+    values: Mapping[str, float],
+    label: str,
+    *,
+    written: str = ".2g",
+    bounds: Sequence[float] = (),
+    logarithmic: bool = False,
+) -> bytes:
+    """Draw one bar for each name, its figure written at its end, as SVG.
 
     Args:
-      values: float [n].
+      values: name → figure, from the top; above 0 where the axis is logarithmic.
+      label: of the axis, with the unit.
+      written: format of a figure.
+      bounds: drawn as dotted lines.
+      logarithmic: whether equal distances are equal ratios.
     """
-    half = len(values) // 40
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    low = np.maximum(np.arange(len(values)) - half, 0)
-    high = np.minimum(np.arange(len(values)) + half + 1, len(values))
-    return (total[high] - total[low]) / (high - low)
+    figures = (*values.values(), *bounds)
+    limits = (min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, 1.12 * max(figures))
+    panel = Panel(
+        [Series(x=list(values.values()), bar=True)],
+        rows=list(values),
+        x_label=label,
+        x_scale="log" if logarithmic else "linear",
+        x_limits=limits,
+        rules=[Rule(x=bound) for bound in bounds],
+        written=written,
+    )
+    return draw([panel])
 
 
-def _curve(points: Sequence[tuple[int, float]]) -> Curve:
-    """Sorted by step; of several lines with one step the last counts."""
-    last = dict(points)
-    steps = sorted(last)
-    return np.array(steps), np.array([last[s] for s in steps])
+Point = tuple[str, float, float, float]
+"""Name, ms a frame, median error, 95th percentile of the error."""
+
+
+def speed_against_error(
+    groups: Mapping[str, Sequence[Point]], error: str, goal: tuple[float, float] | None, *, legend: bool = True
+) -> bytes:
+    """Draw error over time a frame, logarithmic; each point's bar reaches from the median to the 95th percentile.
+
+    Args:
+      groups: points by kind; those of a kind are joined in the order given.
+      error: label of the error axis.
+      goal: time and error that must be kept, drawn as a corner; `None` for none.
+      legend: of the kinds; without one the names of the points must say it.
+    """
+    series = []
+    for kind, points in groups.items():
+        names, ms, median, high = zip(*points, strict=True)
+        series.append(Series(kind, x=ms, y=median, high=high, labels=names))
+    rules = [] if goal is None else [Rule(x=goal[0], y=goal[1])]
+    axes: dict[str, Any] = {"x_scale": "log", "y_scale": "log", "x_label": "time a frame, ms", "y_label": error}
+    return draw([Panel(series, **axes, rules=rules)], size=(7.4, 4.6), legend=legend)
+
+
+def _resolved(panels: Sequence[Panel]) -> list[Panel]:
+    """Panels whose series state colour, marker and positions."""
+    every = [series for panel in panels for series in panel.series if series.name]
+    colour = colours(dict.fromkeys(s.name for s in every if s.colour is None)) | {"": PALETTE[0]}
+    marker = dict(zip(dict.fromkeys(s.name for s in every), itertools.cycle(MARKERS), strict=False)) | {"": MARKERS[0]}
+
+    def resolve(panel: Panel, s: Series) -> Series:
+        y = np.asarray(s.y if len(s.y) else np.arange(len(panel.rows)), float)
+        return dataclasses.replace(
+            s,
+            x=np.asarray(s.x, float) + (0 if panel.rows else s.shift),
+            y=y + (s.shift if panel.rows else 0),
+            colour=colour[s.name] if s.colour is None else s.colour,
+            marker=marker[s.name] if s.marker is None else s.marker,
+        )
+
+    return [dataclasses.replace(panel, series=[resolve(panel, s) for s in panel.series]) for panel in panels]
+
+
+def _size(panels: Sequence[Panel], columns: int, lines: int) -> tuple[float, float]:
+    rows = max(len(panel.rows) for panel in panels)
+    if len(panels) == 1:
+        return (7.4, 0.9 + 0.34 * rows if rows else 4.2)
+    return (3.3 * columns + (0.6 if rows else 0.2), 0.5 + lines * (0.6 + 0.34 * rows if rows else 2.5))
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    axes.set_title(panel.title, fontsize=9.5, loc="left")
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
+    axes.set_xscale(panel.x_scale, **({"linthresh": panel.linear_to} if panel.x_scale == "symlog" else {}))
+    axes.set_yscale(panel.y_scale, **({"linthresh": panel.linear_to} if panel.y_scale == "symlog" else {}))
+    _draw_bars(axes, panel)
+    for series in panel.series:
+        if not series.bar:
+            _draw_points(axes, panel, series)
+    if panel.rows:
+        axes.set_yticks(range(len(panel.rows)), panel.rows)
+        axes.set_ylim(len(panel.rows) - 0.4, -0.6)
+        axes.grid(axis="y", visible=False)
+    for rule in panel.rules:
+        _draw_rule(axes, rule)
+    axes.set_xlim(*panel.x_limits)
+    _set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks, panel.x_format)
+    if not panel.rows:
+        axes.set_ylim(*panel.y_limits)
+        _set_ticks(axes.yaxis, panel.y_scale, panel.y_ticks, panel.y_format)
+
+
+def _draw_bars(axes: Axes, panel: Panel) -> None:
+    """Bars of one series lie on its rows; of several, side by side or end to end."""
+    every = [series for series in panel.series if series.bar]
+    height = 0.6 if panel.stacked else 0.7 / max(len(every), 1)
+    left = np.zeros(len(panel.rows))
+    for i, series in enumerate(every):
+        y = np.asarray(series.y) + (0.0 if panel.stacked else height * (i - (len(every) - 1) / 2))
+        drawn = axes.barh(y, series.x, height, left=left, color=series.colour, alpha=series.alpha)
+        _draw_intervals(axes, panel, dataclasses.replace(series, y=y, colour="black"))
+        if panel.stacked:
+            left = left + np.nan_to_num(series.x)
+        if panel.written and (not panel.stacked or i == len(every) - 1):
+            figures = [number(value, panel.written) for value in (left if panel.stacked else series.x)]
+            axes.bar_label(drawn, figures, padding=3, fontsize=8)
+
+
+def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
+    _draw_intervals(axes, panel, series)
+    if series.line and not panel.rows:
+        axes.plot(series.x, series.y, series.line, color=series.colour, lw=series.width, alpha=series.alpha)
+    if series.marker:
+        outline = {"facecolors": "none", "edgecolors": series.colour}
+        look = outline if series.hollow else {"color": series.colour, "linewidths": 0}
+        axes.scatter(series.x, series.y, series.size, marker=series.marker, alpha=series.alpha, zorder=3, **look)
+
+
+def _draw_intervals(axes: Axes, panel: Panel, series: Series) -> None:
+    if not len(series.low) and not len(series.high):
+        return
+    middle = series.x if panel.rows else series.y
+    low, high = (np.asarray(end if len(end) else middle, float) for end in (series.low, series.high))
+    if panel.rows:
+        axes.hlines(series.y, low, high, color=series.colour, lw=series.width, alpha=series.alpha)
+    elif series.band:
+        axes.fill_between(series.x, low, high, color=series.colour, alpha=0.2 * series.alpha, lw=0)
+    else:
+        axes.vlines(series.x, low, high, color=series.colour, lw=1, alpha=0.5 * series.alpha)
+
+
+def _draw_rule(axes: Axes, rule: Rule) -> None:
+    look: dict[str, Any] = {"color": rule.colour, "ls": rule.line, "lw": rule.width}
+    if rule.x is not None and rule.y is not None:
+        left, ends = axes.get_xlim()[0], axes.get_ylim()
+        axes.plot([rule.x, rule.x, left], [ends[rule.keep == "above"], rule.y, rule.y], **look)
+    elif rule.x is not None:
+        axes.axvline(rule.x, **look)
+    elif rule.y is not None:
+        axes.axhline(rule.y, **look)
+
+
+def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str) -> None:
+    """The ticks given, else matplotlib's; on a short logarithmic axis also 2 and 5 times the powers of ten."""
+    if ticks is not None:
+        axis.set_ticks(list(ticks), list(ticks.values()))
+        axis.set_minor_locator(NullLocator())
+        return
+    if scale == "log":
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < LONG_AXIS * low else (1.0,)))
+        axis.set_minor_formatter(NullFormatter())
+    if form or scale != "linear":
+        axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))
+
+
+def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
+    """Name → handle of the legend, in order of appearance."""
+    entries: dict[str, Line2D | Patch] = {}
+    for panel in panels:
+        for series in panel.series:
+            colour = series.colour if isinstance(series.colour, str) else SHARED
+            line = "" if panel.rows and not len(series.low) else series.line
+            face = "none" if series.hollow else colour
+            handle = Line2D([], [], color=colour, lw=series.width, ls=line, marker=series.marker, mfc=face, ms=5)
+            entries.setdefault(series.name, Patch(color=colour, alpha=series.alpha) if series.bar else handle)
+        for rule in panel.rules:
+            entries.setdefault(rule.name, Line2D([], [], color=rule.colour, ls=rule.line, lw=rule.width))
+    entries.pop("", None)
+    return entries
+
+
+def _write_labels(axes: Axes, panel: Panel) -> None:
+    texts, points = [], []
+    for series in panel.series:
+        for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
+            if not np.isfinite((x, y)).all():
+                continue
+            points.append((x, y))
+            if series.labels and series.labels[i]:
+                colour = series.colour if isinstance(series.colour, str) else SHARED
+                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
+    if texts:
+        line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
+        adjust_text(
+            texts, *zip(*points, strict=True), ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS
+        )

@@ -7,8 +7,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from experiments.core.history import Past, aligned, duration, summary
+from experiments.core.history import Past, summary
 from experiments.core.runs import go_on
+from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
 
 Verdict = Literal["0 lies outside", "differs", "only in A", "only in B", "may be chance", "same"]
@@ -16,8 +17,6 @@ Verdict = Literal["0 lies outside", "differs", "only in A", "only in B", "may be
 
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 """The gravest first."""
-
-ABSENT = "–"
 
 CHANCE = 0.05
 """How often a 95 % interval of no difference leaves 0 outside."""
@@ -132,10 +131,10 @@ def _compare_estimates(where: str, a: Mapping[str, Any], b: Mapping[str, Any]) -
     if one == two:
         return Figure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
     if len(one) != len(two) or len(one) < 2:
-        change = f"{b['mean'] - a['mean']:+.3g}"
+        change = number(b["mean"] - a["mean"], "+.3g")
         return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
     found = student_interval(np.subtract(two, one))
-    change = f"{found.mean:+.3g} [{found.low:.3g}, {found.high:.3g}]"
+    change = interval(found, "+.3g")
     verdict: Verdict = "0 lies outside" if found.excludes_zero else "may be chance"
     return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict=verdict)
 
@@ -144,7 +143,7 @@ def _compare_numbers(where: str, a: Any, b: Any) -> Figure:
     if a == b:
         return Figure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
     numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (a, b))
-    change = f"{b - a:+.3g}" + (f" (× {b / a:.3g})" if a else "") if numbers else ""
+    change = number(b - a, "+.3g") + (f" (× {number(b / a)})" if a else "") if numbers else ""
     return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
 
 
@@ -153,8 +152,8 @@ def _text(value: Any) -> str:
         return ABSENT
     if isinstance(value, Mapping):
         low, high = value["ci95"]
-        return f"{value['mean']:.4g} [{low:.4g}, {high:.4g}]"
-    return f"{value:.4g}" if isinstance(value, float) and math.isfinite(value) else str(value)
+        return f"{number(value['mean'], '.4g')} {bounds(low, high, '.4g')}"
+    return number(value, ".4g") if isinstance(value, float) and math.isfinite(value) else str(value)
 
 
 def _figures_block(figures: Sequence[Figure], most: int) -> str:

@@ -1,16 +1,14 @@
 """What ran: the runs of every experiment, what each cost and what came out."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from experiments.core import runs
 from experiments.core.artifacts import DamagedFileError, read_json
 from experiments.core.catalogue import Entry
-
-MINUTE, HOUR = 60, 3600
-"""In seconds."""
+from experiments.core.text import duration
 
 TOLD = frozenset({"experiment", "scale", "config", "git", "command"})
 """What tells `config.json` of a run from that of a model."""
@@ -153,23 +151,6 @@ def summary(run: Past) -> str:
     """Stamp, scale, code, state and cost of a run."""
     cost = "" if run.seconds is None else f", {duration(run.seconds)}"
     return f"{run.directory.name}  {run.description['scale']}, code {run.code}: {run.state}{cost}"
-
-
-def duration(seconds: float) -> str:
-    """A wall time to read: `48 s`, `19 min 30 s`, `2 h 5 min`."""
-    whole = round(seconds)
-    if whole < MINUTE:
-        return f"{whole} s"
-    if whole < HOUR:
-        return f"{whole // MINUTE} min {whole % MINUTE} s"
-    return f"{whole // HOUR} h {whole % HOUR // MINUTE} min"
-
-
-def aligned(rows: Sequence[Sequence[str]], gap: str = "  ") -> str:
-    """Rows of cells as lines of text, the columns left-aligned."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = (gap.join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def _readable(home: Path) -> tuple[list[Past], list[str]]:

@@ -11,6 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from experiments.core.charts import LOOK, MARKERS, colours, svg
 from experiments.core.results import Cell, Column, Table
+from experiments.core.text import interval
 from touchr1_jax.bench.metrics import BOTTOM
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 
@@ -153,5 +154,4 @@ def _share(hit: np.ndarray, of: np.ndarray, objects: np.ndarray) -> str | None:
     """Per cent of `hit` among `of`, with its interval; nothing where fewer than two objects are left."""
     if len(np.unique(objects[of])) < 2:
         return None
-    found = clustered_bootstrap(100.0 * hit[of], objects[of], resamples=RESAMPLES)
-    return f"{found.mean:.1f} [{found.low:.1f}, {found.high:.1f}]"
+    return interval(clustered_bootstrap(100.0 * hit[of], objects[of], resamples=RESAMPLES), ".1f")

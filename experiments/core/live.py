@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core import charts
+from experiments.core import charts, curves
 from experiments.core.artifacts import read_json, write_text
 from experiments.core.context import read_metrics
-from experiments.core.history import duration
 from experiments.core.page import Html, document, row, table, tag
 from experiments.core.progress import Loop
-from experiments.core.report_parts import appendix, curve_figure, curve_section, data_and_time, header, number
+from experiments.core.report_parts import appendix, curve_figure, curve_section, data_and_time, header
 from experiments.core.runs import go_on
+from experiments.core.text import duration, number
 from experiments.core.watcher import Watcher
 
 EVERY_S = 10
@@ -109,13 +109,13 @@ class LivePage(Watcher):
         return {phase: figure for phase, (_, figure) in self._drawn.items() if phase in rows}
 
     def _figure(self, phase: str, lines: Sequence[Mapping[str, Any]]) -> Html:
-        scalars = charts.curves_by_phase(lines).get(phase, {})
+        scalars = curves.curves_by_phase(lines).get(phase, {})
         wanted = [name for name in self._curves.get(phase, tuple(scalars)[:MOST]) if name in scalars]
         if not wanted:
             return Html("")
         drawn = {name: scalars[name] for name in wanted}
         arms = dict.fromkeys(arm for series in drawn.values() for arm, _ in series if arm)
-        figure = curve_figure(phase, wanted, charts.training_curves(drawn, charts.colours(arms)))
+        figure = curve_figure(phase, wanted, curves.training_curves(drawn, charts.colours(arms)))
         left = len(scalars) - len(wanted)
         return Html(figure + tag("p", f"Scalars in metrics.jsonl that are not drawn: {left}.", class_="note"))
 

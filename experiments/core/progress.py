@@ -18,7 +18,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from experiments.core.history import duration
+from experiments.core.text import duration
 
 PLAIN_EVERY_S = 10.0
 """Seconds between two plain lines."""

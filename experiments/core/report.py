@@ -4,14 +4,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core import charts
+from experiments.core import charts, curves
 from experiments.core.artifacts import write_bytes, write_text
 from experiments.core.context import read_metrics
 from experiments.core.page import Html, document, image, row, table, tag
 from experiments.core.report_findings import picture_section, requirement_section, table_section
-from experiments.core.report_parts import appendix, curve_figure, curve_section, data_and_time, header, number
+from experiments.core.report_parts import appendix, curve_figure, curve_section, data_and_time, header
 from experiments.core.report_rollouts import rollouts
 from experiments.core.results import Comparison, Estimate, Results
+from experiments.core.text import bounds, number
 from touchr1_jax.bench.scoring import REPORTED
 
 ARROW = {"higher": " ↑", "lower": " ↓", "none": ""}
@@ -108,7 +109,7 @@ def _cell(metric: str, value: Estimate | None, best: bool) -> Html | str:
     if value is None:
         return "–"
     shown = tag("b" if best else "span", number(value.mean, REPORTED[metric].format))
-    return tag("td", shown, tag("span", _interval(value.ci95, REPORTED[metric].format), class_="ci"))
+    return tag("td", shown, tag("span", bounds(*value.ci95, REPORTED[metric].format), class_="ci"))
 
 
 def _legend(metrics: list[str]) -> Html:
@@ -167,12 +168,12 @@ def _comparison(metric: str, pair: str, found: Mapping[str, Comparison], first: 
 def _bounds(c: Comparison | None, spec: str) -> Html:
     if c is None:
         return tag("td", "–")
-    interval = _interval(c.ci95, spec)
+    interval = bounds(*c.ci95, spec)
     return tag("td", tag("b", interval) if c.ci95[0] > 0 or c.ci95[1] < 0 else interval)
 
 
 def _middle(directory: Path, results: Results, colour: Mapping[str, str]) -> Html:
-    svg = charts.accuracy_against_middle(results.arms, results.baselines, colour)
+    svg = curves.accuracy_against_middle(results.arms, results.baselines, colour)
     if svg is None:
         return Html("")
     write_bytes(directory / "plots" / "accuracy_against_middle.svg", svg)
@@ -188,11 +189,11 @@ def _middle(directory: Path, results: Results, colour: Mapping[str, str]) -> Htm
 
 def _curves(directory: Path, results: Results, colour: Mapping[str, str]) -> Html:
     figures = {}
-    for phase, scalars in charts.curves_by_phase(read_metrics(directory)).items():
+    for phase, scalars in curves.curves_by_phase(read_metrics(directory)).items():
         wanted = results.curves.get(phase, tuple(scalars))
         drawn = {name: scalars[name] for name in wanted if name in scalars}
         if drawn:
-            svg = charts.training_curves(drawn, colour)
+            svg = curves.training_curves(drawn, colour)
             write_bytes(directory / "plots" / f"curves_{phase}.svg", svg)
             figures[phase] = curve_figure(phase, tuple(drawn), svg)
     return curve_section("Training curves", figures)
@@ -200,10 +201,6 @@ def _curves(directory: Path, results: Results, colour: Mapping[str, str]) -> Htm
 
 def _named(arm: str, colour: Mapping[str, str]) -> Html:
     return tag("th", tag("span", class_="swatch", style=f"background:{colour[arm]}"), arm)
-
-
-def _interval(ci95: tuple[float, float], spec: str) -> str:
-    return f"[{number(ci95[0], spec)}, {number(ci95[1], spec)}]"
 
 
 def _unit(unit: str, bare: bool = False) -> str:

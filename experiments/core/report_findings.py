@@ -5,8 +5,8 @@ from pathlib import Path
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.page import Html, image, row, table, tag
-from experiments.core.report_parts import number
 from experiments.core.results import Cell, Column, Picture, Requirement, Table
+from experiments.core.text import number
 
 MEDIA = {"svg": "svg+xml", "png": "png"}
 

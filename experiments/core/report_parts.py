@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.core.page import Html, image, row, table, tag
+from experiments.core.text import plain
 
 
 def header(
@@ -69,21 +70,3 @@ def appendix(description: Mapping[str, Any]) -> Html:
     """The resolved configuration."""
     text = json.dumps(description, indent=2, ensure_ascii=False)
     return tag("section", tag("h2", "Configuration"), tag("details", tag("summary", "config.json"), tag("pre", text)))
-
-
-def number(value: float, spec: str) -> str:
-    """With a true minus sign, which is as wide as a digit."""
-    return format(value, spec).replace("-", "−")
-
-
-def plain(value: object) -> str:
-    """A setting or a count in words."""
-    if isinstance(value, float):
-        return f"{value:,.4g}"
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{value:,}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {plain(item)}" for key, item in value.items())
-    if isinstance(value, list | tuple):
-        return ", ".join(plain(item) for item in value)
-    return str(value)

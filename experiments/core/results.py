@@ -119,6 +119,16 @@ class Estimate:
     ci95: tuple[float, float]
     per_seed: tuple[float, ...]
 
+    @property
+    def low(self) -> float:
+        """Lower end of the interval."""
+        return self.ci95[0]
+
+    @property
+    def high(self) -> float:
+        """Upper end of the interval."""
+        return self.ci95[1]
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:

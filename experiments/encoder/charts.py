@@ -8,10 +8,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments.core.charts import LOOK, MARKERS, PALETTE, svg
-from experiments.core.names import Named, name_points
+from experiments.core.charts import LOOK, PALETTE, Panel, Rule, Series, draw, svg
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.probes import BOUNDS
 
@@ -100,25 +98,19 @@ def accuracy_against_time(
       reference: accuracy that the intervals are about.
       goal: time and accuracy that must be kept, drawn as a corner.
     """
-    kinds = list(dict.fromkeys(kind for _, kind, *_ in points))
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(8.4, 5.0), layout="constrained")
-        axes = figure.subplots()
-        names: list[Named] = []
-        for kind, colour, marker in zip(kinds, cycle(COLOURS), cycle(MARKERS), strict=False):
-            for name, own, ms, accuracy, lost in points:
-                if own != kind:
-                    continue
-                axes.vlines(ms, reference - lost.high, reference - lost.low, color=colour, lw=1, alpha=0.45)
-                axes.scatter(ms, accuracy, s=46, color=colour, marker=marker, edgecolors="white", zorder=3)
-                names.append(Named(name=name, x=ms, y=accuracy, colour=colour))
-            axes.scatter([], [], color=colour, marker=marker, label=kind)
-        axes.set(xscale="log", xlabel="forward, ms a prompt of 8 frames × 4 sensors", ylabel="probes right, %")
-        limit, bound = goal
-        axes.plot([limit, limit, axes.get_xlim()[0]], [axes.get_ylim()[1], bound, bound], "k:", lw=1)
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))  # less than two decades leave few powers of ten
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        figure.legend(loc="outside right upper", fontsize=8, title="saving in")
-        name_points(axes, names)
-        return svg(figure)
+    series = []
+    for kind in dict.fromkeys(kind for _, kind, *_ in points):
+        names, _, ms, accuracy, lost = zip(*(point for point in points if point[1] == kind), strict=True)
+        ends: dict[str, Any] = {
+            "low": [reference - span.high for span in lost],
+            "high": [reference - span.low for span in lost],
+        }
+        series.append(Series(f"saving in {kind}", x=ms, y=accuracy, **ends, line="", size=46, labels=names))
+    panel = Panel(
+        series,
+        x_label="forward, ms a prompt of 8 frames × 4 sensors",
+        y_label="probes right, %",
+        x_scale="log",
+        rules=[Rule(x=goal[0], y=goal[1], keep="above")],
+    )
+    return draw([panel], size=(8.4, 5.0))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import jax
 
-from experiments.core.bars import bars
+from experiments.core.charts import bars
 from experiments.core.context import Context
 from experiments.core.progress import in_megabytes
 from experiments.core.results import Column, Picture, Requirement, Results, Table
@@ -78,7 +78,7 @@ def run(config: LoadWeightsConfig, context: Context) -> Results:
                 content=bars(
                     {f"{size}, {name}": ratio for size, by in ratios.items() for name, ratio in by.items()},
                     "largest resident size of the process, in weights",
-                    written="{:.2f}",
+                    written=".2f",
                     bounds=(BOUND,),
                 ),
             ),

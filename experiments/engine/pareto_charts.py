@@ -10,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.core.charts import LOOK, MARKERS, PALETTE, SHARED, running_mean, svg
+from experiments.core.charts import LOOK, MARKERS, PALETTE, SHARED, svg
+from experiments.core.curves import running_mean
 
 Key = tuple[str, int]
 """Algorithm and group size."""

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 
 import jax
 
-from experiments.core.bars import bars
+from experiments.core.charts import bars
 from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
@@ -76,9 +76,7 @@ def run(config: GpuConfig, context: Context) -> Results:
                 name="share",
                 title="Share of the peak",
                 caption="Operations that no program can avoid, over the time that they took and the device's peak.",
-                content=bars(
-                    {n: 100 * t.share(peak) for n, t in timed.items()}, "share of the peak, %", written="{:.1f}"
-                ),
+                content=bars({n: 100 * t.share(peak) for n, t in timed.items()}, "share of the peak, %", written=".1f"),
             ),
         ),
         settings={"device": device.device_kind, "platform": device.platform, "jax": jax.__version__},

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 import cv2
 import numpy as np
 
+from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.pareto import Point, speed_against_error
 from experiments.core.results import Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.gels_at_rest import GelAtRest

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from experiments.core.charts import speed_against_error
 from experiments.core.context import Context
-from experiments.core.pareto import speed_against_error
 from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.depth_methods import MAPS, Slopes

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
+from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.pareto import Point, speed_against_error
 from experiments.core.results import Cell, Column, Picture, Requirement, Table
 from experiments.core.timing import interleaved
 from experiments.fields.known_motion import REST_PICTURES, GelCamera

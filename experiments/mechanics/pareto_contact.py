@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import zoom
 
+from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.pareto import Point, speed_against_error
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved

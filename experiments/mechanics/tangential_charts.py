@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter
 
-from experiments.core.charts import LOOK, MARKERS, SHARED, colours, svg
-from experiments.core.pareto import Point
+from experiments.core.charts import LOOK, MARKERS, SHARED, Point, colours, svg
 
 _PER_CENT = FuncFormatter(lambda value, _: f"{100 * value:g} %")
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.pareto import Point
+from experiments.core.charts import Point
 from experiments.core.results import Cell, Column, Picture, Table
 from experiments.mechanics import tangential_charts
 from experiments.mechanics.tangential_checks import PromiseCheck

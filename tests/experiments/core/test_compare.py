@@ -26,7 +26,7 @@ def test_seeds_are_paired():
     b = {"arms": {"x": {"acc": estimate(11, 21, 31.3), "omae": estimate(0, 3), "csc": estimate(5, 6)}}, "baselines": {}}
     assert figures(a, b) == {
         "x acc": ("+1.1 [0.67, 1.53]", "0 lies outside"),
-        "x omae": ("+0 [-12.7, 12.7]", "may be chance"),
+        "x omae": ("+0 [−12.7, 12.7]", "may be chance"),
         "x csc": ("", "same"),
     }
 

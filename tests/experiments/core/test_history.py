@@ -7,9 +7,10 @@ import sys
 import pytest
 
 from experiments.core.artifacts import write_json
-from experiments.core.history import aligned, duration, locate, read_run
+from experiments.core.history import locate, read_run
 from experiments.core.runner import main
 from experiments.core.runs import locked
+from experiments.core.text import aligned, duration
 
 FAKES = "tests.experiments.fakes"
 COMMAND = "python -m experiments coin --steps 9"

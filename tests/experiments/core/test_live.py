@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from experiments.core import charts, live
+from experiments.core import curves, live
 from experiments.core.artifacts import read_json
 from experiments.core.context import Context
 from experiments.core.live import LivePage
@@ -82,7 +82,7 @@ def test_it_follows_loops_and_lines(page, clock):
 
 def test_without_a_choice_the_first_scalars_are_drawn(page, clock, monkeypatch):
     drawn = []
-    monkeypatch.setattr(charts, "training_curves", lambda scalars, colour: drawn.append(tuple(scalars)) or b"<svg/>")
+    monkeypatch.setattr(curves, "training_curves", lambda scalars, colour: drawn.append(tuple(scalars)) or b"<svg/>")
     context, _ = page
     clock.now += live.EVERY_S
     context.log("sft/0", 0, **{f"s{i:02}": i for i in range(20)})
@@ -91,7 +91,7 @@ def test_without_a_choice_the_first_scalars_are_drawn(page, clock, monkeypatch):
 
 def test_pages_take_their_share_of_the_time_and_no_more(page, clock, monkeypatch):
     context, _ = page
-    monkeypatch.setattr(charts, "training_curves", lambda scalars, colour: setattr(clock, "now", clock.now + 2) or b"")
+    monkeypatch.setattr(curves, "training_curves", lambda scalars, colour: setattr(clock, "now", clock.now + 2) or b"")
     pages = []
     monkeypatch.setattr(live, "write_text", lambda path, text: pages.append(clock.now))
     for step in range(1000):
@@ -104,7 +104,7 @@ def test_pages_take_their_share_of_the_time_and_no_more(page, clock, monkeypatch
 def test_a_phase_without_new_lines_is_not_drawn_again(page, clock, monkeypatch):
     context, _ = page
     drawn = []
-    monkeypatch.setattr(charts, "training_curves", lambda scalars, colour: drawn.append(tuple(scalars)) or b"<svg/>")
+    monkeypatch.setattr(curves, "training_curves", lambda scalars, colour: drawn.append(tuple(scalars)) or b"<svg/>")
     for stage in ("sft/0", "grpo/paid/0", "grpo/paid/1"):
         clock.now += live.EVERY_S
         context.log(stage, 0, loss=1.0, reward=0.5)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.core import charts
+from experiments.core import charts, curves
 from experiments.core.artifacts import write_text
 from experiments.core.page import Html, tag
 from experiments.core.report import is_best, write_report
@@ -181,18 +181,18 @@ def test_curves_are_sorted_by_phase_arm_and_seed():
         {"stage": "grpo/paid/1", "step": 0, "reward": 0.25, "note": "text"},
         {"stage": "sft/0", "step": 0, "loss": 1},
     ]
-    curves = charts.curves_by_phase(lines)
-    steps, values = curves["grpo"]["reward"]["paid", "1"]
+    found = curves.curves_by_phase(lines)
+    steps, values = found["grpo"]["reward"]["paid", "1"]
     assert (steps.tolist(), values.tolist()) == ([0, 1], [0.25, 0.5])
-    assert list(curves["sft"]["loss"]) == [("", "0")]
-    assert "note" not in curves["grpo"]
+    assert list(found["sft"]["loss"]) == [("", "0")]
+    assert "note" not in found["grpo"]
 
 
 def test_running_mean_keeps_lines_and_short_series():
     line = np.arange(100.0)
-    assert charts.running_mean(line)[10:90] == pytest.approx(line[10:90])
-    assert charts.running_mean(np.array([1.0, 5.0])).tolist() == [1.0, 5.0]
-    assert charts.running_mean(np.array([2.0])).tolist() == [2.0]
+    assert curves.running_mean(line)[10:90] == pytest.approx(line[10:90])
+    assert curves.running_mean(np.array([1.0, 5.0])).tolist() == [1.0, 5.0]
+    assert curves.running_mean(np.array([2.0])).tolist() == [2.0]
 
 
 def test_another_arm_does_not_recolour_the_others():

@@ -1,0 +1,107 @@
+"""Training curves of a run, and accuracy against the rate of middle answers, as SVG."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.core.charts import Panel, Series, draw
+from experiments.core.look import MARKERS, SHARED
+from experiments.core.results import Estimate
+from touchr1_jax.bench.metrics import METRICS
+
+Curve = tuple[np.ndarray, np.ndarray]
+"""Steps and values of one logged scalar of one stage."""
+
+
+def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:
+    """Sort logged lines into phase → scalar → (arm, seed) → curve; the arm is empty where the stage names none."""
+    points: dict[str, dict[str, dict[tuple[str, str], list[tuple[int, float]]]]] = {}
+    for line in rows:
+        phase, *middle = line["stage"].split("/")
+        seed = middle.pop() if middle else "0"
+        for name, value in line.items():
+            if name not in ("stage", "step") and isinstance(value, int | float):
+                series = points.setdefault(phase, {}).setdefault(name, {})
+                series.setdefault(("/".join(middle), seed), []).append((line["step"], float(value)))
+    return {
+        phase: {name: {key: _curve(p) for key, p in series.items()} for name, series in scalars.items()}
+        for phase, scalars in points.items()
+    }
+
+
+def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:
+    """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm.
+
+    Args:
+      scalars: scalar → (arm, seed) → curve, of one phase.
+      colour: that of each arm; a curve of no arm is grey.
+    """
+    last = len(scalars) - min(3, len(scalars))
+    return draw(
+        [
+            Panel(_seeds_and_means(series, colour), title=name, x_label="step" if i >= last else "")
+            for i, (name, series) in enumerate(scalars.items())
+        ]
+    )
+
+
+def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str]) -> list[Series]:
+    """All thin lines first, so that no seed covers a mean."""
+    seeds, means = [], []
+    for arm in dict.fromkeys(arm for arm, _ in series):
+        curves = [curve for (a, _), curve in series.items() if a == arm]
+        look: dict[str, Any] = {"colour": colour.get(arm, SHARED), "marker": ""}
+        seeds += [Series(x=steps, y=values, width=0.6, alpha=0.25, **look) for steps, values in curves]
+        common = sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves)))
+        if common:
+            mean = running_mean(np.mean([values[np.isin(steps, common)] for steps, values in curves], axis=0))
+            means.append(Series(arm, x=common, y=mean, width=1.8, **look | {"marker": "o" if len(common) == 1 else ""}))
+    return seeds + means
+
+
+def accuracy_against_middle(
+    arms: Mapping[str, Mapping[str, Estimate]],
+    baselines: Mapping[str, Mapping[str, Estimate]],
+    colour: Mapping[str, str],
+) -> bytes | None:
+    """Draw accuracy over the rate of middle answers: a small dot per seed, a large mean; `None` if not measured."""
+    series = [s for name, row in arms.items() for s in _point(name, row, colour[name], "o")]
+    for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
+        series += _point(name, row, SHARED, marker)
+    labels: dict[str, Any] = {
+        "x_label": f"{METRICS['middle_rate'].meaning} (%)",
+        "y_label": f"{METRICS['acc'].title} (%)",
+    }
+    return draw([Panel(series, **labels)], size=(6.6, 3.9)) if series else None
+
+
+def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> list[Series]:
+    if "acc" not in row or "middle_rate" not in row:
+        return []
+    middle, acc = row["middle_rate"], row["acc"]
+    look: dict[str, Any] = {"colour": colour, "marker": marker, "line": ""}
+    seeds = Series(x=middle.per_seed, y=acc.per_seed, size=14, alpha=0.4, **look)
+    mean = Series(name, x=[middle.mean], y=[acc.mean], low=[acc.low], high=[acc.high], size=62, **look)
+    return [seeds, mean] if len(acc.per_seed) > 1 else [mean]
+
+
+def running_mean(values: np.ndarray) -> np.ndarray:
+    """Centred mean over a twentieth of the points, the window cut off at the ends.
+
+    Args:
+      values: float [n].
+    """
+    half = len(values) // 40
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    low = np.maximum(np.arange(len(values)) - half, 0)
+    high = np.minimum(np.arange(len(values)) + half + 1, len(values))
+    return (total[high] - total[low]) / (high - low)
+
+
+def _curve(points: Sequence[tuple[int, float]]) -> Curve:
+    """Sorted by step; of several lines with one step the last counts."""
+    last = dict(points)
+    steps = sorted(last)
+    return np.array(steps), np.array([last[s] for s in steps])

@@ -1,0 +1,48 @@
+"""The look that every chart shares: colours, settings of matplotlib, files whose bytes depend on the data alone."""
+
+import io
+import itertools
+from collections.abc import Iterable
+from typing import Any
+
+from matplotlib.figure import Figure
+
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+"""Okabe and Ito's colours, which colour-blind readers can tell apart (Wong, Nature Methods 8, 441, 2011)."""
+
+SHARED = "#4d5560"
+"""Colour of whatever belongs to no single series."""
+
+MARKERS = "osD^vXph"
+
+LOOK: dict[Any, Any] = {
+    "svg.hashsalt": "touchr1-jax",  # the same data give the same file
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#8a929c",
+    "axes.grid": True,
+    "grid.color": "#eceff2",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+}
+"""Settings of every chart, for `matplotlib.rc_context`."""
+
+
+def colours(names: Iterable[str]) -> dict[str, str]:
+    """The colour of every name, the same in every chart and table."""
+    return dict(zip(names, itertools.cycle(PALETTE), strict=False))
+
+
+def svg(figure: Figure) -> bytes:
+    """The figure as SVG; the same figure gives the same bytes, made within `LOOK`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return buffer.getvalue()
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as PNG; the same figure gives the same bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()

@@ -1,0 +1,65 @@
+"""Numbers, intervals and times as a reader sees them in reports, tables and logs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+ABSENT = "–"
+"""Stands for a number that was not measured."""
+
+MINUTE, HOUR = 60, 3600
+
+
+class WithInterval(Protocol):
+    """An estimate and the ends of its interval: `statistics.Interval`, `results.Estimate`."""
+
+    @property
+    def mean(self) -> float: ...
+    @property
+    def low(self) -> float: ...
+    @property
+    def high(self) -> float: ...
+
+
+def number(value: float | None, spec: str = ".3g") -> str:
+    """A number by its format, with a true minus sign, which is as wide as a digit; a dash for `None`."""
+    return ABSENT if value is None else format(value, spec).replace("-", "−")
+
+
+def interval(found: WithInterval | None, spec: str = ".3g") -> str:
+    """An estimate and its interval, such as `48.7 [38.0, 60.1]`; only the mean takes the plus of a spec like `+.1f`."""
+    return ABSENT if found is None else f"{number(found.mean, spec)} {bounds(found.low, found.high, spec.lstrip('+'))}"
+
+
+def bounds(low: float, high: float, spec: str = ".3g") -> str:
+    """The ends of an interval, such as `[38.0, 60.1]`."""
+    return f"[{number(low, spec)}, {number(high, spec)}]"
+
+
+def plain(value: object) -> str:
+    """A setting or a count in words."""
+    if isinstance(value, float):
+        return number(value, ",.4g")
+    if isinstance(value, int) and not isinstance(value, bool):
+        return number(value, ",")
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {plain(item)}" for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(plain(item) for item in value)
+    return str(value)
+
+
+def duration(seconds: float) -> str:
+    """A wall time to read: `48 s`, `19 min 30 s`, `2 h 5 min`."""
+    whole = round(seconds)
+    if whole < MINUTE:
+        return f"{whole} s"
+    if whole < HOUR:
+        return f"{whole // MINUTE} min {whole % MINUTE} s"
+    return f"{whole // HOUR} h {whole % HOUR // MINUTE} min"
+
+
+def aligned(rows: Sequence[Sequence[str]], gap: str = "  ") -> str:
+    """Rows of cells as lines of text, the columns left-aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = (gap.join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)
