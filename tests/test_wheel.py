@@ -51,9 +51,9 @@ def run(installed: Path, empty: Path, *arguments: str) -> subprocess.CompletedPr
 
 def test_every_source_is_there_and_nothing_else(wheel):
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    sources = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
-    data = {f"{package}/py.typed" for package in PACKAGES} | {"experiments/released/chat_template.jinja"}
-    assert held == sources | data
+    shipped = ("*.py", "py.typed", "*.jinja")
+    paths = [path for package in PACKAGES for pattern in shipped for path in (ROOT / package).rglob(pattern)]
+    assert held == {path.relative_to(ROOT).as_posix() for path in paths}
 
 
 def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):
@@ -61,7 +61,7 @@ def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert (tmp_path / "runs" / "paper_audit" / "latest" / "report.html").exists()
     assert "paper_audit" in run(installed, tmp_path, "experiments", "list").stdout
-    assert (installed / "experiments" / "paper_audit.py").exists()
+    assert (installed / "experiments" / "bench" / "paper_audit.py").exists()
 
 
 @pytest.mark.parametrize(

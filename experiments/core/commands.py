@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.core.artifacts import DamagedFileError
 from experiments.core.catalogue import Entry, find, listing
 from experiments.core.history import listing_of_runs, listing_with_runs, locate, read_run
-from experiments.core.new import NewError, write_new
+from experiments.core.new import FAMILY, NewError, write_new
 from experiments.core.runs import ROOT
 
 PROG = "python -m experiments"
@@ -78,7 +78,7 @@ class New:
     def _next(self) -> Sequence[str]:
         run = [f'make experiment EXP={self.name} ARGS="--scale smoke"', f"make experiment EXP={self.name}"]
         if not self.reward:
-            return [f"edit experiments/{self.name}.py: its question, its arms, what you expect", *run]
+            return [f"edit {FAMILY}/{self.name}.py: its question, its arms, what you expect", *run]
         return [
             f"edit touchr1_jax/rewards/{self.name}.py: the formula, in its docstring and below",
             f"edit tests/touchr1_jax/rewards/test_{self.name}.py: its hand values",

@@ -2,12 +2,12 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
-from experiments.core.look import MARKERS, SHARED
+from experiments.core.look import MARKERS, SHARED, colours
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
@@ -29,6 +29,40 @@ def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, di
         phase: {name: {key: _curve(p) for key, p in series.items()} for name, series in scalars.items()}
         for phase, scalars in points.items()
     }
+
+
+class PhaseCurves(NamedTuple):
+    """Training curves of one phase: the chart, the scalars in it, and how many logged ones are not in it."""
+
+    svg: bytes
+    names: tuple[str, ...]
+    undrawn: int
+
+
+def draw_phases(
+    rows: Sequence[Mapping[str, Any]],
+    wanted: Mapping[str, Sequence[str]],
+    colour: Mapping[str, str] | None = None,
+    *,
+    most: int | None = None,
+) -> dict[str, PhaseCurves]:
+    """Draw the training curves of every phase that has any.
+
+    Args:
+      rows: logged lines.
+      wanted: phase → scalars to draw; all of a phase that is not named, up to `most`.
+      colour: that of each arm; by default in the order of their first line.
+      most: `None` for any number.
+    """
+    drawn = {}
+    for phase, scalars in curves_by_phase(rows).items():
+        names = tuple(name for name in wanted.get(phase, tuple(scalars)[:most]) if name in scalars)
+        if names:
+            shown = {name: scalars[name] for name in names}
+            arms = dict.fromkeys(arm for series in shown.values() for arm, _ in series if arm)
+            svg = training_curves(shown, colours(arms) if colour is None else colour)
+            drawn[phase] = PhaseCurves(svg, names, len(scalars) - len(names))
+    return drawn
 
 
 def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:

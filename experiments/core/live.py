@@ -5,14 +5,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core import charts, curves
 from experiments.core.artifacts import read_json, write_text
 from experiments.core.context import read_metrics
-from experiments.core.page import Html, document, row, table, tag
+from experiments.core.curves import PhaseCurves, draw_phases
+from experiments.core.pages import render
 from experiments.core.progress import Loop
-from experiments.core.report_parts import appendix, curve_figure, curve_section, data_and_time, header
 from experiments.core.runs import go_on
-from experiments.core.text import duration, number
+from experiments.core.text import duration
 from experiments.core.watcher import Watcher
 
 EVERY_S = 10
@@ -45,11 +44,10 @@ class LivePage(Watcher):
         curves: Mapping[str, Sequence[str]],
         usual_s: float | None,
     ) -> None:
-        self._directory, self._description, self._curves, self._usual_s = directory, description, curves, usual_s
-        self._question, _, rest = about.strip().partition("\n")
-        self._rest = rest.strip()
+        self._directory, self._about, self._description = directory, about, description
+        self._wanted, self._usual_s = curves, usual_s
         self._loops: Sequence[Loop] = ()
-        self._drawn: dict[str, tuple[int, Html]] = {}
+        self._drawn: dict[str, tuple[int, dict[str, PhaseCurves]]] = {}
         self._began = self._due = time.monotonic()
         self._look()
 
@@ -80,14 +78,17 @@ class LivePage(Watcher):
         times = self._directory / "timing.json"
         timing = read_json(times) if times.exists() else {}
         earlier_s = timing.pop("total", 0.0)
-        description = self._description
-        page = document(
-            f"{description['experiment']} · {description['scale']}",
-            header(self._question, self._rest, description, {}, (state, self._spent(earlier_s))),
-            _loops(self._loops),
-            curve_section("Training curves so far", self._figures()),
-            data_and_time({}, timing, "Time so far") if timing else Html(""),
-            appendix(description),
+        page = render(
+            "live.jinja",
+            about=self._about,
+            description=self._description,
+            settings={},
+            verdict=(state, self._spent(earlier_s)),
+            data={},
+            data_title="Time so far",
+            timing=timing,
+            loops=self._loops,
+            curves=self._draw(),
             reload_s=reload_s,
         )
         write_text(self._directory / "report.html", page)
@@ -98,49 +99,15 @@ class LivePage(Watcher):
             return f"{spent}; no run of this configuration has finished yet."
         return f"{spent}; the last run of this configuration took {duration(self._usual_s)}."
 
-    def _figures(self) -> dict[str, Html]:
+    def _draw(self) -> dict[str, PhaseCurves]:
         """The curves of each phase; a phase without new lines is not drawn again."""
         rows: dict[str, list[Mapping[str, Any]]] = {}
         for line in read_metrics(self._directory):
             rows.setdefault(line["stage"].partition("/")[0], []).append(line)
         for phase, lines in rows.items():
             if self._drawn.get(phase, (0,))[0] != len(lines):
-                self._drawn[phase] = len(lines), self._figure(phase, lines)
-        return {phase: figure for phase, (_, figure) in self._drawn.items() if phase in rows}
-
-    def _figure(self, phase: str, lines: Sequence[Mapping[str, Any]]) -> Html:
-        scalars = curves.curves_by_phase(lines).get(phase, {})
-        wanted = [name for name in self._curves.get(phase, tuple(scalars)[:MOST]) if name in scalars]
-        if not wanted:
-            return Html("")
-        drawn = {name: scalars[name] for name in wanted}
-        arms = dict.fromkeys(arm for series in drawn.values() for arm, _ in series if arm)
-        figure = curve_figure(phase, wanted, curves.training_curves(drawn, charts.colours(arms)))
-        left = len(scalars) - len(wanted)
-        return Html(figure + tag("p", f"Scalars in metrics.jsonl that are not drawn: {left}.", class_="note"))
-
-
-def _loops(loops: Sequence[Loop]) -> Html:
-    if not loops:
-        return Html("")
-    rows = [
-        row(
-            loop.title,
-            f"{loop.completed:,} of {loop.total:,}",
-            tag("td", tag("div", tag("i", style=f"left:0;width:{100 * _share(loop):.1f}%"), class_="bar")),
-            f"{number(loop.rate, '.3g')}/s",
-            loop.left or "–",
-            tag("td", loop.note, class_="text"),
-            head=1,
-        )
-        for loop in loops
-    ]
-    head = ["Loop", "steps", "", "rate", "time left", tag("th", "latest", class_="text")]
-    return tag("section", tag("h2", "Under way"), table(head, rows))
-
-
-def _share(loop: Loop) -> float:
-    return min(loop.completed / loop.total, 1.0) if loop.total else 1.0
+                self._drawn[phase] = len(lines), draw_phases(lines, self._wanted, most=MOST)
+        return {name: drawn for phase in rows for name, drawn in self._drawn[phase][1].items()}
 
 
 def _clock() -> str:

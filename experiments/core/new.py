@@ -5,12 +5,12 @@ import bisect
 import dataclasses
 import keyword
 import re
-import string
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+import jinja2
+
 from experiments.core.artifacts import write_text
-from experiments.core.templates import EXPERIMENT, REWARD, REWARD_EXPERIMENT, TEST
 
 DICTIONARY = Path("touchr1_jax/rewards/__init__.py")
 """Where every reward has its import and its entry."""
@@ -20,6 +20,14 @@ EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")
 
 MAKER = "make_rewards"
 """The function there that returns the dictionary."""
+
+FAMILY = Path("experiments/paper")
+"""The folder of a new experiment: it begins as an ablation, and lies with the others."""
+
+SOURCES = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), trim_blocks=True, keep_trailing_newline=True
+)
+"""Templates of source files."""
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -51,15 +59,15 @@ def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) ->
       NewError: a name that is no lower-case Python name or taken, a file that exists, or no checkout.
     """
     checked_name(name, taken)
-    filled = lambda template: string.Template(template).substitute(name=name)
-    texts = {Path(f"experiments/{name}.py"): filled(REWARD_EXPERIMENT if reward else EXPERIMENT)}
+    fill = lambda template: SOURCES.get_template(f"{template}.py.jinja").render(name=name, reward=reward)
+    texts = {FAMILY / f"{name}.py": fill("experiment")}
     changed: dict[Path, str] = {}
     for path in (DICTIONARY, EXAMPLES):
         if not (root / path).exists():
             raise NewError(f"{root} holds no {path}: must be a checkout of the project; clone it and work there")
     if reward:
-        texts[Path(f"touchr1_jax/rewards/{name}.py")] = filled(REWARD)
-        texts[Path(f"tests/touchr1_jax/rewards/test_{name}.py")] = filled(TEST)
+        texts[Path(f"touchr1_jax/rewards/{name}.py")] = fill("reward")
+        texts[Path(f"tests/touchr1_jax/rewards/test_{name}.py")] = fill("reward_test")
         changed[DICTIONARY] = with_entry((root / DICTIONARY).read_text(encoding="utf-8"), name)
     for path in texts:
         if (root / path).exists():

@@ -67,6 +67,11 @@ class Loop:
         return time.monotonic() - self._began[1]
 
     @property
+    def share(self) -> float:
+        """Share of the loop that is done, in [0, 1]."""
+        return min(self.completed / self.total, 1.0) if self.total else 1.0
+
+    @property
     def rate(self) -> float:
         """Steps per second; what the first call took does not count once there are others, for it compiled."""
         completed, since = self._began if self.starting else self._first_call

@@ -111,13 +111,10 @@ class Picture:
     kind: Literal["svg", "png"] = "svg"
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """One metric of one arm: its mean over seeds, a 95 % interval and the value of every seed."""
+class _Ci95:
+    """Ends of a 95 % interval by name."""
 
-    mean: float
     ci95: tuple[float, float]
-    per_seed: tuple[float, ...]
 
     @property
     def low(self) -> float:
@@ -131,7 +128,16 @@ class Estimate:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Estimate(_Ci95):
+    """One metric of one arm: its mean over seeds, a 95 % interval and the value of every seed."""
+
+    mean: float
+    ci95: tuple[float, float]
+    per_seed: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparison(_Ci95):
     """`arm` minus `against` on one metric, paired.
 
     `over` says what the interval generalises to: other training `seeds` (Student t on paired per-seed differences) or

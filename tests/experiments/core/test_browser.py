@@ -45,7 +45,7 @@ def report(tmp_path):
 
 def test_what_is_said_without_touch_stands_beside(report):
     page = report.read_text(encoding="utf-8")
-    assert "In the place of the touch" in page
+    assert "In place of the touch" in page
     assert page.count('class="trace"') == 3
     assert "Fields of xense" in page
 

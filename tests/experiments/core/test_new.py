@@ -54,8 +54,8 @@ def test_a_dictionary_that_cannot_be_changed_is_said(source, message):
 
 def test_an_experiment_alone(checkout, capsys):
     assert main(["new", "more_format", "--root", str(checkout)]) == 0
-    assert "made     experiments/more_format.py" in capsys.readouterr().out
-    tree = ast.parse((checkout / "experiments" / "more_format.py").read_text())
+    assert "made     experiments/paper/more_format.py" in capsys.readouterr().out
+    tree = ast.parse((checkout / "experiments" / "paper" / "more_format.py").read_text())
     assert (ast.get_docstring(tree) or "").splitlines()[0].endswith("?")
     assert (checkout / DICTIONARY).read_text() == SOURCE
 

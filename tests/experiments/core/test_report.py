@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.core import charts, curves
+from experiments.core import curves
 from experiments.core.artifacts import write_text
-from experiments.core.page import Html, tag
+from experiments.core.pages import pieces, png, strip
 from experiments.core.report import is_best, write_report
-from experiments.core.report_rollouts import highlighted, rollouts, strip_png
 from experiments.core.results import Comparison, Estimate, Results
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
@@ -128,11 +127,6 @@ def test_hostile_text_stays_text(tmp_path, results):
     assert reader.text.count(HOSTILE) >= 9
 
 
-def test_an_attribute_cannot_be_left():
-    assert tag("i", "x", title='"><b>') == '<i title="&quot;&gt;&lt;b&gt;">x</i>'
-    assert tag("i", Html("<b></b>"), "<b>") == "<i><b></b>&lt;b&gt;</i>"
-
-
 def test_bold_needs_a_paired_interval_without_zero(results):
     assert is_best("acc", "paid", results)
     assert not is_best("acc", "unpaid", results)
@@ -159,20 +153,20 @@ def test_the_report_of_the_same_run_is_the_same_file(tmp_path, results):
     assert write(tmp_path / "a", results) == write(tmp_path / "b", results)
 
 
-def test_slots_are_marked_in_place():
-    assert highlighted("a <b> c", ((2, 5, "compare"),)) == (
-        '<div class="trace">a <mark class="compare">&lt;b&gt;</mark> c</div>'
-    )
+def test_a_text_is_cut_at_its_segments():
+    assert list(pieces("a b c d", ((2, 3, "compare"), (6, 7, "conclude")))) == [
+        ("a ", ""), ("b", "compare"), (" c ", ""), ("d", "conclude"), ("", ""),
+    ]  # fmt: skip
 
 
 def test_a_strip_holds_every_frame_in_its_true_colours(tmp_path, results):
     frames = np.random.default_rng(0).integers(0, 255, (3, 5, 4, 3), dtype=np.uint8)
-    strip = cv2.imdecode(np.frombuffer(strip_png(frames), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    assert strip.shape == (5, 3 * 6, 3)
+    shown = cv2.imdecode(np.frombuffer(png(strip(frames)), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    assert shown.shape == (5, 3 * 6, 3)
     for f in range(3):
-        np.testing.assert_array_equal(strip[:, 6 * f + 1 : 6 * f + 5], frames[f])
+        np.testing.assert_array_equal(shown[:, 6 * f + 1 : 6 * f + 5], frames[f])
     embedded = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", write(tmp_path, results))
-    assert base64.b64decode(embedded[1]) == strip_png(coin.example().frames["xense"])
+    assert base64.b64decode(embedded[1]) == png(strip(coin.example().frames["xense"]))
 
 
 def test_curves_are_sorted_by_phase_arm_and_seed():
@@ -195,19 +189,16 @@ def test_running_mean_keeps_lines_and_short_series():
     assert curves.running_mean(np.array([2.0])).tolist() == [2.0]
 
 
-def test_another_arm_does_not_recolour_the_others():
-    colour = charts.colours(["a", "b", "c"])
-    assert colour.items() <= charts.colours(["a", "b", "c", "d"]).items()
-    assert len(set(colour.values())) == 3
+def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
+    def section(*groups: str) -> str:
+        examples = tuple(dataclasses.replace(coin.example(), group=group) for group in groups)
+        page = write(tmp_path, dataclasses.replace(results, examples=examples))
+        return page[page.index("A few rollouts") : page.index("Data and time")]
 
-
-def test_rollouts_of_a_group_fold_away_under_its_heading():
-    example = coin.example()
-    grouped = [dataclasses.replace(example, group=name) for name in (HOSTILE, HOSTILE, "far off")]
-    section = rollouts([*grouped, example], {})
-    assert read(section).text.count("Question ") == 4
-    assert section.count("<details") == 2
-    assert section.count('<details open="open">') == 1
-    assert section.index("far off") > section.rindex("alert(")
-    assert "<script>" not in section
-    assert "<details" not in rollouts([example], {})
+    grouped = section(HOSTILE, HOSTILE, "far off", "")
+    assert grouped.count("<b>Question </b>") == 4
+    assert grouped.count("<details") == 2
+    assert grouped.count('<details open="open">') == 1
+    assert grouped.index("far off") > grouped.rindex("alert(")
+    assert "<script>" not in grouped
+    assert "<details" not in section("")
