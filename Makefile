@@ -8,7 +8,7 @@ READY  := $(VENV)/.ready
 
 PYTHONS ?= python3.11 python3.12
 
-.PHONY: help setup experiment test test-slow test-matrix lint format picture clean
+.PHONY: help setup experiment test test-slow test-matrix lint format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -43,9 +43,6 @@ lint: setup  ## check style, imports and types
 format: setup  ## rewrite the sources in the house format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-
-picture: setup  ## draw the architecture from the imports
-	$(BIN)/python -m experiments.core.architecture
 
 clean:  ## remove the environments and caches, keep data/ and runs/
 	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -84,7 +84,6 @@ def test_every_command_answers(installed, tmp_path, arguments, printed):
     "arguments",
     [
         ("experiments", "new", "brevity", "--reward"),
-        ("experiments.core.architecture",),
         ("experiments.core.recorded", "fill"),
     ],
     ids=" ".join,

@@ -1,12 +1,11 @@
-"""Figures in the documentation that come from recorded runs.
+"""The table of results in the README, written from runs that are kept in the repository.
 
-    python -m experiments.core.recorded record RUN        # keep a finished run's results in the repository
-    python -m experiments.core.recorded fill              # write every marked figure anew
+    python -m experiments.core.recorded record RUN        # keep the results of a finished run
+    python -m experiments.core.recorded fill              # write the table anew
 
-A marked figure stands between two comments, `<!--= NAME :: KEY :: … :: FORMAT -->63<!--/-->`: the path of a value in
-`experiments/recorded/NAME.json`, and the format of its number; a bar would end the cell of a table.  A key names an
-entry of an object; of a list, the entry with that `name` or `title`; of a table, the row that begins with it, then the
-column.  A test holds the documents to what `fill` would write.
+A figure of a row is `{KEY > KEY > … | FORMAT}`: the path of a value in `experiments/recorded/EXPERIMENT.json` and the
+format of its number.  A key names an entry of an object; of a list, the entry with that `name` or `title`; of a table,
+the row that begins with it, then the column.  A test compares the README with what `fill` would write.
 """
 
 import argparse
@@ -18,22 +17,69 @@ from typing import Any
 
 from experiments.core.artifacts import read_json, write_json, write_text
 from experiments.core.runs import ROOT, NoCheckoutError, checkout
+from experiments.core.text import number
 
 RECORDED = Path("experiments/recorded")
-"""Relative to the checkout; one file for each experiment, the run that the documents speak of."""
+"""Folder of the checkout with one file for each experiment: the run that the README shows."""
 
-DOCUMENTS = tuple(Path(x) / "README.md" for x in (".", "touchr1_jax", "sensors_io", "experiments"))
+BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
+
+SIGHT = "tables > Right answers where sight helps and where it lies > deceptive questions"
+
+ROWS = (
+    (
+        "conflict",
+        "hardness, roughness and protrusion on three levels each",
+        "right: SFT {arms > sft > acc > mean | .0f} %, GRPO with the published rewards "
+        "{arms > full > acc > mean | .0f} %, the same policy without touch "
+        "{baselines > tactile_blind > acc > mean | .0f} %, a constant {baselines > constant > acc > mean | .0f} %",
+    ),
+    (
+        "conflict",
+        "questions where the picture shows the wrong material",
+        f"right: with touch {{{SIGHT} > full model | .0f}} %, without {{{SIGHT} > vision-only | .0f}} %",
+    ),
+    (
+        "main_table",
+        "average of the bench's nine columns",
+        "SFT {arms > sft > avg > mean | .1f}, SFT and GRPO {arms > full > avg > mean | .1f}, a linear probe on the "
+        "encoder of SFT {baselines > encoder_probe > avg > mean | .1f}",
+    ),
+    (
+        "physiclear",
+        "real videos of 67 objects, cross-validated",
+        "{requirements > all right > measured | .0f} % right in all three properties, "
+        "{requirements > mean > measured | .0f} % of the levels right",
+    ),
+    (
+        "pareto_fields",
+        "depth under real balls that calibration never saw",
+        "error of {requirements > ball, gelslam, held out by press: depth rmse > measured | .1f} µm (RMSE)",
+    ),
+    (
+        "speed_grpo",
+        "one iteration of GRPO, 8 × 8 answers of 64 tokens",
+        "{requirements > iteration at prefix 64 > measured | .2f} s with a prefix of 64 tokens, "
+        "{requirements > iteration at prefix 512 > measured | .2f} s with 512",
+    ),
+    (
+        "stability_grpo",
+        "known failures of GRPO, each provoked, over ten seeds",
+        "an alarm fires in {requirements > failed runs whose alarm fired > measured | .0%} of the failed runs",
+    ),
+)
+"""Experiment, subject and figures of every row."""
 
 _ABSOLUTE = re.compile(r"(?:/[\w.+ -]+){2,}/?|[A-Za-z]:\\\S+")
-_MARK = re.compile(r"<!--= (?P<path>[^>]*?) -->(?P<shown>[^<]*)<!--/-->")
+_FIGURE = re.compile(r"\{(?P<path>[^{}|]+)\|(?P<format>[^{}|]+)\}")
 
 
 class FigureError(ValueError):
-    """A marked figure that no recorded run gives; the message names the mark, the key and what there is."""
+    """A figure that no recorded run gives; the message names the figure, the key and the choices."""
 
 
 def record(run: Path, root: Path = ROOT) -> Path:
-    """Keep the results of a finished run, in the place of an earlier one of the same experiment.
+    """Keep the results of a finished run; they replace those of an earlier run of the experiment.
 
     Args:
       run: its directory.
@@ -52,7 +98,7 @@ def record(run: Path, root: Path = ROOT) -> Path:
 
 
 def _placeless(value: Any) -> Any:
-    """The same with the last part alone of every absolute path: where a folder lay is of no use to others."""
+    """The same value with absolute paths reduced to their last part, which alone means something elsewhere."""
     if isinstance(value, Mapping):
         return {key: _placeless(x) for key, x in value.items()}
     if isinstance(value, list):
@@ -60,47 +106,50 @@ def _placeless(value: Any) -> Any:
     return Path(value).name if isinstance(value, str) and _ABSOLUTE.fullmatch(value) else value
 
 
-def filled(text: str, root: Path = ROOT) -> str:
-    """A document with every marked figure as the recorded runs have it.
+def filled(text: str, rows: Sequence[tuple[str, str, str]] = ROWS, root: Path = ROOT) -> str:
+    """A document with the table between `BEGIN` and `END` as the recorded runs have it.
 
     Args:
       text: the document.
+      rows: experiment, subject, figures.
       root: the checkout.
 
     Raises:
-      FigureError: a mark whose run, key or format is unknown.
+      FigureError: no such block, or a figure whose run, key or format is unknown.
     """
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise FigureError(f"the document holds no block between {BEGIN!r} and {END!r}: must hold one; add it")
+    lines = ["| subject | measured | experiment |", "|---|---|---|"]
+    for name, subject, figures in rows:
+        shown = _FIGURE.sub(
+            lambda match, name=name: figure(name, match["path"], match["format"].strip(), root), figures
+        )
+        lines.append(f"| {subject} | {shown} | `{name}` |")
+    return before + "\n".join((BEGIN, *lines, END)) + after
 
-    def write(mark: re.Match[str]) -> str:
-        path = mark["path"]
-        return f"<!--= {path} -->{shown(path, root)}<!--/-->"
 
-    return _MARK.sub(write, text)
-
-
-def shown(path: str, root: Path = ROOT) -> str:
-    """A figure as its mark asks for it: "conflict :: requirements :: least gain from touch :: measured :: .0f".
+def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
+    """A figure of a recorded run, such as `requirements > least gain from touch > measured` with format `.0f`.
 
     Raises:
-      FigureError: an unknown run or key, or something that has no such format.
+      FigureError: an unknown run or key, or a value that has no such format.
     """
-    name, *keys = [part.strip() for part in path.split("::")]
     file = root / RECORDED / f"{name}.json"
-    if len(keys) < 2:
-        raise FigureError(f"mark {path!r} has {len(keys)} parts after the run: must have a key and a format; add them")
     if not file.exists():
-        raise FigureError(f"mark {path!r}: no run of {name!r} is recorded in {RECORDED}; record one")
+        raise FigureError(f"figure {path!r}: no run of {name!r} is recorded in {RECORDED}; record one")
     value: Any = read_json(file)
-    for key in keys[:-1]:
-        value = _entry(value, key, path)
+    for key in path.split(">"):
+        value = _entry(value, key.strip(), path)
     try:
-        return format(value, keys[-1]).replace("-", "−")
+        return number(value, spec)
     except (TypeError, ValueError) as error:
-        raise FigureError(f"mark {path!r}: {value!r} has no format {keys[-1]!r}: {error}; correct either") from error
+        raise FigureError(f"figure {path!r}: {value!r} has no format {spec!r}: {error}; correct either") from error
 
 
 def _entry(value: Any, key: str, path: str) -> Any:
-    """What a key names in a value."""
+    """The entry of a value that a key names."""
     if isinstance(value, Mapping) and "rows" in value and "columns" in value:
         columns = [column["name"] for column in value["columns"]]
         value = {str(row[0]): dict(zip(columns, row, strict=True)) for row in value["rows"]}
@@ -108,7 +157,7 @@ def _entry(value: Any, key: str, path: str) -> Any:
         value = {str(entry.get("name", entry.get("title"))): entry for entry in value if isinstance(entry, Mapping)}
     if not isinstance(value, Mapping) or key not in value:
         known = ", ".join(map(str, value)) if isinstance(value, Mapping) else repr(value)
-        raise FigureError(f"mark {path!r}: {key!r} must be one of {known}; correct it")
+        raise FigureError(f"figure {path!r}: {key!r} must be one of {known}; correct it")
     return value[key]
 
 
@@ -117,16 +166,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("record", help="keep a finished run's results").add_argument("run", type=Path)
-    commands.add_parser("fill", help="write every marked figure anew")
+    commands.add_parser("fill", help="write the table of the README anew")
     chosen = parser.parse_args(arguments)
     try:
-        root = checkout()
+        readme = checkout() / "README.md"
         if chosen.command == "record":
-            record(chosen.run, root)
+            record(chosen.run)
         else:
-            for document in DOCUMENTS:
-                text = (root / document).read_text(encoding="utf-8")
-                write_text(root / document, filled(text, root))
+            write_text(readme, filled(readme.read_text(encoding="utf-8")))
     except (FigureError, NoCheckoutError) as error:
         sys.stderr.write(f"{error}\n")
         return 1

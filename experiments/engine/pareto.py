@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.core.fronts import Axis, Point, dominators, front, points_of
+from experiments.engine.fronts import Axis, Point, dominators, front, points_of
 from experiments.core.history import Past, runs_of, summary
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
