@@ -16,11 +16,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.engine.fronts import Axis, Point, dominators, front, points_of
 from experiments.core.history import Past, runs_of, summary
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
+from experiments.engine.fronts import Axis, Point, dominators, front, points_of
 from experiments.fields import dense_accuracy, marker_accuracy
 from experiments.mechanics.tangential_tables import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
