@@ -9,6 +9,7 @@ the row that begins with it, then the column.  A test compares the README with w
 """
 
 import argparse
+import functools
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -123,11 +124,13 @@ def filled(text: str, rows: Sequence[tuple[str, str, str]] = ROWS, root: Path = 
         raise FigureError(f"the document holds no block between {BEGIN!r} and {END!r}: must hold one; add it")
     lines = ["| subject | measured | experiment |", "|---|---|---|"]
     for name, subject, figures in rows:
-        shown = _FIGURE.sub(
-            lambda match, name=name: figure(name, match["path"], match["format"].strip(), root), figures
-        )
-        lines.append(f"| {subject} | {shown} | `{name}` |")
+        show = functools.partial(_show, name=name, root=root)
+        lines.append(f"| {subject} | {_FIGURE.sub(show, figures)} | `{name}` |")
     return before + "\n".join((BEGIN, *lines, END)) + after
+
+
+def _show(match: re.Match[str], *, name: str, root: Path) -> str:
+    return figure(name, match["path"], match["format"].strip(), root)
 
 
 def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
