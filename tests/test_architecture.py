@@ -1,73 +1,76 @@
-"""Who may import whom, and how long things may get, read from the sources."""
+"""Rules of the sources: who may import whom, how long things may get, which names and docstrings are refused."""
 
 import ast
 import builtins
+import functools
 import graphlib
 import importlib
+import re
 import symtable
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
-MAX_FILE, MAX_FUNCTION = 400, 60
+MAX_FILE, MAX_FUNCTION, MAX_ENTRIES = 400, 60, 15
 
-TOUCHR1_LAYERS = (
-    {"types", "validation"},
-    {"masked"},
-    {"text"},
-    {"models"},
-    {"rewards"},
-    {"rl"},
-    {"training"},
-    {"distributed"},
-    {"bench"},
-)
-"""Lowest first: a module may import its own layer and those before it."""
-
-SENSORS_LAYERS = (
-    {"errors"},
-    {"schema"},
-    {"clock", "json_files"},
-    {"sync", "taps", "force", "offsets"},
-    {"poses"},
-    {"deltas"},
-    {"quality"},
-    {"measures"},
-    {"layer"},
-    {"codec"},
-    {"augment"},
-    {"shards", "selection"},
-    {"index"},
-    {"records"},
-    {"cards"},
-    {"pipeline", "importers", "scenes"},
-    {"fields"},
-    {"calibration"},
-    {"devices"},
-    {"recording", "viewer"},
-    {"generate", "live", "overview"},
-    {"commands"},
-    {"__main__"},
-)
-"""The same; members of one layer do not know each other."""
-
-EXPERIMENTS_LAYERS = (
-    {"core"},
-    {"study"},
-    {"mechanics"},
-    {"scenes"},
-    {"fields"},
-    {"encoder"},
-    {"recordings"},
-    {"bench"},
-    {"paper"},
-    {"engine"},
-    {"faults"},
-)
-"""The same for the families of experiments."""
+LAYERS = {
+    "touchr1_jax": (
+        "types",
+        "validation",
+        "masked",
+        "text",
+        "models",
+        "rewards",
+        "rl",
+        "training",
+        "distributed",
+        "bench",
+    ),
+    "sensors_io": (
+        "errors",
+        "schema",
+        "clock json_files",
+        "sync taps force offsets",
+        "poses",
+        "deltas",
+        "quality",
+        "measures",
+        "layer",
+        "codec",
+        "augment",
+        "shards selection",
+        "index",
+        "records",
+        "cards",
+        "pipeline importers scenes",
+        "fields",
+        "calibration",
+        "devices",
+        "recording viewer",
+        "generate live overview",
+        "commands",
+        "__main__",
+    ),
+    "experiments": (
+        "core",
+        "study",
+        "mechanics",
+        "scenes",
+        "fields",
+        "encoder",
+        "recordings",
+        "bench",
+        "paper",
+        "engine",
+        "faults",
+        "__main__",
+    ),
+}
+"""Lowest first: a module imports its own part of the package and those of lower layers."""
 
 REWARDS_MAY_IMPORT = {
     "touchr1_jax.types",
@@ -77,10 +80,9 @@ REWARDS_MAY_IMPORT = {
     "jax.errors",
     "numpy",
     "jaxtyping",
+    *sys.stdlib_module_names,
 }
 BENCH_MAY_IMPORT = {"touchr1_jax.types", "touchr1_jax.masked", "touchr1_jax.bench"}
-
-FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
 def name_of(path: Path) -> str:
@@ -89,10 +91,10 @@ def name_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports_of(source: str, module: str) -> set[str]:
+def imports_of(tree: ast.AST, module: str) -> set[str]:
     """Dotted names that a source imports, anywhere in it; `from a import b` gives a.b, a module or a name in one."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -105,83 +107,61 @@ def starts(name: str, prefixes: set[str]) -> bool:
     return any(name == prefix or name.startswith(f"{prefix}.") for prefix in prefixes)
 
 
-IMPORTS = {name_of(path): imports_of(path.read_text(), name_of(path)) for path in FILES}
+SOURCES = {name_of(p): p.read_text() for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))}
+TREES = {module: ast.parse(source) for module, source in SOURCES.items()}
+IMPORTS = {module: imports_of(tree, module) for module, tree in TREES.items()}
 
 
-def layer_of(name: str, layers: tuple[set[str], ...]) -> int:
+@functools.cache
+def layer_of(name: str) -> int:
     """Layer of a module or of something imported from it."""
-    parts = name.split(".")
-    if len(parts) == 1:
-        return -1  # the package itself, which must stay empty
-    found = [i for i, layer in enumerate(layers) if parts[1] in layer]
+    package, part, *_ = name.split(".")
+    found = [i for i, layer in enumerate(LAYERS[package]) if part in layer.split()]
     assert found, f"{name} has no layer: give it one in this test"
     return found[0]
 
 
-def test_the_sources_are_found():
-    assert len(FILES) > 50
-    assert "sensors_io.records.RecordWriter" in IMPORTS["sensors_io.generate"]
+def wrong_imports(modules: set[str], allowed: set[str], among: set[str] | None = None) -> list[str]:
+    """Imports by modules of these packages of names (of these packages) that are not allowed."""
+    return [
+        f"{module} imports {name}"
+        for module, names in IMPORTS.items()
+        if starts(module, modules)
+        for name in sorted(names)
+        if (among is None or starts(name, among)) and not starts(name, allowed)
+    ]
 
 
-@pytest.mark.parametrize("module", IMPORTS)
-def test_packages_do_not_know_each_other(module):
-    """touchr1_jax and sensors_io are strangers; nobody imports experiments or tests."""
-    package = module.split(".")[0]
-    strangers = {
-        "touchr1_jax": {"sensors_io", "experiments", "tests"},
-        "sensors_io": {"touchr1_jax", "experiments", "tests"},
-        "experiments": {"tests"},
-    }[package]
-    assert not [name for name in IMPORTS[module] if starts(name, strangers)]
+def test_packages_do_not_know_each_other():
+    """touchr1_jax and sensors_io are strangers; nobody imports tests, or experiments from outside."""
+    every = {*PACKAGES, "tests"}
+    assert not wrong_imports({"touchr1_jax"}, {"touchr1_jax"}, every)
+    assert not wrong_imports({"sensors_io"}, {"sensors_io"}, every)
+    assert not wrong_imports({"experiments"}, set(PACKAGES), every)
 
 
-@pytest.mark.parametrize("module", [m for m in IMPORTS if starts(m, {"sensors_io"})])
-def test_records_are_numpy(module):
-    """Only the scene generator computes with JAX; whoever records or reads needs none."""
-    jax_user = starts(module, {"sensors_io.scenes"})
-    assert jax_user or not [name for name in IMPORTS[module] if starts(name, {"jax", "flax"})]
-
-
-@pytest.mark.parametrize("package", ["touchr1_jax", "sensors_io"])
-def test_the_package_itself_imports_nothing(package):
-    """Its `__init__` runs before every module of it."""
-    assert IMPORTS[package] == set()
-
-
-@pytest.mark.parametrize(
-    ("package", "layers"),
-    [("touchr1_jax", TOUCHR1_LAYERS), ("sensors_io", SENSORS_LAYERS)],
-    ids=lambda x: x if isinstance(x, str) else "",
-)
-def test_lower_layers_do_not_import_higher_ones(package, layers):
+def test_modules_import_their_own_part_and_lower_layers():
     wrong = []
     for module, names in IMPORTS.items():
-        if not module.startswith(f"{package}."):
-            continue
-        own = layer_of(module, layers)
-        wrong += [f"{module} imports {n}" for n in names if starts(n, {package}) and layer_of(n, layers) > own]
+        package, *parts = module.split(".")
+        ours = [name for name in names if starts(name, {package}) and name.split(".")[1:2] != parts[:1]]
+        if not parts:  # an `__init__` runs before every module of its package
+            wrong += [f"{module} imports {name}" for name in ours]
+        else:
+            wrong += [f"{module} imports {name}" for name in ours if layer_of(name) >= layer_of(module)]
     assert not wrong
 
 
-def test_equal_layers_of_sensors_io_do_not_import_each_other():
-    wrong = []
-    for module, names in IMPORTS.items():
-        if not module.startswith("sensors_io."):
-            continue
-        own = module.split(".")[1]
-        for name in names:
-            if not starts(name, {"sensors_io"}) or name.split(".")[1] == own:
-                continue
-            if layer_of(name, SENSORS_LAYERS) == layer_of(module, SENSORS_LAYERS):
-                wrong.append(f"{module} imports {name}")
-    assert not wrong
+def test_records_are_numpy():
+    """Only the scene generator computes with JAX; recording and reading need none."""
+    scenes = [x for x in wrong_imports({"sensors_io"}, set(), {"jax", "flax"}) if not x.startswith("sensors_io.scenes")]
+    assert not scenes
 
 
-@pytest.mark.parametrize("module", [m for m in IMPORTS if starts(m, {"experiments"}) and m.count(".") > 1])
-def test_parts_of_experiments_know_no_experiment_and_no_part_above_them(module):
-    ours = [name for name in IMPORTS[module] if starts(name, {"experiments"})]
-    own = layer_of(module, EXPERIMENTS_LAYERS)
-    assert not [name for name in ours if layer_of(name, EXPERIMENTS_LAYERS) > own]
+def test_rewards_and_the_benchmark_do_not_know_the_policy():
+    rewards = wrong_imports({"touchr1_jax.rewards"}, REWARDS_MAY_IMPORT)
+    assert not [x for x in rewards if not x.startswith("touchr1_jax.rewards.__main__ ")]
+    assert not wrong_imports({"touchr1_jax.bench"}, BENCH_MAY_IMPORT, {"touchr1_jax"})
 
 
 def test_no_module_imports_itself_by_way_of_others():
@@ -193,28 +173,34 @@ def test_no_module_imports_itself_by_way_of_others():
     tuple(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError and names the cycle
 
 
-@pytest.mark.parametrize("module", [m for m in IMPORTS if starts(m, {"touchr1_jax.rewards"})])
-def test_rewards_import_next_to_nothing(module):
-    """The command line beside them reads the answer language too; no reward imports it."""
-    if module.endswith(".__main__"):
-        return
-    allowed = REWARDS_MAY_IMPORT | set(sys.stdlib_module_names)
-    assert not [name for name in IMPORTS[module] if not starts(name, allowed)]
+def test_files_and_functions_are_short():
+    assert not {module: n for module, source in SOURCES.items() if (n := len(source.splitlines())) > MAX_FILE}
+    assert not {f"{m}.{f.name}": n for m, f in functions() if (n := f.end_lineno - f.lineno + 1) > MAX_FUNCTION}
 
 
-@pytest.mark.parametrize("module", [m for m in IMPORTS if starts(m, {"touchr1_jax.bench"})])
-def test_the_bench_does_not_know_the_policy(module):
-    ours = [name for name in IMPORTS[module] if starts(name, {"touchr1_jax"})]
-    assert not [name for name in ours if not starts(name, BENCH_MAY_IMPORT)]
+def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    for module, tree in TREES.items():
+        yield from ((module, n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_files_and_functions_are_short(path):
-    source = path.read_text()
-    assert len(source.splitlines()) <= MAX_FILE
-    functions = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
-    long = {f.name: f.end_lineno - f.lineno + 1 for f in functions if f.end_lineno - f.lineno + 1 > MAX_FUNCTION}
-    assert not long
+def test_every_folder_serves_several_modules():
+    """A folder that one module alone imports is a part of that module; families and commands are found by name."""
+    assert len([p for p in (ROOT / "experiments").iterdir() if p.name not in NO_CODE]) <= MAX_ENTRIES
+    folders = {m for m in IMPORTS if m.count(".") >= 1 and any(other.startswith(f"{m}.") for other in IMPORTS)}
+    importers = {folder: users(folder) for folder in folders if not re.fullmatch(r"experiments\.\w+", folder)}
+    assert not {folder: by for folder, by in importers.items() if len(by) == 1 and not by[0].endswith("__main__")}
+
+
+NO_CODE = {"README.md", "LOG.md", "TUTORIAL.md", "recorded", "figures", "py.typed", "__init__.py", "__pycache__"}
+
+
+def users(folder: str) -> list[str]:
+    """Modules outside a folder that import something of it."""
+    return [
+        module
+        for module, names in IMPORTS.items()
+        if not starts(module, {folder}) and any(starts(name, {folder}) for name in names)
+    ]
 
 
 def unknown_globals(source: str, known: set[str]) -> set[str]:
@@ -228,17 +214,8 @@ def unknown_globals(source: str, known: set[str]) -> set[str]:
     return unknown
 
 
-@pytest.mark.parametrize("path", FILES, ids=name_of)
-def test_every_global_name_exists(path):
-    if path.name == "__main__.py":
-        known = {n for top in ast.parse(path.read_text()).body for n in bound_names(top)} | {"__name__", "__file__"}
-    else:
-        known = set(vars(importlib.import_module(name_of(path))))
-    assert not unknown_globals(path.read_text(), known)
-
-
 def bound_names(statement: ast.stmt) -> set[str]:
-    """What a statement of a module binds."""
+    """Names that a statement of a module binds."""
     if isinstance(statement, ast.Import | ast.ImportFrom):
         return {(a.asname or a.name).split(".")[0] for a in statement.names}
     if isinstance(statement, ast.FunctionDef | ast.ClassDef):
@@ -246,16 +223,25 @@ def bound_names(statement: ast.stmt) -> set[str]:
     return {n.id for n in ast.walk(statement) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
 
 
-def test_an_unknown_global_name_would_be_seen():
-    source = "import os\n\ndef f(x):\n    y = [os.sep for z in x]\n    return g(y, len(x), missing)\n"
-    assert unknown_globals(source, {"os", "f", "g"}) == {"missing"}
+def test_every_global_name_exists():
+    wrong = {}
+    for module, source in SOURCES.items():
+        if module.endswith("__main__"):
+            known = {n for top in TREES[module].body for n in bound_names(top)} | {"__name__", "__file__"}
+        else:
+            known = set(vars(importlib.import_module(module)))
+        if unknown := unknown_globals(source, known):
+            wrong[module] = unknown
+    assert not wrong
 
 
-def test_a_forbidden_import_would_be_seen():
-    """Also one inside a function, and one by its parent package."""
-    hidden = "def f():\n    from sensors_io import schema\n    import experiments.core.runs\n"
+def test_the_rules_see_what_they_forbid():
+    """Also an import inside a function, and one by its parent package."""
+    assert len(SOURCES) > 50
+    hidden = ast.parse("def f():\n    from sensors_io import schema\n    import experiments.core.runs\n")
     assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.core.runs"}
-    assert starts("sensors_io.schema", {"sensors_io"})
     assert not starts("sensors_io_extra", {"sensors_io"})
     with pytest.raises(AssertionError, match="relative import"):
-        imports_of("from . import schema", "sensors_io.x")
+        imports_of(ast.parse("from . import schema"), "sensors_io.x")
+    source = "import os\n\ndef f(x):\n    y = [os.sep for z in x]\n    return g(y, len(x), missing)\n"
+    assert unknown_globals(source, {"os", "f", "g"}) == {"missing"}
