@@ -15,7 +15,7 @@ Flash = Literal["cudnn", "xla"]
 """Who computes `jax.nn.dot_product_attention`: cuDNN's fused kernel, or XLA, which works anywhere."""
 
 
-class Heads(NamedTuple):
+class AttentionInputs(NamedTuple):
     """Queries [P, L, H, d], keys and values [P, L, KV, d] of P prompts, and the gradient of what comes out."""
 
     q: Float[Array, "P L H d"]
@@ -28,12 +28,14 @@ Attention = Callable[[Array, Array, Array], Array]
 """(q, k, v) → [P, L, H, d]."""
 
 
-def draw_heads(prompts: int, tokens: int, heads: int, kv_heads: int, head_dim: int) -> Heads:
+def draw_heads(prompts: int, tokens: int, heads: int, kv_heads: int, head_dim: int) -> AttentionInputs:
     """Normal numbers in bfloat16."""
     keys = jax.random.split(jax.random.key(0), 4)
     shape = lambda count: (prompts, tokens, count, head_dim)
     counts = (heads, kv_heads, kv_heads, heads)
-    return Heads(*(jax.random.normal(key, shape(count), jnp.bfloat16) for key, count in zip(keys, counts, strict=True)))
+    return AttentionInputs(
+        *(jax.random.normal(key, shape(count), jnp.bfloat16) for key, count in zip(keys, counts, strict=True))
+    )
 
 
 def engine_attention(q: Array, k: Array, v: Array) -> Array:
@@ -53,10 +55,10 @@ def flash_attention(implementation: Flash) -> Attention:
     return lambda q, k, v: jax.nn.dot_product_attention(q, k, v, is_causal=True, implementation=implementation)
 
 
-def with_gradient(attention: Attention) -> Callable[[Heads], tuple[Array, tuple[Array, Array, Array]]]:
+def with_gradient(attention: Attention) -> Callable[[AttentionInputs], tuple[Array, tuple[Array, Array, Array]]]:
     """What comes out, and the gradients of queries, keys and values."""
 
-    def both(h: Heads) -> tuple[Array, tuple[Array, Array, Array]]:
+    def both(h: AttentionInputs) -> tuple[Array, tuple[Array, Array, Array]]:
         out, back = jax.vjp(attention, h.q, h.k, h.v)
         return out, back(h.g)
 
@@ -68,7 +70,7 @@ def pairs(prompts: int, tokens: int, heads: int) -> float:
     return prompts * heads * tokens * (tokens + 1) / 2
 
 
-def errors(h: Heads, ways: dict[str, Attention], context: Context) -> dict[str, float]:
+def errors(h: AttentionInputs, ways: dict[str, Attention], context: Context) -> dict[str, float]:
     """Largest difference of the first prompt's results and gradients from float32, over the largest number in each.
 
     Args:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from experiments.engine.training import Effort
-from experiments.engine.world import FNS, LENGTH, PARSER, K, S, Scene, World, draw, noise_bank
+from experiments.engine.training import TrainingBudget
+from experiments.engine.world import FNS, LENGTH, PARSER, K, S, World, WorldBatch, draw, noise_bank
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch, swap_touch
@@ -23,7 +23,7 @@ from touchr1_jax.types import Params, Parsed, Rollout
 Figures = Mapping[str, Float[Array, ""]]
 
 
-def examine(effort: Effort, world: World, params: Params, reference: Params, key: Array) -> dict[str, Array]:
+def examine(effort: TrainingBudget, world: World, params: Params, reference: Params, key: Array) -> dict[str, Array]:
     """Scores of sampled answers to fresh questions, and the same questions with touch changed in every way.
 
     `accuracy_C` is the accuracy under change C, `shuffled` the share of prompts that the shuffle could change.  `kl` to
@@ -52,7 +52,9 @@ def examine(effort: Effort, world: World, params: Params, reference: Params, key
     return figures | divergences(params, reference, scene, own, noise, keys[4])
 
 
-def answers(effort: Effort, params: Params, scene: Scene, features: Features, key: Array) -> tuple[Rollout, Parsed]:
+def answers(
+    effort: TrainingBudget, params: Params, scene: WorldBatch, features: Features, key: Array
+) -> tuple[Rollout, Parsed]:
     """Sampled answers, and what they say; leading axes P and G."""
     batch = dataclasses.replace(scene.batch, features=features)
     config = SampleConfig(group=effort.answers, length=LENGTH, end_ids=FNS.end_ids, pad_id=FNS.pad_id, inverse=True)
@@ -60,7 +62,7 @@ def answers(effort: Effort, params: Params, scene: Scene, features: Features, ke
     return rollout, jax.vmap(jax.vmap(PARSER))(rollout.tokens)
 
 
-def scores(scene: Scene, said: Parsed) -> dict[str, Array]:
+def scores(scene: WorldBatch, said: Parsed) -> dict[str, Array]:
     """Accuracy, ordinal error (⊥ counts K − 1), shares of middle and commonest answers, what the slots are worth."""
     target = scene.batch.target
     asked = jnp.broadcast_to(target.asked[:, None], said.conclude.shape)
@@ -81,7 +83,7 @@ KEPT = ("mode_share", "echo_share", "gamed_share")
 
 
 def divergences(
-    params: Params, reference: Params, scene: Scene, rollout: Rollout, noise: Float[Array, "K S N D"], key: Array
+    params: Params, reference: Params, scene: WorldBatch, rollout: Rollout, noise: Float[Array, "K S N D"], key: Array
 ) -> dict[str, Array]:
     """Exact KL to the reference, grounding of every stream, entropy: means over tokens, nat."""
     features, drawn = scene.batch.features, noise_touch(scene.batch.features, noise, key).features.touch
@@ -104,6 +106,6 @@ def divergences(
 
 
 @functools.cache
-def examine_program(effort: Effort) -> Callable[..., dict[str, Array]]:
+def examine_program(effort: TrainingBudget) -> Callable[..., dict[str, Array]]:
     """Compiled `examine` of many seeds of one world."""
     return jax.jit(jax.vmap(functools.partial(examine, effort), in_axes=(None, 0, 0, 0)))

@@ -9,26 +9,26 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from experiments.engine.training import Dials, Variant, dials_of
+from experiments.engine.training import GrpoVariant, Hyperparameters, dials_of
 from experiments.engine.world import K, S, World
 from touchr1_jax.rl.config import GRPOConfig, Paper, Stable, TactileUse
 from touchr1_jax.rl.stream_check import ROUNDING_NAT
 
-PAPER = Variant(name="paper", algorithm=Paper())
-STABLE = Variant(name="stable", algorithm=Stable(), accuracy="accuracy_debiased", consistency="consistency_gated")
-WATCHED = Variant(
+PAPER = GrpoVariant(name="paper", algorithm=Paper())
+STABLE = GrpoVariant(name="stable", algorithm=Stable(), accuracy="accuracy_debiased", consistency="consistency_gated")
+WATCHED = GrpoVariant(
     name="paper, controls watched",
     algorithm=Paper(tactile_use=TactileUse.RECOMMENDED, tactile_weight=0.0),
 )
-LITERAL = Variant(name="paper, literal bonus", algorithm=Paper(tactile_use=TactileUse.LITERAL), accuracy="exact")
-SCORE_FUNCTION = Variant(name="paper, k1", algorithm=Paper(kl="k1"))
+LITERAL = GrpoVariant(name="paper, literal bonus", algorithm=Paper(tactile_use=TactileUse.LITERAL), accuracy="exact")
+SCORE_FUNCTION = GrpoVariant(name="paper, k1", algorithm=Paper(kl="k1"))
 
 LATE = 40
 """Last steps of a run that a failure of the training signal is read from."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Course:
+class VariantRun:
     """Ten seeds of one variant at one value of a knob; every array has the seeds as its first axis.
 
     `before` and `after` are examinations, `metrics` what every step logged, `refused` says that the engine raised.
@@ -52,12 +52,12 @@ class Course:
         return self.after["accuracy"] - self.after[f"accuracy_{control}"]
 
 
-Place = tuple[World, Dials]
+Place = tuple[World, Hyperparameters]
 PLAIN = World()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scenario:
+class FailureScenario:
     """A failure, the knob that drives it, and the two that are driven.
 
     `place` says where a variant stands at a value of the knob.
@@ -68,9 +68,9 @@ class Scenario:
     knob: str
     values: tuple[float, ...]
     criterion: str
-    failing: Variant
-    place: Callable[[Variant, float], Place]
-    failed: Callable[[Course], np.ndarray]
+    failing: GrpoVariant
+    place: Callable[[GrpoVariant, float], Place]
+    failed: Callable[[VariantRun], np.ndarray]
     others: tuple[str, ...] = ()
     """Codes of other alarms that say the same."""
 
@@ -85,64 +85,64 @@ class Scenario:
         return (self.code, *self.others)
 
 
-def _turn(dial: str, world: World = PLAIN) -> Callable[[Variant, float], Place]:
+def _turn(dial: str, world: World = PLAIN) -> Callable[[GrpoVariant, float], Place]:
     """Turn one dial in a fixed world."""
-    return lambda variant, value: (world, Dials(**(dials_of(variant)._asdict() | {dial: value})))
+    return lambda variant, value: (world, Hyperparameters(**(dials_of(variant)._asdict() | {dial: value})))
 
 
-def _change(field: str, world: World = PLAIN) -> Callable[[Variant, float], Place]:
+def _change(field: str, world: World = PLAIN) -> Callable[[GrpoVariant, float], Place]:
     """Change one thing in the world."""
     return lambda variant, value: (World(**(world._asdict() | {field: value})), dials_of(variant))
 
 
-def _drifts_to_middle(c: Course) -> np.ndarray:
+def _drifts_to_middle(c: VariantRun) -> np.ndarray:
     return c.after["middle"] - 1 / K > 0.25
 
 
-def _echoes(c: Course) -> np.ndarray:
+def _echoes(c: VariantRun) -> np.ndarray:
     return (c.after["echo_share"] > 0.9) & (c.gain("slots_right") < -0.1)
 
 
-def _unlearns(c: Course) -> np.ndarray:
+def _unlearns(c: VariantRun) -> np.ndarray:
     return c.gain("accuracy") < -0.1
 
 
-def _detects_noise(c: Course) -> np.ndarray:
+def _detects_noise(c: VariantRun) -> np.ndarray:
     return (c.after["grounding"] > 0.3) & (c.lead("swap") < 0.05)
 
 
-def _bonus_cancels(c: Course) -> np.ndarray:
+def _bonus_cancels(c: VariantRun) -> np.ndarray:
     telling = c.late("bonus_telling_share")
     return (telling > 0.02) & (c.late("bonus_cancelled_share") > 0.5 * telling)
 
 
-def _credit_by_chance(c: Course) -> np.ndarray:
+def _credit_by_chance(c: VariantRun) -> np.ndarray:
     """Beyond the rate that R_tu is designed for by two standard errors of all groups, those of 80 steps of 8."""
     return c.metrics["tactile_credit_share"].mean(1) > 0.146
 
 
-def _idles(c: Course) -> np.ndarray:
+def _idles(c: VariantRun) -> np.ndarray:
     return (c.late("degenerate_share") > 0.5) & (c.gain("accuracy") < -0.05)
 
 
-def _penalty_does_not_hold(c: Course) -> np.ndarray:
+def _penalty_does_not_hold(c: VariantRun) -> np.ndarray:
     return c.after["kl"] > 1.0
 
 
-def _entropy_blows_up(c: Course) -> np.ndarray:
+def _entropy_blows_up(c: VariantRun) -> np.ndarray:
     return (c.gain("entropy") > 0.2) & _unlearns(c)
 
 
-def _stream_forgotten(c: Course) -> np.ndarray:
+def _stream_forgotten(c: VariantRun) -> np.ndarray:
     """Noise in the last stream moves no answer, and training went on."""
     return (c.after[f"grounding_{S - 1}"] <= ROUNDING_NAT) & (not c.refused)
 
 
-def _shuffle_is_vacuous(c: Course) -> np.ndarray:
+def _shuffle_is_vacuous(c: VariantRun) -> np.ndarray:
     return c.after["shuffled"] < 0.5
 
 
-def _gamed(c: Course) -> np.ndarray:
+def _gamed(c: VariantRun) -> np.ndarray:
     return c.after["gamed_share"] > 0.5
 
 
@@ -152,18 +152,18 @@ ANCHORED = World(anchored=0.8)
 """A supervised policy that concludes what it sees, with touch that knows better."""
 
 
-def _time_ids(variant: Variant, fps: float) -> Place:
+def _time_ids(variant: GrpoVariant, fps: float) -> Place:
     """Two frames a step: the paper's base model counts int(seconds a step) · 2 ids, the engine counts frames."""
     tick = 2 if variant is STABLE else 2 * int(2 / fps)
     return World(asked=1, noise=0.3, tick=tick), dials_of(variant)
 
 
-def _standing_still(variant: Variant, sight: float) -> Place:
+def _standing_still(variant: GrpoVariant, sight: float) -> Place:
     """Touch that says nothing, and the paper's own learning rate, at which the small policy stays what it is."""
     return World(noise=8.0, sight=sight), dials_of(variant)._replace(learning_rate=GRPOConfig().learning_rate)
 
 
-def _lenience(variant: Variant, value: float) -> Place:
+def _lenience(variant: GrpoVariant, value: float) -> Place:
     """The engine's parser reads nothing into an answer that names several levels."""
     return World(), dials_of(variant)._replace(lenient=0.0 if variant is STABLE else value)
 
@@ -171,7 +171,7 @@ def _lenience(variant: Variant, value: float) -> Place:
 GAMMAS = (0.01, 0.16, 0.64, 2.56)
 
 SCENARIOS = (
-    Scenario(
+    FailureScenario(
         code="F1",
         title="answers drift to the middle level",
         knob="noise of touch σ, levels",
@@ -181,7 +181,7 @@ SCENARIOS = (
         place=_change("noise"),
         failed=_drifts_to_middle,
     ),
-    Scenario(
+    FailureScenario(
         code="F2",
         title="slots echo each other",
         knob="weight of consistency",
@@ -191,7 +191,7 @@ SCENARIOS = (
         place=_turn("consistency"),
         failed=_echoes,
     ),
-    Scenario(
+    FailureScenario(
         code="F3",
         title="grounding without bound",
         knob="weight of grounding γ",
@@ -201,7 +201,7 @@ SCENARIOS = (
         place=_turn("gamma"),
         failed=_unlearns,
     ),
-    Scenario(
+    FailureScenario(
         code="F4",
         title="noise is detected, touch is not read",
         knob="weight of grounding γ, useless touch",
@@ -212,7 +212,7 @@ SCENARIOS = (
         failed=_detects_noise,
         others=("F3",),
     ),
-    Scenario(
+    FailureScenario(
         code="F5",
         title="the tactile bonus cancels",
         knob="weight of consistency, 0/1 accuracy",
@@ -222,7 +222,7 @@ SCENARIOS = (
         place=_turn("consistency"),
         failed=_bonus_cancels,
     ),
-    Scenario(
+    FailureScenario(
         code="F6",
         title="tactile credit by chance",
         knob="share of right pictures, useless touch",
@@ -233,7 +233,7 @@ SCENARIOS = (
         place=_standing_still,
         failed=_credit_by_chance,
     ),
-    Scenario(
+    FailureScenario(
         code="F7",
         title="groups that teach nothing",
         knob="sharpness of the start (factor on logits)",
@@ -243,7 +243,7 @@ SCENARIOS = (
         place=_change("sharp", ANCHORED),
         failed=_idles,
     ),
-    Scenario(
+    FailureScenario(
         code="F8",
         title="the KL estimate does not hold",
         knob="weight of the reference KL β",
@@ -253,7 +253,7 @@ SCENARIOS = (
         place=_turn("beta"),
         failed=_penalty_does_not_hold,
     ),
-    Scenario(
+    FailureScenario(
         code="F9",
         title="entropy blows up",
         knob="weight of the entropy bonus",
@@ -263,7 +263,7 @@ SCENARIOS = (
         place=_turn("entropy_weight"),
         failed=_entropy_blows_up,
     ),
-    Scenario(
+    FailureScenario(
         code="F9",
         title="long steps end in one answer",
         knob="learning rate",
@@ -274,7 +274,7 @@ SCENARIOS = (
         failed=_unlearns,
         others=("F7",),
     ),
-    Scenario(
+    FailureScenario(
         code="F10",
         title="a stream that never arrives",
         knob="share of the second sensor's touch that arrives",
@@ -284,7 +284,7 @@ SCENARIOS = (
         place=_change("kept"),
         failed=_stream_forgotten,
     ),
-    Scenario(
+    FailureScenario(
         code="F12",
         title="time ids stand still",
         knob="frames a second",
@@ -294,7 +294,7 @@ SCENARIOS = (
         place=_time_ids,
         failed=_shuffle_is_vacuous,
     ),
-    Scenario(
+    FailureScenario(
         code="F13",
         title="the parser is gamed",
         knob="credit for naming the answer among others",

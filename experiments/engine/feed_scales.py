@@ -16,7 +16,7 @@ from touchr1_jax.types import TouchBatch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Scale:
+class FeedScale:
     """A study, its devices, and how many contacts its feed is tried on."""
 
     study: StudyConfig
@@ -41,7 +41,7 @@ def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
     return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes(touch)))
 
 
-def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
+def answers(assembly: Assembly, data: Dataset, scale: FeedScale) -> AnswerFeed:
     """Batches of SFT, those rows that the first device reads; the evidence is equal for all levels."""
     config = scale.study.sft
     shape = (len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels))
@@ -57,7 +57,7 @@ def answers(assembly: Assembly, data: Dataset, scale: Scale) -> AnswerFeed:
     )
 
 
-def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: Scale) -> QuestionFeed:
+def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: FeedScale) -> QuestionFeed:
     """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
     params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
     one = jax.eval_shape(encode_program(assembly.fns, False), params, touch)

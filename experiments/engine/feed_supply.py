@@ -13,14 +13,14 @@ from experiments.core.loops import run_loop
 from touchr1_jax.training.loop import Batches, LoopConfig
 
 
-class Made(NamedTuple):
+class BatchCost(NamedTuple):
     """What one batch takes: seconds of one core, and bytes that go to the device."""
 
     cpu_s: float
     size_bytes: int
 
 
-class StandIn:
+class SimulatedDevice:
     """A device that computes nothing for as long as a step would take, and knows how long it had nothing to do.
 
     Like a real one it takes the next step while it is at one, and whoever reads a step's metrics waits for its end.
@@ -41,7 +41,7 @@ class StandIn:
             self.idle_s += max(0.0, now - self._free_at)
             self.steps += 1
         self._free_at = max(now, self._free_at) + self._step_s
-        return state, {"idle_s": _Ending(self._free_at, self.idle_s)}
+        return state, {"idle_s": _PendingMetric(self._free_at, self.idle_s)}
 
     @property
     def idle_share(self) -> float:
@@ -49,7 +49,7 @@ class StandIn:
         return self.idle_s / (self.idle_s + self.steps * self._step_s)
 
 
-class _Ending:
+class _PendingMetric:
     """A number that is there when a step ends, with what is asked of arrays on a device."""
 
     def __init__(self, at: float, value: float) -> None:
@@ -63,7 +63,7 @@ class _Ending:
         return np.array(self._value, dtype)
 
 
-def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterable[object]) -> Made:
+def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterable[object]) -> BatchCost:
     """Mean over some batches, of the processor's clock: all threads together, and nobody else's load.
 
     Args:
@@ -78,7 +78,7 @@ def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterab
         began = time.process_time()
         batch = next(batches)
         spent.append(time.process_time() - began)
-    return Made(float(np.mean(spent)), sum(np.asarray(x).nbytes for x in jax.tree.leaves(batch)))
+    return BatchCost(float(np.mean(spent)), sum(np.asarray(x).nbytes for x in jax.tree.leaves(batch)))
 
 
 def idle_share(batches: Batches, step_s: float, steps: int, context: Context, stage: str) -> float:
@@ -91,7 +91,7 @@ def idle_share(batches: Batches, step_s: float, steps: int, context: Context, st
       context: the run.
       stage: its name.
     """
-    device = StandIn(step_s)
+    device = SimulatedDevice(step_s)
     run_loop(
         device.step, {"nothing": jnp.zeros(())}, batches, LoopConfig(steps=steps, save_every=steps), context, stage
     )

@@ -3,7 +3,7 @@
 import dataclasses
 
 from experiments.engine.attention import Flash
-from experiments.engine.size import Size
+from experiments.engine.size import JobSize
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 
@@ -39,7 +39,7 @@ class GpuConfig:
     tactile_px: int = 112
     vision: QwenVisionConfig = QwenVisionConfig(out_size=3584)
     vision_px: int = 448
-    size: Size = Size(
+    size: JobSize = JobSize(
         prompts=8,
         group=8,
         length=256,

@@ -13,7 +13,7 @@ class NoAccelerator(OSError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sheet:
+class DataSheet:
     """Of a data sheet: dense bfloat16 operations a second, bytes of memory read a second."""
 
     flops: float
@@ -21,16 +21,16 @@ class Sheet:
 
 
 SHEETS = {
-    "H200": Sheet(flops=989e12, read_bytes=4.8e12),
-    "H100 PCIe": Sheet(flops=756e12, read_bytes=2.0e12),
-    "H100": Sheet(flops=989e12, read_bytes=3.35e12),
-    "A100": Sheet(flops=312e12, read_bytes=2.0e12),
-    "L40S": Sheet(flops=362e12, read_bytes=0.864e12),
+    "H200": DataSheet(flops=989e12, read_bytes=4.8e12),
+    "H100 PCIe": DataSheet(flops=756e12, read_bytes=2.0e12),
+    "H100": DataSheet(flops=989e12, read_bytes=3.35e12),
+    "A100": DataSheet(flops=312e12, read_bytes=2.0e12),
+    "L40S": DataSheet(flops=362e12, read_bytes=0.864e12),
 }
 """By what stands in the name that the driver gives, the first that fits; NVIDIA's data sheets."""
 
 
-def sheet_of(kind: str) -> Sheet | None:
+def sheet_of(kind: str) -> DataSheet | None:
     """The data sheet of a device by its name; `None` where it is not known."""
     return next((sheet for name, sheet in SHEETS.items() if name in kind), None)
 

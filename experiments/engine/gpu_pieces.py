@@ -14,7 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from experiments.engine.attention import Attention, Heads, engine_attention, flash_attention, pairs, with_gradient
+from experiments.engine.attention import (
+    Attention,
+    AttentionInputs,
+    engine_attention,
+    flash_attention,
+    pairs,
+    with_gradient,
+)
 from experiments.engine.gpu_config import GpuConfig
 from experiments.engine.job import Job, decoder_config
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, counted_peak, grpo_bytes, reserved_bytes
@@ -31,7 +38,7 @@ BACKWARD = 2
 """Operations of a backward pass over those of its forward pass."""
 
 
-class Piece(NamedTuple):
+class Workload(NamedTuple):
     """Something to time: a call whose result can be waited for, its operations, bytes it must read, what it makes."""
 
     call: Callable[[], Any]
@@ -41,18 +48,18 @@ class Piece(NamedTuple):
     unit: str
 
 
-def product(config: GpuConfig) -> Piece:
+def product(config: GpuConfig) -> Workload:
     """A product of two square matrices."""
     a = jax.random.normal(jax.random.key(0), (config.side, config.side), jnp.bfloat16)
     multiply = jax.jit(jnp.matmul)
-    return Piece(lambda: multiply(a, a), 2 * config.side**3, None, 1, "products")
+    return Workload(lambda: multiply(a, a), 2 * config.side**3, None, 1, "products")
 
 
-def attention(config: GpuConfig, heads: Heads, way: Attention, *, gradient: bool) -> Piece:
+def attention(config: GpuConfig, heads: AttentionInputs, way: Attention, *, gradient: bool) -> Workload:
     """Attention of some prompts."""
     compute = jax.jit(with_gradient(way) if gradient else lambda h: way(h.q, h.k, h.v))
     flops = 4 * config.head_dim * pairs(config.prompts, config.tokens, config.heads) * (1 + BACKWARD * gradient)
-    return Piece(lambda: compute(heads), flops, None, config.prompts * config.tokens, "tokens")
+    return Workload(lambda: compute(heads), flops, None, config.prompts * config.tokens, "tokens")
 
 
 def ways(config: GpuConfig) -> dict[str, Attention]:
@@ -60,7 +67,7 @@ def ways(config: GpuConfig) -> dict[str, Attention]:
     return {"the engine's": engine_attention, f"flash ({config.flash})": flash_attention(config.flash)}
 
 
-def tactile_encoder(config: GpuConfig) -> Piece:
+def tactile_encoder(config: GpuConfig) -> Workload:
     """The encoder that this codebase trains, on streams of some contacts, forward and backward; it has no bfloat16."""
     c = dataclasses.replace(config.tactile, sensors=config.streams)
     streams = config.contacts * config.streams
@@ -75,7 +82,7 @@ def tactile_encoder(config: GpuConfig) -> Piece:
     return _encoder(TactileViT(c), streams * config.frames, *inputs, kind=jnp.float32)
 
 
-def vision_tower(config: GpuConfig) -> Piece:
+def vision_tower(config: GpuConfig) -> Workload:
     """Qwen2.5-VL's tower on the streams of a contact, whose attention is `jax.nn`'s, forward and backward."""
     v = config.vision
     side = config.vision_px // v.patch_px
@@ -84,7 +91,7 @@ def vision_tower(config: GpuConfig) -> Piece:
     return _encoder(QwenVision(v), config.streams * config.frames, patches, static=(grids,), kind=jnp.bfloat16)
 
 
-def _encoder(module: Any, frames: int, *inputs: Any, static: tuple[Any, ...] = (), kind: DTypeLike) -> Piece:
+def _encoder(module: Any, frames: int, *inputs: Any, static: tuple[Any, ...] = (), kind: DTypeLike) -> Workload:
     shapes = jax.eval_shape(lambda key: module.init(key, *inputs, *static), jax.random.key(0))["params"]
     params = drawn(shapes, kind)
 
@@ -94,7 +101,7 @@ def _encoder(module: Any, frames: int, *inputs: Any, static: tuple[Any, ...] = (
 
     step = jax.jit(jax.value_and_grad(squared))
     work: Any = step.lower(params, *inputs).cost_analysis()
-    return Piece(lambda: step(params, *inputs), float(work["flops"]), None, frames, "frames")
+    return Workload(lambda: step(params, *inputs), float(work["flops"]), None, frames, "frames")
 
 
 def drawn(shapes: Any, kind: DTypeLike) -> Any:
@@ -109,7 +116,7 @@ def drawn(shapes: Any, kind: DTypeLike) -> Any:
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-class Learning:
+class PolicyWorkloads:
     """The policy that decodes and learns, made once for both."""
 
     def __init__(self, config: GpuConfig) -> None:
@@ -118,7 +125,7 @@ class Learning:
         mesh = MeshConfig()
         self._shape = GRPOShape(decoder=decoder, grpo=step_config(config), mesh=mesh, prompt_tokens=config.prefix)
 
-    def decoding(self) -> Piece:
+    def decoding(self) -> Workload:
         """Completions of encoded prompts, token by token."""
         size = self._config.size
         fns = dataclasses.replace(self._job.fns, cache_dtype=jnp.dtype(jnp.bfloat16))
@@ -128,13 +135,13 @@ class Learning:
         decode = jax.jit(lambda p, prompts, key: sample_prompts(fns, p, prompts, key, draw))
         work, key = grpo_work(self._shape)["sampling"], jax.random.key(3)
         made = size.prompts * size.group * size.length
-        return Piece(lambda: decode(params, prompts, key), work.flops, work.read_bytes, made, "tokens")
+        return Workload(lambda: decode(params, prompts, key), work.flops, work.read_bytes, made, "tokens")
 
-    def step(self) -> Piece:
+    def step(self) -> Workload:
         """Sampling, scoring, update, with the reference and the counterfactual pass."""
         size = self._config.size
         made = size.prompts * size.group * size.length
-        return Piece(self._job.step, model_flops(self._shape), None, made, "tokens")
+        return Workload(self._job.step, model_flops(self._shape), None, made, "tokens")
 
     def memory(self) -> tuple[Compiled, int]:
         """Bytes that the compiler reserves for a step, and those counted by hand."""

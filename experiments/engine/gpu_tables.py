@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from experiments.core.results import Cell, Column, Table
-from experiments.engine.gpu_device import Sheet
+from experiments.engine.gpu_device import DataSheet
 
 
-class Timed(NamedTuple):
+class TimedWorkload(NamedTuple):
     """A piece that was timed: seconds of every round, its work, what it makes."""
 
     seconds: tuple[float, ...]
@@ -26,14 +26,14 @@ class Timed(NamedTuple):
         """Share of a device's operations."""
         return self.flops / self.median_s / peak_flops
 
-    def read_share(self, sheet: Sheet | None) -> float | None:
+    def read_share(self, sheet: DataSheet | None) -> float | None:
         """Share of what the memory's data sheet promises, where both are known."""
         if sheet is None or self.read_bytes is None:
             return None
         return self.read_bytes / self.median_s / sheet.read_bytes
 
 
-def time_table(timed: Mapping[str, Timed], sheet: Sheet | None, peak_flops: float) -> Table:
+def time_table(timed: Mapping[str, TimedWorkload], sheet: DataSheet | None, peak_flops: float) -> Table:
     """Every piece against the peak."""
     rows: list[tuple[Cell, ...]] = []
     for name, t in timed.items():

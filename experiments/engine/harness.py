@@ -16,7 +16,7 @@ import random
 import resource
 from collections.abc import Mapping, Sequence
 
-from experiments.engine.size import BETA, LEARNING_RATE, Size
+from experiments.engine.size import BETA, LEARNING_RATE, JobSize
 
 ANSWER = "measured: "
 """Opens the line that the harness prints; whatever else the peer prints is left aside."""
@@ -35,7 +35,7 @@ class PeerJob:
     warmup: int = 1
     beta: float = BETA
     learning_rate: float = LEARNING_RATE
-    size: Size = Size()
+    size: JobSize = JobSize()
 
     @property
     def iterations(self) -> int:
@@ -73,7 +73,7 @@ class PeerJob:
     def from_json(text: str) -> "PeerJob":
         """The job of a command line."""
         fields = json.loads(text)
-        return PeerJob(**fields | {"size": Size(**fields["size"])})
+        return PeerJob(**fields | {"size": JobSize(**fields["size"])})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -26,7 +26,7 @@ def main(job: PeerJob) -> str:
     torch.manual_seed(0)
     starts: list[float] = []
 
-    class Clock(transformers.TrainerCallback):
+    class StepTimer(transformers.TrainerCallback):
         """An iteration runs from one step's begin to the next one's, data included."""
 
         def on_step_begin(self, *args: Any, **kwargs: Any) -> None:
@@ -44,7 +44,7 @@ def main(job: PeerJob) -> str:
             args=trl.GRPOConfig(**settings(job, folder)),
             train_dataset=datasets.Dataset.from_list(rows),
             processing_class=transformers.AutoTokenizer.from_pretrained(folder),
-            callbacks=[Clock()],
+            callbacks=[StepTimer()],
         )
         trainer.train()
     versions = {m.__name__: m.__version__ for m in (trl, torch, transformers)}

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.engine.size import BETA, LEARNING_RATE, Size
+from experiments.engine.size import BETA, LEARNING_RATE, JobSize
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
@@ -47,7 +47,7 @@ class Job:
 
     def __init__(
         self,
-        size: Size,
+        size: JobSize,
         prefix: int,
         config: GRPOConfig,
         *,
@@ -92,7 +92,7 @@ class Job:
 
 @functools.cache
 def engine(
-    size: Size, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
+    size: JobSize, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
 ) -> tuple[PolicyFns, optax.GradientTransformation, Any]:
     """Policy, optimizer and compiled step, made once for all seeds."""
     fns = make_fns(size, prefix, end_share)
@@ -101,7 +101,7 @@ def engine(
     return fns, optimizer, make_grpo_step(fns, score, optimizer, config)
 
 
-def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
+def config_of(size: JobSize, micro_prompts: int = 1) -> GRPOConfig:
     """The step that the job asks for: plain GRPO with a reference, nothing else."""
     return GRPOConfig(
         prompts=size.prompts,
@@ -113,7 +113,7 @@ def config_of(size: Size, micro_prompts: int = 1) -> GRPOConfig:
     )
 
 
-def decoder_config(size: Size) -> DecoderConfig:
+def decoder_config(size: JobSize) -> DecoderConfig:
     """The decoder of a size; three eighths of the rotary frequencies each for row and column, the rest for time."""
     names = {f.name for f in dataclasses.fields(DecoderConfig)}
     half = size.head_dim // 2
@@ -122,7 +122,7 @@ def decoder_config(size: Size) -> DecoderConfig:
     return DecoderConfig(**shape, mrope_section=sections, rope_theta=1e6)
 
 
-def make_fns(size: Size, prefix: int, end_share: float = 0.0) -> PolicyFns:
+def make_fns(size: JobSize, prefix: int, end_share: float = 0.0) -> PolicyFns:
     """A policy of the given decoder whose prompts have `prefix` tokens; the highest ids end a completion."""
     policy = Policy(
         PolicyConfig(
@@ -138,7 +138,7 @@ def make_fns(size: Size, prefix: int, end_share: float = 0.0) -> PolicyFns:
     return PolicyFns(module=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
 
 
-def make_batch(size: Size, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
+def make_batch(size: JobSize, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
     """Random prompts."""
     rng = np.random.default_rng(seed)
     normal = lambda *shape: jnp.asarray(rng.normal(size=shape), jnp.float32)

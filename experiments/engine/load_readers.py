@@ -21,7 +21,7 @@ Reader = Callable[[Path, QwenConfig, Tell], list[jax.Array]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Reading:
+class LoadMeasurement:
     """What one reading took: seconds, bytes of parameters, largest resident size, that of the process before it."""
 
     seconds: float
@@ -49,7 +49,7 @@ def whole_first(directory: Path, config: QwenConfig, tell: Tell) -> list[jax.Arr
 READERS: dict[str, Reader] = {"streamed": streamed, "whole first": whole_first}
 
 
-def measure(reader: str, directory: Path, config: QwenConfig, tell: Tell) -> Reading:
+def measure(reader: str, directory: Path, config: QwenConfig, tell: Tell) -> LoadMeasurement:
     """Read once in a fresh process, whose largest size is then that of the reading.
 
     Args:
@@ -70,9 +70,9 @@ def measure(reader: str, directory: Path, config: QwenConfig, tell: Tell) -> Rea
         ) from None
 
 
-def _read(reader: Reader, directory: Path, config: QwenConfig, tell: Tell) -> Reading:
+def _read(reader: Reader, directory: Path, config: QwenConfig, tell: Tell) -> LoadMeasurement:
     jax.block_until_ready(jnp.zeros(1))  # the runtime's own memory
     before, began = peak_memory(), time.perf_counter()
     leaves = jax.block_until_ready(reader(directory, config, tell))
     seconds = time.perf_counter() - began
-    return Reading(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)
+    return LoadMeasurement(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)

@@ -24,14 +24,14 @@ from experiments.core.progress import in_megabytes
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.engine.load_checkpoints import random_checkpoint
-from experiments.engine.load_readers import Reading, measure
+from experiments.engine.load_readers import LoadMeasurement, measure
 from experiments.engine.load_shapes import SHAPES
 from touchr1_jax.models.qwen.model import abstract_params
 
 BOUND = 1.2
 OURS, PLAIN = "streamed", "whole first"
 
-Measured = Mapping[str, Mapping[str, Reading]]
+Measured = Mapping[str, Mapping[str, LoadMeasurement]]
 """Size → reader → reading."""
 
 
@@ -87,7 +87,7 @@ def run(config: LoadWeightsConfig, context: Context) -> Results:
     )
 
 
-def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[str, Reading]:
+def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[str, LoadMeasurement]:
     """Write one checkpoint, read it by every reader, and remove it."""
     directory = Path(tempfile.mkdtemp(prefix=f"weights-{size}-", dir=config.scratch))
     try:

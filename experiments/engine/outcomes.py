@@ -5,15 +5,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.engine.failures import Scenario
-from experiments.engine.stability_runs import First
+from experiments.engine.failures import FailureScenario
+from experiments.engine.stability_runs import FirstAlarm
 
-Raised = Mapping[str, First]
+Raised = Mapping[str, FirstAlarm]
 """Codes of the alarms that a run raised, each with its first."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Side:
+class VariantOutcome:
     """One variant in one scenario: which seeds failed, bool [value, seed], and what each raised, alike."""
 
     failed: np.ndarray
@@ -29,13 +29,13 @@ class Side:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Outcome:
+class ScenarioOutcome:
     """Both sides of a scenario at the values that were driven."""
 
-    scenario: Scenario
+    scenario: FailureScenario
     values: tuple[float, ...]
-    failing: Side
-    cure: Side
+    failing: VariantOutcome
+    cure: VariantOutcome
 
     @property
     def name(self) -> str:
@@ -79,7 +79,7 @@ class Outcome:
         codes = self.scenario.alarms
         return np.concatenate([s.fired(codes)[s.failed == failed] for s in (self.failing, self.cure)])
 
-    def firsts(self) -> list[First]:
+    def firsts(self) -> list[FirstAlarm]:
         """The scenario's first alarm of every failed run that raised one."""
         found = []
         for side in (self.failing, self.cure):

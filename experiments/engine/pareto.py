@@ -30,7 +30,7 @@ GRPO_DEFAULT = "paper (default)"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Judged:
+class JudgedDefault:
     """A default, and where it was measured.
 
     Attributes:
@@ -50,50 +50,50 @@ class Judged:
 
 TIME = Axis(column="time", better="lower")
 
-DEFAULTS: tuple[Judged, ...] = (
-    Judged(
+DEFAULTS: tuple[JudgedDefault, ...] = (
+    JudgedDefault(
         what="contact solver",
         experiment="pareto_contact",
         table="Tiers at",
         default="nested 1e-3",
         axes=(TIME, Axis(column="slope median", better="lower")),
     ),
-    Judged(
+    JudgedDefault(
         what="friction",
         experiment="pareto_tangential",
         table="",
         default=FRICTION,
         axes=(TIME, Axis(column="median error", better="lower")),
     ),
-    Judged(
+    JudgedDefault(
         what="markers",
         experiment="pareto_fields",
         table="Markers under known motion",
         default=marker_accuracy.MAIN,
         axes=(Axis(column="time", better="lower"), Axis(column="95 %", better="lower")),
     ),
-    Judged(
+    JudgedDefault(
         what="dense field",
         experiment="pareto_fields",
         table="Dense displacement",
         default=dense_accuracy.MAIN,
         axes=(TIME, Axis(column="95 %", better="lower")),
     ),
-    Judged(
+    JudgedDefault(
         what="storage",
         experiment="pareto_storage",
         table="Codecs:",
         default=OWN,
         axes=(Axis(column="of raw", better="lower"), Axis(column="read", better="higher")),
     ),
-    Judged(
+    JudgedDefault(
         what="encoder",
         experiment="pareto_encoder",
         table="Variants",
         default=STUDIED,
         axes=(Axis(column="a prompt", better="lower"), Axis(column="mean", better="higher")),
     ),
-    Judged(
+    JudgedDefault(
         what="GRPO",
         experiment="pareto_grpo",
         table="Cost and gain",
@@ -128,10 +128,10 @@ class GatherConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Judgement:
+class DefaultJudgement:
     """A default on one table: the points that were measured and those that beat it, `None` where it is not there."""
 
-    judged: Judged
+    judged: JudgedDefault
     title: str
     run: Past
     points: tuple[Point, ...]
@@ -164,7 +164,7 @@ def newest(home: Path) -> Past | None:
     return min(finished, key=lambda past: past.description["scale"] == "smoke", default=None)
 
 
-def judge(judged: Judged, past: Past) -> list[Judgement]:
+def judge(judged: JudgedDefault, past: Past) -> list[DefaultJudgement]:
     """A default on every table of a run that begins as it says and has its row."""
     tables = [] if past.results is None else past.results["tables"]
     judgements = []
@@ -175,12 +175,12 @@ def judge(judged: Judged, past: Past) -> list[Judgement]:
             points = points_of(table, judged.axes)
             beaten_by = dominators(default, points)
             judgements.append(
-                Judgement(judged=judged, title=table["title"], run=past, points=points, beaten_by=beaten_by)
+                DefaultJudgement(judged=judged, title=table["title"], run=past, points=points, beaten_by=beaten_by)
             )
     return judgements
 
 
-def verdict(judgements: Sequence[Judgement], missing: Sequence[str]) -> tuple[str, ...]:
+def verdict(judgements: Sequence[DefaultJudgement], missing: Sequence[str]) -> tuple[str, ...]:
     """Which defaults are dominated, by what, and what has not run."""
     said = []
     for j in judgements:
@@ -194,7 +194,7 @@ def verdict(judgements: Sequence[Judgement], missing: Sequence[str]) -> tuple[st
     return tuple(said)
 
 
-def default_table(judgements: Sequence[Judgement]) -> Table:
+def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
     """Every default on every table that judges it."""
     rows: list[tuple[Cell, ...]] = [
         (

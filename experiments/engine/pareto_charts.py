@@ -20,7 +20,7 @@ COLUMNS = 3  # panels in a row
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Course:
+class LearningCurves:
     """One algorithm and group size: mean reward of every seed's steps, [seeds, steps], and the seconds of a step."""
 
     rewards: np.ndarray
@@ -37,7 +37,7 @@ class Course:
         return np.where(passed.any(1), passed.argmax(1) + 1.0, np.inf)
 
 
-def cost_and_gain(courses: Mapping[Key, Course], target: float, default: Key) -> bytes:
+def cost_and_gain(courses: Mapping[Key, LearningCurves], target: float, default: Key) -> bytes:
     """Score over the time of a step, and time to the target by algorithm.
 
     Args:
@@ -73,7 +73,7 @@ def cost_and_gain(courses: Mapping[Key, Course], target: float, default: Key) ->
         return svg(figure)
 
 
-def reward_over_time(courses: Mapping[Key, Course], target: float) -> bytes:
+def reward_over_time(courses: Mapping[Key, LearningCurves], target: float) -> bytes:
     """Mean reward over seconds, a panel for each algorithm and a line for each group size.
 
     Args:
@@ -104,7 +104,7 @@ def reward_over_time(courses: Mapping[Key, Course], target: float) -> bytes:
         return svg(figure)
 
 
-def _keys(courses: Mapping[Key, Course]) -> tuple[dict[str, str], dict[int, str]]:
+def _keys(courses: Mapping[Key, LearningCurves]) -> tuple[dict[str, str], dict[int, str]]:
     """Colour of each algorithm, marker of each group size."""
     colour = dict(zip(dict.fromkeys(name for name, _ in courses), itertools.cycle(PALETTE), strict=False))
     return colour, dict(zip(dict.fromkeys(group for _, group in courses), itertools.cycle(MARKERS), strict=False))

@@ -29,8 +29,8 @@ from experiments.core.results import Cell, Column, Picture, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job
-from experiments.engine.pareto_charts import Course, Key, cost_and_gain, reward_over_time
-from experiments.engine.size import Size
+from experiments.engine.pareto_charts import Key, LearningCurves, cost_and_gain, reward_over_time
+from experiments.engine.size import JobSize
 from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable
 
 ALGORITHMS: Mapping[str, AnyAlgorithm] = {
@@ -50,7 +50,7 @@ FEW = 4  # names that a sentence can hold
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ParetoConfig:
+class ParetoGrpoConfig:
     """Rollouts of a step, how they are grouped, how long a run is, and what it should come to."""
 
     groups: tuple[int, ...] = (4, 8, 16)
@@ -63,7 +63,7 @@ class ParetoConfig:
     """Rounds in which the step of every program is timed."""
     learning_rate: float = 1e-3
     seeds: int = 3
-    size: Size = Size(length=16, num_layers=2)
+    size: JobSize = JobSize(length=16, num_layers=2)
 
     def __post_init__(self) -> None:
         uneven = [g for g in self.groups if self.rollouts % g]
@@ -71,7 +71,7 @@ class ParetoConfig:
             raise ValueError(f"groups holds {uneven}: must divide rollouts = {self.rollouts}; choose divisors of it")
 
 
-def run(config: ParetoConfig, context: Context) -> Results:
+def run(config: ParetoGrpoConfig, context: Context) -> Results:
     """Every algorithm at every group size."""
     rewards, last = {}, {}
     keys = tuple(itertools.product(ALGORITHMS, config.groups))
@@ -83,7 +83,7 @@ def run(config: ParetoConfig, context: Context) -> Results:
     calls = {f"{name} {group}": job.step for (name, group), job in last.items()}
     seconds = interleaved(calls, context.rounds("timing steps", config.timed))
     courses = {
-        (name, group): Course(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
+        (name, group): LearningCurves(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
         for name, group in rewards
     }
     return Results(
@@ -99,7 +99,7 @@ def run(config: ParetoConfig, context: Context) -> Results:
     )
 
 
-def learn(config: ParetoConfig, algorithm: AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
+def learn(config: ParetoGrpoConfig, algorithm: AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
     """Mean reward of every seed's steps, [seeds, steps], and the last seed's job; `advance` is called after a seed."""
     prompts = config.rollouts // group
     size = dataclasses.replace(config.size, prompts=prompts, group=group)
@@ -119,7 +119,7 @@ def learn(config: ParetoConfig, algorithm: AnyAlgorithm, group: int, advance: Ad
     return np.array(rewards), job
 
 
-def pictures(config: ParetoConfig, courses: Mapping[Key, Course]) -> tuple[Picture, ...]:
+def pictures(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> tuple[Picture, ...]:
     """Cost against gain, and the courses."""
     return (
         Picture(
@@ -139,7 +139,7 @@ def pictures(config: ParetoConfig, courses: Mapping[Key, Course]) -> tuple[Pictu
     )
 
 
-def table(config: ParetoConfig, courses: Mapping[Key, Course]) -> Table:
+def table(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> Table:
     """Seconds a step, score, steps and seconds to the target."""
     rows: list[tuple[Cell, ...]] = []
     for (name, group), c in courses.items():
@@ -164,7 +164,7 @@ def table(config: ParetoConfig, courses: Mapping[Key, Course]) -> Table:
     )
 
 
-def verdict(config: ParetoConfig, courses: Mapping[Key, Course]) -> tuple[str, ...]:
+def verdict(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> tuple[str, ...]:
     """The fastest of those that every seed of which arrived, the default beside it, and who did not arrive."""
     steps = {key: float(np.median(c.reached(config.target))) for key, c in courses.items()}
     whole = [key for key, c in courses.items() if np.isfinite(c.reached(config.target)).all()]
@@ -184,15 +184,15 @@ def verdict(config: ParetoConfig, courses: Mapping[Key, Course]) -> tuple[str, .
     return tuple(said) or ("Every seed passed the target at once.",)
 
 
-DEFAULT = ParetoConfig()
-SMOKE = ParetoConfig(
+DEFAULT = ParetoGrpoConfig()
+SMOKE = ParetoGrpoConfig(
     groups=(2,),
     rollouts=4,
     prefix=16,
     steps=2,
     timed=1,
     seeds=1,
-    size=Size(length=4, vocab_size=32, hidden_size=16, num_layers=1, num_heads=1, num_kv_heads=1, head_dim=16),
+    size=JobSize(length=4, vocab_size=32, hidden_size=16, num_layers=1, num_heads=1, num_kv_heads=1, head_dim=16),
 )
 
 EXPERIMENT = Experiment(name="pareto_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -57,14 +57,14 @@ TOOLKIT = "nvidia.cuda_nvcc"
 """Python package of NVIDIA's compiler."""
 
 
-class Outcome(NamedTuple):
+class Compilation(NamedTuple):
     """What the compiler reserves, and how long it took, seconds."""
 
     compiled: Compiled
     seconds: float
 
 
-def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Outcome:
+def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
     """Compile in a fresh process.
 
     Raises:
@@ -78,13 +78,13 @@ def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Outc
         return in_own_process(compile_here, training, setup, compiler)
 
 
-def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Outcome:
+def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
     """The same in this process, whose environment must be right."""
     began = time.perf_counter()
     score = score_of(training.prompt.streams)
     devices = jax.devices() if compiler == "cpu" else h200s(setup.mesh.devices)
     compiled = compile_grpo(training.step(setup), training.shape(setup), score, OPTIMIZER, devices)
-    return Outcome(compiled, time.perf_counter() - began)
+    return Compilation(compiled, time.perf_counter() - began)
 
 
 def h200s(count: int) -> list[jax.Device]:

@@ -9,7 +9,7 @@ LEARNING_RATE = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Size:
+class JobSize:
     """Prompts, rollouts of each, new tokens, and the decoder."""
 
     prompts: int = 8

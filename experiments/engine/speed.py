@@ -15,7 +15,7 @@ from experiments.core.context import Context
 from experiments.core.progress import Tell
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
-from experiments.engine.size import Size
+from experiments.engine.size import JobSize
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -44,7 +44,7 @@ Option = Literal[
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Alone:
+class ProcessTiming:
     """One job in a process of its own; `programs` counts those of the step, `first_s` is the first iteration."""
 
     seconds: tuple[float, ...]
@@ -55,7 +55,7 @@ class Alone:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Course:
+class LongRun:
     """Many steps of one job in a process of its own.
 
     Args:
@@ -71,7 +71,7 @@ class Course:
     programs: int
 
 
-def time_alone(size: Size, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> Alone:
+def time_alone(size: JobSize, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> ProcessTiming:
     """Seconds of each iteration after the first two, of the first, peak memory of this process, matrix products.
 
     Args:
@@ -90,7 +90,7 @@ def time_alone(size: Size, prefix: int, config: GRPOConfig, rounds: int, cache: 
     jax.block_until_ready(job.step())
     seconds = interleaved({"step": job.step}, range(rounds))["step"]
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB / GIB
-    return Alone(
+    return ProcessTiming(
         seconds=tuple(seconds.tolist()),
         first_s=first_s,
         peak_gb=peak_gb,
@@ -108,7 +108,7 @@ def matrix_gflops(rounds: int = 10) -> float:
 
 
 def options(
-    size: Size, prefix: int, micro_prompts: int, buckets: tuple[int, ...], names: Sequence[Option]
+    size: JobSize, prefix: int, micro_prompts: int, buckets: tuple[int, ...], names: Sequence[Option]
 ) -> dict[str, Callable[[], Job]]:
     """How to make the engine as it is, and with one thing changed; short answers are ones that end."""
     plain = config_of(size, micro_prompts)
@@ -130,7 +130,7 @@ def options(
     return {"this": lambda: Job(size, prefix, plain)} | {name: makers[name] for name in names if name in makers}
 
 
-def repeated(size: Size, prefix: int, micro_prompts: int) -> dict[str, Callable[[], Job]]:
+def repeated(size: JobSize, prefix: int, micro_prompts: int) -> dict[str, Callable[[], Job]]:
     """How to make the engine as it is, and one that encodes the prefix for every rollout."""
     plain = config_of(size, micro_prompts)
     return {
@@ -158,7 +158,7 @@ def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, c
     return {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
 
 
-def parser_seconds(size: Size, rounds: int = 20) -> float:
+def parser_seconds(size: JobSize, rounds: int = 20) -> float:
     """Median time to parse all completions of one iteration, random words of the touch language."""
     tokenizer = word_level(TOUCH_LANGUAGE, prompt_words())
     parse = jax.jit(jax.vmap(jax.vmap(compile_parser(TOUCH_LANGUAGE, tokenizer))))
@@ -168,7 +168,7 @@ def parser_seconds(size: Size, rounds: int = 20) -> float:
     return float(np.median(interleaved({"parse": lambda: parse(tokens)}, range(rounds))["parse"]))
 
 
-def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int, tell: Tell) -> Course:
+def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: Tell) -> LongRun:
     """Steps whose answers end early and late, so that every bucket is taken; nothing is learned, so that they go on to.
 
     Args:
@@ -191,7 +191,7 @@ def many_steps(size: Size, prefix: int, buckets: tuple[int, ...], steps: int, te
             resident.append(resident_mb())
             lengths.append(float(metrics["length"]))
             tell(t + 1, steps)
-    return Course(
+    return LongRun(
         seconds=seconds,
         resident_mb=np.array(resident),
         lengths=(min(lengths), max(lengths)),

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.core.charts import LOOK, MARKERS, PALETTE, svg
-from experiments.engine.speed import RESIDENT_EVERY, Course
+from experiments.engine.speed import RESIDENT_EVERY, LongRun
 
 Series = Mapping[str, Mapping[int, float]]
 """Engine → prefix → figure."""
@@ -44,7 +44,7 @@ def _lines(axes: Axes, series: Series, label: str) -> None:
     axes.yaxis.set_major_formatter("{x:g}")
 
 
-def over_steps(course: Course) -> bytes:
+def over_steps(course: LongRun) -> bytes:
     """Time of a step, median and 5th to 95th percentile of every hundred, and the memory held."""
     bins = course.seconds[: len(course.seconds) // RESIDENT_EVERY * RESIDENT_EVERY].reshape(-1, RESIDENT_EVERY)
     low, middle, high = 1e3 * np.percentile(bins, (5, 50, 95), axis=1)

@@ -26,12 +26,20 @@ from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
-from experiments.engine.attention import Heads, draw_heads, errors
+from experiments.engine.attention import AttentionInputs, draw_heads, errors
 from experiments.engine.gpu_config import GpuConfig
-from experiments.engine.gpu_device import Sheet, accelerator, sheet_of
-from experiments.engine.gpu_pieces import Learning, Piece, attention, product, tactile_encoder, vision_tower, ways
-from experiments.engine.gpu_tables import Timed, time_table
-from experiments.engine.size import Size
+from experiments.engine.gpu_device import DataSheet, accelerator, sheet_of
+from experiments.engine.gpu_pieces import (
+    PolicyWorkloads,
+    Workload,
+    attention,
+    product,
+    tactile_encoder,
+    vision_tower,
+    ways,
+)
+from experiments.engine.gpu_tables import TimedWorkload, time_table
+from experiments.engine.size import JobSize
 from touchr1_jax.distributed.memory import Compiled
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -56,7 +64,7 @@ def run(config: GpuConfig, context: Context) -> Results:
     off = errors(heads, ways(config), context)
     del heads
     with context.progress("making the policy", 2) as advance:
-        learning = Learning(config)
+        learning = PolicyWorkloads(config)
         advance()
         reserved, counted = learning.memory()
         advance()
@@ -83,9 +91,9 @@ def run(config: GpuConfig, context: Context) -> Results:
     )
 
 
-def without_policy(config: GpuConfig, heads: Heads) -> dict[str, Callable[[], Piece]]:
+def without_policy(config: GpuConfig, heads: AttentionInputs) -> dict[str, Callable[[], Workload]]:
     """How to make the product, attention and the encoders."""
-    pieces: dict[str, Callable[[], Piece]] = {PRODUCT: functools.partial(product, config)}
+    pieces: dict[str, Callable[[], Workload]] = {PRODUCT: functools.partial(product, config)}
     for name, way in ways(config).items():
         for gradient in (False, True):
             title = f"attention, {name}{', with gradient' if gradient else ''}"
@@ -96,20 +104,22 @@ def without_policy(config: GpuConfig, heads: Heads) -> dict[str, Callable[[], Pi
     }
 
 
-def measured(title: str, pieces: Mapping[str, Callable[[], Piece]], rounds: int, context: Context) -> dict[str, Timed]:
+def measured(
+    title: str, pieces: Mapping[str, Callable[[], Workload]], rounds: int, context: Context
+) -> dict[str, TimedWorkload]:
     """The times of some pieces."""
     shown = context.each(title, pieces.items(), still=True)
     return {name: measure(name, make, rounds, context) for name, make in shown}
 
 
-def measure(name: str, make: Callable[[], Piece], rounds: int, context: Context) -> Timed:
+def measure(name: str, make: Callable[[], Workload], rounds: int, context: Context) -> TimedWorkload:
     """Make a piece, run it twice, time it."""
     with context.timed(re.sub(r"\W+", "_", name)):
         piece = make()
         for _ in range(2):
             jax.block_until_ready(piece.call())
         seconds = interleaved({name: piece.call}, context.rounds(f"timing {name}", rounds))[name]
-    timed = Timed(tuple(seconds.tolist()), piece.flops, piece.read_bytes, piece.made, piece.unit)
+    timed = TimedWorkload(tuple(seconds.tolist()), piece.flops, piece.read_bytes, piece.made, piece.unit)
     context.say(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / timed.median_s / 1e12:.3g} TFLOP/s")
     return timed
 
@@ -133,7 +143,9 @@ def memory_table(reserved: Compiled, counted: int, device: jax.Device) -> Table:
     )
 
 
-def verdict(device: jax.Device, timed: Mapping[str, Timed], peak: float, sheet: Sheet | None) -> tuple[str, ...]:
+def verdict(
+    device: jax.Device, timed: Mapping[str, TimedWorkload], peak: float, sheet: DataSheet | None
+) -> tuple[str, ...]:
     """What the device is, what a step takes of it, what flash attention would gain."""
     step, decoding = timed[STEP], timed["decoding"]
     read = decoding.read_share(sheet)
@@ -170,7 +182,7 @@ SMOKE = GpuConfig(
         full_layers=(0,),
     ),
     vision_px=16,
-    size=Size(
+    size=JobSize(
         prompts=2, group=2, length=6, vocab_size=64, hidden_size=32, num_layers=1, head_dim=8, intermediate_size=64
     ),
     prefix=16,

@@ -33,11 +33,11 @@ from experiments.core.runner import Experiment
 from experiments.engine.harness import PeerJob, PeerTimes
 from experiments.engine.job import config_of
 from experiments.engine.peers import PeerFailed, installed_peers
-from experiments.engine.size import BETA, Size
+from experiments.engine.size import BETA, JobSize
 from experiments.engine.speed import (
-    Alone,
-    Course,
+    LongRun,
     Option,
+    ProcessTiming,
     many_steps,
     options,
     parser_seconds,
@@ -81,7 +81,7 @@ class SpeedConfig:
     """The large vocabulary; 0 leaves it out."""
     steps: int = 10_000
     """Steps over which time and memory must stay flat."""
-    steps_size: Size = Size(
+    steps_size: JobSize = JobSize(
         prompts=2,
         group=2,
         length=16,
@@ -99,7 +99,7 @@ class SpeedConfig:
     """An interpreter that has Tunix; by default this one, where it has."""
     peer_tokens: int = 512
     """Prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one."""
-    size: Size = Size()
+    size: JobSize = JobSize()
 
     def __post_init__(self) -> None:
         missing = sorted({*self.repeated_at} - {*self.prefixes})
@@ -153,7 +153,9 @@ def run(config: SpeedConfig, context: Context) -> Results:
     )
 
 
-def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[dict[int, Alone], dict[int, Alone]]:
+def every_prefix(
+    config: SpeedConfig, cache: Path, context: Context
+) -> tuple[dict[int, ProcessTiming], dict[int, ProcessTiming]]:
     """Each prefix in a process that compiles, and in one that reads what the first compiled."""
     first, alone = {}, {}
     step = config_of(config.size, config.micro_prompts)
@@ -165,7 +167,7 @@ def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[di
     return first, alone
 
 
-def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, Alone]:
+def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, ProcessTiming]:
     """A large vocabulary, all logits at once and in blocks, each in a process of its own."""
     if not config.words:
         return {}
@@ -213,7 +215,7 @@ def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[s
 
 
 def pictures(
-    size: Size, alone: Mapping[int, Alone], first: Mapping[int, Alone], peers: Peers, course: Course
+    size: JobSize, alone: Mapping[int, ProcessTiming], first: Mapping[int, ProcessTiming], peers: Peers, course: LongRun
 ) -> tuple[Picture, ...]:
     """Engines over prefixes, and one engine over many steps."""
     seconds = {"this": {prefix: median(a.seconds) for prefix, a in alone.items()}}
@@ -245,7 +247,9 @@ def said(ratios: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
 
 
-def verdict(alone: Mapping[int, Alone], twice: Mapping[int, Mapping[str, float]], peers: Peers) -> tuple[str, ...]:
+def verdict(
+    alone: Mapping[int, ProcessTiming], twice: Mapping[int, Mapping[str, float]], peers: Peers
+) -> tuple[str, ...]:
     """What an iteration takes, what once-encoded prefixes gain, and how the others fare."""
     times = ", ".join(f"{median(a.seconds):.3g} s at {prefix}" for prefix, a in alone.items())
     gains = ", ".join(f"{ratios['repeated prefix']:.1f} × at {prefix}" for prefix, ratios in twice.items())
@@ -266,7 +270,7 @@ SMOKE = SpeedConfig(
     buckets=(4,),
     words=0,
     steps=300,
-    size=Size(
+    size=JobSize(
         prompts=2, group=2, length=8, vocab_size=64, hidden_size=32, num_layers=1, head_dim=8, intermediate_size=64
     ),
 )

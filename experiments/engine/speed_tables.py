@@ -6,8 +6,8 @@ import numpy as np
 
 from experiments.core.results import Cell, Column, Requirement, Table
 from experiments.engine.harness import PeerTimes
-from experiments.engine.size import Size
-from experiments.engine.speed import Alone, Course
+from experiments.engine.size import JobSize
+from experiments.engine.speed import LongRun, ProcessTiming
 
 LIMITS_S = {64: 0.55, 512: 1.3}
 """Seconds an iteration may take at a prefix, on two cores of about 240 GFLOP/s."""
@@ -24,11 +24,11 @@ Peers = Mapping[tuple[str, int], PeerTimes]
 
 
 def requirements(
-    alone: Mapping[int, Alone],
-    first: Mapping[int, Alone],
-    lean: Mapping[int, Alone],
+    alone: Mapping[int, ProcessTiming],
+    first: Mapping[int, ProcessTiming],
+    lean: Mapping[int, ProcessTiming],
     peers: Peers,
-    course: Course,
+    course: LongRun,
     parser_s: float,
 ) -> tuple[Requirement, ...]:
     """The bounds on time, memory, compilations and drift.
@@ -60,7 +60,7 @@ def requirements(
     )
 
 
-def _times(alone: Mapping[int, Alone], how: str = "") -> list[Requirement]:
+def _times(alone: Mapping[int, ProcessTiming], how: str = "") -> list[Requirement]:
     return [
         Requirement(
             name=f"iteration at prefix {prefix}{how}",
@@ -75,7 +75,7 @@ def _times(alone: Mapping[int, Alone], how: str = "") -> list[Requirement]:
     ]
 
 
-def _ratios(alone: Mapping[int, Alone], peers: Peers) -> list[Requirement]:
+def _ratios(alone: Mapping[int, ProcessTiming], peers: Peers) -> list[Requirement]:
     return [
         Requirement(
             name=f"{name}'s time over this at prefix {prefix}",
@@ -89,7 +89,7 @@ def _ratios(alone: Mapping[int, Alone], peers: Peers) -> list[Requirement]:
     ]
 
 
-def _memory(alone: Mapping[int, Alone], how: str) -> list[Requirement]:
+def _memory(alone: Mapping[int, ProcessTiming], how: str) -> list[Requirement]:
     return [
         Requirement(
             name=f"peak memory, {how}",
@@ -102,7 +102,7 @@ def _memory(alone: Mapping[int, Alone], how: str) -> list[Requirement]:
     ]
 
 
-def steadiness(course: Course) -> tuple[Requirement, ...]:
+def steadiness(course: LongRun) -> tuple[Requirement, ...]:
     """Time and memory of late steps against early ones, and one program for all lengths."""
     early, n = course.seconds[:EARLY], len(course.seconds)
     tenth = max(1, len(early) // 10)
@@ -124,7 +124,7 @@ def steadiness(course: Course) -> tuple[Requirement, ...]:
     )
 
 
-def alone_table(size: Size, alone: Mapping[int, Alone], first: Mapping[int, Alone]) -> Table:
+def alone_table(size: JobSize, alone: Mapping[int, ProcessTiming], first: Mapping[int, ProcessTiming]) -> Table:
     """Seconds, memory and share of the peak of every prefix."""
     rows: list[tuple[Cell, ...]] = []
     for prefix, a in alone.items():
@@ -150,7 +150,9 @@ def alone_table(size: Size, alone: Mapping[int, Alone], first: Mapping[int, Alon
     )
 
 
-def peer_table(size: Size, alone: Mapping[int, Alone], first: Mapping[int, Alone], peers: Peers) -> Table:
+def peer_table(
+    size: JobSize, alone: Mapping[int, ProcessTiming], first: Mapping[int, ProcessTiming], peers: Peers
+) -> Table:
     """Every peer at every prefix beside this engine."""
     rows: list[tuple[Cell, ...]] = []
     for (name, prefix), p in peers.items():
@@ -201,7 +203,7 @@ def compare_table(title: str, found: Mapping[int, Mapping[str, float]]) -> Table
     )
 
 
-def memory_table(title: str, note: str, found: Mapping[str, Alone]) -> Table:
+def memory_table(title: str, note: str, found: Mapping[str, ProcessTiming]) -> Table:
     """Memory and time of ways to do the same, each in a process that compiles its program."""
     return Table(
         title=title,

@@ -16,7 +16,7 @@ FAILING, CURE = PALETTE[1], PALETTE[0]
 COLUMNS = 4
 
 
-class Panel(NamedTuple):
+class KnobPanel(NamedTuple):
     """One failure: its code and title, its knob, and of both sides the shares of seeds at every value.
 
     `failing` and `cure` are the seeds that failed, `failing_fired` and `cure_fired` those that raised its alarm.
@@ -31,7 +31,7 @@ class Panel(NamedTuple):
     cure_fired: Sequence[float]
 
 
-def failed_against_knob(panels: Sequence[Panel]) -> bytes:
+def failed_against_knob(panels: Sequence[KnobPanel]) -> bytes:
     """Share of seeds failed over the knob; values are evenly spaced in the order in which they are driven."""
     rows = math.ceil(len(panels) / COLUMNS)
     with mpl.rc_context(LOOK):
@@ -48,7 +48,7 @@ def failed_against_knob(panels: Sequence[Panel]) -> bytes:
         return svg(figure)
 
 
-def _draw(axes: Axes, panel: Panel, *, first: bool) -> None:
+def _draw(axes: Axes, panel: KnobPanel, *, first: bool) -> None:
     place = np.arange(len(panel.values))
     axes.plot(place, panel.failing_fired, color=FAILING, lw=1.2, ls=":", clip_on=False)
     axes.plot(place, panel.cure_fired, color=CURE, lw=1.2, ls=":", clip_on=False)

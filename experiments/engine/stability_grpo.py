@@ -23,10 +23,10 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
-from experiments.engine.failures import PAPER, PLAIN, SCENARIOS, STABLE, Scenario
-from experiments.engine.outcomes import Outcome, Raised, Side
-from experiments.engine.stability_charts import Panel, failed_against_knob
-from experiments.engine.stability_runs import Courses, First, alarms_of
+from experiments.engine.failures import PAPER, PLAIN, SCENARIOS, STABLE, FailureScenario
+from experiments.engine.outcomes import Raised, ScenarioOutcome, VariantOutcome
+from experiments.engine.stability_charts import KnobPanel, failed_against_knob
+from experiments.engine.stability_runs import FirstAlarm, VariantRuns, alarms_of
 from experiments.engine.stability_tables import (
     Sound,
     alarm_table,
@@ -37,14 +37,14 @@ from experiments.engine.stability_tables import (
     summary,
     verdict,
 )
-from experiments.engine.training import Effort, Variant, dials_of
+from experiments.engine.training import GrpoVariant, TrainingBudget, dials_of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StabilityConfig:
+class StabilityGrpoConfig:
     """How long and how often; `codes` name failures, `most_values` of a knob are driven from its mild end."""
 
-    effort: Effort = Effort()
+    effort: TrainingBudget = TrainingBudget()
     seeds: int = 10
     first_seed: int = 0
     codes: tuple[str, ...] = tuple(dict.fromkeys(s.code for s in SCENARIOS))
@@ -53,9 +53,9 @@ class StabilityConfig:
     """Margins δ of the tactile-use reward whose odds are tabulated."""
 
 
-def run(config: StabilityConfig, context: Context) -> Results:
+def run(config: StabilityGrpoConfig, context: Context) -> Results:
     """Drive every knob, judge every seed, listen to the alarms."""
-    courses = Courses(config.effort, range(config.first_seed, config.first_seed + config.seeds))
+    courses = VariantRuns(config.effort, range(config.first_seed, config.first_seed + config.seeds))
     outcomes = []
     for scenario in context.each("failures", [s for s in SCENARIOS if s.code in config.codes]):
         outcomes.append(drive(scenario, config, courses, context))
@@ -83,7 +83,9 @@ def run(config: StabilityConfig, context: Context) -> Results:
     )
 
 
-def drive(scenario: Scenario, config: StabilityConfig, courses: Courses, context: Context) -> Outcome:
+def drive(
+    scenario: FailureScenario, config: StabilityGrpoConfig, courses: VariantRuns, context: Context
+) -> ScenarioOutcome:
     """Both sides at every value of the knob; a stopped run goes on with the first side that it has not finished."""
     values = scenario.values[: config.most_values]
     sides = []
@@ -94,12 +96,16 @@ def drive(scenario: Scenario, config: StabilityConfig, courses: Courses, context
             context.save_stage(stage, _drive_side(scenario, variant, shown, config, courses))
         kept = context.load_stage(stage)
         raised = [[_firsts(run) for run in runs] for runs in kept["raised"]]
-        sides.append(Side(failed=np.array(kept["failed"], bool), raised=raised))
-    return Outcome(scenario=scenario, values=values, failing=sides[0], cure=sides[1])
+        sides.append(VariantOutcome(failed=np.array(kept["failed"], bool), raised=raised))
+    return ScenarioOutcome(scenario=scenario, values=values, failing=sides[0], cure=sides[1])
 
 
 def _drive_side(
-    scenario: Scenario, variant: Variant, values: Iterable[float], config: StabilityConfig, courses: Courses
+    scenario: FailureScenario,
+    variant: GrpoVariant,
+    values: Iterable[float],
+    config: StabilityGrpoConfig,
+    courses: VariantRuns,
 ) -> dict[str, list[list[object]]]:
     """Failed, and what was raised, [value][seed]; a run that the engine refuses raises nothing."""
     found = [courses.course(variant, scenario.place(variant, v), guarded=variant is STABLE) for v in values]
@@ -107,7 +113,7 @@ def _drive_side(
     return {"failed": [scenario.failed(c).tolist() for c in found], "raised": raised}
 
 
-def undriven(config: StabilityConfig, courses: Courses, context: Context) -> Sound:
+def undriven(config: StabilityGrpoConfig, courses: VariantRuns, context: Context) -> Sound:
     """What both presets raise as they are, in the plain world."""
     sound = {}
     for variant in context.each("undriven", (PAPER, STABLE)):
@@ -121,18 +127,18 @@ def undriven(config: StabilityConfig, courses: Courses, context: Context) -> Sou
 
 def _firsts(run: dict[str, list[float]]) -> Raised:
     """First alarms as they were before they became JSON."""
-    return {code: First(int(step), value) for code, (step, value) in run.items()}
+    return {code: FirstAlarm(int(step), value) for code, (step, value) in run.items()}
 
 
-def _panel(o: Outcome) -> Panel:
+def _panel(o: ScenarioOutcome) -> KnobPanel:
     failed = [side.failed.mean(1).tolist() for side in (o.failing, o.cure)]
     fired = [side.fired(o.scenario.alarms).mean(1).tolist() for side in (o.failing, o.cure)]
-    return Panel(o.name, o.scenario.knob, o.values, *failed, *fired)
+    return KnobPanel(o.name, o.scenario.knob, o.values, *failed, *fired)
 
 
-DEFAULT = StabilityConfig()
-SMOKE = StabilityConfig(
-    effort=Effort(pretrain_steps=4, pretrain_batch=8, steps=22, prompts=2, group=4, examined=8, answers=2),
+DEFAULT = StabilityGrpoConfig()
+SMOKE = StabilityGrpoConfig(
+    effort=TrainingBudget(pretrain_steps=4, pretrain_batch=8, steps=22, prompts=2, group=4, examined=8, answers=2),
     seeds=2,
     codes=("F3",),
     most_values=2,

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.core.results import Cell, Column, Requirement, Table
-from experiments.engine.outcomes import Outcome, Raised, share
+from experiments.engine.outcomes import Raised, ScenarioOutcome, share
 from touchr1_jax.rl.alarms import RULES
 from touchr1_jax.rl.config import GRPOConfig, Stable
 from touchr1_jax.rl.credit_odds import HELPED, HINDERED, credit_odds, false_credit
@@ -19,7 +19,7 @@ Sound = Mapping[str, Sequence[Raised]]
 """What the seeds of a preset raise where nothing drives it, by the preset's name."""
 
 
-def summary(outcomes: Sequence[Outcome]) -> Table:
+def summary(outcomes: Sequence[ScenarioOutcome]) -> Table:
     """One line a scenario: where either side breaks, and what the alarm is worth."""
     rows: list[tuple[Cell, ...]] = [
         (
@@ -52,7 +52,7 @@ def summary(outcomes: Sequence[Outcome]) -> Table:
     )
 
 
-def criteria(outcomes: Sequence[Outcome]) -> Table:
+def criteria(outcomes: Sequence[ScenarioOutcome]) -> Table:
     """What counts as failed, and how many seeds did at each value."""
     listed = lambda o, side: " · ".join(
         f"{v:g}:\N{NO-BREAK SPACE}{n}" for v, n in zip(o.values, side.failed.sum(1), strict=True)
@@ -72,7 +72,7 @@ def criteria(outcomes: Sequence[Outcome]) -> Table:
     )
 
 
-def alarm_table(outcomes: Sequence[Outcome]) -> Table:
+def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
     """What each failure's alarm said, when, and how often it fired where nothing had failed."""
     return Table(
         title="What the alarms said",
@@ -90,7 +90,7 @@ def alarm_table(outcomes: Sequence[Outcome]) -> Table:
     )
 
 
-def _alarm_row(o: Outcome) -> tuple[Cell, ...]:
+def _alarm_row(o: ScenarioOutcome) -> tuple[Cell, ...]:
     failed, others, firsts = o.heard(failed=True), o.heard(failed=False), o.firsts()
     bounds = [f"{r.code} {'<' if r.below else '>'} {r.bound:g}" for r in RULES if r.code in o.scenario.alarms]
     middle = lambda numbers: float(np.median(numbers)) if firsts else None
@@ -140,7 +140,7 @@ def _percent(p: np.ndarray) -> str:
     return " / ".join(f"{x:.0%}" for x in p)
 
 
-def requirements(outcomes: Sequence[Outcome]) -> tuple[Requirement, ...]:
+def requirements(outcomes: Sequence[ScenarioOutcome]) -> tuple[Requirement, ...]:
     """No run of `stable` fails where the other side does, alarms are worth hearing, R_tu's odds at its margin."""
     sizes, margin = _sizes(), Stable().tactile_margin
     return (
@@ -170,7 +170,7 @@ def requirements(outcomes: Sequence[Outcome]) -> tuple[Requirement, ...]:
     )
 
 
-def _alarm_requirements(outcomes: Sequence[Outcome]) -> list[Requirement]:
+def _alarm_requirements(outcomes: Sequence[ScenarioOutcome]) -> list[Requirement]:
     """Both shares, where there are runs to take them of."""
     noticed, struck = (share(np.concatenate([o.heard(failed=f) for o in outcomes])) for f in (True, False))
     found = []
@@ -182,7 +182,7 @@ def _alarm_requirements(outcomes: Sequence[Outcome]) -> list[Requirement]:
     return found
 
 
-def verdict(outcomes: Sequence[Outcome], sound: Sound) -> tuple[str, ...]:
+def verdict(outcomes: Sequence[ScenarioOutcome], sound: Sound) -> tuple[str, ...]:
     """What broke, what held, what the alarms are worth."""
     driven = [o for o in outcomes if o.compared]
     harmed = [o for o in driven if o.harmed]
@@ -198,7 +198,7 @@ def verdict(outcomes: Sequence[Outcome], sound: Sound) -> tuple[str, ...]:
     return (*said, *_alarm_sentences(outcomes), _sound_sentence(sound))
 
 
-def _alarm_sentences(outcomes: Sequence[Outcome]) -> list[str]:
+def _alarm_sentences(outcomes: Sequence[ScenarioOutcome]) -> list[str]:
     """How often alarms fired, and which were missed."""
     failed, others = (np.concatenate([o.heard(failed=f) for o in outcomes]) for f in (True, False))
     noticed = f"Alarms fired in {failed.mean():.0%} of {len(failed)} failed runs" if len(failed) else "No run failed"
@@ -221,7 +221,7 @@ def _codes(runs: Sequence[Raised]) -> str:
     return f"{listed} of {len(runs)} seeds" if counts else f"none in {len(runs)} seeds"
 
 
-def counts(o: Outcome) -> dict[str, list[int]]:
+def counts(o: ScenarioOutcome) -> dict[str, list[int]]:
     """Seeds of either side that failed, and that raised the scenario's alarm, at every value."""
     return {
         "failed": o.failing.failed.sum(1).tolist(),

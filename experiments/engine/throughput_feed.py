@@ -30,8 +30,8 @@ from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.engine.feed_demand import grpo_seconds, sft_seconds
-from experiments.engine.feed_scales import Scale, answers, clip_bytes, memory_share, questions
-from experiments.engine.feed_supply import Made, idle_share, make_seconds
+from experiments.engine.feed_scales import FeedScale, answers, clip_bytes, memory_share, questions
+from experiments.engine.feed_supply import BatchCost, idle_share, make_seconds
 from experiments.paper import presets
 from experiments.study.assembly import assemble
 from experiments.study.feeds import Feed
@@ -48,10 +48,10 @@ MOST_IDLE = 0.02
 class FeedingConfig:
     """Scales, and how long each feed is watched."""
 
-    scales: Mapping[str, Scale] = dataclasses.field(
+    scales: Mapping[str, FeedScale] = dataclasses.field(
         default_factory=lambda: {
-            "gpu": Scale(study=presets.GPU, devices=1, contacts=48),
-            "paper": Scale(study=presets.PAPER, devices=16, contacts=16),
+            "gpu": FeedScale(study=presets.GPU, devices=1, contacts=48),
+            "paper": FeedScale(study=presets.PAPER, devices=16, contacts=16),
         }
     )
     cores: int = 16
@@ -73,7 +73,7 @@ class FeedingConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Fed:
+class FeedMeasurement:
     """One feed: what a batch takes, how long a step lasts, and how long the device stood still.
 
     `configured`: whether the study would feed it so; else it shows what memory is good for.
@@ -82,7 +82,7 @@ class Fed:
     scale: str
     stage: str
     source: str
-    made: Made
+    made: BatchCost
     step_s: float
     idle: float
     configured: bool
@@ -132,7 +132,7 @@ def cores_here() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def feeds_of(config: FeedingConfig, name: str, scale: Scale, context: Context) -> Iterator[Fed]:
+def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Context) -> Iterator[FeedMeasurement]:
     """The feeds of one scale: SFT from records, SFT with the scale's memory where it has one, and GRPO."""
     study = dataclasses.replace(
         scale.study,
@@ -161,7 +161,7 @@ def feeds_of(config: FeedingConfig, name: str, scale: Scale, context: Context) -
 
 def watch(
     config: FeedingConfig, stage: str, feed: Feed, step_s: float, context: Context, *, configured: bool, warm: int = 1
-) -> Fed:
+) -> FeedMeasurement:
     """Time some batches of a feed, then run it beside a stand-in.
 
     Args:
@@ -182,11 +182,11 @@ def watch(
         context.save_stage(stage, {"made": made._asdict(), "idle": idle})
     saved = context.load_stage(stage)
     scale, name, source = stage.split("/")
-    return Fed(
+    return FeedMeasurement(
         scale=scale,
         stage=name,
         source=source,
-        made=Made(**saved["made"]),
+        made=BatchCost(**saved["made"]),
         step_s=step_s,
         idle=saved["idle"],
         configured=configured,
@@ -198,7 +198,7 @@ def stretch(config: FeedingConfig, needed: float) -> float:
     return min(max(1.0, 2 * needed / cores_here()), max(1.0, config.cores / cores_here()))
 
 
-def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:
+def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
     """What every feed delivers, and what the device asks."""
     return Table(
         title="What a batch takes, and what a device asks",
@@ -226,7 +226,7 @@ def feed_table(config: FeedingConfig, fed: Sequence[Fed]) -> Table:
     )
 
 
-def verdict(config: FeedingConfig, fed: Sequence[Fed]) -> tuple[str, ...]:
+def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str, ...]:
     """Which feed is the hardest, how long devices stand still, and that it is no measurement of one."""
     used = [one for one in fed if one.configured]
     worst, hardest = max(used, key=lambda one: one.idle), max(used, key=lambda one: one.cores)
@@ -245,7 +245,7 @@ def verdict(config: FeedingConfig, fed: Sequence[Fed]) -> tuple[str, ...]:
 
 DEFAULT = FeedingConfig()
 SMOKE = FeedingConfig(
-    scales={"smoke": Scale(study=dataclasses.replace(TINY_STUDY, clip_memory_gib=0.002), devices=2, contacts=24)},
+    scales={"smoke": FeedScale(study=dataclasses.replace(TINY_STUDY, clip_memory_gib=0.002), devices=2, contacts=24)},
     machine=Machine(flops=2e10),
     batches=1,
     steps=3,

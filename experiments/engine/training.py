@@ -1,7 +1,7 @@
 """Training the policy of the small world, by the engine's own step, many seeds as one program.
 
-A `Variant` is what is compiled: algorithm, rewards.  A `World` and `Dials` are traced, so that one program serves every
-value of a knob; `vmap` runs the seeds.
+A `GrpoVariant` is static: algorithm and rewards.  A `World` and its `Hyperparameters` are traced, so that one compiled
+program serves every value of a knob; `vmap` runs the seeds.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from experiments.engine.world import (
     A,
     K,
     Scalar,
-    Scene,
     World,
+    WorldBatch,
     draw,
     noise_bank,
     verified_answers,
@@ -45,7 +45,7 @@ FORMAT = 0.1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Effort:
+class TrainingBudget:
     """How long and how broadly everything is trained and asked."""
 
     pretrain_steps: int = 200
@@ -62,7 +62,7 @@ class Effort:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Variant:
+class GrpoVariant:
     """What a program is compiled for: the algorithm, and which rewards stand for accuracy and consistency."""
 
     name: str
@@ -71,7 +71,7 @@ class Variant:
     consistency: str = "consistency"
 
 
-class Dials(NamedTuple):
+class Hyperparameters(NamedTuple):
     """Weights and rates that a knob may turn, numbers or traced scalars.
 
     `consistency` is the weight of that reward; accuracy has .9 minus it.  `lenient` is what a scorer pays that is
@@ -90,10 +90,10 @@ LEARNING_RATE = 3e-3
 """The paper's 1e-6 times 3,000: the small policy stands still at less."""
 
 
-def dials_of(variant: Variant) -> Dials:
+def dials_of(variant: GrpoVariant) -> Hyperparameters:
     """The preset's own weights."""
     a = variant.algorithm
-    return Dials(LEARNING_RATE, float(a.beta), float(a.gamma), float(a.entropy_weight))
+    return Hyperparameters(LEARNING_RATE, float(a.beta), float(a.gamma), float(a.entropy_weight))
 
 
 def fresh_params() -> Params:
@@ -101,11 +101,11 @@ def fresh_params() -> Params:
     return init_decoder(FNS, draw(World(), jax.random.key(0), 1).batch)
 
 
-def pretrain(effort: Effort, world: World, key: Array) -> Params:
+def pretrain(effort: TrainingBudget, world: World, key: Array) -> Params:
     """Imitate verified answers."""
     optimizer = optax.adam(optax.cosine_decay_schedule(effort.pretrain_rate, effort.pretrain_steps))
 
-    def loss(params: Params, scene: Scene, tokens: Int[Array, "P T"], counts: Array) -> Array:
+    def loss(params: Params, scene: WorldBatch, tokens: Int[Array, "P T"], counts: Array) -> Array:
         batch = scene.batch
         logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))(
             params, batch.features, batch.ids, batch.mask, tokens[:, None]
@@ -126,7 +126,7 @@ def pretrain(effort: Effort, world: World, key: Array) -> Params:
 
 
 def reinforce(
-    effort: Effort, variant: Variant, world: World, dials: Dials, start: Params, key: Array
+    effort: TrainingBudget, variant: GrpoVariant, world: World, dials: Hyperparameters, start: Params, key: Array
 ) -> tuple[Params, dict[str, Float[Array, "n"]]]:
     """GRPO from a supervised policy, which is also the reference: what it becomes, and every metric of every step."""
     algorithm = dataclasses.replace(
@@ -154,7 +154,7 @@ def reinforce(
     return end.params, metrics
 
 
-def make_world_score(variant: Variant, dials: Dials) -> ScoreFn:
+def make_world_score(variant: GrpoVariant, dials: Hyperparameters) -> ScoreFn:
     """R = (.9 − w) accuracy + w consistency + .1 format, with the engine's rewards and a traced w."""
     rewards = make_rewards(np.full((A, K), 1 / K, np.float32))
     weights = {variant.accuracy: 1 - FORMAT - dials.consistency, variant.consistency: dials.consistency}
@@ -182,12 +182,12 @@ def lenient_credit(tokens: Int[Array, "T"], parsed: Parsed, target: Target) -> F
 
 
 @functools.cache
-def pretrain_program(effort: Effort) -> Callable[..., Params]:
+def pretrain_program(effort: TrainingBudget) -> Callable[..., Params]:
     """Compiled `pretrain` of many seeds of one world."""
     return jax.jit(jax.vmap(functools.partial(pretrain, effort), in_axes=(None, 0)))
 
 
 @functools.cache
-def reinforce_program(effort: Effort, variant: Variant) -> Callable[..., tuple[Params, dict[str, Array]]]:
+def reinforce_program(effort: TrainingBudget, variant: GrpoVariant) -> Callable[..., tuple[Params, dict[str, Array]]]:
     """Compiled `reinforce` of many seeds."""
     return jax.jit(jax.vmap(functools.partial(reinforce, effort, variant), in_axes=(None, None, 0, 0)))

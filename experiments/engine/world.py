@@ -98,7 +98,7 @@ class World(NamedTuple):
     sharp: Scalar = 1.0
 
 
-class Scene(NamedTuple):
+class WorldBatch(NamedTuple):
     """P questions with the truth behind them: evidence of the asked attribute in levels, and the level in view."""
 
     batch: GRPOBatch
@@ -107,7 +107,7 @@ class Scene(NamedTuple):
     seen: Int[Array, "P"]
 
 
-def draw(world: World, key: Array, p: int) -> Scene:
+def draw(world: World, key: Array, p: int) -> WorldBatch:
     """P objects, felt, seen and asked about."""
     keys = jax.random.split(key, 5)
     level = jax.random.randint(keys[0], (p, A), 0, K)
@@ -130,7 +130,7 @@ def draw(world: World, key: Array, p: int) -> Scene:
         target=target_of(asked, y),
         ordered=jnp.broadcast_to(jnp.array([a.ordered for a in LANGUAGE.attributes])[asked], (p,)),
     )
-    return Scene(batch, y, evidence[..., asked], seen)
+    return WorldBatch(batch, y, evidence[..., asked], seen)
 
 
 def touch_tokens(world: World, evidence: Float[Array, "P S A"], key: Array) -> Float[Array, "P S N D"]:
@@ -181,7 +181,7 @@ WORDS = np.array([[_ids(words[0])[0] for words in a.levels] for a in LANGUAGE.at
 (CONCLUDE,) = _ids("<conclude>")
 
 
-def verified_answers(world: World, scene: Scene, key: Array) -> tuple[Int[Array, "P T"], Array]:
+def verified_answers(world: World, scene: WorldBatch, key: Array) -> tuple[Int[Array, "P T"], Array]:
     """What supervised training imitates, and which tokens count, both [P, T].
 
     Each slot says its own evidence; the conclusion is the label, or what the view shows, or, sloppily, two levels.

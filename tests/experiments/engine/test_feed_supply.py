@@ -7,10 +7,10 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context
-from experiments.engine.feed_supply import StandIn, idle_share, make_seconds
+from experiments.engine.feed_supply import SimulatedDevice, idle_share, make_seconds
 
 
-class Slow:
+class SlowBatches:
     """Batches that take as long as they are told, by sleeping."""
 
     def __init__(self, seconds: float) -> None:
@@ -39,16 +39,16 @@ def context(tmp_path):
 
 
 def test_a_device_that_is_fed_in_time_never_stands_still(context):
-    assert idle_share(Slow(0.0), 0.15, 6, context, "fast/0") < 0.05
+    assert idle_share(SlowBatches(0.0), 0.15, 6, context, "fast/0") < 0.05
 
 
 def test_a_device_stands_still_for_as_long_as_its_batch_is_late(context):
-    share = idle_share(Slow(0.3), 0.1, 6, context, "slow/0")
+    share = idle_share(SlowBatches(0.3), 0.1, 6, context, "slow/0")
     assert share == pytest.approx(1 - 0.1 / 0.3, abs=0.1)
 
 
 def test_steps_queue_as_on_a_device():
-    device = StandIn(0.2)
+    device = SimulatedDevice(0.2)
     began = time.perf_counter()
     (_, first), (_, second) = device.step(None, None), device.step(None, None)
     assert time.perf_counter() - began < 0.1

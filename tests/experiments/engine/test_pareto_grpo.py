@@ -8,12 +8,12 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.engine import pareto_grpo
-from experiments.engine.pareto_charts import Course
-from experiments.engine.pareto_grpo import ALGORITHMS, ParetoConfig, table, verdict
+from experiments.engine.pareto_charts import LearningCurves
+from experiments.engine.pareto_grpo import ALGORITHMS, ParetoGrpoConfig, table, verdict
 
 
-def course(*rewards: list[float], step_s: float = 1.0) -> Course:
-    return Course(rewards=np.array(rewards), step_s=step_s)
+def course(*rewards: list[float], step_s: float = 1.0) -> LearningCurves:
+    return LearningCurves(rewards=np.array(rewards), step_s=step_s)
 
 
 def test_a_seed_arrives_where_it_first_passes_the_target():
@@ -31,19 +31,19 @@ def test_the_verdict_names_the_fastest_the_default_and_the_late():
         ("b", 8): course([0.95, 0.95], [0.1, 0.9], step_s=1.0),
         ("c", 8): course([0.5, 0.8], [0.95, 0.95], step_s=0.1),
     }
-    assert verdict(ParetoConfig(steps=2), courses) == (
+    assert verdict(ParetoGrpoConfig(steps=2), courses) == (
         "b in groups of 8 is first at 0.9, in 1.5 s.",
         "The default, paper in groups of 8, takes 4.0 s.",
         "Not every seed passed 0.9 within 2 steps with c in groups of 8.",
     )
-    rows = {row[0]: row[1:] for row in table(ParetoConfig(), courses).rows}
+    rows = {row[0]: row[1:] for row in table(ParetoGrpoConfig(), courses).rows}
     assert rows["paper (default)"] == (8, 2000.0, 0.95, 2.0, 4.0, "2 of 2")
     assert rows["c"][3:] == (None, None, "1 of 2")
 
 
 def test_groups_must_divide_the_rollouts():
     with pytest.raises(ValueError, match=r"groups holds \[5\]: must divide rollouts = 32"):
-        ParetoConfig(groups=(4, 5))
+        ParetoGrpoConfig(groups=(4, 5))
 
 
 @pytest.mark.slow

@@ -8,9 +8,9 @@ import pytest
 from experiments.engine.harness import PeerJob, answer, read_answer
 from experiments.engine.harness_trl import settings
 from experiments.engine.peers import Peer, PeerFailed, installed_peers
-from experiments.engine.size import Size
+from experiments.engine.size import JobSize
 
-JOB = PeerJob(prefix=5, rounds=2, size=Size(prompts=2, group=3, length=4, vocab_size=10))
+JOB = PeerJob(prefix=5, rounds=2, size=JobSize(prompts=2, group=3, length=4, vocab_size=10))
 PRETENDER = """
 import sys
 from experiments.engine.harness import PeerJob, answer

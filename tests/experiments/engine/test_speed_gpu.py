@@ -11,7 +11,7 @@ from experiments.engine import speed_gpu
 from experiments.engine.attention import draw_heads, engine_attention, errors, flash_attention, pairs, with_gradient
 from experiments.engine.gpu_config import GpuConfig
 from experiments.engine.gpu_device import NoAccelerator, accelerator, sheet_of
-from experiments.engine.gpu_tables import Timed
+from experiments.engine.gpu_tables import TimedWorkload
 from tests.experiments.shrunk import run_shrunk
 
 
@@ -51,7 +51,7 @@ def test_both_ways_to_attend_are_one_in_float32_and_near_it_in_bfloat16(context)
 def test_work_and_shares_by_hand():
     """Three tokens look at 1 + 2 + 3 keys; half of 8 operations a second is a half."""
     assert pairs(2, 3, 4) == 2 * 4 * 6
-    timed = Timed((1.0, 2.0, 5.0), 8.0, 6.0, 4.0, "tokens")
+    timed = TimedWorkload((1.0, 2.0, 5.0), 8.0, 6.0, 4.0, "tokens")
     assert timed.share(8.0) == 0.5
     assert timed.read_share(None) is None
 

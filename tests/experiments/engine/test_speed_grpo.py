@@ -14,21 +14,21 @@ from experiments.engine import speed_grpo
 from experiments.engine.harness import PeerTimes
 from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
 from experiments.engine.peers import PeerFailed
-from experiments.engine.size import Size
-from experiments.engine.speed import Course, Option, many_steps, options, time_alone
+from experiments.engine.size import JobSize
+from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
 from experiments.engine.speed_tables import steadiness
 
 TINY = speed_grpo.SMOKE.size
 
 
 def test_the_decoder_has_its_advertised_size():
-    fns, batch = make_fns(Size(), 64), make_batch(Size(), 64, 1)
+    fns, batch = make_fns(JobSize(), 64), make_batch(JobSize(), 64, 1)
     assert sum(x.size for x in jax.tree.leaves(init_decoder(fns, batch))) == 1_050_752
 
 
 def test_work_by_hand():
     """One layer of width 2 with one head of 2, MLP 2, vocabulary 2: 16 + 12 weights, 4 to the vocabulary."""
-    size = Size(
+    size = JobSize(
         prompts=1,
         group=1,
         length=1,
@@ -120,7 +120,7 @@ def test_many_steps_take_every_length_in_one_program():
 def test_drift_and_growth_by_hand():
     """Steps that slow down by half, and memory that grows by 20 MB."""
     seconds = np.concatenate([np.full(500, 1.0), np.full(500, 1.5), np.full(1000, 9.0)])
-    course = Course(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
+    course = LongRun(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
     time, memory, programs = steadiness(course)
     assert (time.measured, time.met) == (1.5, False)  # judged by the first thousand
     assert (memory.measured, memory.met) == (20.0, False)
@@ -145,7 +145,7 @@ def test_the_experiment_reports_every_prefix(tmp_path):
 
 
 @dataclasses.dataclass(frozen=True)
-class Limited:
+class FailingPeer:
     """An engine that fails past a prefix."""
 
     name: str
@@ -159,10 +159,10 @@ class Limited:
 
 def test_an_engine_that_fails_at_a_long_prefix_costs_no_other_figure(context, monkeypatch):
     config = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16, 32))
-    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("Short", 16), Limited("Long", 32)))
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (FailingPeer("Short", 16), FailingPeer("Long", 32)))
     found, failed = speed_grpo.measure_peers(config, context)
     assert list(found) == [("Short", 16), ("Long", 16), ("Long", 32)]
     assert failed == ("Short has no figure at 32: its process ended with -9.",)
-    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (Limited("None", 0),))
+    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (FailingPeer("None", 0),))
     with pytest.raises(PeerFailed, match="None ended with -9"):
         speed_grpo.measure_peers(config, context)

@@ -7,9 +7,9 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import stability_grpo
-from experiments.engine.failures import PAPER, SCENARIOS, STABLE, Course
-from experiments.engine.outcomes import Outcome, Side
-from experiments.engine.stability_runs import First, alarms_of, refused
+from experiments.engine.failures import PAPER, SCENARIOS, STABLE, VariantRun
+from experiments.engine.outcomes import ScenarioOutcome, VariantOutcome
+from experiments.engine.stability_runs import FirstAlarm, alarms_of, refused
 from experiments.engine.stability_tables import alarm_table, criteria, requirements, summary, verdict
 from tests.experiments.shrunk import run_shrunk
 from tests.touchr1_jax.rl.test_alarms import HEALTHY
@@ -62,7 +62,7 @@ def exam(**figures: float) -> dict[str, np.ndarray]:
     return {name: np.array([value, figures.get(name, value)]) for name, value in sound.items()}
 
 
-def course(late: dict[str, float] | None = None, **figures: float) -> Course:
+def course(late: dict[str, float] | None = None, **figures: float) -> VariantRun:
     metrics = {
         "degenerate_share": 0.3,
         "tactile_credit_share": 0.05,
@@ -72,7 +72,7 @@ def course(late: dict[str, float] | None = None, **figures: float) -> Course:
     rows = {n: np.stack([np.full(50, v), np.full(50, (late or {}).get(n, v))]) for n, v in metrics.items()}
     before = exam()
     before["accuracy"] -= 0.15
-    return Course(before=before, after=exam(**figures), metrics=rows)
+    return VariantRun(before=before, after=exam(**figures), metrics=rows)
 
 
 FAILED = {
@@ -109,13 +109,15 @@ def test_a_course_that_the_engine_refuses_has_not_failed():
     assert not scenario.failed(dataclasses.replace(broken, refused=True)).any()
 
 
-def side(failed: list[int], fired: list[int]) -> Side:
+def side(failed: list[int], fired: list[int]) -> VariantOutcome:
     """Ten seeds at each value, of which the first so many failed, and the first so many raised F1 after step 30."""
-    raised = [[{"F1": First(30, 0.4)} if seed < n else {"F7": First(20, 0.9)} for seed in range(10)] for n in fired]
-    return Side(failed=np.array([np.arange(10) < n for n in failed]), raised=raised)
+    raised = [
+        [{"F1": FirstAlarm(30, 0.4)} if seed < n else {"F7": FirstAlarm(20, 0.9)} for seed in range(10)] for n in fired
+    ]
+    return VariantOutcome(failed=np.array([np.arange(10) < n for n in failed]), raised=raised)
 
 
-OUTCOME = Outcome(
+OUTCOME = ScenarioOutcome(
     scenario=SCENARIOS[0], values=(1.0, 2.0, 3.0), failing=side([0, 1, 6], [1, 0, 6]), cure=side([0, 0, 1], [0, 0, 0])
 )
 
@@ -140,7 +142,7 @@ def test_tables_and_sentences_say_what_was_counted():
     met = {r.name: r.met for r in requirements([OUTCOME])}
     assert not met["failed runs whose alarm fired"]
     assert met["other runs whose alarm fired"]
-    said = verdict([OUTCOME], {"paper": [{}] * 10, "stable": [{"F7": First(20, 0.9)}, {}]})
+    said = verdict([OUTCOME], {"paper": [{}] * 10, "stable": [{"F7": FirstAlarm(20, 0.9)}, {}]})
     assert said[1] == "It failed too in F1 answers drift to the middle level (1 of 20 runs)."
     assert said[2] == "Alarms fired in 75% of 8 failed runs and in 1.9% of the 52 others."
     assert said[3] == "Failed in silence: F1 answers drift to the middle level (2)."
@@ -150,7 +152,7 @@ def test_tables_and_sentences_say_what_was_counted():
 def test_alarms_are_those_of_the_training_log():
     steps = 2 * WINDOW
     calm = {name: np.full((1, steps), value) for name, value in HEALTHY.items()}
-    rows = Course(before={}, after={}, metrics={**calm, "reward": np.zeros((1, steps))})
+    rows = VariantRun(before={}, after={}, metrics={**calm, "reward": np.zeros((1, steps))})
     assert alarms_of(rows, 0) == {}
     grown = np.where(np.arange(steps) < WINDOW, 0.1, 5.0)[None]
     alarms = alarms_of(dataclasses.replace(rows, metrics={**rows.metrics, "grounding": grown}), 0)

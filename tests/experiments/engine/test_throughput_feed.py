@@ -7,7 +7,7 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.engine import throughput_feed
-from experiments.engine.feed_scales import Scale
+from experiments.engine.feed_scales import FeedScale
 from experiments.engine.throughput_feed import SMOKE, FeedingConfig
 from experiments.paper import presets
 from tests.experiments import tiny
@@ -17,7 +17,7 @@ STUDY = dataclasses.replace(tiny.STUDY, clip_memory_gib=0.0002)  # of a quarter 
 
 @pytest.fixture(scope="module")
 def results(cache_dir, tmp_path_factory):
-    scales = {"tiny": Scale(study=STUDY, devices=2, contacts=tiny.SCENES.objects)}
+    scales = {"tiny": FeedScale(study=STUDY, devices=2, contacts=tiny.SCENES.objects)}
     context = Context(tmp_path_factory.mktemp("feed"), cache_dir, Console(quiet=True))
     findings = throughput_feed.run(dataclasses.replace(SMOKE, scales=scales), context)
     context.close()
@@ -55,7 +55,7 @@ def test_bad_settings_are_named(changes, message):
 
 def test_devices_must_share_a_batch_evenly():
     with pytest.raises(ValueError, match=r"devices is 3: must divide sft\.batch_size = 64"):
-        Scale(study=presets.GPU, devices=3, contacts=8)
+        FeedScale(study=presets.GPU, devices=3, contacts=8)
 
 
 def test_steps_last_longer_where_fewer_cores_are_here(monkeypatch):
