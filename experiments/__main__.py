@@ -5,18 +5,17 @@ import os
 import signal
 import sys
 
-from experiments.core.commands import answer, complain
+from experiments.core.commands import print_error, run_command
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
 
 
 def leave(status: int) -> None:
-    """End the process; after a signal at once, without tearing JAX down.
+    """End the process; after a signal at once, without the interpreter's teardown.
 
-    A signal may strike while XLA compiles on a thread of its own: the wait for it is broken off, the compiling is not,
-    and would go on in a client that the interpreter frees at its end (a segmentation fault, or "free(): invalid
-    pointer").  The run has closed its files by then.
+    A signal may arrive while XLA compiles on a thread of its own.  The compilation would go on in a client that the
+    interpreter frees at its end (a segmentation fault, or "free(): invalid pointer").  The run has closed its files.
     """
     if status > SIGNALLED:
         for child in multiprocessing.active_children():
@@ -28,16 +27,16 @@ def leave(status: int) -> None:
 
 
 def main() -> None:
-    """Answer the command line and end the process."""
+    """Run the command line and end the process."""
     arguments = sys.argv[1:]
     try:
-        status = answer(arguments, "experiments")
+        status = run_command(arguments, "experiments")
         if status is None:
             from experiments.core.runner import run  # JAX and charts, which only runs need
 
             status = run(arguments)
-    except KeyboardInterrupt:  # a run that has begun hears it by itself
-        complain("Stopped before anything was begun.")
+    except KeyboardInterrupt:  # a run handles the signal itself
+        print_error("Stopped before any work began.")
         status = SIGNALLED + signal.SIGINT
     leave(status)
 

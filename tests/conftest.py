@@ -10,7 +10,7 @@ import hypothesis
 import jax
 import pytest
 
-from experiments.core.quick import FLAGS, compiled_quickly
+from experiments.core.machine import FLAGS, compiled_quickly
 from tests.typecheck import install
 
 install("touchr1_jax")

@@ -12,8 +12,7 @@ import pytest
 import tyro
 
 from experiments.bench.__main__ import Command as Bench
-from experiments.core.catalogue import find
-from experiments.core.commands import COMMANDS, Command
+from experiments.core.commands import COMMANDS, Command, find
 from experiments.core.runner import parse
 from sensors_io.__main__ import read as sensors_command
 from touchr1_jax.models.load import Load
@@ -100,7 +99,8 @@ def test_commands_of_the_documents_are_understood(document):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_commands_of_an_experiment_are_understood(name):
-    about = ast.get_docstring(ast.parse((ROOT / "experiments" / f"{name}.py").read_text(encoding="utf-8"))) or ""
+    source = ROOT / Path(*EXPERIMENTS[name].module.split(".")).with_suffix(".py")
+    about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or ""
     commands = list(shown(about))
     assert any(arguments.split()[0] == name for _, arguments in commands), "its docstring shows no command"
     for module, arguments in commands:

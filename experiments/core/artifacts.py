@@ -13,18 +13,18 @@ import numpy as np
 
 
 class DamagedFileError(ValueError):
-    """A file of a run that is not what was written."""
+    """A file of a run with other content than was written."""
 
 
 class UnwrittenError(OSError):
-    """A file that did not reach the disk; what was there before is still there."""
+    """A file that did not reach the disk; an older version is still there."""
 
 
 def jsonable(value: Any, where: str = "value") -> Any:
     """The same value in JSON's own types: dataclasses and mappings become objects, tuples and arrays lists.
 
     Raises:
-      ValueError: a number is not finite (JSON has no word for it), or an object's key is no string.
+      ValueError: a number is not finite (JSON has no such number), or an object's key is no string.
       TypeError: a type that has no JSON form.
     """
     if isinstance(value, enum.Enum):

@@ -1,4 +1,4 @@
-"""Two runs side by side: what was set, what it ran on, and which figures differ."""
+"""Comparison of two runs: settings, code, machine, and every figure that differs."""
 
 import dataclasses
 import math
@@ -7,19 +7,19 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from experiments.core.history import Past, summary
-from experiments.core.runs import go_on
+from experiments.core.history import PastRun, summary
+from experiments.core.runs import continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
 
 Verdict = Literal["0 lies outside", "differs", "only in A", "only in B", "may be chance", "same"]
-"""Of paired seeds 0 lies outside the interval of the difference, or it may be chance; `differs` has no seeds."""
+"""With paired seeds: 0 lies outside the interval of the difference, or the difference may be chance; else `differs`."""
 
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-"""The gravest first."""
+"""The most important first."""
 
 CHANCE = 0.05
-"""How often a 95 % interval of no difference leaves 0 outside."""
+"""Rate at which a 95 % interval of no difference excludes 0."""
 
 
 class ComparisonError(ValueError):
@@ -27,14 +27,14 @@ class ComparisonError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Figure:
+class ComparedFigure:
     """One figure of both runs.
 
     Attributes:
-      where: what it is.
+      where: arm and metric, requirement, or cell of a table.
       a, b: its value in either run, as shown.
       change: B − A, with its interval where seeds are paired.
-      verdict: whether they differ.
+      verdict: kind of the difference.
     """
 
     where: str
@@ -44,15 +44,15 @@ class Figure:
     verdict: Verdict
 
 
-def compare_runs(a: Past, b: Past, most: int) -> str:
-    """The comparison as text: runs, what was set otherwise, figures, cost.
+def compare_runs(a: PastRun, b: PastRun, most: int) -> str:
+    """Compare two runs as text: runs, differing settings, figures, cost.
 
     Args:
       a, b: finished runs.
-      most: figures to show, the gravest differences first; the others are counted.
+      most: figures to show, the most important differences first; the others are counted.
 
     Raises:
-      ComparisonError: one run twice, a run that is unfinished, or two that have no figure in common.
+      ComparisonError: the same run twice, an unfinished run, or two runs without a common figure.
     """
     if a.directory == b.directory:
         raise ComparisonError(f"RUN_A and RUN_B are both {a.directory}: must be two runs; name them by NAME/STAMP")
@@ -60,7 +60,7 @@ def compare_runs(a: Past, b: Past, most: int) -> str:
         if run.results is None:
             raise ComparisonError(
                 f"{run.directory} is {run.state}: must be finished to be compared; "
-                f"go on with: {go_on(run.description['command'])}"
+                f"continue it with: {continuing(run.description['command'])}"
             )
     figures = list(compare_results(_results(a), _results(b)))
     if not any(f.verdict not in ("only in A", "only in B") for f in figures):
@@ -71,15 +71,15 @@ def compare_runs(a: Past, b: Past, most: int) -> str:
     return "\n\n".join(
         [
             aligned([("A", a.name, summary(a)), ("B", b.name, summary(b))]),
-            _block("Set otherwise", _differing(_settings(a), _settings(b))),
-            _block("Ran on something else", _differing(_machine(a), _machine(b))),
+            _block("Different settings", _differing(_settings(a), _settings(b))),
+            _block("Different code or machine", _differing(_machine(a), _machine(b))),
             _figures_block(figures, most),
             f"Cost: A {_cost(a)}, B {_cost(b)}",
         ]
     )
 
 
-def compare_results(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Figure]:
+def compare_results(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[ComparedFigure]:
     """Every figure of two `results.json`: arms and baselines, requirements, cells of tables."""
     yield from _paired(_scores(a), _scores(b), _compare_estimates)
     yield from _paired(_requirements(a), _requirements(b), _compare_numbers)
@@ -116,35 +116,35 @@ def _cells(results: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _paired(a: Mapping[str, Any], b: Mapping[str, Any], compare: Any) -> Iterator[Figure]:
+def _paired(a: Mapping[str, Any], b: Mapping[str, Any], compare: Any) -> Iterator[ComparedFigure]:
     for where in {**a, **b}:
         if where in a and where in b:
             yield compare(where, a[where], b[where])
         else:
             verdict: Verdict = "only in A" if where in a else "only in B"
-            yield Figure(where=where, a=_text(a.get(where)), b=_text(b.get(where)), change="", verdict=verdict)
+            yield ComparedFigure(where=where, a=_text(a.get(where)), b=_text(b.get(where)), change="", verdict=verdict)
 
 
-def _compare_estimates(where: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Figure:
+def _compare_estimates(where: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> ComparedFigure:
     """Seeds are paired by their number: seed s draws the same random numbers in both runs."""
     one, two = a["per_seed"], b["per_seed"]
     if one == two:
-        return Figure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
+        return ComparedFigure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
     if len(one) != len(two) or len(one) < 2:
         change = number(b["mean"] - a["mean"], "+.3g")
-        return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
+        return ComparedFigure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
     found = student_interval(np.subtract(two, one))
     change = interval(found, "+.3g")
     verdict: Verdict = "0 lies outside" if found.excludes_zero else "may be chance"
-    return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict=verdict)
+    return ComparedFigure(where=where, a=_text(a), b=_text(b), change=change, verdict=verdict)
 
 
-def _compare_numbers(where: str, a: Any, b: Any) -> Figure:
+def _compare_numbers(where: str, a: Any, b: Any) -> ComparedFigure:
     if a == b:
-        return Figure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
+        return ComparedFigure(where=where, a=_text(a), b=_text(b), change="", verdict="same")
     numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in (a, b))
     change = number(b - a, "+.3g") + (f" (× {number(b / a)})" if a else "") if numbers else ""
-    return Figure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
+    return ComparedFigure(where=where, a=_text(a), b=_text(b), change=change, verdict="differs")
 
 
 def _text(value: Any) -> str:
@@ -156,13 +156,13 @@ def _text(value: Any) -> str:
     return number(value, ".4g") if isinstance(value, float) and math.isfinite(value) else str(value)
 
 
-def _figures_block(figures: Sequence[Figure], most: int) -> str:
-    """How many figures there are of each verdict, and those that differ."""
+def _figures_block(figures: Sequence[ComparedFigure], most: int) -> str:
+    """The number of figures of each verdict, and the figures that differ."""
     counts = {verdict: sum(f.verdict == verdict for f in figures) for verdict in VERDICTS}
     head = f"{len(figures)} figures; " + "; ".join(f"{verdict}: {count}" for verdict, count in counts.items() if count)
     paired = counts["0 lies outside"] + counts["may be chance"]
     if paired:
-        head += f" (of {paired} intervals, chance alone leaves 0 outside {paired * CHANCE:.1f})"
+        head += f" (of {paired} intervals, chance alone excludes 0 from {paired * CHANCE:.1f})"
     differing = sorted((f for f in figures if f.verdict != "same"), key=lambda f: VERDICTS.index(f.verdict))
     if not differing:
         return head
@@ -183,18 +183,18 @@ def _differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[tuple[str, st
     ]
 
 
-def _settings(run: Past) -> dict[str, Any]:
+def _settings(run: PastRun) -> dict[str, Any]:
     return {"scale": run.description["scale"], **flat(run.description["config"])}
 
 
-def _machine(run: Past) -> dict[str, Any]:
+def _machine(run: PastRun) -> dict[str, Any]:
     return {"code": run.code, **flat(run.description["versions"]), **flat(run.description["machine"])}
 
 
-def _results(run: Past) -> Mapping[str, Any]:
+def _results(run: PastRun) -> Mapping[str, Any]:
     assert run.results is not None
     return run.results
 
 
-def _cost(run: Past) -> str:
+def _cost(run: PastRun) -> str:
     return ABSENT if run.seconds is None else duration(run.seconds)

@@ -1,4 +1,4 @@
-"""What a run offers the experiment: where to write, how to log, and which of its stages are already done.
+"""The context of a run: directories, log, progress, and the stages that are already done.
 
 A *stage* is a piece of work that is done once and remembered, named `PHASE/SEED` or `PHASE/ARM/SEED`, for example
 `sft/0` and `grpo/ordinal/0`; the report takes phases, arms and seeds of the curves from these names.
@@ -16,10 +16,9 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
-from experiments.core.distributed import ALONE, Devices, Team
-from experiments.core.progress import Advance, Loop, Tell, progress
+from experiments.core.distributed import SINGLE_PROCESS, ProcessGroup, SingleDevice
+from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, progress
 from experiments.core.stopping import Stopping
-from experiments.core.watcher import Watcher
 
 T = TypeVar("T")
 
@@ -33,7 +32,7 @@ class MetricLog:
 
     Args:
       path: of the file.
-      watchers: told of every line.
+      watchers: called with every line.
     """
 
     def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
@@ -81,16 +80,16 @@ class MetricLog:
 
 
 class Context:
-    """The hands of a run.
+    """Everything through which an experiment acts on its run.
 
     Args:
       directory: `runs/NAME/STAMP`.
       cache_dir: data shared between runs; whatever is stored there must be named by the hash of what made it.
-      console: where people read along.
-      watchers: told of every logged line and of every loop.
-      stopping: hears the signals that ask the run to stop; one of its own hears none.
-      team: the processes of the run, of which the first alone writes.
-      devices: where training steps run.
+      console: for people.
+      watchers: called with every logged line and every loop.
+      stopping: receives the signals that ask the run to stop; the default receives none.
+      processes: of which the first alone writes.
+      devices: of the training steps.
     """
 
     def __init__(
@@ -100,21 +99,21 @@ class Context:
         console: Console,
         watchers: Sequence[Watcher] = (),
         stopping: Stopping | None = None,
-        team: Team = ALONE,
-        devices: Devices | None = None,
+        processes: ProcessGroup = SINGLE_PROCESS,
+        devices: SingleDevice | None = None,
     ) -> None:
         self.directory = directory
         self.cache_dir = cache_dir
         self.console = console
         self.stopping = stopping or Stopping()
-        self.team = team
-        self.devices = devices or Devices()
+        self.processes = processes
+        self.devices = devices or SingleDevice()
         self._opened = time.monotonic()
         self._watchers = watchers
         self._loops: list[Loop] = []
-        self._log = MetricLog(directory / "metrics.jsonl", watchers) if team.leads else None
+        self._log = MetricLog(directory / "metrics.jsonl", watchers) if processes.writes else None
 
-    def say(self, text: str) -> None:
+    def print(self, text: str) -> None:
         """Print one line to the reader."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
@@ -139,13 +138,13 @@ class Context:
 
     @contextlib.contextmanager
     def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
-        """A progress bar for one loop.
+        """Show a progress bar for one loop.
 
         Args:
-          title: what is going on.
+          title: of the bar.
           total: steps of the whole loop.
           completed: steps done before this session.
-          still: draw the bar with each step only, and so all bars within, so that they take no time of what is timed.
+          still: redraw this bar and those inside with each step only, so that they take no time from what is timed.
         """
         loop = Loop(title, total, completed, still=still or any(outer.still for outer in self._loops))
         self._loops.append(loop)
@@ -158,7 +157,7 @@ class Context:
         self._looping()
 
     def each(self, title: str, items: Iterable[T], *, still: bool = False) -> Iterator[T]:
-        """The items one after the other, under a progress bar; an item counts once the next is asked for."""
+        """Yield the items under a progress bar; an item counts as done when the next one is requested."""
         listed = tuple(items)
         with self.progress(title, len(listed), still=still) as advance:
             for item in listed:
@@ -166,20 +165,20 @@ class Context:
                 advance()
 
     def rounds(self, title: str, number: int) -> Iterator[int]:
-        """Rounds of a timing, from 0, under a bar that is drawn between them alone and so takes no time of theirs."""
+        """Yield the numbers of timed rounds, from 0, under a bar that is drawn between rounds only."""
         return self.each(title, range(number), still=True)
 
     @contextlib.contextmanager
-    def told(self, title: str, *, still: bool = False) -> Iterator[Tell]:
-        """A progress bar for a loop that tells of itself how many steps are done and of how many, first or later.
+    def progress_callback(self, title: str, *, still: bool = False) -> Iterator[ProgressCallback]:
+        """Show a progress bar for a loop that reports (steps done, all steps) by a callback.
 
-        The first word opens the bar; what is done by then does not count into the rate.
+        The first report opens the bar; steps done by then do not count into the rate.
         """
         with contextlib.ExitStack() as stack:
             bar: list[Advance] = []
             seen = 0
 
-            def tell(done: int, total: int) -> None:
+            def report(done: int, total: int) -> None:
                 nonlocal seen
                 if not bar:
                     bar.append(stack.enter_context(self.progress(title, total, done, still=still)))
@@ -187,15 +186,15 @@ class Context:
                     bar[0](done - seen)
                 seen = done
 
-            yield tell
+            yield report
 
     def require_logged(self, stage: str, steps: int) -> None:
-        """Hold the log to a checkpoint: every step before it is there, so that no run ends with a part of its log.
+        """Require that the log has every step before a checkpoint, so that no run ends with a part of its log.
 
         Raises:
           DamagedFileError: a line is missing.
         """
-        if steps == 0 or not self.team.leads:
+        if steps == 0 or not self.processes.writes:
             return
         seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
         missing = sorted(set(range(steps)) - seen)
@@ -217,12 +216,12 @@ class Context:
         return path
 
     def done(self, stage: str) -> bool:
-        """Whether the stage has a saved result."""
+        """True if the stage has a saved result."""
         return self._stage_file(stage).exists()
 
     def save_stage(self, stage: str, result: Any) -> None:
-        """Publish the result of a finished stage as JSON; from now on the stage is done."""
-        self.team.once(lambda: write_json(self._stage_file(stage), result))
+        """Write the result of a finished stage as JSON, which marks the stage as done."""
+        self.processes.write_once(lambda: write_json(self._stage_file(stage), result))
 
     def load_stage(self, stage: str) -> Any:
         """The saved result of a finished stage, in JSON's types.
@@ -237,7 +236,7 @@ class Context:
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the wall time of the block to the stage's, in `timing`, over interruptions too."""
+        """Add the wall time of the block to the stage's in `timing`, which adds up over interruptions."""
         _checked(stage)
         start = time.monotonic()
         try:
@@ -246,8 +245,8 @@ class Context:
             self.add_time(stage, time.monotonic() - start)
 
     def add_time(self, name: str, seconds: float) -> None:
-        """Add to the wall time that is kept under a name, in `timing`, over interruptions too."""
-        if self.team.leads:
+        """Add to the wall time under a name in `timing`."""
+        if self.processes.writes:
             kept = self.timing()
             write_json(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
 
@@ -257,7 +256,7 @@ class Context:
 
     @property
     def elapsed_s(self) -> float:
-        """Wall seconds of the run so far, those before interruptions too."""
+        """Wall seconds of the run so far, including those before interruptions."""
         return self.timing().get("total", 0.0) + time.monotonic() - self._opened
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.watcher import Watcher
+from experiments.core.progress import Watcher
 
 PACKAGE = "tensorboardX"
 
@@ -21,19 +21,19 @@ HINT = (
 )
 
 FLUSH_S = 10
-"""Seconds after which a line is on the disk at the latest."""
+"""Seconds until a line is on the disk."""
 
 
 def installed() -> bool:
-    """Whether event files can be written."""
+    """True if event files can be written."""
     return importlib.util.find_spec(PACKAGE) is not None
 
 
 class Events(Watcher):
     """Writes every number of every logged line.
 
-    A stage that goes on gets one more file, whose first event tells TensorBoard to drop what the last session wrote at
-    or past its step.  Events carry the time, which `metrics.jsonl` does not.
+    A continued stage gets one more file, whose first event makes TensorBoard drop the events of the last session at or
+    past its step.  Events have a time, lines of `metrics.jsonl` do not.
 
     Args:
       folder: a folder for each stage is made in it.

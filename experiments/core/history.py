@@ -1,4 +1,4 @@
-"""What ran: the runs of every experiment, what each cost and what came out."""
+"""Finished and unfinished runs, read from their directories."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -6,31 +6,30 @@ from pathlib import Path
 from typing import Any
 
 from experiments.core import runs
-from experiments.core.artifacts import DamagedFileError, read_json
-from experiments.core.catalogue import Entry
+from experiments.core.artifacts import read_json
 from experiments.core.text import duration
 
-TOLD = frozenset({"experiment", "scale", "config", "git", "command"})
-"""What tells `config.json` of a run from that of a model."""
+FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
+"""Fields in `config.json` of a run; that of a model has others."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Past:
-    """A run as its directory tells it.
+class PastRun:
+    """A run, read from its directory.
 
     Attributes:
       directory: `runs/NAME/STAMP`.
       description: content of `config.json`.
       seconds: wall time of all its sessions; `None` before the first one ended.
       results: content of `results.json`; `None` while it is unfinished.
-      held: a process is working in it.
+      in_use: a process is working in it.
     """
 
     directory: Path
     description: Mapping[str, Any]
     seconds: float | None
     results: Mapping[str, Any] | None
-    held: bool
+    in_use: bool
 
     @property
     def name(self) -> str:
@@ -39,10 +38,10 @@ class Past:
 
     @property
     def state(self) -> str:
-        """`finished`, `going on`, or `unfinished`."""
+        """`finished`, `running`, or `unfinished`."""
         if self.results is not None:
             return "finished"
-        return "going on" if self.held else "unfinished"
+        return "running" if self.in_use else "unfinished"
 
     @property
     def code(self) -> str:
@@ -54,40 +53,42 @@ class Past:
 
     @property
     def outcome(self) -> tuple[str, ...]:
-        """Sentences of the verdict, led by how many requirements were met; how to go on where there is none."""
+        """The number of requirements met and the verdict; of an unfinished run the command that continues it."""
         if self.results is None:
-            return (f"to go on: {runs.go_on(self.description['command'])}",) if self.state == "unfinished" else ()
-        held = [r["met"] for r in self.results.get("requirements", ())]  # older runs of trained arms have none
-        met = [f"{sum(held)} of {len(held)} requirements met."] if held else []
+            return (
+                (f"to continue: {runs.continuing(self.description['command'])}",) if self.state == "unfinished" else ()
+            )
+        kept = [r["met"] for r in self.results.get("requirements", ())]  # older runs of trained arms have none
+        met = [f"{sum(kept)} of {len(kept)} requirements met."] if kept else []
         return (*met, *self.results["verdict"])
 
 
-def read_run(directory: Path) -> Past:
-    """What lies in the directory of one run.
+def read_run(directory: Path) -> PastRun:
+    """Read the directory of a run.
 
     Raises:
-      FileNotFoundError: no `config.json` there, or not that of a run.
-      DamagedFileError: a file that is not what was written.
+      FileNotFoundError: no `config.json`, or not that of a run.
+      DamagedFileError: a damaged file.
     """
     if not (directory / "config.json").exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
     description = read_json(directory / "config.json")
-    if not isinstance(description, Mapping) or not description.keys() >= TOLD:
+    if not isinstance(description, Mapping) or not description.keys() >= FIELDS:
         raise FileNotFoundError(
             f"{directory / 'config.json'} is not that of a run: must be its directory; correct the path"
         )
     times = directory / "timing.json"
     results = directory / "results.json"
-    return Past(
+    return PastRun(
         directory=directory,
         description=description,
         seconds=read_json(times).get("total") if times.exists() else None,  # stages come before the total
         results=read_json(results) if results.exists() else None,
-        held=runs.held(directory),
+        in_use=runs.in_use(directory),
     )
 
 
-def runs_of(home: Path) -> list[Past]:
+def runs_of(home: Path) -> list[PastRun]:
     """Every run under `runs/NAME`, the newest first."""
     return [read_run(directory) for directory in sorted(runs.started(home), reverse=True)]
 
@@ -106,10 +107,10 @@ def seconds_of_last(home: Path, config: Any) -> float | None:
 
 
 def locate(name: str, runs_dir: Path) -> Path:
-    """The directory that a run is meant by: its path, `NAME/STAMP`, or `NAME` for the latest of an experiment.
+    """Find the directory of a run by its path, by `NAME/STAMP`, or by `NAME` for the latest of an experiment.
 
     Raises:
-      FileNotFoundError: none of them.
+      FileNotFoundError: there is none.
     """
     choices = (Path(name), Path(name) / "latest", runs_dir / name, runs_dir / name / "latest")
     for directory in choices:
@@ -117,53 +118,11 @@ def locate(name: str, runs_dir: Path) -> Path:
             return directory.resolve()
     raise FileNotFoundError(
         f"{name!r} is no run: must be a directory with config.json, NAME/STAMP or NAME under {runs_dir}; "
-        "`python -m experiments list` shows what ran"
+        "`python -m experiments list` shows all runs"
     )
 
 
-def listing_with_runs(entries: Mapping[str, Entry], runs_dir: Path) -> str:
-    """Experiments by family, and below each one line for its newest run with the first sentence of its verdict."""
-    lines: list[str] = []
-    width = max(map(len, entries), default=0)
-    for name, entry in sorted(entries.items(), key=lambda item: (item[1].family, item[0])):
-        if entry.family and f"{entry.family}:" not in lines:
-            lines += ["", f"{entry.family}:"] if lines else [f"{entry.family}:"]
-        lines.append(f"  {name:<{width}}  {entry.question}")
-        past, damaged = _readable(runs_dir / name)
-        for run in past[:1]:
-            more = f" (and {len(past) - 1} more)" if len(past) > 1 else ""
-            lines.append(f"  {'':<{width}}    {summary(run)}{more}  {' '.join(run.outcome[:1])}".rstrip())
-        lines += [f"  {'':<{width}}    {complaint}" for complaint in damaged]
-    return "\n".join(lines)
-
-
-def listing_of_runs(name: str, question: str, runs_dir: Path) -> str:
-    """Every run of one experiment, the newest first, with all that it says."""
-    past, damaged = _readable(runs_dir / name)
-    if not past and not damaged:
-        return f"{name}: {question}\n  has not run under {runs_dir}"
-    blocks = [[f"  {summary(run)}", *(f"      {s}" for s in run.outcome), f"      {_report(run)}"] for run in past]
-    blocks.append([f"  {complaint}" for complaint in damaged])
-    return "\n".join([f"{name}: {question}", *(line.rstrip() for block in blocks for line in block if line.strip())])
-
-
-def summary(run: Past) -> str:
+def summary(run: PastRun) -> str:
     """Stamp, scale, code, state and cost of a run."""
     cost = "" if run.seconds is None else f", {duration(run.seconds)}"
     return f"{run.directory.name}  {run.description['scale']}, code {run.code}: {run.state}{cost}"
-
-
-def _readable(home: Path) -> tuple[list[Past], list[str]]:
-    """Every run under `runs/NAME` that can be read, the newest first, and what is wrong with the others."""
-    past, damaged = [], []
-    for directory in sorted(runs.started(home), reverse=True):
-        try:
-            past.append(read_run(directory))
-        except (DamagedFileError, FileNotFoundError) as error:
-            damaged.append(str(error))
-    return past, damaged
-
-
-def _report(run: Past) -> str:
-    report = run.directory / "report.html"
-    return f"report: {report}" if report.exists() else ""

@@ -1,4 +1,4 @@
-"""The report of a run that is still going on: where it stands, the time left, the curves so far."""
+"""The page of a run in progress: its loops, the time left, the training curves so far."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -9,30 +9,29 @@ from experiments.core.artifacts import read_json, write_text
 from experiments.core.context import read_metrics
 from experiments.core.curves import PhaseCurves, draw_phases
 from experiments.core.pages import render
-from experiments.core.progress import Loop
-from experiments.core.runs import go_on
+from experiments.core.progress import Loop, Watcher
+from experiments.core.runs import continuing
 from experiments.core.text import duration
-from experiments.core.watcher import Watcher
 
 EVERY_S = 10
-"""Seconds between two pages at least, and between two looks of a browser."""
+"""Least seconds between two pages, and between two reloads by a browser."""
 
 SHARE = 0.01
-"""Of the run's time that pages may take: one that took a second is followed by the next after 100 s."""
+"""Share of the run's time for pages: after one that took a second, the next follows after 100 s."""
 
 MOST = 9
-"""Panels of a phase for which nobody chose the scalars."""
+"""Panels of a phase whose scalars the experiment does not choose."""
 
 
 class LivePage(Watcher):
-    """Writes `report.html` while a run goes on, until the report takes its place; no server, no script.
+    """Writes `report.html` during a run, until the report replaces it; no server, no script.
 
     Args:
       directory: the run's.
       about: docstring of the experiment; its first line is the question.
       description: content of the run's `config.json`.
-      curves: of each phase the scalars to draw.
-      usual_s: what the last run of the same configuration took; `None` if there was none.
+      curves: phase → scalars to draw.
+      usual_s: duration of the last run of the same configuration; `None` if there was none.
     """
 
     def __init__(
@@ -61,16 +60,16 @@ class LivePage(Watcher):
         self._look()
 
     def end(self, error: BaseException) -> None:
-        """The last page of a session that something ended: why, and how to go on."""
+        """Write the last page of a session that an error or a signal ended: the cause, and how to continue."""
         why = f"{type(error).__name__}: {error}".rstrip(": ")
-        command = go_on(self._description["command"])
-        self._write(f"Ended on {_clock()} by {why}. To go on: {command}", reload_s=None)
+        command = continuing(self._description["command"])
+        self._write(f"Ended on {_clock()} by {why}. To continue: {command}", reload_s=None)
 
     def _look(self) -> None:
-        """Write the page if the last one is old enough for what it cost."""
+        """Write the page if the last one is old enough for its cost."""
         began = time.monotonic()
         if began >= self._due:
-            self._write(f"Going on: this page is of {_clock()} and reads itself again.", reload_s=EVERY_S)
+            self._write(f"Running: this page is of {_clock()} and reloads itself.", reload_s=EVERY_S)
             now = time.monotonic()
             self._due = now + max(EVERY_S, (now - began) / SHARE)
 

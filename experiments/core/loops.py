@@ -8,11 +8,11 @@ from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.loop import Batches, Log, LoopConfig, LoopTime, fit, resume
 
 STEPPING, WAITING = "in steps", "waiting for data"
-"""What the time of a stage's steps after the first, and the part of it without a batch, is kept under: `NAME/STAGE`."""
+"""Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
 
 
 def plain_log(context: Context, stage: str, start: int) -> Log:
-    """A function that logs the metrics of each step as they are."""
+    """Log the metrics of each step unchanged."""
     del start
     return lambda t, metrics: context.log(stage, t, **metrics)
 
@@ -28,25 +28,25 @@ def run_loop(
     make_log: Callable[[Context, str, int], Log] = plain_log,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
-    """`fit` from the newest checkpoint of the stage; a stopped one goes on there and ends in the same state.
+    """Run `fit` as a stage, from its newest checkpoint, so that an interrupted stage ends in the same state.
 
     Args:
       step: jitted (state, batch) → (state, metrics).
-      state: where a stage without a checkpoint begins.
+      state: the first one of a stage without a checkpoint.
       batches: training data.
-      loop: how long, and how often to save.
+      loop: number of steps, and of those between checkpoints.
       context: the run.
       stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
-      make_log: from context, stage and first step to what receives (step, metrics).
-      held_out: score of a state, the higher the better, taken at every checkpoint; the best one is kept.
+      make_log: from context, stage and first step to a function of (step, metrics).
+      held_out: score of a state on unseen data, higher is better, computed at every checkpoint; the best one is kept.
     """
     times = LoopTime()
     with (
         Checkpoints(
-            context.checkpoint_dir(stage), better=None if held_out is None else "higher", say=context.say
+            context.checkpoint_dir(stage), better=None if held_out is None else "higher", say=context.print
         ) as checkpoints,
         context.timed(stage),
-        context.stopping.patient(context.team.any) as stopping,
+        context.stopping.patient(context.processes.any) as stopping,
     ):
         start, state = resume(state, batches, checkpoints)
         context.require_logged(stage, start)
@@ -65,7 +65,7 @@ def run_loop(
         if times.steps:
             context.add_time(f"{STEPPING}/{stage}", times.total_s)
             context.add_time(f"{WAITING}/{stage}", times.input_s)
-            context.say(
+            context.print(
                 f"{stage}: {1e3 * times.total_s / times.steps:.3g} ms a step, {times.input_share:.2%} of it {WAITING}"
             )
     return state

@@ -1,9 +1,9 @@
-"""A progress bar with rate and time left; plain lines where the output is no terminal."""
+"""Progress of loops: a bar with rate and time left, or plain lines where the output is no terminal."""
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -25,30 +25,30 @@ PLAIN_EVERY_S = 10.0
 
 
 class Advance(Protocol):
-    """What a loop calls after each step: `advance()`, or `advance(3, "reward 0.52")`."""
+    """The function that a loop calls after each step: `advance()`, or `advance(3, "reward 0.52")`."""
 
     def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
-Tell = Callable[[int, int], None]
-"""What a loop calls that knows how far it is: with the steps that are done, and all of them."""
+ProgressCallback = Callable[[int, int], None]
+"""Called with the steps that are done, and the number of all steps."""
 
 MB = 1_000_000
 
 
-def in_megabytes(tell: Tell) -> Tell:
-    """For a loop that tells bytes; those begun are counted, so that the last word is all of all."""
-    return lambda done, total: tell(-(-done // MB), -(-total // MB))
+def in_megabytes(callback: ProgressCallback) -> ProgressCallback:
+    """A callback for bytes that reports megabytes, rounded up, so that the last report is complete."""
+    return lambda done, total: callback(-(-done // MB), -(-total // MB))
 
 
 class Loop:
-    """How far a loop has come.
+    """The progress of a loop.
 
     Args:
-      title: what is going on.
+      title: of its bar.
       total: steps of the whole loop.
-      completed: steps that an earlier session did; they do not count into the rate.
-      still: whether it is drawn with each step only, not ten times a second, which would take time of what is timed.
+      completed: steps of earlier sessions; they do not count into the rate.
+      still: redraw with each step only, not ten times a second, which would take time from what is timed.
     """
 
     def __init__(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> None:
@@ -56,14 +56,14 @@ class Loop:
         self._began = self._first_call = (completed, time.monotonic())
 
     def advance(self, steps: int, note: str = "") -> None:
-        """So many more steps are done."""
+        """Count further steps as done."""
         self.completed, self.note = self.completed + steps, note
         if self._first_call is self._began:
             self._first_call = (self.completed, time.monotonic())
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since it began in this session."""
+        """Seconds since its beginning in this session."""
         return time.monotonic() - self._began[1]
 
     @property
@@ -73,27 +73,64 @@ class Loop:
 
     @property
     def rate(self) -> float:
-        """Steps per second; what the first call took does not count once there are others, for it compiled."""
+        """Steps per second, without the first call as soon as there is another, since the first one compiled."""
         completed, since = self._began if self.starting else self._first_call
         elapsed_s = time.monotonic() - since
         return (self.completed - completed) / elapsed_s if elapsed_s > 0 else 0.0
 
     @property
     def starting(self) -> bool:
-        """Whether there was no second call yet, so that all that is known of its speed is a first that compiled."""
+        """True until the second call: the only known speed is that of the call that compiled."""
         return self.completed == self._first_call[0]
 
     @property
     def left_s(self) -> float | None:
-        """Seconds to its end at this rate, `None` before the first step."""
+        """Seconds to the end at this rate, `None` before the first step."""
         return (self.total - self.completed) / self.rate if self.rate > 0 else None
 
     @property
     def left(self) -> str:
-        """The same in words, empty before the first step and at the end; "at most" while all steps seem as slow."""
+        """The same in words, empty before the first step and at the end; "at most" while `starting`."""
         if not self.left_s:
             return ""
         return f"{'at most ' if self.starting else ''}{duration(self.left_s)}"
+
+
+class Watcher:
+    """Base of whatever follows a run: it is called with every logged line and every loop; here it does nothing."""
+
+    def rewound(self, stage: str, step: int) -> None:
+        """The lines of a stage at or past a step are dropped; every stage is rewound before its first line."""
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """A line was written to `metrics.jsonl`; `scalars` are in JSON's types."""
+
+    def looping(self, loops: Sequence[Loop]) -> None:
+        """A loop began, advanced or ended; `loops` are the open ones, the outermost first."""
+
+    def closed(self) -> None:
+        """The session is over."""
+
+
+@contextlib.contextmanager
+def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
+    """Show the progress of one loop.
+
+    Args:
+      console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
+      loop: advanced by the function that this yields.
+      after: called after each advance.
+    """
+    if console.is_terminal:
+        with _bar(console, loop.still) as bar:
+            task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
+            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
+            yield _advance(loop, draw, after)
+    else:
+        lines = _PlainLines(console, loop)
+        yield _advance(loop, lines.look, after)
+        if lines.completed != loop.completed:
+            lines.print()
 
 
 class RateColumn(ProgressColumn):
@@ -103,27 +140,6 @@ class RateColumn(ProgressColumn):
         """The rate, or nothing before the first step."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.3g}/s", style="progress.data.speed")
-
-
-@contextlib.contextmanager
-def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
-    """Show the progress of one loop.
-
-    Args:
-      console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
-      loop: advanced by what this yields.
-      after: called after each advance.
-    """
-    if console.is_terminal:
-        with _bar(console, loop.still) as bar:
-            task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
-            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
-            yield _advance(loop, draw, after)
-    else:
-        plain = _Plain(console, loop)
-        yield _advance(loop, plain.look, after)
-        if plain.said != loop.completed:
-            plain.print()
 
 
 def _advance(loop: Loop, *shows: Callable[[], None]) -> Advance:
@@ -150,23 +166,20 @@ def _bar(console: Console, still: bool) -> Progress:
     )
 
 
-class _Plain:
-    """The same figures as lines of text."""
+class _PlainLines:
+    """The same figures as lines of text; `completed` is that of the last line."""
 
     def __init__(self, console: Console, loop: Loop) -> None:
         self._console, self._loop = console, loop
-        self._printed = time.monotonic()
-        self.said: int | None = None
-        """Steps that the last line told of."""
+        self._printed_s = time.monotonic()
+        self.completed: int | None = None
 
     def look(self) -> None:
-        """Print a line if the last one is old."""
-        if time.monotonic() - self._printed >= PLAIN_EVERY_S:
+        if time.monotonic() - self._printed_s >= PLAIN_EVERY_S:
             self.print()
 
     def print(self) -> None:
-        """Print a line."""
-        self._printed, self.said, loop = time.monotonic(), self._loop.completed, self._loop
+        self._printed_s, self.completed, loop = time.monotonic(), self._loop.completed, self._loop
         left = f", {loop.left} left" if loop.left else ""
         note = f"  {loop.note}" if loop.note else ""
         line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {duration(loop.elapsed_s)}{left}{note}"

@@ -61,7 +61,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
 
 def is_best(metric: str, arm: str, results: Results) -> bool:
-    """Whether an arm has the best mean of all arms and every other arm is behind it by a paired interval without 0."""
+    """True if an arm has the best mean, and the paired interval between it and every other arm excludes 0."""
     better = REPORTED[metric].better
     means = {name: row[metric].mean for name, row in results.arms.items() if metric in row}
     others = set(means) - {arm}
@@ -72,7 +72,7 @@ def is_best(metric: str, arm: str, results: Results) -> bool:
 
 
 def _clear(metric: str, pair: set[str], results: Results) -> bool:
-    """Whether the two are compared on the metric and every interval between them excludes 0."""
+    """True if the two are compared on the metric and every interval between them excludes 0."""
     found = [c for c in results.comparisons if c.metric == metric and {c.arm, c.against} == pair]
     return bool(found) and all(c.low > 0 or c.high < 0 for c in found)
 

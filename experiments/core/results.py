@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from experiments.core.artifacts import jsonable
-from experiments.core.checks import require
+from experiments.core.errors import require
 from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")
@@ -35,7 +35,7 @@ class Requirement:
 
     @property
     def met(self) -> bool:
-        """Whether the figure keeps its bound."""
+        """True if the figure keeps its bound."""
         return self.measured <= self.bound if self.better == "lower" else self.measured >= self.bound
 
     def to_json(self) -> dict[str, Any]:

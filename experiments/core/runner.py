@@ -22,18 +22,16 @@ from rich.console import Console
 
 from experiments.core import events, runs
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_json
-from experiments.core.catalogue import find
-from experiments.core.commands import PROG, answer, complain, say
+from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
-from experiments.core.distributed import Launch, NoTeam, Team, devices_of, joined
+from experiments.core.distributed import Launch, ProcessesNotFoundError, ProcessGroup, join_processes, select_devices
 from experiments.core.history import seconds_of_last
 from experiments.core.live import LivePage
-from experiments.core.machine import Machine, MachineError, require_machine
-from experiments.core.quick import compiled_quickly
+from experiments.core.machine import Accelerators, MachineError, compiled_quickly, require_accelerators
+from experiments.core.progress import Watcher
 from experiments.core.report import write_report
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
-from experiments.core.watcher import Watcher
 from sensors_io.errors import UserError
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import WeightsError
@@ -45,10 +43,10 @@ from touchr1_jax.training.loop import NonFiniteGradientError
 EVENTS = "events"
 """Folder of a run that holds its TensorBoard events."""
 
-EVENTS_HELP = f"Write TensorBoard events beside metrics.jsonl: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
+EVENTS_HELP = f"Also write TensorBoard events: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
 
 COMPILED = "compiled"
-"""Folder of the cache that holds compiled programs, so that a run like an earlier one compiles next to nothing."""
+"""Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
 
 KNOWN_ERRORS = (
     runs.RunInUse,
@@ -56,14 +54,14 @@ KNOWN_ERRORS = (
     CheckpointError,
     NonFiniteGradientError,
     DamagedFileError,
-    NoTeam,
+    ProcessesNotFoundError,
     MachineError,
     RewardError,
     SizeError,
     WeightsError,
     OSError,
 )
-"""Whose message says all that a user needs; others come with their traceback."""
+"""Errors whose message is all that a user needs; others come with their traceback."""
 
 C = TypeVar("C")
 
@@ -75,13 +73,12 @@ class Experiment(Generic[C]):
     Args:
       name: the name of its module.
       config: the default configuration, a frozen keyword-only dataclass.
-      run: computes results (trained arms) or findings (measurements); it must skip the stages that `Context.done` names
-        and continue from checkpoints.
+      run: computes the results; it skips stages for which `Context.done` is true and continues from checkpoints.
       scales: further configurations by name, `smoke` for one that takes under two minutes.
-      curves: of each phase the scalars to draw while it runs; of a phase that is not named, the first few.
-      needs: of each scale what it asks of the machine; one that is not named runs on any.
-      quick: scales whose programs run so few times that they are compiled quickly (`core/quick.py`).
-      spreads: whether its training runs on the devices of all processes; others know one device.
+      curves: phase → scalars to draw while it runs; of a phase that is not named, the first few.
+      needs: scale → accelerators that it needs; a scale that is not named runs on any machine.
+      quick: scales whose programs run so few times that they are compiled quickly.
+      spreads: whether its training runs on the devices of all processes; others use one device.
     """
 
     name: str
@@ -89,7 +86,7 @@ class Experiment(Generic[C]):
     run: Callable[[C, Context], Results]
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    needs: Mapping[str, Machine] = dataclasses.field(default_factory=dict)
+    needs: Mapping[str, Accelerators] = dataclasses.field(default_factory=dict)
     quick: tuple[str, ...] = ()
     spreads: bool = False
 
@@ -121,7 +118,7 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
       package: the package to find experiments in.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    status = answer(arguments, package)
+    status = run_command(arguments, package)
     return run(arguments, package) if status is None else status
 
 
@@ -137,7 +134,7 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
         command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
         jsonable(command.config, where="config")
     except ValueError as error:  # a configuration refuses its own values, or one is not finite
-        complain(f"{type(error).__name__}: {error}")
+        print_error(f"{type(error).__name__}: {error}")
         return 2
     with compiled_quickly() if command.scale in module.EXPERIMENT.quick else contextlib.nullcontext():
         return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
@@ -155,11 +152,11 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     command = dataclasses.make_dataclass(
         "Command",
         [
-            ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Whose defaults to start from.")]),
-            ("fresh", Annotated[bool, tyro.conf.arg(help="Start anew beside an unfinished run.")]),
+            ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Set of defaults.")]),
+            ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")]),
             ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)]),
-            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Where runs are kept.")]),
-            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Where data and compiled programs are kept.")]),
+            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")]),
+            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")]),
             ("launch", Annotated[Launch, tyro.conf.arg(name="")]),
             ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")]),
         ],
@@ -183,43 +180,45 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
 def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
     """Run or continue an experiment; returns the exit code, 128 + n after signal n."""
     if command.tensorboard and not events.installed():
-        complain(events.HINT)
+        print_error(events.HINT)
         return 2
     if not experiment.spreads and command.launch != Launch():
-        complain(f"{experiment.name} knows one process and one device; leave --distributed and --mesh out")
+        print_error(f"{experiment.name} runs in one process on one device; leave --distributed and --mesh out")
         return 2
     stopping = Stopping()
     directory = None
     try:
-        team = joined(command.launch)
-        require_machine(command.scale, experiment.needs.get(command.scale))
-        chosen, resumed = team.agreed(lambda: _directory(experiment, command, typed))
+        processes = join_processes(command.launch)
+        require_accelerators(command.scale, experiment.needs.get(command.scale))
+        chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
         directory = Path(chosen)
-        with stopping.listening(), _held(directory, team), compilations_kept(command.cache_dir / COMPILED):
-            if team.leads:
+        with stopping.listening(), _locked(directory, processes), compilations_kept(command.cache_dir / COMPILED):
+            if processes.writes:
                 runs.point_latest(directory)
                 _announce(directory, resumed)
-                _run(experiment, command, directory, about, stopping, team)
+                _run(experiment, command, directory, about, stopping, processes)
             else:
-                _follow(experiment, command, directory, stopping, team)
+                _follow(experiment, command, directory, stopping, processes)
     except KNOWN_ERRORS as error:
-        complain(f"{type(error).__name__}: {error}")
+        print_error(f"{type(error).__name__}: {error}")
         if directory is not None:
-            say(f"Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
+            print_lines(f"Everything so far is in {directory}. To continue: {runs.continuing(typed)}")
         return 1
     except Stopped as stopped:
-        say(f"\nStopped by {stopped}. Everything so far is in {directory}. To go on: {runs.go_on(typed)}")
+        print_lines(
+            f"\nStopped by {stopped}. Everything so far is in {directory}. To continue: {runs.continuing(typed)}"
+        )
         return 128 + stopped.number
     return 0
 
 
-def _held(directory: Path, team: Team) -> contextlib.AbstractContextManager[None]:
-    """The run's lock, which the process that writes holds for all."""
-    return runs.locked(directory) if team.leads else contextlib.nullcontext()
+def _locked(directory: Path, processes: ProcessGroup) -> contextlib.AbstractContextManager[None]:
+    """The lock of the run, held by the process that writes."""
+    return runs.locked(directory) if processes.writes else contextlib.nullcontext()
 
 
 def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[str, bool]:
-    """The run's directory, and whether it is an unfinished one that goes on."""
+    """The run's directory, and whether it is that of an unfinished run."""
     config = jsonable(command.config, where="config")
     home = command.runs_dir / experiment.name
     unfinished = None if command.fresh else runs.newest_unfinished(home, config)
@@ -228,18 +227,20 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
 
 
-def _follow(experiment: Experiment[Any], command: Any, directory: Path, stopping: Stopping, team: Team) -> None:
-    """Compute with the process that writes."""
-    devices = devices_of(command.launch)
-    context = Context(directory, command.cache_dir, Console(quiet=True), (), stopping, team, devices)
+def _follow(
+    experiment: Experiment[Any], command: Any, directory: Path, stopping: Stopping, processes: ProcessGroup
+) -> None:
+    """Compute together with the process that writes."""
+    devices = select_devices(command.launch)
+    context = Context(directory, command.cache_dir, Console(quiet=True), (), stopping, processes, devices)
     with contextlib.closing(context):
         experiment.run(command.config, context)
 
 
 def _run(
-    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, team: Team
+    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, processes: ProcessGroup
 ) -> None:
-    """Compute and publish; whatever ends a run before that is what its page says last."""
+    """Compute and publish; an error that ends the run is shown on its page."""
     description = read_json(directory / "config.json")
     page = LivePage(
         directory,
@@ -252,8 +253,8 @@ def _run(
         watchers: list[Watcher] = [page]
         if command.tensorboard:
             watchers.append(events.Events(directory / EVENTS))
-        devices = devices_of(command.launch)
-        context = Context(directory, command.cache_dir, Console(), watchers, stopping, team, devices)
+        devices = select_devices(command.launch)
+        context = Context(directory, command.cache_dir, Console(), watchers, stopping, processes, devices)
         with contextlib.closing(context), context.timed("total"):
             results = experiment.run(command.config, context)
         _publish(results, context, description, about)
@@ -267,22 +268,22 @@ def _publish(results: Results, context: Context, description: Mapping[str, Any],
     results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
     report = write_report(context.directory, results, about=about, description=description)
     write_json(context.directory / "results.json", results.to_json(description))
-    context.say(f"report: {report}")
+    context.print(f"report: {report}")
     for sentence in results.verdict:
-        context.say(sentence)
+        context.print(sentence)
 
 
 def _announce(directory: Path, resumed: bool) -> None:
-    """Say which of the two happens, where to watch, and whether the code changed meanwhile."""
-    say(f"continuing {directory} (--fresh starts anew)" if resumed else f"new run {directory}")
-    say(f"to watch: {directory / 'report.html'}")
+    """Print whether the run is new, the path of its page, and a note if the code has changed since it began."""
+    print_lines(f"continuing {directory} (--fresh starts a new run)" if resumed else f"new run {directory}")
+    print_lines(f"to watch: {directory / 'report.html'}")
     began, now = read_json(directory / "config.json")["git"], dataclasses.asdict(runs.revision())
     if resumed and began != now:
-        say(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
+        print_lines(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
 
 
 def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:
-    """The scale that the arguments name; `default` where they name none or an unknown one, which tyro then answers."""
+    """The scale that the arguments name; `default` where they name none or an unknown one, which tyro then refuses."""
     named = "default"
     for flag, value in itertools.pairwise([*arguments, ""]):
         if flag == "--scale":

@@ -1,4 +1,4 @@
-"""Run directories: `runs/NAME/STAMP`, which of them an unfinished run is continued in, and where its code came from.
+"""Run directories `runs/NAME/STAMP`: creating, finding and locking them, and the provenance of the code.
 
     runs/NAME/latest -> STAMP
     runs/NAME/STAMP/{config.json, metrics.jsonl, timing.json, stages/, checkpoints/, plots/, report.html, results.json}
@@ -22,13 +22,13 @@ from typing import Any
 from experiments.core.artifacts import point_link, read_json, write_json
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
-"""The packages whose versions are kept with a run."""
+"""Packages whose versions are kept with a run."""
 
 UNKNOWN = "unknown"
-"""Commit of code that lies in no checkout."""
+"""Commit of code outside a checkout."""
 
 ROOT = Path(__file__).resolve().parents[2]
-"""The checkout that this code lies in, if it lies in one."""
+"""The checkout of this code, if there is one."""
 
 
 class RunInUse(RuntimeError):
@@ -36,14 +36,14 @@ class RunInUse(RuntimeError):
 
 
 class NoCheckoutError(FileNotFoundError):
-    """The code is installed by itself: what belongs to a checkout alone is not there."""
+    """The code is installed without a checkout."""
 
 
 def checkout(root: Path = ROOT) -> Path:
-    """The top of the checkout that this code lies in.
+    """The top of the checkout of this code.
 
     Raises:
-      NoCheckoutError: it is installed without one.
+      NoCheckoutError: there is none.
     """
     if not (root / "pyproject.toml").exists():
         raise NoCheckoutError(
@@ -120,7 +120,7 @@ def create(home: Path, description: dict[str, Any]) -> Path:
 
 
 def describe(name: str, scale: str, config: Any, command: str) -> dict[str, Any]:
-    """What `config.json` holds: the resolved configuration and everything needed to run it again."""
+    """The content of `config.json`: the resolved configuration and everything needed to run it again."""
     return {
         "experiment": name,
         "scale": scale,
@@ -139,24 +139,24 @@ def point_latest(directory: Path) -> None:
 
 @contextlib.contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Hold a run directory for this process; the lock goes with the process, however it ends.
+    """Lock a run directory for this process; the lock ends with the process.
 
     Raises:
-      RunInUse: another process holds it.
+      RunInUse: another process has locked it.
     """
     with (directory / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise RunInUse(
-                f"{directory} is being worked in by another process: two would overwrite each other; "
-                "wait for it, stop it, or start anew with --fresh"
+                f"{directory} is in use by another process: two would overwrite each other; "
+                "wait for it, stop it, or start a new run with --fresh"
             ) from None
         yield
 
 
-def held(directory: Path) -> bool:
-    """Whether a process is working in a run directory; it looks for an instant in which none could begin."""
+def in_use(directory: Path) -> bool:
+    """True if a process works in a run directory; while this checks, none can begin."""
     lock = directory / ".lock"
     if not lock.exists():
         return False
@@ -168,13 +168,13 @@ def held(directory: Path) -> bool:
     return False
 
 
-def go_on(command: str) -> str:
-    """The command that continues what a command began."""
+def continuing(command: str) -> str:
+    """The command that continues the run of a command."""
     return shlex.join(part for part in shlex.split(command) if part != "--fresh")
 
 
 def _git(root: Path, *arguments: str) -> str | None:
-    """What a git command prints, or `None` where there is no git or no checkout."""
+    """The output of a git command, `None` without git or a checkout."""
     try:
         done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=False)
     except FileNotFoundError:

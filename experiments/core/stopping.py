@@ -1,4 +1,4 @@
-"""How a run hears that it should stop: at once, or, inside a training loop, once the step is done and saved."""
+"""Stopping a run by a signal: at once, or, inside a training loop, after the step is done and saved."""
 
 import contextlib
 import os
@@ -10,17 +10,16 @@ from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""Control-C, and what a scheduler sends before it takes the machine away."""
-
+"""Control-C, and the signal that a scheduler sends before it takes the machine away."""
 
 PATIENCE = b"\nstopping once this step is done and saved; a second signal ends at once, unsaved\n"
-"""Told on standard error where a stop has to wait, for minutes where the step is one that compiles."""
+"""Written to standard error where a stop has to wait; a step that compiles takes minutes."""
 
 STDERR = 2
-"""Its descriptor: what stands in for `sys.stderr`, as in a notebook, may have none."""
+"""Its descriptor; a replacement of `sys.stderr`, as in a notebook, may have none."""
 
 AGAIN_S = 0.02
-"""Between two looks whether the `Stopped` that was raised is still on its way."""
+"""Interval of the checks whether the raised `Stopped` still propagates."""
 
 
 class Stopped(BaseException):
@@ -34,8 +33,8 @@ class Stopped(BaseException):
 class Stopping:
     """The first of `SIGNALS` raises `Stopped`, at once or when a patient block ends; a second one ends the process.
 
-    A signal may strike within a callback of the garbage collector, of which JAX has one, or within a `__del__`.  Python
-    reports what is raised there and goes on; `Stopped` is then raised again a moment later.
+    A signal may arrive within a callback of the garbage collector, of which JAX has one, or within a `__del__`.  Python
+    only reports exceptions that are raised there; `Stopped` is then raised again a moment later.
     """
 
     def __init__(self) -> None:
@@ -45,8 +44,8 @@ class Stopping:
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear the signals inside the block; only a process's main thread can."""
-        before = {n: signal.signal(n, self._hear) for n in SIGNALS}
+        """Handle the signals inside the block; only a process's main thread can."""
+        before = {n: signal.signal(n, self._handle) for n in SIGNALS}
         before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._again)
         report = sys.unraisablehook
         sys.unraisablehook = lambda lost: self._lost(lost, report)
@@ -60,32 +59,32 @@ class Stopping:
 
     @contextlib.contextmanager
     def patient(self, agreed: Callable[[bool], bool] = bool) -> Iterator[Callable[[], bool]]:
-        """A block that ends by itself soon after the function that it gets says that a signal came.
+        """Delay the stop: the block polls the function that it gets, and leaves when that returns True.
 
         Args:
-          agreed: from whether one came to this process, whether one came to any process of the run; all ask it equally
-            often, so that all leave after the same step.
+          agreed: from "a signal came to this process" to "one came to any process of the run"; all processes call it
+            equally often, so that all leave after the same step.
 
         Raises:
-          Stopped: when the block ends, if one came, to whichever process.
+          Stopped: when the block ends, if a signal came to any process.
         """
         stop = False
 
-        def asked() -> bool:
+        def poll() -> bool:
             nonlocal stop
             stop = stop or agreed(self._number is not None)
             return stop
 
         self._patient = True
         try:
-            yield asked
-            asked()  # one that came after the last step
+            yield poll
+            poll()  # one that came after the last step
         finally:
             self._patient = False
         if stop or self._number is not None:
             raise self._stopped(self._number or signal.SIGTERM)
 
-    def _hear(self, number: int, frame: FrameType | None) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         for n in SIGNALS:
             signal.signal(n, signal.SIG_DFL)
@@ -101,7 +100,7 @@ class Stopping:
             report(lost)
 
     def _again(self, number: int, frame: FrameType | None) -> None:
-        """Raise another where the last one is gone; one that is on its way up, through what is put away, is alive."""
+        """Raise another `Stopped` if the last one is gone; while it propagates, it is alive."""
         del number, frame
         alive = self._raised is not None and self._raised() is not None
         if self._number is not None and not self._patient and not alive:

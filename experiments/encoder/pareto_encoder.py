@@ -133,7 +133,7 @@ def learn(
         found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen, context)
         context.save_stage(answers, found)
     right = np.array(context.load_stage(answers))
-    context.say(f"{variant.name}: {100 * right.mean():.1f} %")
+    context.print(f"{variant.name}: {100 * right.mean():.1f} %")
     return state.target, right
 
 

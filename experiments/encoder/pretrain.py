@@ -191,7 +191,7 @@ def _measure(
         found |= {"probe_lead": found["probe"] - start["probe"], "kept": found["told_apart"] / start["told_apart"]}
     if before:
         for alarm in collapse_alarms(context.load_stage(f"{stage}/at{before}"), found):
-            context.say(f"{stage}, step {step}: {alarm}")
+            context.print(f"{stage}, step {step}: {alarm}")
     context.log(stage, step, **found)
-    context.say(f"{stage}, step {step}: " + ", ".join(f"{name} {value:.3g}" for name, value in found.items()))
+    context.print(f"{stage}, step {step}: " + ", ".join(f"{name} {value:.3g}" for name, value in found.items()))
     context.save_stage(f"{stage}/at{step}", found)

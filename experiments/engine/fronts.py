@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from experiments.core.checks import require
+from experiments.core.errors import require
 
 Better = Literal["lower", "higher"]
 

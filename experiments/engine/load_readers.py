@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.core.processes import in_own_process
+from experiments.engine.processes import in_own_process
 from touchr1_jax.models.load import peak_memory
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.names import read, sources

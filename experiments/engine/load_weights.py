@@ -91,18 +91,18 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
     """Write one checkpoint, read it by every reader, and remove it."""
     directory = Path(tempfile.mkdtemp(prefix=f"weights-{size}-", dir=config.scratch))
     try:
-        context.say(f"{size}: writing {weight_bytes(size) / 1e9:.1f} GB to {directory}")
-        with context.told(f"writing {size}, MB") as tell:
+        context.print(f"{size}: writing {weight_bytes(size) / 1e9:.1f} GB to {directory}")
+        with context.progress_callback(f"writing {size}, MB") as tell:
             random_checkpoint(directory, SHAPES[size], config.shard_bytes, config.seed, in_megabytes(tell))
         readings = {}
         for name in (OURS, PLAIN) if size in config.compare else (OURS,):
-            with context.told(f"reading {size}, {name}, MB", still=True) as tell:
+            with context.progress_callback(f"reading {size}, {name}, MB", still=True) as tell:
                 in_megabytes(tell)(0, weight_bytes(size))
                 readings[name] = measure(name, directory, SHAPES[size], in_megabytes(tell))
     finally:
         shutil.rmtree(directory)
     for name, r in readings.items():
-        context.say(f"{size}, {name}: {r.peak / r.held:.3f} × {r.held / 1e9:.2f} GB in {r.seconds:.1f} s")
+        context.print(f"{size}, {name}: {r.peak / r.held:.3f} × {r.held / 1e9:.2f} GB in {r.seconds:.1f} s")
     return readings
 
 

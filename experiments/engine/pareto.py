@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.core.history import Past, runs_of, summary
+from experiments.core.history import PastRun, runs_of, summary
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
@@ -133,7 +133,7 @@ class DefaultJudgement:
 
     judged: JudgedDefault
     title: str
-    run: Past
+    run: PastRun
     points: tuple[Point, ...]
     beaten_by: tuple[Point, ...] | None
 
@@ -158,13 +158,13 @@ def run(config: GatherConfig, context: Context) -> Results:
     )
 
 
-def newest(home: Path) -> Past | None:
+def newest(home: Path) -> PastRun | None:
     """The newest finished run of an experiment; one at another scale than `smoke` goes before all that are."""
     finished = [past for past in runs_of(home) if past.results is not None]
     return min(finished, key=lambda past: past.description["scale"] == "smoke", default=None)
 
 
-def judge(judged: JudgedDefault, past: Past) -> list[DefaultJudgement]:
+def judge(judged: JudgedDefault, past: PastRun) -> list[DefaultJudgement]:
     """A default on every table of a run that begins as it says and has its row."""
     tables = [] if past.results is None else past.results["tables"]
     judgements = []
@@ -223,7 +223,7 @@ def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
     )
 
 
-def run_table(ran: Mapping[str, Past]) -> Table:
+def run_table(ran: Mapping[str, PastRun]) -> Table:
     """Which runs the page is made of."""
     return Table(
         title="Runs",
@@ -232,7 +232,7 @@ def run_table(ran: Mapping[str, Past]) -> Table:
     )
 
 
-def charts(name: str, past: Past) -> list[Picture]:
+def charts(name: str, past: PastRun) -> list[Picture]:
     """All pictures of a run, as they lie in its folder."""
     files = sorted(path for kind in MEDIA for path in (past.directory / "plots").glob(f"*.{kind}"))
     return [

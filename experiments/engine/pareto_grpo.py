@@ -79,7 +79,7 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
         for name, group in keys:
             key = name, group
             rewards[key], last[key] = learn(config, ALGORITHMS[name], group, advance)
-            context.say(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
+            context.print(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
     calls = {f"{name} {group}": job.step for (name, group), job in last.items()}
     seconds = interleaved(calls, context.rounds("timing steps", config.timed))
     courses = {

@@ -15,8 +15,8 @@ from typing import Literal, NamedTuple
 import jax
 from jax.experimental import topologies
 
-from experiments.core.processes import in_own_process
 from experiments.engine.paper_shapes import OPTIMIZER, Setup, Training, score_of
+from experiments.engine.processes import in_own_process
 from touchr1_jax.distributed.abstract import compile_grpo
 from touchr1_jax.distributed.memory import Compiled
 

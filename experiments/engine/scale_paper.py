@@ -142,7 +142,7 @@ def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, C
             context.save_stage(stage, {"bytes": outcome.compiled, "seconds": outcome.seconds})
         saved = context.load_stage(stage)
         found[layers] = Compiled(*saved["bytes"])
-        context.say(
+        context.print(
             f"{setup.name}, {layers} layers: {found[layers].peak / GB:.2f} GB, compiled in {saved['seconds']:.0f} s"
         )
     return found | {depth(config): at_depths(found, depth(config))}

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.progress import Tell
+from experiments.core.progress import ProgressCallback
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
 from experiments.engine.size import JobSize
@@ -168,7 +168,7 @@ def parser_seconds(size: JobSize, rounds: int = 20) -> float:
     return float(np.median(interleaved({"parse": lambda: parse(tokens)}, range(rounds))["parse"]))
 
 
-def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: Tell) -> LongRun:
+def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: ProgressCallback) -> LongRun:
     """Steps whose answers end early and late, so that every bucket is taken; nothing is learned, so that they go on to.
 
     Args:

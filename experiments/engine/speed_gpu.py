@@ -120,7 +120,7 @@ def measure(name: str, make: Callable[[], Workload], rounds: int, context: Conte
             jax.block_until_ready(piece.call())
         seconds = interleaved({name: piece.call}, context.rounds(f"timing {name}", rounds))[name]
     timed = TimedWorkload(tuple(seconds.tolist()), piece.flops, piece.read_bytes, piece.made, piece.unit)
-    context.say(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / timed.median_s / 1e12:.3g} TFLOP/s")
+    context.print(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / timed.median_s / 1e12:.3g} TFLOP/s")
     return timed
 
 

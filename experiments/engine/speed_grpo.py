@@ -27,12 +27,12 @@ from typing import get_args
 import jax
 
 from experiments.core.context import Context
-from experiments.core.processes import in_own_process
 from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
 from experiments.engine.harness import PeerJob, PeerTimes
 from experiments.engine.job import config_of
 from experiments.engine.peers import PeerFailed, installed_peers
+from experiments.engine.processes import in_own_process
 from experiments.engine.size import BETA, JobSize
 from experiments.engine.speed import (
     LongRun,
@@ -122,14 +122,14 @@ def run(config: SpeedConfig, context: Context) -> Results:
         words = many_words(config, Path(folder), context)
     makers = options(config.size, config.options_at, config.micro_prompts, config.buckets, config.options)
     found = side_by_side(makers, config.rounds, "options", context)
-    context.say(f"options at prefix {config.options_at}: {said(found)}")
+    context.print(f"options at prefix {config.options_at}: {said(found)}")
     twice = {}
     for prefix in config.repeated_at:
         makers = repeated(config.size, prefix, config.micro_prompts)
         twice[prefix] = side_by_side(makers, max(2, config.rounds // 2), f"prefix {prefix}", context)
-        context.say(f"prefix {prefix}: {said(twice[prefix])}")
+        context.print(f"prefix {prefix}: {said(twice[prefix])}")
     short = min(config.prefixes)
-    with context.told("steps", still=True) as tell:
+    with context.progress_callback("steps", still=True) as tell:
         tell(0, config.steps)
         course = in_own_process(many_steps, config.steps_size, short, bucket_lengths(config), config.steps, tell=tell)
     peers, failed = measure_peers(config, context)
@@ -163,7 +163,7 @@ def every_prefix(
         first[prefix] = in_own_process(time_alone, config.size, prefix, step, 1, cache)
         alone[prefix] = in_own_process(time_alone, config.size, prefix, step, config.rounds, cache)
         a, b = alone[prefix], first[prefix]
-        context.say(f"prefix {prefix}: {median(a.seconds):.3f} s, {a.peak_gb:.2f} GB, compiling {b.peak_gb:.2f} GB")
+        context.print(f"prefix {prefix}: {median(a.seconds):.3f} s, {a.peak_gb:.2f} GB, compiling {b.peak_gb:.2f} GB")
     return first, alone
 
 
@@ -178,7 +178,7 @@ def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, 
     ways = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
     for name, step in context.each("many words", ways.items(), still=True):
         found[name] = in_own_process(time_alone, size, min(config.prefixes), step, 2, cache)
-        context.say(f"{config.words} words, {name}: {median(found[name].seconds):.2f} s, {found[name].peak_gb:.2f} GB")
+        context.print(f"{config.words} words, {name}: {median(found[name].seconds):.2f} s, {found[name].peak_gb:.2f} GB")
     return found
 
 
@@ -197,7 +197,7 @@ def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[s
     peers = installed_peers(config.trl_python, config.tunix_python)
     absent = {"TRL", "Tunix"} - {peer.name for peer in peers}
     if absent:
-        context.say(f"not measured, for want of an interpreter that has them: {', '.join(sorted(absent))}")
+        context.print(f"not measured, for want of an interpreter that has them: {', '.join(sorted(absent))}")
     found: dict[tuple[str, int], PeerTimes] = {}
     failed: list[str] = []
     for prefix, peer in context.each("other engines", itertools.product(config.prefixes, peers), still=True):
@@ -208,9 +208,9 @@ def measure_peers(config: SpeedConfig, context: Context) -> tuple[Peers, tuple[s
             if prefix == config.prefixes[0]:
                 raise
             failed.append(f"{peer.name} has no figure at {prefix}: its process ended with {failure.code}.")
-            context.say(str(failure))
+            context.print(str(failure))
         else:
-            context.say(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
+            context.print(f"{peer.name} at prefix {prefix}: {median(times.seconds):.2f} s, {times.peak_gb:.2f} GB")
     return found, tuple(failed)
 
 

@@ -59,7 +59,7 @@ def run(config: StabilityGrpoConfig, context: Context) -> Results:
     outcomes = []
     for scenario in context.each("failures", [s for s in SCENARIOS if s.code in config.codes]):
         outcomes.append(drive(scenario, config, courses, context))
-        context.say(outcomes[-1].sentence)
+        context.print(outcomes[-1].sentence)
     sound = undriven(config, courses, context)
     return Results(
         verdict=verdict(outcomes, sound),

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from experiments.core.progress import Tell
+from experiments.core.progress import ProgressCallback
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices.base import Identity
 from sensors_io.devices.intake import Counts, Intake
@@ -85,7 +85,7 @@ def endure(
     capacity: int,
     every: int = 1,
     traced: bool = False,
-    tell: Tell = lambda done_s, all_s: None,
+    tell: ProgressCallback = lambda done_s, all_s: None,
 ) -> ReplayOutcome:
     """Replay for so long; the consumer reads `every`-th time only, so that a small ring overflows.
 

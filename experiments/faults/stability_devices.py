@@ -82,7 +82,7 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
     outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
     short = dataclasses.replace(config, seconds=config.traced_seconds)
     faults = _faults(short, hidden=False)
-    with context.told("device time with Python's memory traced, s") as tell:
+    with context.progress_callback("device time with Python's memory traced, s") as tell:
         traced = endure(_source(short), short.seconds, faults, capacity=256, traced=True, tell=tell)
     sweep = over_jitter(config, context)
     paths = recordings(config.data_dir)
@@ -213,7 +213,7 @@ def _watched(seen: Sequence[watching.ViewedRecording], carried: watching.BridgeT
 def _replay(name: str, config: DeviceStabilityConfig, context: Context) -> ReplayOutcome:
     capacity, every = (16, 24) if name == SLOW else (256, 1)
     faults = _faults(config, hidden=name == BY_STAMPS)
-    shown = context.told(f"device time {name}, s")
+    shown = context.progress_callback(f"device time {name}, s")
     with context.timed(name.replace(" ", "_")), shown as tell, warnings.catch_warnings():
         warnings.simplefilter("ignore", OverloadWarning)  # meant, and counted
         return endure(_source(config), config.seconds, faults, capacity=capacity, every=every, tell=tell)

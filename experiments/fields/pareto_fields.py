@@ -80,7 +80,7 @@ def run(config: FieldsConfig, context: Context) -> Results:
     """Measure field by field, gather."""
     panels: list[FieldSection] = []
     for name, make in context.each("panels", panels_of(config, context).items()):
-        context.say(name)
+        context.print(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
             panels += make()
     return Results(

@@ -54,7 +54,7 @@ def run(config: RealConfig, context: Context) -> Results:
     pictures = []
     there = [f for f in FOLDERS if (config.data_dir / f.path).is_dir()][: config.folders]
     for folder in context.each("folders", there):
-        context.say(folder.name)
+        context.print(folder.name)
         row, note, picture = study(folder, config.data_dir, config)
         rows.append(row)
         notes.append((folder.name, note))

@@ -121,7 +121,7 @@ def _outcomes(
                 context.save_stage(
                     stage, measured.measure(batch, context.each(stage, menu, still=True), true).to_json()
                 )
-            context.say(f"{stage}: {config.batch} scenes under {len(menu)} settings")
+            context.print(f"{stage}: {config.batch} scenes under {len(menu)} settings")
         parts.append(context.load_stage(stage))
     return measured.join(parts)
 
@@ -142,7 +142,7 @@ def _trials(
                 shown = context.each(stage, config.asked, still=True)
                 made = [trial.try_out(batch, menu, errors, cost, a, true) for a in shown]
                 context.save_stage(stage, [t.to_json() for t in made])
-            context.say(f"{stage}: {config.batch} scenes at {len(config.asked)} errors asked for")
+            context.print(f"{stage}: {config.batch} scenes at {len(config.asked)} errors asked for")
         parts.append(context.load_stage(stage))
     return [trial.join([p[j] for p in parts]) for j in range(len(config.asked))]
 
@@ -157,7 +157,7 @@ def _sequences(config: ChooserConfig, context: Context) -> list[SequenceTrial]:
                 seed = hash_seed(config.seed, "sequences", sensor, 0)
                 made = sequences.try_out(sensor, config.sequences, config.asked, config.reference, seed)
                 context.save_stage(stage, [k.to_json() for k in made])
-            context.say(f"{stage}: {config.sequences} at {len(config.asked)} errors asked for")
+            context.print(f"{stage}: {config.sequences} at {len(config.asked)} errors asked for")
         parts.append(context.load_stage(stage))
     return [sequences.join([p[j] for p in parts]) for j in range(len(config.asked))]
 

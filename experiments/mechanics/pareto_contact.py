@@ -83,7 +83,7 @@ def methods() -> tuple[ContactMethod, ...]:
 
 def run(config: ParetoContactConfig, context: Context) -> Results:
     """Measure, compare, chart."""
-    context.say(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
+    context.print(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
     kernels, scenes = gel_kernels(SENSOR, config.grid), sample(SENSOR, config.scenes, config.grid, config.seed)
     rows = measure(methods(), scenes, kernels, config.rounds, context)
     ladder = grid_ladder(config, context)

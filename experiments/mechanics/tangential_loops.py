@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.core.checks import require
+from experiments.core.errors import require
 from experiments.core.results import Cell, Column, Table
 from sensors_io.scenes import history
 

@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Mapping
 
 from experiments.bench.draw import Quota
-from experiments.core.machine import Machine
+from experiments.core.machine import Accelerators
 from experiments.study import paper_numbers as paper
 from experiments.study.assembly import ModelConfig
 from experiments.study.stages import SFTConfig
@@ -35,9 +35,9 @@ what several studies share may cost more than a main job."""
 SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
 """Questions of the bench at `smoke`; every other scale asks all 4,800."""
 
-NEEDS: Mapping[str, Machine] = {
-    "gpu": Machine(accelerators=1, memory_gib=70.0),
-    "paper": Machine(accelerators=16, memory_gib=130.0),
+NEEDS: Mapping[str, Accelerators] = {
+    "gpu": Accelerators(number=1, memory_gib=70.0),
+    "paper": Accelerators(number=16, memory_gib=130.0),
 }
 """An H100 or H200; sixteen H200, on which `scale_paper` counts 47 to 53 GB of a step on each."""
 

@@ -32,9 +32,9 @@ def written(source: Path, trained: Trained) -> Evaluated:
     """
     assembly, data, context = trained.assembly, trained.data, trained.context
     folder = folder_of(context.directory, trained.seed)
-    with context.told("writing weights, MB") as tell:
-        context.team.once(lambda: write_policy(folder, source, trained.params, in_megabytes(tell)))
-    with context.told("reading weights, MB") as tell:
+    with context.progress_callback("writing weights, MB") as tell:
+        context.processes.write_once(lambda: write_policy(folder, source, trained.params, in_megabytes(tell)))
+    with context.progress_callback("reading weights, MB") as tell:
         params = read_policy(folder, assembly.fns.cache_dtype, in_megabytes(tell))
     test = encode_contacts(assembly, params, data, data.parts["test"], context)
     return evaluate_policy(assembly, params, test, trained.label, context, alone=False)

@@ -73,7 +73,9 @@ def study_apart(config: StudyConfig, name: str, context: Context) -> tuple[Study
     """
     directory = context.directory / name
     directory.mkdir(exist_ok=True)
-    inner = Context(directory, context.cache_dir, context.console, (), context.stopping, context.team, context.devices)
+    inner = Context(
+        directory, context.cache_dir, context.console, (), context.stopping, context.processes, context.devices
+    )
     with contextlib.closing(inner), context.timed(f"study/{name}"):
         study = run_study(config, {FULL: PUBLISHED}, inner, {FULL: Paper()})
         for line in read_metrics(directory):

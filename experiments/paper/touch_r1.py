@@ -169,7 +169,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
     check_ways(ways, arms)
     assembly, start = begin(config, source, context)
     memory = counted(config, assembly, start.data, context.devices.shape)
-    context.say(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
+    context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
     study = train_study(config, start, arms, context, ways=ways)
     scored = score_study(study)
     zero = [score(study, said) for said in study.further[ZERO]]
@@ -198,7 +198,7 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
       WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `shape_of`.
     """
     model = config.model
-    with context.told("reading weights, MB") as tell:
+    with context.progress_callback("reading weights, MB") as tell:
         found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(tell))
     require_same(source, context)
     ahead = assemble_released(model, found, SENSORS)
@@ -227,7 +227,7 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
         )
     made = context.directory / "tiny"
     if not context.done("tiny"):
-        context.team.once(lambda: make_tiny(made, config, context))
+        context.processes.write_once(lambda: make_tiny(made, config, context))
         context.save_stage("tiny", {})
     return made
 

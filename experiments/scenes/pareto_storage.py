@@ -72,7 +72,7 @@ def run(config: StorageConfig, context: Context) -> Results:
     rows: dict[str, list[CodecMeasurement]] = {}
     missing: dict[str, str] = {}
     for kind, group in clips.items():
-        context.say(f"{kind}: {len(group)} clips, {sum(map(len, group))} frames")
+        context.print(f"{kind}: {len(group)} clips, {sum(map(len, group))} frames")
         rows[kind], absent = measure(all_codecs(), group, config.rounds, context)
         missing |= absent
     store = make_store(config.feed, context.directory / "records", context)

@@ -7,8 +7,8 @@ import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.core.checks import ResultsError, require
 from experiments.core.context import Context
+from experiments.core.errors import ResultsError, require
 from sensors_io.calibration import circles
 from sensors_io.calibration.presses import BallPresses as Recorded
 from sensors_io.scenes import fitting, mini_optics, optics, photometric

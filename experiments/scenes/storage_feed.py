@@ -104,7 +104,7 @@ def feed_rates(config: FeedConfig, store: RecordStore, rounds: int, context: Con
 
 def make_store(config: FeedConfig, directory: Path, context: Context) -> RecordStore:
     """The records, made first where they are not there."""
-    with context.told("making records") as tell:
+    with context.progress_callback("making records") as tell:
         generate_records(config.scenes, directory, progress=tell)
     return RecordStore(directory)
 

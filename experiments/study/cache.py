@@ -104,11 +104,11 @@ def shared_grpo(
 def _shared(path: Path, make: Callable[[], Params], context: Context, stage: str) -> Params:
     """What lies at `path`; where nothing does, what `make` gives, published there."""
     if path.exists():
-        context.say(f"{stage}: made before, {path}")
+        context.print(f"{stage}: made before, {path}")
         with context.timed(stage):
             return _found(path, context, stage)
     params = make()
-    context.team.once(lambda: _publish(path, params, _logged(context, stage)))
+    context.processes.write_once(lambda: _publish(path, params, _logged(context, stage)))
     return params
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments.core.checks import require
+from experiments.core.errors import require
 from experiments.core.results import Comparison, Estimate
 from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores

@@ -101,13 +101,13 @@ def run_grpo(
     decoder = {"decoder": params["decoder"]}
     influence = influence_program(assembly.fns, config.length)
     check_streams(*jax.device_get(influence(decoder, next(new_feed()), asked.noise, jax.random.key(seed))))
-    feed = new_feed(own=context.devices.rows(config.drawn))
+    feed = new_feed(own=context.devices.local_rows(config.drawn))
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
     state = start_state(trained, optimizer, jax.random.key(seed), config)
     shared = (FrozenInputs(reference=trained, noise=asked.noise), *(() if lora is None else (decoder,)))
-    step, state, batches = context.devices.spread(step, state, feed, config.drawn, *shared)
+    step, state, batches = context.devices.shard(step, state, feed, config.drawn, *shared)
     end = run_loop(step, state, batches, arm.loop, context, stage, make_log=watched_log)
-    found = context.devices.whole(end.params)
+    found = context.devices.gather(end.params)
     return {**params, **(found if lora is None else merge_noted(decoder, found.adapters, lora, context, stage))}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments.core.context import Context
-from experiments.core.progress import Tell
+from experiments.core.progress import ProgressCallback
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
 from sensors_io.scenes.config import SceneConfig, config_hash
@@ -54,7 +54,7 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     return path
 
 
-def _make(context: Context, title: str, make: Callable[[Tell], object]) -> None:
+def _make(context: Context, title: str, make: Callable[[ProgressCallback], object]) -> None:
     """Run `make` under a progress bar."""
-    with context.timed("data"), context.told(title) as tell:
-        context.team.once(lambda: make(tell))
+    with context.timed("data"), context.progress_callback(title) as report:
+        context.processes.write_once(lambda: make(report))

@@ -116,7 +116,7 @@ class Probed:
 
 def probe_features(data: Dataset, context: Context) -> Probed:
     """Summarise all contacts once; every seed shares it, and every process does its part."""
-    found = context.team.shared_out(np.arange(len(data.store)), lambda rows: _features(data, rows, context))
+    found = context.processes.split_work(np.arange(len(data.store)), lambda rows: _features(data, rows, context))
     return Probed(**found)
 
 
@@ -187,7 +187,7 @@ def run_sft(
         augment=config.augment,
         easy_steps=round(config.curriculum * config.steps),
         packing=config.packing(math.prod(context.devices.shape[:2])),
-        own=context.devices.rows(config.batch_size),
+        own=context.devices.local_rows(config.batch_size),
     )
     optimizer, step = sft_program(assembly.fns, config, blind)
     params = untrained(assembly, data, seed)
@@ -199,8 +199,8 @@ def run_sft(
     trained = params if config.lora is None else fresh_adapters(frozen, others, config.lora, seed)
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
-    step, state, batches = context.devices.spread(step, state, feed, config.batch_size, *([frozen] if frozen else []))
-    found = context.devices.whole(run_loop(step, state, batches, loop, context, stage).params)
+    step, state, batches = context.devices.shard(step, state, feed, config.batch_size, *([frozen] if frozen else []))
+    found = context.devices.gather(run_loop(step, state, batches, loop, context, stage).params)
     if config.lora is None:
         return found
     return {**merge_noted(frozen, found.adapters, config.lora, context, stage), **found.towers}
@@ -251,7 +251,7 @@ def encode_contacts(
     assembly: Assembly, params: Params, data: Dataset, rows: np.ndarray, context: Context, *, blind: bool = False
 ) -> Features:
     """Encode contacts once, each process its part, and keep the features on the host, in the order of `rows`."""
-    return context.team.shared_out(rows, lambda own: _encoded(assembly, params, data, own, context, blind=blind))
+    return context.processes.split_work(rows, lambda own: _encoded(assembly, params, data, own, context, blind=blind))
 
 
 def _encoded(

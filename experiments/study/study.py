@@ -289,7 +289,7 @@ class _Seed:
         if not self._path(name).exists():
             with self.context.timed(f"ask/{name}/{self.seed}"):
                 said = evaluate()
-                self.context.team.once(lambda: save_answers(self._path(name), said))
+                self.context.processes.write_once(lambda: save_answers(self._path(name), said))
 
     def _ask_further(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Ask a policy in all other ways that are wanted of it."""

@@ -30,7 +30,7 @@ def watched_log(context: Context, stage: str, start: int) -> Callable[[int, dict
         alarms = watch.see(metrics)
         for alarm in alarms:
             if aloud and alarm.code not in told:
-                context.say(f"{stage}, step {t}: {alarm}")
+                context.print(f"{stage}, step {t}: {alarm}")
             told.add(alarm.code)
         return {f"{_ALARM}{alarm.code}": alarm.value for alarm in alarms}
 

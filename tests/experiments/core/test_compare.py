@@ -83,7 +83,7 @@ def test_two_runs_of_one_experiment(home, capsys):
     out = capsys.readouterr().out
     assert f"A  coin  {first}  smoke" in out
     assert "toss.bias  0.5  0.25" in out
-    assert "Ran on something else: nothing" in out
+    assert "Different code or machine: nothing" in out
     assert "same: " in next(line for line in out.splitlines() if " figures; " in line)
     assert "Cost: A " in out
 
@@ -115,4 +115,4 @@ def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):
     unfinished.mkdir(parents=True)
     (unfinished / "config.json").write_bytes((home / "coin" / stamps(home)[0] / "config.json").read_bytes())
     assert main(["compare", str(unfinished), "coin", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "must be finished to be compared; go on with: python -m experiments coin" in capsys.readouterr().err
+    assert "must be finished to be compared; continue it with: python -m experiments coin" in capsys.readouterr().err

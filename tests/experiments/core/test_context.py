@@ -149,7 +149,7 @@ def test_bars_within_a_still_one_are_drawn_with_their_steps_alone(tmp_path):
 
 
 def test_a_loop_that_tells_of_itself_is_shown_from_its_first_word(context):
-    with context.told("contacts") as tell:
+    with context.progress_callback("contacts") as tell:
         assert not context._loops
         tell(4, 10)  # an earlier session's
         (loop,) = context._loops

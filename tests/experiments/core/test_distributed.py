@@ -14,8 +14,17 @@ from rich.console import Console
 
 from experiments.core import distributed
 from experiments.core.context import Context
-from experiments.core.distributed import ALONE, Devices, Launch, NoTeam, Spread, Team, devices_of, joined
-from experiments.core.quick import OLDER_LOOPS
+from experiments.core.distributed import (
+    SINGLE_PROCESS,
+    DeviceMesh,
+    Launch,
+    ProcessesNotFoundError,
+    ProcessGroup,
+    SingleDevice,
+    join_processes,
+    select_devices,
+)
+from experiments.core.machine import OLDER_LOOPS
 from tests.touchr1_jax.distributed.problems import ROWS, feed, words
 from touchr1_jax.distributed.mesh import MeshConfig
 
@@ -27,7 +36,7 @@ PATIENCE_S = 1800
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"process": None}, r"process is not given: must be, beside .*; give all three or none"),
+        ({"process": None}, r"process is not given, .*; give all three or none"),
         ({"distributed": False}, r"coordinator is h:1, but the run is not distributed; add --distributed"),
         ({"process": 2}, r"process is 2: must be 0 … 1, one of the processes"),
     ],
@@ -43,23 +52,25 @@ def test_without_a_cluster_the_address_is_asked_for(monkeypatch):
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr(jax.distributed, "initialize", nobody)
-    with pytest.raises(NoTeam, match=r"--distributed finds no other processes .* say --coordinator HOST:PORT"):
-        joined(Launch(distributed=True))
+    with pytest.raises(
+        ProcessesNotFoundError, match=r"--distributed finds no other processes .* give --coordinator HOST:PORT"
+    ):
+        join_processes(Launch(distributed=True))
 
 
 def test_one_process_asks_nobody(monkeypatch):
     monkeypatch.setattr(distributed, "multihost_utils", None)
-    assert joined(Launch()) is ALONE
-    assert type(devices_of(Launch())) is Devices
-    assert ALONE.agreed(lambda: ["runs/x", True]) == ["runs/x", True]
-    assert ALONE.any(True)
-    assert not ALONE.any(False)
-    assert ALONE.shared_out(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
+    assert join_processes(Launch()) is SINGLE_PROCESS
+    assert type(select_devices(Launch())) is SingleDevice
+    assert SINGLE_PROCESS.broadcast(lambda: ["runs/x", True]) == ["runs/x", True]
+    assert SINGLE_PROCESS.any(True)
+    assert not SINGLE_PROCESS.any(False)
+    assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
 
 
 def test_a_mesh_of_other_devices_is_refused():
     with pytest.raises(ValueError, match="must be the number of devices"):
-        devices_of(Launch(mesh=MeshConfig(fsdp=64)))
+        select_devices(Launch(mesh=MeshConfig(fsdp=64)))
 
 
 def test_the_parts_of_all_processes_are_what_one_makes(monkeypatch):
@@ -74,14 +85,14 @@ def test_the_parts_of_all_processes_are_what_one_makes(monkeypatch):
     make = lambda rows: 10 * rows
     monkeypatch.setattr(distributed.multihost_utils, "process_allgather", gathered)
     for process, own in enumerate(([0, 10], [20, 30], [40, 40])):
-        found = Team(3, process).shared_out(np.arange(5), make)
+        found = ProcessGroup(3, process).split_work(np.arange(5), make)
         assert found.tolist() == [0, 10, 20, 30, 40]
         assert made[process].tolist() == own
 
 
 def test_only_the_first_process_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(Team, "_meet", lambda self: None)
-    follower = Context(tmp_path, tmp_path, Console(quiet=True), team=Team(2, 1))
+    monkeypatch.setattr(ProcessGroup, "_barrier", lambda self: None)
+    follower = Context(tmp_path, tmp_path, Console(quiet=True), processes=ProcessGroup(2, 1))
     follower.log("sft/0", 0, loss=1.0)
     follower.rewind("sft/0", 0)
     follower.save_stage("sft/0", {})
@@ -94,18 +105,18 @@ def test_only_the_first_process_writes(tmp_path, monkeypatch):
 def test_a_step_on_a_mesh_is_the_step():
     """Of one device here; `tests/touchr1_jax/distributed` has more of them."""
     problem = words()
-    devices = Spread(MeshConfig().build(jax.devices()[:1]))
-    assert devices.rows(ROWS).tolist() == list(range(ROWS))
+    devices = DeviceMesh(MeshConfig().build(jax.devices()[:1]))
+    assert devices.local_rows(ROWS).tolist() == list(range(ROWS))
     losses = []
-    for where in (Devices(), devices, devices):
+    for where in (SingleDevice(), devices, devices):
         state = jax.tree.map(jax.numpy.copy, problem.state)
-        step, state, batches = where.spread(problem.step, state, feed(problem), ROWS)
+        step, state, batches = where.shard(problem.step, state, feed(problem), ROWS)
         found = []
         for _ in range(3):
             state, metrics = step(state, next(batches))
             found.append(float(metrics["loss"]))
         losses.append(found)
-        assert jax.tree.structure(where.whole(state.params)) == jax.tree.structure(problem.state.params)
+        assert jax.tree.structure(where.gather(state.params)) == jax.tree.structure(problem.state.params)
     np.testing.assert_allclose(losses[1], losses[0], atol=1e-6)
     assert losses[1] == losses[2]
     assert len(devices._compiled) == 1

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from experiments.core.checks import ResultsError
+from experiments.core.errors import ResultsError
 from experiments.core.report import write_report
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, VOID, read

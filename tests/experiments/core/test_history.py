@@ -67,10 +67,10 @@ def test_the_list_of_one_experiment_shows_every_run_and_how_to_go_on(tmp_path, c
         "20260103-000000", "20260102-000000", "20260101-000000",
     ]  # fmt: skip
     assert "      Really." in lines
-    assert f"      to go on: {COMMAND}" in lines
-    assert lines[-1].endswith("going on")
+    assert f"      to continue: {COMMAND}" in lines
+    assert lines[-1].endswith("running")
     with locked(oldest):  # looking at it has left it free
-        assert read_run(oldest).state == "going on"
+        assert read_run(oldest).state == "running"
     assert read_run(oldest).state == "unfinished"
 
 

@@ -117,7 +117,7 @@ def test_an_ended_session_says_why_and_how_to_go_on(page, clock):
     made.end(RuntimeError(f"rolled away {HOSTILE}"))
     assert RELOAD not in shown(context)
     text = read(shown(context)).text
-    assert f"Ended on noon by RuntimeError: rolled away {HOSTILE}. To go on: python -m experiments coin" in text
+    assert f"Ended on noon by RuntimeError: rolled away {HOSTILE}. To continue: python -m experiments coin" in text
     assert "--fresh" not in text.partition("Configuration")[0]
 
 
@@ -128,7 +128,7 @@ def test_the_report_takes_its_place(tmp_path, monkeypatch, capsys):
         main(["coin", "--crash-at", "2"], package=FAKES)
     latest = tmp_path / "runs" / "coin" / "latest"
     stopped = (latest / "report.html").read_text()
-    assert "by RuntimeError: the coin rolled away. To go on: python -m experiments coin --crash-at 2" in stopped
+    assert "by RuntimeError: the coin rolled away. To continue: python -m experiments coin --crash-at 2" in stopped
     monkeypatch.delenv("COIN_CRASHES")
     assert main(["coin", "--crash-at", "2"], package=FAKES) == 0
     assert "to watch: runs/coin" in capsys.readouterr().out

@@ -65,7 +65,7 @@ def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_pat
         assert run(tmp_path) == code
     said = capsys.readouterr().out
     assert f"Stopped by {number.name}" in said
-    assert "To go on: python -m experiments counting" in said
+    assert "To continue: python -m experiments counting" in said
     assert [line["step"] for line in lines(tmp_path)] == list(range(6))
     assert (run_directory(tmp_path) / "checkpoints" / "count" / "0" / "6").is_dir()
     assert run(tmp_path) == 0

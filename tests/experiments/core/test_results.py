@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.core.checks import ResultsError
+from experiments.core.errors import ResultsError
 from experiments.core.results import Comparison, Estimate, Results
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from tests.experiments.fakes import coin

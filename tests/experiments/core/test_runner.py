@@ -13,7 +13,7 @@ import pytest
 
 from experiments.core import runner, runs
 from experiments.core.artifacts import read_json
-from experiments.core.catalogue import find
+from experiments.core.commands import find
 from experiments.core.runner import Experiment, main, parse
 from tests.experiments.fakes import coin
 
@@ -49,7 +49,7 @@ def test_an_unknown_name_is_answered_with_close_ones(capsys):
     assert run("coyn") == 2
     error = capsys.readouterr().err
     assert "Did you mean coin?" in error
-    assert "experiments:" in error
+    assert "coin  Does a coin" in error
 
 
 def test_the_modules_of_the_runner_are_no_experiments():
@@ -168,7 +168,7 @@ def test_a_signal_stops_cleanly_and_says_how_to_go_on(workplace, number, code):
     process.send_signal(number)
     out, _ = process.communicate(timeout=60)
     assert process.returncode == code
-    assert "To go on: python -m experiments coin --step-s 0.05" in out
+    assert "To continue: python -m experiments coin --step-s 0.05" in out
     assert "--fresh" not in out.splitlines()[-1]
     (directory,) = (p for p in workplace.glob("runs/coin/*") if not p.is_symlink())
     lines = (directory / "metrics.jsonl").read_text().splitlines()

@@ -8,7 +8,7 @@ import importlib
 import signal
 import sys
 
-from experiments.core.catalogue import find
+from experiments.core.commands import find
 from experiments.core.runner import main
 from experiments.paper.presets import SMALL_QUOTA
 from experiments.study.feeds import AnswerFeed

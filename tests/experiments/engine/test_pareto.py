@@ -3,7 +3,7 @@
 import pytest
 
 from experiments.core.artifacts import read_json, write_json, write_text
-from experiments.core.checks import ResultsError
+from experiments.core.errors import ResultsError
 from experiments.engine import pareto
 from experiments.engine.fronts import Axis, Point, dominators, front, points_of
 from experiments.engine.pareto import DEFAULTS, GatherConfig, judge, newest

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.processes import in_own_process
 from experiments.core.runner import main
 from experiments.engine import speed_grpo
 from experiments.engine.harness import PeerTimes
 from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
 from experiments.engine.peers import PeerFailed
+from experiments.engine.processes import in_own_process
 from experiments.engine.size import JobSize
 from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
 from experiments.engine.speed_tables import steadiness

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.checks import ResultsError
+from experiments.core.errors import ResultsError
 from experiments.mechanics import (
     pareto_tangential,
     tangential_checks,

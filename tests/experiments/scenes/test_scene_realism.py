@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.checks import ResultsError
 from experiments.core.context import Context
+from experiments.core.errors import ResultsError
 from experiments.core.runner import main
 from experiments.scenes import realism
 from experiments.scenes.shadows import shadow_gain

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.core.quick import OLDER_LOOPS
+from experiments.core.machine import OLDER_LOOPS
 from tests.touchr1_jax.distributed.problems import PROBLEMS, STEPS, feed
 from tests.touchr1_jax.distributed.worker import SAVE_AT, plain_losses
 from touchr1_jax.training.checkpoint import Checkpoints

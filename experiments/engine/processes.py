@@ -7,12 +7,12 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from experiments.core.progress import Tell
+from experiments.core.progress import ProgressCallback
 
 T = TypeVar("T")
 
 
-def in_own_process(work: Callable[..., T], *arguments: Any, tell: Tell | None = None) -> T:
+def in_own_process(work: Callable[..., T], *arguments: Any, tell: ProgressCallback | None = None) -> T:
     """The result of a function of a module, called in a fresh interpreter, whose peak memory is then the work's.
 
     Args:

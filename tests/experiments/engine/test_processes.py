@@ -5,7 +5,7 @@ from concurrent.futures.process import BrokenProcessPool
 
 import pytest
 
-from experiments.core.processes import in_own_process
+from experiments.engine.processes import in_own_process
 
 
 def told_thrice(steps, tell):
