@@ -178,7 +178,8 @@ def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, 
     ways = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
     for name, step in context.each("many words", ways.items(), still=True):
         found[name] = in_own_process(time_alone, size, min(config.prefixes), step, 2, cache)
-        context.print(f"{config.words} words, {name}: {median(found[name].seconds):.2f} s, {found[name].peak_gb:.2f} GB")
+        seconds = median(found[name].seconds)
+        context.print(f"{config.words} words, {name}: {seconds:.2f} s, {found[name].peak_gb:.2f} GB")
     return found
 
 
