@@ -9,7 +9,8 @@ A chart is a sequence of `Panel`s, a panel a sequence of `Series`:
         )
     ])
 
-- Lines, points and both: `Series.line` and `Series.marker`.  `low` and `high` add intervals, with `band=True` a band.
+- Lines, points and both: `Series.line`, `Series.marker`.  `low` and `high` add intervals, with `band=True` a band.
+- `estimates` makes a series from `statistics.Interval` or `results.Estimate`.
 - Series of one name have one colour, one marker and one entry in the legend in all panels; unnamed ones have no entry.
 - `Panel.rows` names rows from the top in place of a y axis: for bars (`Series.bar`) and for intervals of named things.
 - `Series.labels` writes a name at each point where it hides neither points nor other names.
@@ -36,7 +37,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from experiments.core.look import LOOK, MARKERS, PALETTE, SHARED, colours, svg
-from experiments.core.text import number
+from experiments.core.text import WithInterval, number
 
 LONG_AXIS = 300.0
 """Ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone."""
@@ -111,6 +112,13 @@ class Series:
     alpha: float = 1.0
     shift: float = 0.0
     labels: Sequence[str] = ()
+
+
+def estimates(name: str, found: Sequence[WithInterval], *, at: Values = (), **look: Any) -> Series:
+    """A series of estimates with their intervals, over the positions `at`; without them in a panel of rows."""
+    mean, low, high = np.array([(one.mean, one.low, one.high) for one in found]).reshape(-1, 3).T
+    x, y = (at, mean) if len(at) else (mean, ())
+    return Series(name, x=x, y=y, low=low, high=high, **look)
 
 
 @dataclasses.dataclass(frozen=True)

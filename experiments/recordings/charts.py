@@ -7,8 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from experiments.core.charts import LOOK, MARKERS, PALETTE, svg
-from experiments.core.levels import draw_confusion
+from experiments.core.pictures import heatmaps
 from experiments.recordings.policy import LANGUAGE
+from experiments.study.levels import confusion_map
 from touchr1_jax.bench.statistics import Interval
 
 
@@ -19,12 +20,11 @@ def confusions(answer: np.ndarray, label: np.ndarray, titles: tuple[str, ...]) -
       answer, label: int [n, A].
       titles: what the attributes are called.
     """
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(9.0, 3.2), layout="constrained")
-        for a, axes in enumerate(figure.subplots(1, len(titles))):
-            draw_confusion(axes, answer[:, a], label[:, a], [words[0] for words in _words(a)])
-            axes.set_title(titles[a], fontsize=9.5, loc="left")
-        return svg(figure)
+    maps = [
+        confusion_map(answer[:, a], label[:, a], [words[0] for words in _words(a)], title)
+        for a, title in enumerate(titles)
+    ]
+    return heatmaps(maps, x_label="answered", y_label="label", size=(9.0, 3.2))
 
 
 def against_objects(curves: Mapping[str, Mapping[int, Interval]], goals: Mapping[str, float]) -> bytes:

@@ -1,29 +1,57 @@
-"""The levels that the policies of a study answer, beside the true ones: what every report of a study shows."""
+"""Answered levels against the true ones: confusions, reliability, and agreement between sensors."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.charts import PALETTE
-from experiments.core.levels import Levels, confusion_chart, reliability_table, trust_chart
-from experiments.core.results import Picture, Table
+from experiments.core.charts import Panel, draw, estimates
+from experiments.core.look import PALETTE
+from experiments.core.pictures import Heatmap, heatmaps
+from experiments.core.results import Cell, Picture, Table, named_table
+from experiments.core.text import interval
 from experiments.study.answers import Evaluated
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+
+RESAMPLES = 1_000
+"""Of each interval over objects; its ends are then accurate to a tenth of its width."""
 
 _COLUMNS = [ATTRIBUTES.index(name) for name in ORDINAL]
 
+Words = Mapping[str, Sequence[str]]
+"""Attribute → names of its levels, in order."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LevelAnswers:
+    """Answers of one policy, its seeds one after the other.
+
+    Attributes:
+      answer: int [N, A], `BOTTOM` where the answer could not be parsed.
+      label: int [N, A], `BOTTOM` where the question does not ask for the attribute.
+      objects: [N], the object of each question.
+      agree: int [N, A], number of sensors that, given alone, lead to the answer given by all together; `None` if not
+        measured.
+    """
+
+    answer: np.ndarray
+    label: np.ndarray
+    objects: np.ndarray
+    agree: np.ndarray | None = None
+
 
 def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
-    """Confusions of every policy, what agreement of its sensors says, and the reliability of each level."""
+    """Confusions of every policy, accuracy by agreement of its sensors, and the reliability of each level."""
     objects = study.data.object_ids[study.data.parts["test"]]
-    rows = {name: _levels(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
+    rows = {name: _level_answers(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
     language = study.assembly.language
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
-    felt = {name: said for name, said in rows.items() if said.agree is not None}
-    if len(felt) > len(PALETTE):  # more lines than colours: where training begins, and where it ends
-        felt = {name: said for name, said in felt.items() if name in (SFT, list(study.arms)[-1])}
+    with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
+    if len(with_agreement) > len(PALETTE):  # more lines than colours: keep where training begins and where it ends
+        with_agreement = {name: rows[name] for name in (SFT, list(study.arms)[-1]) if name in with_agreement}
     pictures = [
         Picture(
             name="confusions",
@@ -32,33 +60,146 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
             content=confusion_chart(rows, words),
         )
     ]
-    if felt:
+    if with_agreement:
         pictures.append(
             Picture(
                 name="trust",
                 title="How far an answer can be trusted",
-                caption="Right answers, given how many sensors alone say the same as all together; areas are shares of "
-                "the answers, lines 95 % over objects; hardness, roughness, protrusion and all seeds pooled.",
-                content=trust_chart(felt),
+                caption="Right answers by the number of sensors that, given alone, lead to the same answer as all "
+                "together; areas are shares of the answers, lines 95 % over objects; hardness, roughness, protrusion "
+                "and all seeds pooled.",
+                content=agreement_chart(with_agreement),
             )
         )
     return tuple(pictures), (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words),)
 
 
-def _levels(seeds: Sequence[Evaluated], objects: np.ndarray) -> Levels:
-    agree = [_agree(said) for said in seeds]
-    return Levels(
-        answer=np.concatenate([np.asarray(said.parsed.conclude)[:, _COLUMNS] for said in seeds]),
-        label=np.concatenate([said.label[:, _COLUMNS] for said in seeds]),
-        objects=np.concatenate([objects[said.contact] for said in seeds]),
+def _level_answers(seeds: Sequence[Evaluated], objects: np.ndarray) -> LevelAnswers:
+    agree = [_agree(answers) for answers in seeds]
+    return LevelAnswers(
+        answer=np.concatenate([np.asarray(answers.parsed.conclude)[:, _COLUMNS] for answers in seeds]),
+        label=np.concatenate([answers.label[:, _COLUMNS] for answers in seeds]),
+        objects=np.concatenate([objects[answers.contact] for answers in seeds]),
         agree=np.concatenate([x for x in agree if x is not None]) if all(x is not None for x in agree) else None,
     )
 
 
-def _agree(said: Evaluated) -> np.ndarray | None:
-    """How many sensors alone say what all together say, int [N, A]; `None` where none was asked alone."""
-    if said.alone is None:
+def _agree(answers: Evaluated) -> np.ndarray | None:
+    if answers.alone is None:
         return None
-    together = np.asarray(said.parsed.conclude)
-    same = (said.alone == together[:, None]) & (said.alone != BOTTOM) & said.streams[:, :, None]
+    together = np.asarray(answers.parsed.conclude)
+    same = (answers.alone == together[:, None]) & (answers.alone != BOTTOM) & answers.streams[:, :, None]
     return same.sum(1)[:, _COLUMNS]
+
+
+def confusion_chart(rows: Mapping[str, LevelAnswers], words: Words) -> bytes:
+    """Draw one confusion matrix per policy and attribute.
+
+    Args:
+      rows: policy → answers; attribute a of them is the a-th of `words`.
+      words: attribute → levels.
+    """
+    maps = [
+        confusion_map(answers.answer[:, a], answers.label[:, a], levels, f"{name}: {attribute}")
+        for name, answers in rows.items()
+        for a, (attribute, levels) in enumerate(words.items())
+    ]
+    return heatmaps(maps, columns=len(words), x_label="answered", y_label="label")
+
+
+def confusion_map(answer: np.ndarray, label: np.ndarray, levels: Sequence[str], title: str) -> Heatmap:
+    """Labels down, answers across, shares of a row; a last column if some answer could not be parsed.
+
+    Args:
+      answer, label: int [N].
+      levels: their names.
+      title: of the matrix.
+    """
+    asked = label != BOTTOM
+    columns = [*levels, "unread"] if np.any(answer[asked] == BOTTOM) else list(levels)
+    count = np.zeros((len(levels), len(levels) + 1), int)
+    np.add.at(count, (label[asked], answer[asked]), 1)  # an unparsed answer, −1, falls into the last column
+    count = count[:, : len(columns)]
+    share = count / np.maximum(count.sum(1, keepdims=True), 1)
+    cells = [[f"{s:.0%}\n{c}" for s, c in zip(*row, strict=True)] for row in zip(share, count, strict=True)]
+    return Heatmap(share, rows=levels, columns=columns, title=title, cells=cells)
+
+
+def reliability_table(rows: Mapping[str, LevelAnswers], words: Words) -> Table:
+    """For every level: how often it is answered, its precision and its recall."""
+    lines: list[dict[str, Cell]] = []
+    for name, answers in rows.items():
+        for a, (attribute, levels) in enumerate(words.items()):
+            asked = answers.label[:, a] != BOTTOM
+            answer, label, objects = answers.answer[asked, a], answers.label[asked, a], answers.objects[asked]
+            lines += [
+                {
+                    "policy and level": f"{name}: {attribute} {level}",
+                    "answered": 100 * float(np.mean(answer == k)),
+                    "right when answered": _share(label == k, answer == k, objects),
+                    "found where true": _share(answer == k, label == k, objects),
+                }
+                for k, level in enumerate(levels)
+            ]
+    return named_table(
+        "Reliability of the levels",
+        lines,
+        formats={"answered": ".1f"},
+        units=dict.fromkeys(("answered", "right when answered", "found where true"), "%"),
+        meanings={
+            "answered": "of all questions about the attribute",
+            "right when answered": "95 % over objects",
+            "found where true": "95 % over objects",
+        },
+        note="An answer that favours a level finds it often and is right about it seldom.",
+    )
+
+
+def agreement_chart(rows: Mapping[str, LevelAnswers]) -> bytes:
+    """Draw the share of right answers over the number of agreeing sensors; areas are shares of answers.
+
+    Args:
+      rows: policy → answers whose `agree` is known.
+    """
+    series = []
+    for i, (name, answers) in enumerate(rows.items()):
+        counts, right, weight = accuracy_by_agreement(answers)
+        shift = 0.06 * (i - (len(rows) - 1) / 2)
+        series.append(estimates(name, right, at=counts, size=12 + 300 * weight, shift=shift))
+    every = sorted({float(count) for one in series for count in one.x})
+    panel = Panel(
+        series,
+        x_label="sensors that, given alone, lead to the same answer",
+        y_label="right (%)",
+        y_limits=(0, 100),
+        x_ticks={count: f"{count:g}" for count in every},
+    )
+    return draw([panel], size=(6.6, 3.6))
+
+
+def accuracy_by_agreement(answers: LevelAnswers) -> tuple[list[int], list[Interval], np.ndarray]:
+    """For each number of agreeing sensors: the share of right answers with its interval, and its share of all answers.
+
+    Raises:
+      ValueError: no sensor was given alone.
+    """
+    if answers.agree is None:
+        raise ValueError("agree is None: needs answers from single sensors; ask with each sensor alone")
+    parsed = (answers.label != BOTTOM) & (answers.answer != BOTTOM)
+    objects = np.broadcast_to(answers.objects[:, None], parsed.shape)[parsed]
+    agree, right = answers.agree[parsed], (answers.answer == answers.label)[parsed]
+    counts, intervals, weight = [], [], []
+    for count in np.unique(agree):
+        at = agree == count
+        if len(np.unique(objects[at])) > 1:
+            counts.append(int(count))
+            intervals.append(clustered_bootstrap(100.0 * right[at], objects[at], resamples=RESAMPLES))
+            weight.append(float(np.mean(at)))
+    return counts, intervals, np.array(weight)
+
+
+def _share(hit: np.ndarray, of: np.ndarray, objects: np.ndarray) -> str | None:
+    """Per cent of `hit` among `of`, with its interval; nothing where fewer than two objects are left."""
+    if len(np.unique(objects[of])) < 2:
+        return None
+    return interval(clustered_bootstrap(100.0 * hit[of], objects[of], resamples=RESAMPLES), ".1f")

@@ -1,12 +1,18 @@
-"""Confusions, reliability and trust by hand: what is not asked or not read counts where it should."""
+"""Confusions, reliability and agreement by hand: questions not asked and answers not parsed count where they should."""
 
 import numpy as np
 import pytest
 
-from experiments.core.levels import Levels, confusion_chart, reliability_table, trust, trust_chart
+from experiments.study.levels import (
+    LevelAnswers,
+    accuracy_by_agreement,
+    agreement_chart,
+    confusion_chart,
+    reliability_table,
+)
 
 WORDS = {"hardness": ("soft", "hard")}
-SAID = Levels(
+ANSWERS = LevelAnswers(
     answer=np.array([[0], [0], [1], [-1], [1], [0]]),
     label=np.array([[0], [1], [1], [1], [-1], [0]]),  # the fifth was not asked
     objects=np.array(["a", "b", "c", "d", "e", "e"]),
@@ -15,7 +21,7 @@ SAID = Levels(
 
 
 def test_reliability_by_hand():
-    table = reliability_table({"sft": SAID}, WORDS)
+    table = reliability_table({"sft": ANSWERS}, WORDS)
     rows = {row[0]: row[1:] for row in table.rows}
     answered, right, found = rows["sft: hardness soft"]
     assert answered == pytest.approx(60)  # three of the five asked
@@ -27,21 +33,21 @@ def test_reliability_by_hand():
     assert str(found).startswith("33.3 [")  # of three that are hard one was read as soft, one not at all
 
 
-def test_trust_by_hand():
-    counts, right, weight = trust(SAID)
+def test_accuracy_by_agreement_by_hand():
+    counts, right, weight = accuracy_by_agreement(ANSWERS)
     assert counts == [1, 4]  # two objects each; unread and not asked are left out
     assert [r.mean for r in right] == [50.0, 100.0]
     np.testing.assert_allclose(weight, [0.5, 0.5])
 
 
-def test_trust_needs_single_sensors():
-    with pytest.raises(ValueError, match="ask each sensor alone"):
-        trust(Levels(answer=SAID.answer, label=SAID.label, objects=SAID.objects))
+def test_agreement_needs_single_sensors():
+    with pytest.raises(ValueError, match="ask with each sensor alone"):
+        accuracy_by_agreement(LevelAnswers(answer=ANSWERS.answer, label=ANSWERS.label, objects=ANSWERS.objects))
 
 
 def test_charts_name_what_they_show():
-    confusions = confusion_chart({"sft": SAID, "blind": SAID}, WORDS)
-    assert confusions == confusion_chart({"sft": SAID, "blind": SAID}, WORDS)
-    read = Levels(answer=np.maximum(SAID.answer, 0), label=SAID.label, objects=SAID.objects)
+    confusions = confusion_chart({"sft": ANSWERS, "blind": ANSWERS}, WORDS)
+    assert confusions == confusion_chart({"sft": ANSWERS, "blind": ANSWERS}, WORDS)
+    read = LevelAnswers(answer=np.maximum(ANSWERS.answer, 0), label=ANSWERS.label, objects=ANSWERS.objects)
     assert confusions != confusion_chart({"sft": read, "blind": read}, WORDS)
-    assert b"<svg" in trust_chart({"sft": SAID})
+    assert b"<svg" in agreement_chart({"sft": ANSWERS})
