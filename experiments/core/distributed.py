@@ -8,6 +8,7 @@ All must see the same run and cache directories, as over a network file system.
 """
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from typing import Any, Self
@@ -19,7 +20,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.placement import Step, local_rows, place_batch, place_state, shard_step
+from touchr1_jax.distributed.placement import Step, gather_params, local_rows, place_batch, place_state, shard_step
 from touchr1_jax.training.loop import Batches
 
 MESSAGE_BYTES = 8192
@@ -143,6 +144,8 @@ class SingleDevice:
 
     shape: tuple[int, ...] = (1, 1, 1)
     """Devices along the axes of the mesh."""
+    gather: Callable[[Any], Any] = staticmethod(lambda params: params)
+    """All-gathers weights inside a traced step, as `make_grpo_step` takes it."""
 
     def local_rows(self, batch_size: int) -> np.ndarray:
         """Rows of a batch that this process must read, ascending."""
@@ -174,6 +177,7 @@ class DeviceMesh(SingleDevice):
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
         self.shape = mesh.devices.shape
+        self.gather = functools.partial(gather_params, mesh)
         self._compiled: dict[Step, Step] = {}
 
     def local_rows(self, batch_size: int) -> np.ndarray:

@@ -13,11 +13,9 @@ from experiments.engine.world import FNS, LENGTH, PARSER, K, S, World, WorldBatc
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch, swap_touch
-from touchr1_jax.rl.grpo import encode_prompts, sample_prompts
-from touchr1_jax.rl.kl import exact_kl
-from touchr1_jax.rl.losses import entropy
+from touchr1_jax.rl.losses import entropy, exact_kl
 from touchr1_jax.rl.metrics import answer_metrics
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.types import Params, Parsed, Rollout
 
 Figures = Mapping[str, Float[Array, ""]]

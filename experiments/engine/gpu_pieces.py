@@ -31,8 +31,7 @@ from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.models.tactile_vit import TactileViT
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.grpo import encode_prompts, sample_prompts
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
 
 BACKWARD = 2
 """Operations of a backward pass over those of its forward pass."""

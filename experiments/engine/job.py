@@ -22,7 +22,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 

@@ -19,7 +19,7 @@ from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.language import HARDNESS, TOUCH_LANGUAGE, Attribute
 from touchr1_jax.text.parser import Parser, compile_parser
 from touchr1_jax.text.template import build_layout

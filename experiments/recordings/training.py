@@ -16,7 +16,7 @@ from touchr1_jax import masked
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import make_score
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.types import Params, Target

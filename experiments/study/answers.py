@@ -18,7 +18,7 @@ from experiments.study.feeds import each, labelled, question_batch
 from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards, total_reward
-from touchr1_jax.rl.evaluate import make_answer
+from touchr1_jax.rl.rollout import make_answer
 from touchr1_jax.types import Params, Parsed
 
 EVAL_BATCH = 64

@@ -21,7 +21,7 @@ from experiments.study.dataset import Dataset
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import CLIP_ARRAYS
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.template import answer_text, encode_answer
 from touchr1_jax.training.packing import PackedRows, Packing, existing_tokens, pack_rows
 from touchr1_jax.training.sft import SFTBatch

@@ -6,6 +6,7 @@ last checkpoint.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,7 +25,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import LEAN, FrozenInputs, GRPOState, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
@@ -97,7 +98,9 @@ def run_grpo(
         QuestionFeed, assembly, asked.features, asked.label, batch_size=config.drawn, seed=seed
     )
     constraint = assembly.constraint if config.algorithm.constrained else None
-    optimizer, step = grpo_program(assembly.fns, arm.score, config, arm.loop.steps, constraint, lora)
+    optimizer, step = grpo_program(
+        assembly.fns, arm.score, config, arm.loop.steps, constraint, lora, context.devices.gather
+    )
     decoder = {"decoder": params["decoder"]}
     influence = influence_program(assembly.fns, config.length)
     check_streams(*jax.device_get(influence(decoder, next(new_feed()), asked.noise, jax.random.key(seed))))
@@ -119,12 +122,13 @@ def grpo_program(
     steps: int,
     constraint: Constraint | None,
     lora: LoraConfig | None = None,
+    gather: Callable[[Params], Params] = lambda params: params,
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds of an arm; with adapters the frozen decoder comes last."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    plain = make_grpo_step(fns, score, optimizer, config, constraint)
+    plain = make_grpo_step(fns, score, optimizer, config, constraint, gather=gather)
     if lora is None:
         return optimizer, plain
     # a jitted step inside another takes no options of the compiler: the outer one gets them
@@ -134,7 +138,7 @@ def grpo_program(
         state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params
     ) -> tuple[GRPOState, dict[str, Array]]:
         adapted = adapt(fns, base, lora)
-        return make_grpo_step(adapted, score, optimizer, inner, constraint)(state, batch, frozen)
+        return make_grpo_step(adapted, score, optimizer, inner, constraint, gather=gather)(state, batch, frozen)
 
     return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 

@@ -13,7 +13,7 @@ from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots, ini
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.template import build_layout, prompt_words
 from touchr1_jax.text.tokenizer import word_level

@@ -1,6 +1,7 @@
 """A GRPO step of a Qwen2.5-VL policy in shapes alone, to be compiled without weights or data."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 import optax
 
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
-from touchr1_jax.distributed.placement import shard_step
+from touchr1_jax.distributed.placement import gather_params, shard_step
 from touchr1_jax.models.lora import LoraConfig, LoraFns, Trainable, adapt, init_adapters
 from touchr1_jax.models.policy import Features, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
@@ -19,7 +20,7 @@ from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.types import Params, Target
 
@@ -129,7 +130,8 @@ def compile_grpo(
         fns = abstract.fns
         if isinstance(fns, LoraFns):
             fns = dataclasses.replace(fns, base=base)
-        return make_grpo_step(fns, score, optimizer, shape.grpo)(state, batch, frozen)
+        gather = functools.partial(gather_params, mesh)
+        return make_grpo_step(fns, score, optimizer, shape.grpo, gather=gather)(state, batch, frozen)
 
     if abstract.base is not None:
         arguments = (*arguments, abstract.base)

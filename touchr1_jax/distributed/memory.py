@@ -18,7 +18,7 @@ from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.types import Params
 
 GIB = 2**30

@@ -4,7 +4,6 @@ The steps of all stages, (state, batch, …) → (state, metrics), stay as they 
 program that they trace to by the shardings of its arguments and results.
 """
 
-import functools
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -18,7 +17,6 @@ from jax.sharding import Mesh, NamedSharding
 
 from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, state_shardings, whole
 from touchr1_jax.models.layers import RMSNorm
-from touchr1_jax.rl.holding import holding
 
 LAYERS = (nn.Dense, nn.Embed, RMSNorm)
 """Layers whose results are held in place; what lies between follows from them."""
@@ -109,7 +107,7 @@ def shard_step(
     plain = inspect.unwrap(step)  # a jitted step would bring along a trace from before, or of another mesh
 
     def on_mesh(*arguments: Any) -> tuple[Any, dict[str, jax.Array]]:
-        with split_activations(mesh), holding(functools.partial(gathered, mesh)):
+        with split_activations(mesh):
             return plain(*arguments)
 
     results = (placed, whole(mesh))
@@ -117,8 +115,11 @@ def shard_step(
     return jax.jit(on_mesh, in_shardings=given, out_shardings=results, donate_argnums=0, compiler_options=options)
 
 
-def gathered(mesh: Mesh, params: Any) -> Any:
-    """Parameters of a traced program, gathered along fsdp; what reads them after that exchanges none."""
+def gather_params(mesh: Mesh, params: Any) -> Any:
+    """All-gather the parameters of a traced program along fsdp; a loop that reads them then exchanges nothing.
+
+    Partially applied to a mesh it is the `gather` of `rl.grpo.make_grpo_step`.
+    """
     return jax.tree.map(jax.lax.with_sharding_constraint, params, gathered_shardings(mesh, params))
 
 

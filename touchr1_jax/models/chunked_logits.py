@@ -5,19 +5,22 @@ gradient each make as much again.  What is kept of a token is a handful of numbe
 """
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 
 Rows = dict[str, jax.Array]
 """Arrays with one leading axis."""
+RowsOut = TypeVar("RowsOut")
+"""Any tree of such arrays."""
 
 MAX_LOGITS = 2**24
 """Logits that may exist at once, 64 MB in float32: up to 110 tokens of a language model's 152 000 words, and all tokens
 of a policy that knows a few hundred."""
 
 
-def by_blocks(f: Callable[[Rows], Rows], rows: Rows, *, width: int, most: int = MAX_LOGITS) -> Rows:
+def by_blocks(f: Callable[[Rows], RowsOut], rows: Rows, *, width: int, most: int = MAX_LOGITS) -> RowsOut:
     """f(rows) for an f that treats every row by itself, in blocks of rows for which it makes at most `most` numbers.
 
     Blocks are of one size, at least one row each; the gradient computes each of them again.  Rows that make no more

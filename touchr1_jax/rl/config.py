@@ -5,16 +5,21 @@ A preset is a dataclass of its own, so that the command line can choose it: `…
 
 import dataclasses
 import enum
+from typing import Literal
 
 import jax
+import jax.numpy as jnp
 
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
-from touchr1_jax.rl.kl import KLEstimator
+from touchr1_jax.types import Params
 from touchr1_jax.validation import above, at_least, within
+
+KLEstimator = Literal["k1", "k2", "k3", "exact"]
+"""Estimators of the KL to the reference (see `losses.estimated_kl`)."""
 
 
 class Surrogate(enum.Enum):
-    """What of the ratio π/π_old is clipped, and how (see `losses`)."""
+    """Ratio π/π_old that is clipped (see `losses.surrogate`)."""
 
     TOKEN = "token"
     SEQUENCE = "sequence"
@@ -108,7 +113,7 @@ class Algorithm:
 
 
 def left_out(weight: float | jax.Array) -> bool:
-    """Whether a term is not even computed: its weight is the number 0, not an array that may hold it."""
+    """True for a term that is not computed: its weight is the number 0, and no array that may hold another."""
     return not isinstance(weight, jax.Array) and weight == 0.0
 
 
@@ -254,6 +259,11 @@ class GRPOConfig:
     def stable() -> "GRPOConfig":
         """The objective that stays bounded."""
         return GRPOConfig(algorithm=Stable())
+
+
+def at_precision(config: GRPOConfig, params: Params) -> Params:
+    """The parameters in the type that forward passes compute in."""
+    return jax.tree.map(lambda x: x.astype(jnp.bfloat16), params) if config.bfloat16 else params
 
 
 def preset_name(config: GRPOConfig) -> str:

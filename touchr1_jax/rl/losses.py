@@ -1,157 +1,206 @@
-"""The terms of the objective, per token of one rollout; the objective averages them.
+"""The loss of GRPO on arrays, and its terms.
 
-Every surrogate takes one rollout and is to be maximised; it returns also where its clip cut the gradient off.
+`grpo_loss` is the whole objective.  `gradient` computes its arguments from a policy, prompt by prompt and in blocks of
+the vocabulary, and differentiates it.
 """
 
-from typing import assert_never
+from typing import Literal, NamedTuple, assert_never
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.rl.config import Algorithm, Average, Surrogate
-from touchr1_jax.rl.kl import LOG_RATIO_CLAMP, exact_kl
+from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, KLEstimator, Surrogate, left_out
+
+LOG_RATIO_CLAMP = 20.0
+"""Bound of a log-ratio before `exp`: e^20 is far past any meaning and far from float32 overflow."""
 
 
-def clipped_surrogate(
-    log_prob: Float[Array, "T"], old: Float[Array, "T"], advantage: Float[Array, ""], low: float, high: float
-) -> tuple[Float[Array, "T"], Bool[Array, "T"]]:
-    """Clipped policy-gradient objective, min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A) with ρ_t = π/π_old.
+class TokenTerms(NamedTuple):
+    """Numbers of every completion token; the loss averages them, and their gradients are those of the policy."""
+
+    log_prob: Float[Array, "*n"]
+    """log π(o_t) of the sampled token."""
+    reference_kl: Float[Array, "*n"]
+    """KL(π ‖ π_ref) at this token, nat, by the configured estimator."""
+    grounding: Float[Array, "*n"]
+    """KL(π(· | touch) ‖ π(· | one stream replaced by noise)), nat, at most `grounding_cap_nat`."""
+    entropy: Float[Array, "*n"]
+    """Entropy of π, nat."""
+
+
+def grpo_loss(
+    terms: TokenTerms,
+    old: Float[Array, "P G T"],
+    sampler: Float[Array, "P G T"],
+    mask: Bool[Array, "P G T"],
+    advantage: Float[Array, "P G"],
+    weight: Float[Array, "P"],
+    config: GRPOConfig,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
+    """Loss −J of a micro-batch of groups; the losses of all micro-batches of a step add up to that of the step.
+
+        J   = Σ_p w_p ⟨c_t S_t⟩ + 1/N Σ_p [ min(γ ⟨G_t⟩, budget) − β ⟨KL_t⟩ + η min(⟨H_t⟩, floor) ]
+        S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
+        c_t = min(π_old(o_t) / π_sampler(o_t), cap)
+
+    ⟨·⟩ is the mean over the tokens of a prompt's group: `algorithm.average` for S and KL, per rollout for G and H.
+    Source: Touch-R1 (arXiv 2605.27154, eq. 5), where N = P, w = 1/N, c = 1, η = 0 and nothing bounds G.
 
     Args:
-      log_prob: learner's log-probabilities of the sampled tokens.
-      old: those of the policy that the ratio is taken to.
-      advantage: one number for the whole rollout.
-      low: clip range below 1.
-      high: clip range above 1; DAPO (arXiv 2503.14476) sets it higher than `low`.
+      terms: log-probability, reference KL, grounding G and entropy H of every token, [P, G, T].
+      old: log-probabilities that ratios are taken to.
+      sampler: log-probabilities that the tokens were drawn with.
+      mask: which tokens exist.
+      advantage: A of each rollout.
+      weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
+      config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
 
     Returns:
-      The objective of each token, to be maximised, and where the clip cut its gradient off.
-
-    Source: PPO (arXiv 1707.06347, eq. 7) with GRPO's per-rollout advantage.
+      The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, and the share
+      of clipped tokens.
     """
-    return _clip(_ratio(log_prob - old), advantage, low, high)
+    algorithm = config.algorithm
+    objective, clipped = surrogate(algorithm, terms.log_prob, old, mask, advantage)
+    if algorithm.importance_cap is not None:
+        objective *= jnp.minimum(_ratio(old - sampler), algorithm.importance_cap)
+    policy, kl = (group_mean(algorithm.average, x, mask, config.length) for x in (objective, terms.reference_kl))
+    per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, config.length)
+    grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
 
+    grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
+    explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
+    gain = jnp.sum(weight * policy) + jnp.sum(grounded - algorithm.beta * kl + explored) / config.prompts
 
-def sequence_surrogate(
-    log_prob: Float[Array, "T"],
-    old: Float[Array, "T"],
-    mask: Bool[Array, "T"],
-    advantage: Float[Array, ""],
-    low: float,
-    high: float,
-) -> tuple[Float[Array, "T"], Bool[Array, "T"]]:
-    """The same with one ratio for all tokens, s = exp(1/|o| Σ_t log π_t/π_old,t), whose gradient all tokens share.
-
-    Its mean over the tokens of a rollout is GSPO's objective (arXiv 2507.18071, eq. 5 and 7).
-
-    Args:
-      mask: which tokens exist; the others as in `clipped_surrogate`.
-    """
-    ratio = _ratio(masked.mean(log_prob - old, mask))
-    return _clip(jnp.broadcast_to(ratio, log_prob.shape), advantage, low, high)
-
-
-def cispo_surrogate(
-    log_prob: Float[Array, "T"], old: Float[Array, "T"], advantage: Float[Array, ""], low: float, high: float
-) -> tuple[Float[Array, "T"], Bool[Array, "T"]]:
-    """Policy gradient with a clipped weight, sg(clip(ρ_t, 1 − low, 1 + high)) A log π_t.
-
-    No token loses its gradient; the flags say where the weight was clipped.  Source: MiniMax-M1 (arXiv 2506.13585,
-    eq. 4), which leaves the lower bound open: `low` = 1.
-    """
-    ratio = jax.lax.stop_gradient(_ratio(log_prob - old))
-    weight = jnp.clip(ratio, 1.0 - low, 1.0 + high)
-    return weight * advantage * log_prob, weight != ratio
+    peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
+    return -gain, {
+        "surrogate": policy,
+        "kl": kl,
+        "kl_peak": peak(terms.reference_kl),
+        "grounding": grounding,
+        "grounding_peak": peak(terms.grounding),
+        "entropy": entropy,
+        "clip_share": per_rollout(clipped.astype(jnp.float32)),
+    }
 
 
 def surrogate(
     algorithm: Algorithm,
-    log_prob: Float[Array, "T"],
-    old: Float[Array, "T"],
-    mask: Bool[Array, "T"],
-    advantage: Float[Array, ""],
-) -> tuple[Float[Array, "T"], Bool[Array, "T"]]:
-    """The configured surrogate of one rollout."""
-    low, high = algorithm.clip_low, algorithm.clip_high
-    match algorithm.surrogate:
-        case Surrogate.TOKEN:
-            return clipped_surrogate(log_prob, old, advantage, low, high)
-        case Surrogate.SEQUENCE:
-            return sequence_surrogate(log_prob, old, mask, advantage, low, high)
-        case Surrogate.CISPO:
-            return cispo_surrogate(log_prob, old, advantage, low, high)
-        case _:
-            assert_never(algorithm.surrogate)
+    log_prob: Float[Array, "*n T"],
+    old: Float[Array, "*n T"],
+    mask: Bool[Array, "*n T"],
+    advantage: Float[Array, "*n"],
+) -> tuple[Float[Array, "*n T"], Bool[Array, "*n T"]]:
+    """Clipped policy-gradient objective of every token, to be maximised, and where the clip cut its gradient off.
 
-
-def importance_weight(old: Float[Array, "*n"], sampler: Float[Array, "*n"], cap: float) -> Float[Array, "*n"]:
-    """Truncated importance sampling, min(π_old/π_sampler, cap): corrects a sampler that rounds unlike the learner.
+    TOKEN: min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A) with ρ_t = π/π_old (PPO, arXiv 1707.06347, eq. 7; DAPO, arXiv
+    2503.14476, sets high above low).  SEQUENCE: the same with one ratio for all tokens, ρ = exp(1/|o| Σ_t log π/π_old),
+    whose mean over a rollout is GSPO's objective (arXiv 2507.18071, eq. 5 and 7).  CISPO: sg(clip(ρ_t)) A log π_t, in
+    which every token keeps its gradient and the flag marks a clipped weight (MiniMax-M1, arXiv 2506.13585, eq. 4).
 
     Args:
-      old: log-probabilities of the learner before the update.
-      sampler: those that the tokens were drawn with.
-      cap: largest weight; truncation trades a little bias for bounded variance (Ionides 2008).
+      algorithm: kind and clip range.
+      log_prob: the learner's log-probabilities of the sampled tokens.
+      old: those of the policy that the ratio is taken to.
+      mask: which tokens exist; the others have values of no meaning.
+      advantage: one number for a whole rollout.
     """
-    return jnp.minimum(_ratio(old - sampler), cap)
+    a, low, high = advantage[..., None], algorithm.clip_low, algorithm.clip_high
+    log_ratio = log_prob - old
+    if algorithm.surrogate is Surrogate.SEQUENCE:
+        log_ratio = masked.mean(log_ratio, mask, -1, keepdims=True)
+    ratio = jnp.broadcast_to(_ratio(log_ratio), log_prob.shape)
+    if algorithm.surrogate is Surrogate.CISPO:
+        ratio = jax.lax.stop_gradient(ratio)
+        weight = jnp.clip(ratio, 1.0 - low, 1.0 + high)
+        return weight * a * log_prob, weight != ratio
+    free, bound = ratio * a, jnp.clip(ratio, 1.0 - low, 1.0 + high) * a
+    return jnp.minimum(free, bound), free > bound
 
 
-def group_mean(kind: Average, x: Float[Array, "G T"], mask: Bool[Array, "G T"], longest: int) -> Float[Array, ""]:
-    """One number for the tokens of a group.
+def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: int) -> Array:
+    """Mean over the tokens of each group, [*p].
 
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO), so that long rollouts weigh more.
     LENGTH: mean_i 1/N Σ_t x with the longest length N that is allowed (Dr. GRPO), so that no length is favoured.
 
     Args:
-      kind: which.
+      kind: which of them.
       x: value of each token.
       mask: which tokens exist.
       longest: N, which may exceed the T at hand.
     """
     match kind:
         case Average.ROLLOUT:
-            return jnp.mean(masked.mean(x, mask, axis=-1))
+            return jnp.mean(masked.mean(x, mask, -1), -1)
         case Average.TOKEN:
-            return masked.mean(x, mask)
+            return masked.mean(x, mask, (-2, -1))
         case Average.LENGTH:
-            return jnp.mean(masked.total(x, mask, axis=-1)) / longest
+            return jnp.mean(masked.total(x, mask, -1), -1) / longest
         case _:
             assert_never(kind)
 
 
-def grounding_kl(
-    log_p: Float[Array, "*n V"], log_masked: Float[Array, "*n V"], *, stop_masked: bool, cap: float | None
-) -> Float[Array, "*n"]:
-    """Tactile grounding of each token, KL(π(· | touch) ‖ π(· | one stream made noise)), exact over the vocabulary.
+def token_terms(
+    algorithm: Algorithm,
+    tokens: Int[Array, "*n"],
+    log_p: Float[Array, "*n V"],
+    log_ref: Float[Array, "*n V"] | None,
+    log_masked: Float[Array, "*n V"] | None,
+) -> TokenTerms:
+    """Terms of the sampled tokens from log-probabilities of the whole vocabulary.
 
     Args:
-      log_p: log-probabilities under the true touch.
-      log_masked: the same tokens under the perturbed touch.
-      stop_masked: no gradient through the perturbed branch (a departure of the `stable` preset).
-      cap: largest value a token may contribute, nat; `None` leaves it unbounded as in the paper.
+      algorithm: estimator of the reference KL, bound of the grounding, weights.
+      tokens: the sampled ones.
+      log_p: log-probabilities under the learner.
+      log_ref: under the reference policy; `None` where β is 0.
+      log_masked: under the learner with one stream of touch replaced by noise; `None` where γ is 0.
     """
-    kl = exact_kl(log_p, jax.lax.stop_gradient(log_masked) if stop_masked else log_masked)
-    return kl if cap is None else jnp.minimum(kl, cap)
+    nothing = jnp.zeros(tokens.shape)
+    if log_masked is not None and algorithm.grounding_stop_masked:
+        log_masked = jax.lax.stop_gradient(log_masked)
+    return TokenTerms(
+        log_prob=token_log_probs(log_p, tokens),
+        reference_kl=nothing if log_ref is None else reference_kl(algorithm.kl, log_p, log_ref, tokens),
+        grounding=nothing if log_masked is None else at_most(exact_kl(log_p, log_masked), algorithm.grounding_cap_nat),
+        entropy=entropy(jax.lax.stop_gradient(log_p) if left_out(algorithm.entropy_weight) else log_p),
+    )
 
 
-def grounding_bonus(mean_grounding: Float[Array, "*n"], algorithm: Algorithm) -> Float[Array, "*n"]:
-    """min(γ G_tg, budget): what a prompt's grounding adds to the objective, and no gradient once that is the budget.
+def reference_kl(
+    estimator: KLEstimator, log_p: Float[Array, "*n V"], log_q: Float[Array, "*n V"], tokens: Int[Array, "*n"]
+) -> Float[Array, "*n"]:
+    """KL(p ‖ q) at each token: exact over the vocabulary, or estimated from the sampled token."""
+    if estimator == "exact":
+        return exact_kl(log_p, log_q)
+    return estimated_kl(token_log_probs(log_p, tokens), token_log_probs(log_q, tokens), estimator)
 
-    Without a budget the term is linear, as published: at a large γ it pays more than any answer can earn.
+
+def exact_kl(log_p: Float[Array, "*n V"], log_q: Float[Array, "*n V"]) -> Float[Array, "*n"]:
+    """KL(p ‖ q) = Σ_v p_v (log p_v − log q_v) over the whole vocabulary, from log-probabilities."""
+    return jnp.sum(jnp.exp(log_p) * (log_p - log_q), -1)
+
+
+def estimated_kl(
+    log_p: Float[Array, "*n"], log_q: Float[Array, "*n"], estimator: Literal["k1", "k2", "k3"]
+) -> Float[Array, "*n"]:
+    """Estimate of KL(p ‖ q) from the sampled token's log-probabilities, with r = q/p.
+
+    k1 = −log r, k2 = (log r)²/2, k3 = r − 1 − log r (Schulman, "Approximating KL divergence", 2020).  Under samples of
+    p and the gradient of the estimate itself, E[∇k1] = 0, E[∇k2] = ∇KL(p ‖ q) and E[∇k3] = ∇KL(q ‖ p) (arXiv
+    2510.01555): as a loss, k3 penalises the reverse divergence.
     """
-    linear = algorithm.gamma * mean_grounding
-    return linear if algorithm.grounding_budget is None else jnp.minimum(linear, algorithm.grounding_budget)
+    log_r = jnp.clip(log_q - log_p, -LOG_RATIO_CLAMP, LOG_RATIO_CLAMP)
+    if estimator == "k1":
+        return -log_r
+    if estimator == "k2":
+        return 0.5 * log_r**2
+    return jnp.expm1(log_r) - log_r
 
 
-def entropy_bonus(mean_entropy: Float[Array, ""], algorithm: Algorithm) -> Float[Array, ""]:
-    """w · min(H, floor): pays for entropy as long as a prompt's mean entropy H lies below the floor, nat."""
-    if algorithm.entropy_floor_nat is None:
-        return algorithm.entropy_weight * mean_entropy
-    return algorithm.entropy_weight * jnp.minimum(mean_entropy, algorithm.entropy_floor_nat)
-
-
-def token_log_probs(log_p: Float[Array, "*n V"], tokens: Array) -> Float[Array, "*n"]:
+def token_log_probs(log_p: Float[Array, "*n V"], tokens: Int[Array, "*n"]) -> Float[Array, "*n"]:
     """Log-probability of each given token."""
     return jnp.take_along_axis(log_p, tokens[..., None], -1)[..., 0]
 
@@ -161,10 +210,10 @@ def entropy(log_p: Float[Array, "*n V"]) -> Float[Array, "*n"]:
     return -jnp.sum(jnp.exp(log_p) * log_p, -1)
 
 
+def at_most(x: Float[Array, "*n"], bound: float | None) -> Float[Array, "*n"]:
+    """min(x, bound), without gradient where the bound holds; `None` is no bound."""
+    return x if bound is None else jnp.minimum(x, bound)
+
+
 def _ratio(log_ratio: Array) -> Array:
     return jnp.exp(jnp.clip(log_ratio, -LOG_RATIO_CLAMP, LOG_RATIO_CLAMP))
-
-
-def _clip(ratio: Array, advantage: Array, low: float, high: float) -> tuple[Array, Array]:
-    free, bound = ratio * advantage, jnp.clip(ratio, 1.0 - low, 1.0 + high) * advantage
-    return jnp.minimum(free, bound), free > bound

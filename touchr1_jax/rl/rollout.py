@@ -1,4 +1,4 @@
-"""Sample a group of completions per prompt from a shared, once-encoded prefix.
+"""Completions of prompts: a group of samples of each, or the greedy answer, from a shared, once-encoded prefix.
 
 The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix
 batched).  The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended, those of all
@@ -11,12 +11,45 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.text.constraint import Constraint
-from touchr1_jax.types import Rollout
+from touchr1_jax.types import Params, Parsed, Rollout, Target
+
+
+@struct.dataclass
+class GRPOBatch:
+    """P encoded contacts with a question each.
+
+    `ordered` marks questions whose answer depends on the order of frames; `None`: none does.
+    """
+
+    features: Features
+    ids: Int[Array, "P L"]
+    mask: Bool[Array, "P L"]
+    target: Target
+    ordered: Bool[Array, "P"] | None = None
+
+
+class EncodedPrompts(NamedTuple):
+    """Encoded prompts, [P, …]: logits of the first token, and the keys and values that completions attend to."""
+
+    first: Float[Array, "P V"]
+    prefix: PrefixCache
+
+
+@struct.dataclass
+class GreedyAnswers:
+    """The most likely completion of each prompt, token by token, and what the parser read in it."""
+
+    tokens: Int[Array, "P T"]
+    parsed: Parsed
+
 
 DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[Array, tuple[LayerCache, ...]]]
 """(token [], t [], prefix, caches) → (logits [V] of token t + 1, caches), for one rollout."""
@@ -37,6 +70,39 @@ class SampleConfig:
     greedy: bool = False
     inverse: bool = False
     constraint: Constraint | None = None
+
+
+def encode_prompts(
+    fns: PolicyFns, params: Params, batch: GRPOBatch, known: PrefixCache | None = None, start: int = 0
+) -> EncodedPrompts:
+    """Prefill each prompt once, or only what follows `start` where `known` holds the rest."""
+    prefill = lambda f, i, m, k: fns.prefill(params, f, i, m, k, start)
+    return EncodedPrompts(*jax.vmap(prefill)(batch.features, batch.ids, batch.mask, known))
+
+
+def sample_prompts(fns: PolicyFns, params: Params, prompts: EncodedPrompts, key: Array, draw: SampleConfig) -> Rollout:
+    """Draw the completions of encoded prompts."""
+    decode = lambda token, t, past, caches: fns.decode(params, token, t, past, caches)
+    return sample(decode, prompts.first, prompts.prefix, fns.empty_cache(draw.length), key, draw)
+
+
+def sample_group(fns: PolicyFns, params: Params, batch: GRPOBatch, key: Array, draw: SampleConfig) -> Rollout:
+    """Prefill each prompt once and draw its completions."""
+    return sample_prompts(fns, params, encode_prompts(fns, params, batch), key, draw)
+
+
+def make_answer(
+    fns: PolicyFns, parser: Callable[[Int[Array, "T"]], Parsed], length: int
+) -> Callable[[Params, GRPOBatch], GreedyAnswers]:
+    """Build the jitted (params, batch) → greedy answers of at most `length` tokens."""
+    draw = SampleConfig(group=1, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, greedy=True)
+
+    @jax.jit
+    def answer(params: Params, batch: GRPOBatch) -> GreedyAnswers:
+        tokens = sample_group(fns, params, batch, jax.random.key(0), draw).tokens[:, 0]
+        return GreedyAnswers(tokens=tokens, parsed=jax.vmap(parser)(tokens))
+
+    return answer
 
 
 class _Loop(NamedTuple):

@@ -9,10 +9,8 @@ from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.rl.grpo import sample_group
-from touchr1_jax.rl.kl import exact_kl
-from touchr1_jax.rl.objective import GRPOBatch
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.losses import exact_kl
+from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, sample_group
 from touchr1_jax.types import Params
 
 ROUNDING_NAT = 1e-7

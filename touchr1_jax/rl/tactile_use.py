@@ -6,12 +6,98 @@ With s = max(R_acc, 0) and, for each control c of the touch, the mean s̄^c of i
 Both are 0 where nothing is right, and the recommended one does not cancel when all right rollouts earn it.
 """
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
+from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards.accuracy import accuracy
+from touchr1_jax.rl.advantages import advantages, zero_variance
+from touchr1_jax.rl.config import Algorithm, TactileUse
+from touchr1_jax.rl.counterfactual import Perturbed, drop_touch, noise_touch, shuffle_touch, swap_touch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.types import Parsed, Target
+
+CONTROLS = ("drop", "noise", "order")
+"""Names of the controls, in the order of `controls`."""
+
+UNMOVED = 1e-2
+"""A bonus that changes advantages by less, a hundredth of a standard deviation, has no effect."""
+
+AnswerFn = Callable[[Features, Array], Parsed]
+"""(features of D prompts, key) → parsed answers [D, J] of the policy to the same questions with that touch."""
+
+
+def tactile_bonus(
+    algorithm: Algorithm, parsed: Parsed, batch: GRPOBatch, noise: Float[Array, "K S N D"], answer: AnswerFn, key: Array
+) -> tuple[Float[Array, "P G"], dict[str, Array]]:
+    """Bonus m of each rollout, and metrics of the controls.
+
+    Args:
+      algorithm: literal or recommended, δ.
+      parsed: the rollouts' answers.
+      batch: the prompts.
+      noise: encoded noise as in `grpo.FrozenInputs`.
+      answer: samples answers under perturbed touch.
+      key: randomness of the perturbations and of the answers.
+    """
+    keys = jax.random.split(key, 5)
+    scored = jax.vmap(jax.vmap(score, in_axes=(0, None)))
+    own = scored(parsed, batch.target)
+    control, counts = [], []
+    for perturbed, draw_key in zip(controls(algorithm, batch, noise, keys), keys[2:], strict=True):
+        control.append(scored(answer(perturbed.features, draw_key), batch.target))
+        counts.append(perturbed.applies)
+    by_prompt, applies = jnp.stack(control, 1), jnp.stack(counts, 1)
+    best = jax.vmap(bar)(by_prompt, applies)
+    if algorithm.tactile_use is TactileUse.LITERAL:
+        is_right = jax.vmap(jax.vmap(right, in_axes=(0, None)))(parsed, batch.target)
+        bonus = jax.vmap(literal, in_axes=(0, 0, 0, None))(own, best, is_right, algorithm.tactile_margin)
+    else:
+        bonus = jax.vmap(recommended, in_axes=(0, 0, 0, None))(own, best, parsed.formatted, algorithm.tactile_margin)
+    return bonus, {
+        "touch_score": jnp.mean(own),
+        **{f"control_{n}": masked.mean(by_prompt[:, i], applies[:, i, None]) for i, n in enumerate(CONTROLS)},
+        **{f"control_{n}_share": jnp.mean(applies[:, i]) for i, n in enumerate(CONTROLS)},
+        "tactile_credit_share": jnp.mean(jnp.any(bonus > 0, -1)),
+        "control_missing_share": 1 - jnp.mean(applies),
+        "credit_unearned_share": jnp.mean(jnp.any((bonus > 0) & (own <= 0), -1)),
+    }
+
+
+def controls(
+    algorithm: Algorithm, batch: GRPOBatch, noise: Float[Array, "K S N D"], keys: Array
+) -> tuple[Perturbed, Perturbed, Perturbed]:
+    """Touch under R_tu's three controls: dropped, replaced by noise, and out of order.
+
+    Literal: order is a shuffle, which counts where the question is marked as depending on order.  Recommended: other
+    questions get another object's touch instead, so that a policy which only detects noise does not pass.
+    """
+    features = batch.features
+    depends = jnp.zeros(features.stream_mask.shape[0], bool) if batch.ordered is None else batch.ordered
+    shuffled = shuffle_touch(features, keys[1])
+    use = depends & shuffled.applies
+    if algorithm.tactile_use is TactileUse.LITERAL:
+        third = shuffled._replace(applies=use)
+    else:
+        swapped = swap_touch(features, keys[1])
+        choose = lambda a, b: jnp.where(use.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+        third = jax.tree.map(choose, shuffled, swapped)
+    return drop_touch(features), noise_touch(features, noise, keys[0]), third
+
+
+def bonus_metrics(
+    algorithm: Algorithm, reward: Float[Array, "P G"], bonus: Float[Array, "P G"], advantage: Float[Array, "P G"]
+) -> dict[str, Array]:
+    """Share of groups whose rollouts earn different bonuses, and of those among them whose advantages ignore it."""
+    if algorithm.tactile_use is TactileUse.LITERAL:
+        reward = reward - algorithm.tactile_weight * bonus
+    moved = jnp.max(jnp.abs(advantage - advantages(algorithm, reward)), -1)
+    differs = ~zero_variance(bonus)
+    return {"bonus_telling_share": jnp.mean(differs), "bonus_cancelled_share": jnp.mean(differs & (moved < UNMOVED))}
 
 
 def score(parsed: Parsed, target: Target) -> Float[Array, ""]:
@@ -29,7 +115,7 @@ def bar(control: Float[Array, "C J"], counts: Bool[Array, "C"]) -> Float[Array, 
 
     Args:
       control: s of the rollouts under each control.
-      counts: whether a control says anything about this prompt, such as a shuffle where order matters.
+      counts: controls that apply to this prompt, as a shuffle does where order matters.
     """
     return masked.maximum(jnp.mean(control, -1), counts, empty=1.0)
 

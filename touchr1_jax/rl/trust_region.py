@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from touchr1_jax import masked
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.kl import estimated_kl
-from touchr1_jax.rl.objective import Experience, in_order, micro_batches, token_terms
+from touchr1_jax.rl.gradient import Experience, experience_terms, in_order, micro_batches
+from touchr1_jax.rl.losses import estimated_kl
 from touchr1_jax.types import Params
 
 NEAR = 1.5
@@ -67,5 +67,5 @@ def log_probs(fns: PolicyFns, config: GRPOConfig, params: Params, learn: Experie
     """Log-probabilities of the sampled tokens under some parameters, nothing else."""
     algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
     plain = dataclasses.replace(config, algorithm=algorithm)
-    of_prompt = lambda e: token_terms(fns, plain, params, params, e)["log_prob"]
-    return in_order(jax.lax.map(jax.vmap(of_prompt), micro_batches(config, learn)))
+    of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob
+    return in_order(jax.lax.map(of_micro_batch, micro_batches(config, learn)))

@@ -34,7 +34,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 

@@ -11,7 +11,7 @@ from experiments.study import answers
 from experiments.study.answers import Evaluated, evaluate_policy, reward_of, reward_terms
 from tests.experiments import tiny
 from touchr1_jax.rewards import make_rewards, total_reward
-from touchr1_jax.rl.evaluate import Answers
+from touchr1_jax.rl.rollout import GreedyAnswers
 from touchr1_jax.types import Parsed
 
 WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
@@ -109,7 +109,7 @@ def felt_sum(decoder, batch):
         truncated=flag,
         length=silent,
     )
-    return Answers(tokens=batch.ids, parsed=parsed)
+    return GreedyAnswers(tokens=batch.ids, parsed=parsed)
 
 
 def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(assembly, context, monkeypatch):

@@ -27,7 +27,7 @@ def main() -> None:
     """Compile for four devices along fsdp."""
     problem, mesh = grpo(), MeshConfig(fsdp=4).build()
     batch = next(feed(problem))
-    step = shard_step(problem.step, mesh, problem.state, batch, *problem.shared)
+    step = shard_step(problem.step_on(mesh), mesh, problem.state, batch, *problem.shared)
     program = step.lower(problem.state, batch, *problem.shared).compile().as_text()
     sys.stdout.write(json.dumps({"loops": of_loops(program), "all": len(COLLECTIVE.findall(program))}))
 

@@ -1,6 +1,7 @@
 """Short trainings that any mesh must do alike: one layer, and SFT, GRPO and tactile dynamics of the tiny policy."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,12 +14,13 @@ import optax
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.drawn import draw_params
+from touchr1_jax.distributed.placement import gather_params
 from touchr1_jax.models.layers import GatedMLP, RMSNorm
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.training.dynamics import DynamicsConfig, make_dynamics_step, start_dynamics
 from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 from touchr1_jax.training.packing import Packing, existing_tokens, pack_rows
@@ -26,6 +28,7 @@ from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params, Parsed, Target
 
 ROWS, STEPS, TOKENS = 8, 20, 6
+Gather = Callable[[Params], Params]
 FNS = tiny.SHALLOW
 LORA = LoraConfig(rank=2, alpha=4.0)
 GRPO = GRPOConfig(prompts=ROWS, group=4, length=TOKENS, micro_prompts=ROWS, algorithm=Paper(beta=0.1, gamma=0.05))
@@ -34,14 +37,23 @@ OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A jitted step, its first state, what a run never changes, and the items that batches are made of."""
+    """A training: its step for a given gather of weights, first state, batches, and inputs that never change."""
 
-    step: Callable[..., Any]
+    make_step: Callable[[Gather], Callable[..., Any]]
     state: Any
     item: Callable[[int], Any]
     shared: tuple[Any, ...] = ()
     finish: Callable[[Any], Any] = lambda batch: batch
-    """What is made of a batch of items, or of those rows of it that a process reads."""
+    """Completes a batch of items, or those rows of it that a process reads."""
+
+    @functools.cached_property
+    def step(self) -> Callable[..., Any]:
+        """The step on one device."""
+        return self.make_step(lambda params: params)
+
+    def step_on(self, mesh: jax.sharding.Mesh) -> Callable[..., Any]:
+        """The step to be split over a mesh."""
+        return self.make_step(functools.partial(gather_params, mesh))
 
 
 def feed(problem: Problem, own: np.ndarray | None = None) -> Any:
@@ -81,7 +93,9 @@ def words() -> Problem:
         return SFTState(params=params, opt_state=opt_state, step=state.step + 1), {"loss": value}
 
     state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
-    return Problem(jax.jit(step), state, lambda i: {"token": np.int32(i % 16), "label": np.int32((i + 2) % 16)})
+    return Problem(
+        lambda gather: jax.jit(step), state, lambda i: {"token": np.int32(i % 16), "label": np.int32((i + 2) % 16)}
+    )
 
 
 def sft() -> Problem:
@@ -100,7 +114,7 @@ def sft() -> Problem:
 
     params = {**tiny.params(loud=0.2), **tiny.shallow_params(loud=0.2)}
     state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
-    return Problem(make_sft_step(FNS, OPTIMIZER), state, item)
+    return Problem(lambda gather: make_sft_step(FNS, OPTIMIZER), state, item)
 
 
 def packed() -> Problem:
@@ -125,7 +139,7 @@ def adapters() -> Problem:
     def step(state: SFTState, batch: SFTBatch, base: Params) -> tuple[SFTState, dict[str, jax.Array]]:
         return make_sft_step(adapt(FNS, base, LORA), OPTIMIZER)(state, batch)
 
-    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (base,))
+    return Problem(lambda gather: jax.jit(step, donate_argnums=0), state, plain.item, (base,))
 
 
 def adapters_grpo() -> Problem:
@@ -137,10 +151,13 @@ def adapters_grpo() -> Problem:
     state = start_state(trained, optimizer, jax.random.key(0), GRPO)
     frozen = FrozenInputs(reference=Trainable(adapters=_adapters(base, 1), towers={}), noise=plain.shared[0].noise)
 
-    def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params):
-        return make_grpo_step(adapt(FNS, base, LORA), score, optimizer, GRPO)(state, batch, frozen)
+    def make_step(gather: Gather) -> Callable[..., Any]:
+        def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params):
+            return make_grpo_step(adapt(FNS, base, LORA), score, optimizer, GRPO, gather=gather)(state, batch, frozen)
 
-    return Problem(jax.jit(step, donate_argnums=0), state, plain.item, (frozen, base))
+        return jax.jit(step, donate_argnums=0)
+
+    return Problem(make_step, state, plain.item, (frozen, base))
 
 
 def _apart(params: Params) -> tuple[Params, Params]:
@@ -179,7 +196,8 @@ def grpo() -> Problem:
     frozen = FrozenInputs(reference=tiny.shallow_params(1, loud=0.2), noise=jnp.asarray(noise, jnp.float32))
     item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
     questions = tiny.question_batch(0, 16)
-    return Problem(make_grpo_step(FNS, score, optimizer, GRPO), state, item, (frozen,))
+    make_step = lambda gather: make_grpo_step(FNS, score, optimizer, GRPO, gather=gather)
+    return Problem(make_step, state, item, (frozen,))
 
 
 def dynamics() -> Problem:
@@ -198,7 +216,7 @@ def dynamics() -> Problem:
         step=jnp.int32(0),
         key=jax.random.key(1),
     )
-    return Problem(make_dynamics_step(config, OPTIMIZER), state, contact)
+    return Problem(lambda gather: make_dynamics_step(config, OPTIMIZER), state, contact)
 
 
 PROBLEMS: dict[str, Callable[[], Problem]] = {

@@ -45,7 +45,7 @@ def train(name: str, config: MeshConfig, directory: Path, devices: list[jax.Devi
     rows = local_rows(mesh, ROWS)
     batches = Placed(feed(problem, rows), mesh)
     example = next(feed(problem))
-    step = shard_step(problem.step, mesh, problem.state, example, *problem.shared)
+    step = shard_step(problem.step_on(mesh), mesh, problem.state, example, *problem.shared)
     shared = tuple(place_state(mesh, x) for x in problem.shared)
     found: list[dict[str, float]] = []
     with Checkpoints(directory) as checkpoints:

@@ -169,3 +169,10 @@ def test_what_a_coarse_type_keeps_of_a_change_by_hand(dtype, change, kept):
     adapters = {"decoder": {"q_proj": Adapter(a=jnp.array([[change]]), b=jnp.array([[1.0]]))}}
     lora = LoraConfig(rank=1, alpha=1.0)
     assert kept_share(base, merge(base, adapters, lora), adapters, lora) == pytest.approx(kept)
+
+
+def test_a_change_of_context_reaches_the_frozen_base():
+    fns = adapt(tiny.SHALLOW, {"decoder": {"scale": jnp.ones(2)}}, LoraConfig(rank=1))
+    doubled = fns.with_context(lambda params: jax.tree.map(lambda x: 2 * x, params))
+    assert doubled.base["decoder"]["scale"].tolist() == [2, 2]
+    assert tiny.SHALLOW.with_context(lambda params: None) is tiny.SHALLOW

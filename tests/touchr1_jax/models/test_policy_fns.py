@@ -9,9 +9,8 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.models import naive
-from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.losses import clipped_surrogate, token_log_probs
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.rollout import SampleConfig, sample_group
 
 P, G, T = 2, 3, 6
 BLOCKS = [

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchr1_jax.rl.advantages import batch_advantage, group_advantage, zero_variance
+from touchr1_jax.rl.advantages import batch_advantage, group_advantage, prompt_weights, zero_variance
 
 
 def test_advantages_by_hand():
@@ -78,3 +78,8 @@ def test_zero_variance_groups_have_no_part_in_the_sigma_of_the_batch():
     expected = np.array([[0.5, -0.5], [0, 0], [0.25, -0.25]]) / sigma
     np.testing.assert_allclose(batch_advantage(reward, epsilon=0.0), expected, rtol=1e-6)
     assert not batch_advantage(jnp.full((2, 3), 0.4)).any()
+
+
+def test_weights_of_prompts_that_count():
+    np.testing.assert_allclose(prompt_weights(jnp.array([True, False, True, False])), [0.5, 0, 0.5, 0])
+    np.testing.assert_array_equal(prompt_weights(jnp.zeros(3, bool)), [0, 0, 0])

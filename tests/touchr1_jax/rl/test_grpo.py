@@ -10,9 +10,9 @@ from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl import reference
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, prompt_weights, sample_group
+from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step
 from touchr1_jax.rl.metrics import rollout_metrics
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.rollout import SampleConfig, sample_group
 from touchr1_jax.types import Parsed, Rollout, Target
 
 P, G, T, K = 4, 3, 4, 3
@@ -227,9 +227,17 @@ def test_uncompiled_step_is_the_compiled_one(run):
     assert_first_step(run, end, metrics)
 
 
-def test_weights_of_prompts_that_count():
-    np.testing.assert_allclose(prompt_weights(jnp.array([True, False, True, False])), [0.5, 0, 0.5, 0])
-    np.testing.assert_array_equal(prompt_weights(jnp.zeros(3, bool)), [0, 0, 0])
+def test_weights_are_gathered_for_the_sampler_and_not_for_the_learner(run):
+    """A gather that returns zeros makes the sampler uniform; the learner's weights, and its gradient, stay."""
+    gathered = []
+
+    def zeros(params):
+        gathered.append(jax.tree.structure(params))
+        return jax.tree.map(jnp.zeros_like, params)
+
+    _, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG, gather=zeros)(state(), run.batches[0], FROZEN)
+    assert gathered == [jax.tree.structure(run.before[0].params)]
+    assert metrics["grad_norm"] > 0
 
 
 def test_one_present_stream_is_masked_uniformly():

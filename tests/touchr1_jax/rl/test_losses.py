@@ -1,4 +1,6 @@
-"""The terms of the objective by hand."""
+"""The loss on arrays against NumPy, and its terms by hand."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -6,113 +8,70 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.rl import reference
-from touchr1_jax.rl.config import Average, Paper, Surrogate
-from touchr1_jax.rl.kl import exact_kl
+from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Stable, Surrogate
 from touchr1_jax.rl.losses import (
-    cispo_surrogate,
-    clipped_surrogate,
+    TokenTerms,
+    at_most,
     entropy,
-    entropy_bonus,
-    grounding_kl,
+    estimated_kl,
+    exact_kl,
     group_mean,
-    importance_weight,
-    sequence_surrogate,
+    grpo_loss,
+    reference_kl,
     surrogate,
     token_log_probs,
+    token_terms,
 )
 
 RATIO = np.array([0.5, 0.9, 1.0, 1.1, 2.0])
 
 
-def clipped_at(advantage: float, low: float = 0.2, high: float = 0.3):
-    """Value, clip flag and d value / d log π of each ratio."""
-    run = lambda x: clipped_surrogate(x, jnp.zeros(5), jnp.array(advantage), low, high)
-    log_prob = jnp.log(jnp.asarray(RATIO, jnp.float32))
-    return *run(log_prob), jax.grad(lambda x: run(x)[0].sum())(log_prob)
+def surrogate_of(log_prob, advantage: float, *, low: float = 0.2, high: float = 0.3, kind=Surrogate.TOKEN, mask=True):
+    """Value, clip flag and d Σ value / d log π of one rollout whose old log-probabilities are 0."""
+    algorithm = Paper(surrogate=kind, clip_low=low, clip_high=high)
+    zero = jnp.zeros(len(log_prob))
+    run = lambda x: surrogate(algorithm, x, zero, jnp.broadcast_to(jnp.array(mask), zero.shape), jnp.array(advantage))
+    x = jnp.asarray(log_prob, jnp.float32)
+    return *run(x), jax.grad(lambda x: run(x)[0].sum())(x)
 
 
-def test_positive_advantage_is_clipped_above_alone():
-    value, clipped, gradient = clipped_at(2.0)
-    np.testing.assert_allclose(value, 2 * np.minimum(RATIO, 1.3), rtol=1e-6)
-    np.testing.assert_array_equal(clipped, RATIO > 1.3)
-    np.testing.assert_allclose(gradient, np.where(RATIO > 1.3, 0, 2 * RATIO), rtol=1e-5)
+@pytest.mark.parametrize(
+    ("advantage", "value", "clipped"),
+    [
+        (2.0, 2 * np.minimum(RATIO, 1.3), RATIO > 1.3),
+        (-2.0, -2 * np.maximum(RATIO, 0.8), RATIO < 0.8),
+        (0.0, 0 * RATIO, RATIO < 0),
+    ],
+    ids=["a good rollout is clipped above", "a bad one below", "one of advantage zero has no gradient"],
+)
+def test_clip_by_hand(advantage, value, clipped):
+    ours, flags, gradient = surrogate_of(np.log(RATIO), advantage)
+    np.testing.assert_allclose(ours, value, rtol=1e-6)
+    np.testing.assert_array_equal(flags, clipped)
+    np.testing.assert_allclose(gradient, np.where(clipped, 0, advantage * RATIO), rtol=1e-5)
 
 
-def test_negative_advantage_is_clipped_below_alone():
-    value, clipped, gradient = clipped_at(-2.0)
-    np.testing.assert_allclose(value, -2 * np.maximum(RATIO, 0.8), rtol=1e-6)
-    np.testing.assert_array_equal(clipped, RATIO < 0.8)
-    np.testing.assert_allclose(gradient, np.where(RATIO < 0.8, 0, -2 * RATIO), rtol=1e-5)
-
-
-def test_zero_advantage_has_no_gradient():
-    value, clipped, gradient = clipped_at(0.0)
-    assert not value.any()
-    assert not clipped.any()
-    assert not gradient.any()
-
-
-def test_on_policy_gradient_is_the_policy_gradient():
-    gradient = jax.grad(lambda x: clipped_surrogate(x, jnp.array([-3.0]), jnp.array(1.5), 0.2, 0.2)[0].sum())
-    np.testing.assert_allclose(gradient(jnp.array([-3.0])), [1.5], rtol=1e-6)
-
-
-def test_far_ratios_stay_finite():
+@pytest.mark.parametrize("gap", [-1e9, 1e9])
+def test_far_ratios_stay_finite(gap):
     """A padding token has a log-probability of −1e9; it is masked later, but 0 · ∞ would be NaN."""
-    for gap in (-1e9, 1e9):
-        run = lambda x: clipped_surrogate(x, jnp.array([0.0]), jnp.array(-1.0), 0.2, 0.2)[0].sum()
-        value, gradient = jax.value_and_grad(run)(jnp.array([gap]))
-        assert jnp.isfinite(value)
-        assert jnp.isfinite(gradient).all()
+    value, _, gradient = surrogate_of([gap], -1.0)
+    assert jnp.isfinite(value).all()
+    assert jnp.isfinite(gradient).all()
 
 
-@pytest.fixture
-def branches():
-    """Scores [T, V] under the true and the perturbed touch."""
-    rng = np.random.default_rng(0)
-    return [jnp.asarray(rng.normal(0, 2, (4, 6)), jnp.float32) for _ in range(2)]
+def test_sequence_ratio_by_hand():
+    """Two tokens, ratios e^.2 and 1: s = e^.1, clipped at 1.05 for a good answer, free for a bad one."""
+    sequence = {"kind": Surrogate.SEQUENCE, "low": 0.05, "high": 0.05, "mask": [True, True, False]}
+    good, bad = (surrogate_of([0.2, 0.0, 9.0], a, **sequence) for a in (2.0, -2.0))
+    np.testing.assert_allclose(good[0][:2], [2.1, 2.1], rtol=1e-6)
+    assert good[1][:2].all()
+    np.testing.assert_allclose(bad[0][:2], -2 * np.exp(0.1), rtol=1e-6)
 
 
-def grounding(p, q, **kwargs):
-    return grounding_kl(jax.nn.log_softmax(p), jax.nn.log_softmax(q), **kwargs).sum()
-
-
-def test_grounding_is_the_exact_kl_and_zero_when_nothing_is_perturbed(branches):
-    p, q = (np.asarray(jax.nn.softmax(x), np.float64) for x in branches)
-    ours = grounding_kl(*map(jax.nn.log_softmax, branches), stop_masked=False, cap=None)
-    np.testing.assert_allclose(ours, (p * np.log(p / q)).sum(-1), rtol=1e-5)
-    assert not grounding_kl(*[jax.nn.log_softmax(branches[0])] * 2, stop_masked=False, cap=None).any()
-
-
-def test_cap_bounds_each_token_and_cuts_its_gradient(branches):
-    free = grounding_kl(*map(jax.nn.log_softmax, branches), stop_masked=False, cap=None)
-    cap = float(jnp.median(free))
-    ours = grounding_kl(*map(jax.nn.log_softmax, branches), stop_masked=False, cap=cap)
-    np.testing.assert_allclose(ours, np.minimum(free, cap), rtol=1e-6)
-    gradient = jax.grad(grounding)(*branches, stop_masked=False, cap=cap)
-    np.testing.assert_array_equal(jnp.any(gradient != 0, -1), free < cap)
-
-
-def test_stopped_branch_has_no_gradient_and_the_free_one_has(branches):
-    gradient = lambda stop: jax.grad(grounding, (0, 1))(*branches, stop_masked=stop, cap=None)
-    (true_free, masked_free), (true_stopped, masked_stopped) = gradient(False), gradient(True)
-    np.testing.assert_array_equal(true_free, true_stopped)
-    assert not masked_stopped.any()
-    q, p = jax.nn.softmax(branches[1]), jax.nn.softmax(branches[0])
-    np.testing.assert_allclose(masked_free, q - p, atol=1e-5)  # ∇_q KL(p ‖ softmax q)
-
-
-def test_token_log_probs_and_entropy_by_hand():
-    log_p = jnp.log(jnp.array([[0.5, 0.25, 0.25], [1.0, 0.0, 0.0]]).clip(1e-30))
-    np.testing.assert_allclose(token_log_probs(log_p, jnp.array([1, 0])), [np.log(0.25), 0], rtol=1e-6)
-    np.testing.assert_allclose(entropy(log_p), [1.5 * np.log(2), 0], atol=1e-6)
-
-
-def test_entropy_of_the_uniform_is_its_distance_from_nothing():
-    """H(p) = log V − KL(p ‖ uniform), with banned tokens as the decoder writes them."""
-    log_p = jax.nn.log_softmax(jnp.array([1.0, 0.3, -2, -1e9]))
-    uniform = jax.nn.log_softmax(jnp.array([0.0, 0, 0, -1e9]))
-    np.testing.assert_allclose(entropy(log_p), np.log(3) - exact_kl(log_p, uniform), rtol=1e-5)
+def test_cispo_keeps_the_gradient_of_clipped_tokens():
+    _, clipped, gradient = surrogate_of(np.log([0.5, 1.0, 4.0]), 1.5, low=1.0, high=0.5, kind=Surrogate.CISPO)
+    np.testing.assert_allclose(gradient, 1.5 * np.array([0.5, 1, 1.5]), rtol=1e-6)
+    np.testing.assert_array_equal(clipped, [False, False, True])
 
 
 RNG = np.random.default_rng(3)
@@ -124,61 +83,216 @@ MASK = np.arange(7) < np.array([[7], [3], [5], [1]])
 ADVANTAGE = np.array([1.2, -0.7, 0.3, -2.0])
 
 
-def batched(kind: Surrogate, low: float, high: float):
-    """Objective [G, T], clip flags and the gradient of its group mean by rollout, under the configured surrogate."""
-    algorithm = Paper(surrogate=kind, clip_low=low, clip_high=high)
-    rollouts = jax.vmap(lambda *x: surrogate(algorithm, *x))
-    args = [jnp.asarray(x, jnp.float32) if x.dtype != bool else jnp.asarray(x) for x in (OLD, MASK, ADVANTAGE)]
-    value, clipped = rollouts(jnp.asarray(LOG_PROB, jnp.float32), *args)
-    mean = lambda x: group_mean(Average.ROLLOUT, rollouts(x, *args)[0], args[1], 7)
-    return value, clipped, jax.grad(mean)(jnp.asarray(LOG_PROB, jnp.float32))
-
-
 @pytest.mark.parametrize("kind", list(Surrogate))
 @pytest.mark.parametrize(("low", "high"), [(0.2, 0.28), (0.05, 0.1)])
 def test_every_surrogate_equals_an_independent_reference(kind, low, high):
-    value, clipped, gradient = batched(kind, low, high)
+    algorithm = Paper(surrogate=kind, clip_low=low, clip_high=high)
+    old, advantage, mask = jnp.asarray(OLD, jnp.float32), jnp.asarray(ADVANTAGE, jnp.float32), jnp.asarray(MASK)
+    run = lambda x: surrogate(algorithm, x, old, mask, advantage)
+    value, clipped = run(jnp.asarray(LOG_PROB, jnp.float32))
+    gradient = jax.grad(lambda x: group_mean(Average.ROLLOUT, run(x)[0], mask, 7))(jnp.asarray(LOG_PROB, jnp.float32))
     expected = reference.surrogate(kind.value, LOG_PROB, OLD, MASK, ADVANTAGE, low, high)
     np.testing.assert_allclose(np.where(MASK, value, 0), np.where(MASK, expected["value"], 0), rtol=2e-5, atol=1e-6)
     np.testing.assert_array_equal(np.where(MASK, clipped, False), np.where(MASK, expected["clipped"], False))
     np.testing.assert_allclose(gradient, expected["gradient"], rtol=2e-4, atol=1e-6)
-    assert np.asarray(clipped)[MASK].any()
-    assert not np.asarray(clipped)[MASK].all()
-
-
-def test_sequence_ratio_by_hand():
-    """Two tokens, ratios e^.2 and 1: s = e^.1, clipped at 1.05 for a good answer, free for a bad one."""
-    run = lambda a: sequence_surrogate(
-        jnp.array([0.2, 0.0, 9.0]), jnp.zeros(3), jnp.array([True, True, False]), jnp.array(a), 0.05, 0.05
-    )
-    np.testing.assert_allclose(run(2.0)[0][:2], [2.1, 2.1], rtol=1e-6)
-    assert run(2.0)[1][:2].all()
-    np.testing.assert_allclose(run(-2.0)[0][:2], -2 * np.exp(0.1), rtol=1e-6)
-
-
-def test_cispo_keeps_the_gradient_of_clipped_tokens():
-    run = lambda x: cispo_surrogate(x, jnp.zeros(3), jnp.array(1.5), 1.0, 0.5)
-    log_prob = jnp.log(jnp.array([0.5, 1.0, 4.0]))
-    np.testing.assert_allclose(jax.grad(lambda x: run(x)[0].sum())(log_prob), 1.5 * np.array([0.5, 1, 1.5]), rtol=1e-6)
-    np.testing.assert_array_equal(run(log_prob)[1], [False, False, True])
-
-
-def test_importance_weight_is_truncated():
-    weight = importance_weight(jnp.log(jnp.array([0.2, 0.2, 0.9])), jnp.log(jnp.array([0.4, 0.2, 0.1])), 2.0)
-    np.testing.assert_allclose(weight, [0.5, 1, 2], rtol=1e-6)
+    assert 0 < np.asarray(clipped)[MASK].sum() < MASK.sum()
 
 
 def test_group_means_by_hand():
     x = jnp.array([[1.0, 2, 3, 4], [10.0, -99, -99, -99]])
     mask = jnp.array([[True] * 4, [True] + [False] * 3])
-    assert group_mean(Average.ROLLOUT, x, mask, 4) == pytest.approx((2.5 + 10) / 2)
-    assert group_mean(Average.TOKEN, x, mask, 4) == pytest.approx(20 / 5)
-    assert group_mean(Average.LENGTH, x, mask, 5) == pytest.approx((10 / 5 + 10 / 5) / 2)
+    means = {Average.ROLLOUT: (2.5 + 10) / 2, Average.TOKEN: 20 / 5, Average.LENGTH: (10 / 5 + 10 / 5) / 2}
+    for kind, expected in means.items():
+        np.testing.assert_allclose(
+            group_mean(kind, jnp.stack([x, 2 * x]), jnp.stack([mask, mask]), 5), [expected, 2 * expected]
+        )
 
 
-def test_entropy_bonus_stops_at_its_floor():
-    assert entropy_bonus(jnp.array(0.7), Paper(entropy_weight=0.1)) == pytest.approx(0.07)
-    floored = Paper(entropy_weight=0.1, entropy_floor_nat=0.5)
-    value, gradient = jax.value_and_grad(lambda h: entropy_bonus(h, floored))(jnp.array(0.7))
-    assert (float(value), float(gradient)) == pytest.approx((0.05, 0.0))
-    assert jax.grad(lambda h: entropy_bonus(h, floored))(jnp.array(0.3)) == pytest.approx(0.1)
+def loss_arguments() -> dict[str, np.ndarray]:
+    """Random arguments of the loss of three prompts of four rollouts; prompt 1 does not count."""
+    rng = np.random.default_rng(0)
+    shape = 3, 4, 7
+    log_prob = rng.normal(-1, 0.4, shape)
+    return {
+        "log_prob": log_prob,
+        "reference_kl": rng.uniform(0, 1, shape),
+        "grounding": rng.uniform(0, 3, shape),
+        "entropy": rng.uniform(0, 2, shape),
+        "old": log_prob + rng.uniform(-0.5, 0.5, shape),
+        "sampler": log_prob + rng.uniform(-0.5, 0.5, shape),
+        "mask": np.arange(7) < rng.integers(1, 8, (3, 4, 1)),
+        "advantage": rng.normal(size=(3, 4)),
+        "weight": np.array([0.5, 0.0, 0.5]),
+    }
+
+
+OPTIONS = {
+    "published": Paper(beta=0.1, gamma=0.05),
+    "mean over tokens": Paper(beta=0.1, gamma=0.05, average=Average.TOKEN),
+    "constant length": Paper(beta=0.1, gamma=0.05, average=Average.LENGTH),
+    "entropy": Paper(gamma=0.0, entropy_weight=0.1),
+    "entropy up to a floor": Paper(gamma=0.0, entropy_weight=0.1, entropy_floor_nat=1.0),
+    "grounding up to a budget": Paper(gamma=0.1, grounding_budget=0.15),
+    "importance weights up to a cap": Paper(importance_cap=1.2),
+}
+
+
+@pytest.mark.parametrize("algorithm", OPTIONS.values(), ids=OPTIONS)
+def test_loss_is_its_formula(algorithm):
+    arguments = loss_arguments()
+    config = GRPOConfig(prompts=4, micro_prompts=4, group=4, length=9, algorithm=algorithm)
+    arrays = {name: jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for name, x in arguments.items()}
+    terms = TokenTerms(**{name: arrays.pop(name) for name in TokenTerms._fields})
+    loss, parts = grpo_loss(terms, **arrays, config=config)
+    expected, means = reference.loss(algorithm, prompts=4, longest=9, **arguments)
+    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    for name, value in means.items():
+        np.testing.assert_allclose(parts[name], value, rtol=1e-5, err_msg=name)
+    mask = arguments["mask"]
+    np.testing.assert_allclose(parts["kl_peak"], np.where(mask, arguments["reference_kl"], 0).max((1, 2)), rtol=1e-6)
+    np.testing.assert_allclose(
+        parts["grounding_peak"], np.where(mask, arguments["grounding"], 0).max((1, 2)), rtol=1e-6
+    )
+
+
+def test_a_bound_cuts_the_gradient_off():
+    gradient = jax.vmap(jax.grad(lambda x: at_most(x, 0.5)))
+    np.testing.assert_array_equal(gradient(jnp.array([0.3, 0.7])), [1, 0])
+    assert at_most(jnp.array(3.0), None) == 3.0
+
+
+@pytest.fixture
+def branches():
+    """Scores [T, V] under the true and the perturbed touch."""
+    rng = np.random.default_rng(0)
+    return [jnp.asarray(rng.normal(0, 2, (4, 6)), jnp.float32) for _ in range(2)]
+
+
+def grounding(p, q, **options):
+    """Grounding of each of four tokens, from scores."""
+    log_p, log_q = jax.nn.log_softmax(p), jax.nn.log_softmax(q)
+    return token_terms(Paper(**options), jnp.zeros(4, jnp.int32), log_p, None, log_q).grounding
+
+
+def test_grounding_is_the_exact_kl_and_zero_when_nothing_is_perturbed(branches):
+    p, q = (np.asarray(jax.nn.softmax(x), np.float64) for x in branches)
+    np.testing.assert_allclose(grounding(*branches), (p * np.log(p / q)).sum(-1), rtol=1e-5)
+    assert not grounding(branches[0], branches[0]).any()
+
+
+def test_cap_bounds_the_grounding_of_each_token_and_cuts_its_gradient(branches):
+    free = grounding(*branches)
+    cap = float(jnp.median(free))
+    np.testing.assert_allclose(grounding(*branches, grounding_cap_nat=cap), np.minimum(free, cap), rtol=1e-6)
+    gradient = jax.grad(lambda p, q: grounding(p, q, grounding_cap_nat=cap).sum())(*branches)
+    np.testing.assert_array_equal(jnp.any(gradient != 0, -1), free < cap)
+
+
+def test_stopped_branch_has_no_gradient_and_the_free_one_has(branches):
+    gradient = lambda stop: jax.grad(lambda p, q: grounding(p, q, grounding_stop_masked=stop).sum(), (0, 1))(*branches)
+    (true_free, masked_free), (true_stopped, masked_stopped) = gradient(False), gradient(True)
+    np.testing.assert_array_equal(true_free, true_stopped)
+    assert not masked_stopped.any()
+    q, p = jax.nn.softmax(branches[1]), jax.nn.softmax(branches[0])
+    np.testing.assert_allclose(masked_free, q - p, atol=1e-5)  # ∇_q KL(p ‖ softmax q)
+
+
+def test_terms_of_policies_that_are_not_run_are_zero(branches):
+    terms = token_terms(Paper(), jnp.zeros(4, jnp.int32), jax.nn.log_softmax(branches[0]), None, None)
+    assert not terms.reference_kl.any()
+    assert not terms.grounding.any()
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.1])
+def test_entropy_has_a_gradient_where_it_is_paid_for(branches, weight):
+    algorithm, tokens = Paper(entropy_weight=weight), jnp.zeros(4, jnp.int32)
+    of = lambda x: token_terms(algorithm, tokens, jax.nn.log_softmax(x), None, None).entropy.sum()
+    assert bool(jax.grad(of)(branches[0]).any()) is (weight > 0)
+
+
+def test_token_log_probs_and_entropy_by_hand():
+    log_p = jnp.log(jnp.array([[0.5, 0.25, 0.25], [1.0, 0.0, 0.0]]).clip(1e-30))
+    np.testing.assert_allclose(token_log_probs(log_p, jnp.array([1, 0])), [np.log(0.25), 0], rtol=1e-6)
+    np.testing.assert_allclose(entropy(log_p), [1.5 * np.log(2), 0], atol=1e-6)
+
+
+def test_entropy_is_the_distance_from_the_uniform():
+    """H(p) = log V − KL(p ‖ uniform), with banned tokens as the decoder writes them."""
+    log_p = jax.nn.log_softmax(jnp.array([1.0, 0.3, -2, -1e9]))
+    uniform = jax.nn.log_softmax(jnp.array([0.0, 0, 0, -1e9]))
+    np.testing.assert_allclose(entropy(log_p), np.log(3) - exact_kl(log_p, uniform), rtol=1e-5)
+
+
+THETA = jnp.asarray(RNG.normal(size=6), jnp.float32)
+REFERENCE = jax.nn.log_softmax(jnp.asarray(RNG.normal(size=6), jnp.float32))
+ESTIMATORS = ("k1", "k2", "k3")
+forward = lambda theta: exact_kl(jax.nn.log_softmax(theta), REFERENCE)
+reverse = lambda theta: exact_kl(REFERENCE, jax.nn.log_softmax(theta))
+
+
+def test_exact_kl_by_hand():
+    """KL((½, ½) ‖ (¼, ¾)) = ½ log 2 + ½ log ⅔."""
+    ours = exact_kl(jnp.log(jnp.array([0.5, 0.5])), jnp.log(jnp.array([0.25, 0.75])))
+    np.testing.assert_allclose(ours, 0.5 * np.log(2) + 0.5 * np.log(2 / 3), rtol=1e-6)
+
+
+def test_exact_kl_of_equal_distributions_is_zero_even_with_banned_tokens():
+    scores = jnp.array([1.0, 2.0, -1e9, -1e9])
+    log_p = jax.nn.log_softmax(scores)
+    value, gradient = jax.value_and_grad(lambda x: exact_kl(jax.nn.log_softmax(x), log_p))(scores)
+    assert value == 0
+    np.testing.assert_allclose(gradient, 0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "value"), [("k1", np.log(2)), ("k2", np.log(2) ** 2 / 2), ("k3", 0.5 - 1 + np.log(2))]
+)
+def test_estimators_by_hand(estimator, value):
+    """π = .5, ref = .25 at the sampled token: r = ½."""
+    ours = estimated_kl(jnp.log(jnp.array(0.5)), jnp.log(jnp.array(0.25)), estimator)
+    np.testing.assert_allclose(ours, value, rtol=1e-6)
+
+
+@pytest.mark.parametrize("estimator", ["k1", "k3"])
+def test_k1_and_k3_are_unbiased_values(estimator):
+    log_p = jax.nn.log_softmax(THETA)
+    np.testing.assert_allclose(jnp.exp(log_p) @ estimated_kl(log_p, REFERENCE, estimator), forward(THETA), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "divergence"), [("k1", lambda theta: 0 * theta[0]), ("k2", forward), ("k3", reverse)], ids=ESTIMATORS
+)
+def test_expected_gradient_of_an_estimator(estimator, divergence):
+    """E_{v ~ π} ∇ k(v), by enumerating the vocabulary; sampling itself carries no gradient (arXiv 2510.01555)."""
+    of = lambda theta: estimated_kl(jax.nn.log_softmax(theta), REFERENCE, estimator)
+    np.testing.assert_allclose(jax.nn.softmax(THETA) @ jax.jacobian(of)(THETA), jax.grad(divergence)(THETA), atol=1e-6)
+    assert jnp.abs(jax.grad(reverse)(THETA) - jax.grad(forward)(THETA)).max() > 0.05
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("gap", [-1e9, -1e3, 1e3, 1e9])
+def test_clamp_keeps_far_ratios_finite(estimator, gap):
+    value, gradient = jax.value_and_grad(lambda x: estimated_kl(x, jnp.array(gap), estimator))(jnp.array(0.0))
+    assert jnp.isfinite(value)
+    assert jnp.isfinite(gradient)
+
+
+def test_clamp_leaves_near_ratios_alone():
+    np.testing.assert_allclose(estimated_kl(jnp.array(0.0), jnp.array(-19.0), "k1"), 19.0, rtol=1e-6)
+
+
+def test_k3_keeps_its_digits_near_zero():
+    """exp(x) − 1 − x would round x = 1e-3 to two digits."""
+    np.testing.assert_allclose(estimated_kl(jnp.array(0.0), jnp.array(1e-3), "k3"), 5.0016671e-7, rtol=1e-3)
+
+
+@pytest.mark.parametrize("estimator", [*ESTIMATORS, "exact"])
+def test_reference_kl_by_the_configured_estimator(estimator):
+    rng = np.random.default_rng(0)
+    log_p, log_ref = (jax.nn.log_softmax(jnp.asarray(rng.normal(size=(2, 4, 5)), jnp.float32)) for _ in range(2))
+    tokens = jnp.asarray(rng.integers(0, 5, (2, 4)))
+    ours = token_terms(dataclasses.replace(Stable(), kl=estimator), tokens, log_p, log_ref, None).reference_kl
+    here, there = token_log_probs(log_p, tokens), token_log_probs(log_ref, tokens)
+    expected = exact_kl(log_p, log_ref) if estimator == "exact" else estimated_kl(here, there, estimator)
+    np.testing.assert_array_equal(ours, expected)
+    np.testing.assert_array_equal(reference_kl(estimator, log_p, log_ref, tokens), expected)

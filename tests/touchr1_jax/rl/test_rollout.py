@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax import tiny
 from touchr1_jax.models.lm import PrefixCache
-from touchr1_jax.rl.rollout import SampleConfig, sample
+from touchr1_jax.rl.rollout import SampleConfig, make_answer, sample
+from touchr1_jax.text.parser import compile_parser
 
 V, PAD, END, STOP = 8, 0, 1, 2
 CONFIG = SampleConfig(group=2, length=6, end_ids=(END, STOP), pad_id=PAD, greedy=True)
@@ -122,3 +124,17 @@ def test_end_token_is_counted_and_nothing_after_it(end):
     np.testing.assert_array_equal(said.tokens[0, 0], [end, PAD, PAD, PAD, PAD, PAD])
     np.testing.assert_array_equal(said.mask[0, 0], [True] + [False] * 5)
     assert not said.log_prob[0, 0, 1:].any()
+
+
+def test_greedy_answers_are_parsed_and_begin_with_the_most_likely_token():
+    params, batch = tiny.shallow_params(), tiny.question_batch(1, 2)
+    parser = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
+    answers = make_answer(tiny.SHALLOW, parser, 3)(params, batch)
+    assert answers.tokens.shape == (2, 3)
+    for i in range(2):
+        one = parser(answers.tokens[i])
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a, b[i]), one, answers.parsed)
+    first, _ = jax.jit(jax.vmap(tiny.SHALLOW.prefill, in_axes=(None, 0, 0, 0)))(
+        params, batch.features, batch.ids, batch.mask
+    )
+    np.testing.assert_array_equal(answers.tokens[:, 0], first.argmax(-1))

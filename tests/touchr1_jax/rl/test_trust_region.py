@@ -1,7 +1,5 @@
 """An update that is too long is shortened to its bound; a short one stays as it is."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +7,9 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, P
-from touchr1_jax.rl.config import GRPOConfig, Paper, Stable
-from touchr1_jax.rl.grpo import sample_group
-from touchr1_jax.rl.losses import grounding_bonus
-from touchr1_jax.rl.objective import Experience
-from touchr1_jax.rl.rollout import SampleConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.gradient import Experience
+from touchr1_jax.rl.rollout import SampleConfig, sample_group
 from touchr1_jax.rl.trust_region import NEAR, log_probs, within_trust
 
 G, T, DELTA = 8, 4, 0.01
@@ -69,12 +65,3 @@ def test_a_long_update_ends_near_its_bound(shorten, size):
 def test_a_far_update_is_shortened_more_than_once(shorten):
     _, far = shorten(3.0)
     assert far["update_scale"] < 0.9 * np.sqrt(DELTA / far["update_kl"])
-
-
-def test_grounding_pays_up_to_its_budget():
-    algorithm = dataclasses.replace(Stable(), gamma=0.1, grounding_budget=0.05)
-    gain = lambda g: grounding_bonus(g, algorithm)
-    np.testing.assert_allclose(gain(jnp.array([0.2, 0.5, 3.0])), [0.02, 0.05, 0.05], rtol=1e-6)
-    assert jax.grad(gain)(0.2) == pytest.approx(0.1)
-    assert jax.grad(gain)(3.0) == 0
-    assert grounding_bonus(jnp.array(3.0), Paper(gamma=0.1)) == pytest.approx(0.3)

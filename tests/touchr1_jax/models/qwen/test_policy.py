@@ -20,7 +20,7 @@ from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, q
 from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
 from touchr1_jax.rl.config import Algorithm, GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
-from touchr1_jax.rl.objective import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Parsed, Target
 

@@ -1,0 +1,196 @@
+"""Gradient of the GRPO loss: forward passes of the policies, prompt by prompt, in micro-batches.
+
+Per prompt the policy and the reference each encode their prefix once and pass over the whole group; the perturbed
+policy encodes only what follows the first perturbed token.  Logits exist in one place, `prompt_terms`, and in blocks
+where the vocabulary is large.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax import masked
+from touchr1_jax.models.chunked_logits import Rows, by_blocks
+from touchr1_jax.models.lm import PrefixCache
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out
+from touchr1_jax.rl.losses import TokenTerms, grpo_loss, token_terms
+from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.types import Params, Rollout
+
+
+class Experience(NamedTuple):
+    """Rollouts and what an update needs to learn from them; every field has a leading P.
+
+    `old` are the log-probabilities that ratios are taken to: the sampler's, or, under an importance cap and after the
+    first of several updates, the learner's before it.
+    """
+
+    batch: GRPOBatch
+    masked_touch: Float[Array, "P S N D"]
+    masked_stream: Int[Array, "P"]
+    rollout: Rollout
+    old: Float[Array, "P G T"]
+    advantage: Float[Array, "P G"]
+    weight: Float[Array, "P"]
+
+
+def grpo_gradient(
+    fns: PolicyFns,
+    config: GRPOConfig,
+    params: Params,
+    reference: Params,
+    experience: Experience,
+    *,
+    first: bool | Bool[Array, ""] = True,
+) -> tuple[Params, dict[str, Array], Float[Array, "P G T"]]:
+    """Gradient of `grpo_loss` with respect to the parameters, summed over micro-batches of `micro_prompts` prompts.
+
+    Args:
+      fns, config: as in `make_grpo_step`.
+      params: the learner.
+      reference: the policy that the KL is taken to.
+      experience: rollouts with their advantages.
+      first: true before the first update from this experience; read under an importance cap only, where the learner's
+        own log-probabilities are then the old ones.
+
+    Returns:
+      The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest); and the
+      log-probabilities that the ratios were taken to.
+    """
+    algorithm = config.algorithm
+
+    def loss(params: Params, micro: Experience) -> tuple[Array, tuple[dict[str, Array], Array]]:
+        terms = experience_terms(fns, config, params, reference, micro)
+        old = micro.old
+        if algorithm.importance_cap is not None:
+            old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
+        rollout = micro.rollout
+        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, micro.advantage, micro.weight, config)
+        return value, (parts | {"loss": value}, old)
+
+    def add_micro_batch(grads: Params, micro: Experience) -> tuple[Params, tuple[dict[str, Array], Array]]:
+        more, found = jax.grad(loss, has_aux=True)(params, micro)
+        return jax.tree.map(jnp.add, grads, more), found
+
+    zero = jax.tree.map(jnp.zeros_like, params)
+    grads, (by_prompt, old) = jax.lax.scan(add_micro_batch, zero, micro_batches(config, experience))
+    over_prompts = lambda name: {"loss": jnp.sum}.get(name, jnp.max if name.endswith("_peak") else jnp.mean)
+    parts = {name: over_prompts(name)(value) for name, value in by_prompt.items()}
+    parts["kl_cost_peak"] = algorithm.beta * parts["kl_peak"]
+    return grads, parts | _grounding_by_stream(in_order(by_prompt["grounding"]), experience), in_order(old)
+
+
+def micro_batches(config: GRPOConfig, tree: Any) -> Any:
+    """Arrays [P, …] cut into [P / `micro_prompts`, `micro_prompts`, …], neighbours into different micro-batches.
+
+    Where devices share the prompts, neighbours lie on one device, so that each has its part of every micro-batch.
+    """
+    size = config.micro_prompts
+    cut = lambda x: x.reshape(size, x.shape[0] // size, *x.shape[1:])  # not −1: a prompt without a view has 0 tokens
+    return jax.tree.map(lambda x: cut(x).swapaxes(0, 1), tree)
+
+
+def in_order(x: Array) -> Array:
+    """An array [P, …] again from its micro-batches."""
+    return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
+
+
+def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
+    """Mean G of the prompts in which each stream was perturbed, and how many they were."""
+    streams = experience.batch.features.stream_mask
+    found = {}
+    for s in range(streams.shape[1]):
+        perturbed = (experience.masked_stream == s) & streams[:, s]
+        found[f"grounding_stream_{s}"] = masked.mean(grounding, perturbed)
+        found[f"perturbed_stream_{s}"] = jnp.sum(perturbed).astype(jnp.float32)
+    return found
+
+
+def experience_terms(
+    fns: PolicyFns, config: GRPOConfig, params: Params, reference: Params, micro: Experience
+) -> TokenTerms:
+    """`prompt_terms` of every prompt of a micro-batch; a single prompt is not batched, so that its branches stay."""
+    terms = lambda e: prompt_terms(fns, config, params, reference, e)
+    if micro.weight.shape[0] > 1:
+        return jax.vmap(terms)(micro)
+    return jax.tree.map(lambda x: x[None], terms(jax.tree.map(lambda x: x[0], micro)))
+
+
+def prompt_terms(
+    fns: PolicyFns, config: GRPOConfig, params: Params, reference: Params, experience: Experience
+) -> TokenTerms:
+    """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
+
+    The reference is not run at β = 0, nor the perturbed policy at γ = 0.
+    """
+    algorithm, batch, tokens = config.algorithm, experience.batch, experience.rollout.tokens
+    states = group_states(fns, config, experience)
+    own, prefix = states(params, batch.features)
+    rows: Rows = {"own": own, "token": tokens}
+    if not left_out(algorithm.beta):
+        rows["reference"] = jax.lax.stop_gradient(states(reference, batch.features)[0])
+    if not left_out(algorithm.gamma):
+        rows["perturbed"] = perturbed_states(fns, config, params, experience, prefix)
+    heads = {"own": params, "reference": reference, "perturbed": _masked_branch(config, params)}
+    heads = {name: at_precision(config, p) for name, p in heads.items()}
+
+    def of_rows(rows: Rows) -> TokenTerms:
+        log = {name: jax.nn.log_softmax(fns.logits(p, rows[name])) for name, p in heads.items() if name in rows}
+        return token_terms(algorithm, rows["token"], log["own"], log.get("reference"), log.get("perturbed"))
+
+    if config.remat:
+        of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
+    rows = {name: x.reshape(-1, *x.shape[2:]) for name, x in rows.items()}
+    found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
+    return jax.tree.map(lambda x: x.reshape(tokens.shape), found)
+
+
+def group_states(
+    fns: PolicyFns, config: GRPOConfig, experience: Experience
+) -> Callable[..., tuple[Float[Array, "G T D"], PrefixCache]]:
+    """The function (params, features, known, start) → hidden states of one prompt's completions and their prefix."""
+    batch, tokens = experience.batch, experience.rollout.tokens
+    if config.remat:
+        fns = dataclasses.replace(fns, module=fns.module.clone(remat=True))
+
+    def states(params: Params, features: Features, known: PrefixCache | None = None, start: int = 0):
+        params = at_precision(config, params)
+        return fns.group_states(params, features, batch.ids, batch.mask, tokens, known, start)
+
+    return states
+
+
+def perturbed_states(
+    fns: PolicyFns, config: GRPOConfig, params: Params, experience: Experience, prefix: PrefixCache
+) -> Float[Array, "G T D"]:
+    """Hidden states of the completions under perturbed touch.
+
+    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
+    batch of prompts, whose branches would all be computed, what follows the first stream's.
+
+    Args:
+      prefix: the prompt as the policy encodes it.
+    """
+    states = group_states(fns, config, experience)
+    features = dataclasses.replace(experience.batch.features, touch=experience.masked_touch)
+    known, own = _masked_branch(config, prefix), _masked_branch(config, params)
+    starts = [int(row.min()) for row in fns.slots.touch]
+
+    def again(start: int, p: Params) -> Array:
+        return states(p, features, known, start)[0]
+
+    if config.micro_prompts > 1:
+        return again(min(starts), own)
+    return jax.lax.switch(experience.masked_stream, [functools.partial(again, start) for start in starts], own)
+
+
+def _masked_branch(config: GRPOConfig, tree: Any) -> Any:
+    """Parameters or states of the perturbed branch, without gradient where `grounding_stop_masked` is set."""
+    return jax.lax.stop_gradient(tree) if config.algorithm.grounding_stop_masked else tree
