@@ -144,7 +144,7 @@ class SingleDevice:
 
     shape: tuple[int, ...] = (1, 1, 1)
     """Devices along the axes of the mesh."""
-    gather: Callable[[Any], Any] = staticmethod(lambda params: params)
+    gather_params: Callable[[Any], Any] = staticmethod(lambda params: params)
     """All-gathers weights inside a traced step, as `make_grpo_step` takes it."""
 
     def local_rows(self, batch_size: int) -> np.ndarray:
@@ -177,7 +177,7 @@ class DeviceMesh(SingleDevice):
     def __init__(self, mesh: Mesh) -> None:
         self._mesh = mesh
         self.shape = mesh.devices.shape
-        self.gather = functools.partial(gather_params, mesh)
+        self.gather_params = functools.partial(gather_params, mesh)
         self._compiled: dict[Step, Step] = {}
 
     def local_rows(self, batch_size: int) -> np.ndarray:

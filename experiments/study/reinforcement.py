@@ -99,7 +99,7 @@ def run_grpo(
     )
     constraint = assembly.constraint if config.algorithm.constrained else None
     optimizer, step = grpo_program(
-        assembly.fns, arm.score, config, arm.loop.steps, constraint, lora, context.devices.gather
+        assembly.fns, arm.score, config, arm.loop.steps, constraint, lora, context.devices.gather_params
     )
     decoder = {"decoder": params["decoder"]}
     influence = influence_program(assembly.fns, config.length)
