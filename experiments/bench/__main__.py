@@ -1,28 +1,259 @@
 """`python -m experiments.bench`: make, annotate, audit and score the questions of the touch bench."""
 
+import contextlib
+import dataclasses
+import itertools
+import pathlib
 import sys
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
-from experiments.bench.card import CardError
-from experiments.bench.commands import (
-    Accept,
-    Annotate,
-    AnnotateSheets,
-    Audit,
-    AuditSheet,
-    GenerateItems,
-    Propose,
-    Score,
+from experiments.bench import annotate, audit, card, scoring
+from experiments.bench.contacts import ContactError, measure_split
+from experiments.bench.draw import Quota, QuotaError
+from experiments.bench.generate import (
+    BenchSource,
+    author_requests,
+    draw_questions,
+    generate,
+    read_candidates,
+    read_source,
+    rejected_rows,
 )
-from experiments.bench.contacts import ContactError
-from experiments.bench.draw import QuotaError
+from experiments.bench.rules import FilteredItems, apply_rules
 from experiments.bench.sheets import SheetError
-from sensors_io.commands.console import complain
+from experiments.core.artifacts import write_json
+from sensors_io.commands.console import complain, progress_bar
 from sensors_io.errors import UserError
-from touchr1_jax.bench.items import ItemError
-from touchr1_jax.bench.json_lines import LinesError
+from sensors_io.records import RecordStore
+from touchr1_jax.bench.items import ItemError, read_items, write_items
+from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
+
+OUT = Console(highlight=False)
+
+KNOWN_ERRORS = (card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, UserError, OSError)
+"""Errors whose message tells a user all that is needed."""
+
+Records = tyro.conf.Positional[pathlib.Path]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FromRecords:
+    """Questions about records; the same records, quota and seed give the same questions."""
+
+    records: Records
+    """Directory of the records; the questions are about objects of their test split."""
+    quota: Quota = dataclasses.field(default_factory=Quota)
+    seed: int = 0
+
+    def source(self) -> BenchSource:
+        """The measured records."""
+        store = RecordStore(self.records)
+        with _contact_bar(store, "test", "train") as advance:
+            return read_source(store, advance)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GenerateItems(FromRecords):
+    """Make a bench of questions worded by rule; it is written only if every check of the data card passes."""
+
+    out: pathlib.Path
+    """File for the items, JSON Lines."""
+
+    def run(self) -> int:
+        source = self.source()
+        return _publish(self.out, generate(source, self.quota, self.seed), source)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Propose(FromRecords):
+    """Write requests from which another author, such as a language model, can word the same questions."""
+
+    out: pathlib.Path
+    """File for the requests, JSON Lines."""
+
+    def run(self) -> int:
+        source = self.source()
+        asks = draw_questions(source, self.quota, self.seed)
+        write_lines(self.out, author_requests(asks, source.bench.by_touch()))
+        OUT.print(f"{len(asks)} requests in {self.out}; candidates go to `accept` with the same quota and seed")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Accept(FromRecords):
+    """Make a bench of another author's candidates that pass the rules and the data card."""
+
+    candidates: tyro.conf.Positional[pathlib.Path]
+    """File of the candidates, JSON Lines."""
+    out: pathlib.Path
+    """File for the items; removed candidates are written next to it, to a file that ends in .rejected.jsonl."""
+
+    def run(self) -> int:
+        source = self.source()
+        asks, contacts = draw_questions(source, self.quota, self.seed), source.bench.by_touch()
+        found = apply_rules(read_candidates(read_lines(self.candidates), asks), contacts)
+        write_lines(self.out.with_suffix(".rejected.jsonl"), rejected_rows(found.removed))
+        return _publish(self.out, found, source)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Score:
+    """Score anybody's answers: every metric with its interval over objects, and the average if all parts are there.
+
+    An answer is {"id", "text"}, the text in the three segments; a question without an answer counts as unparsable.
+    """
+
+    items: tyro.conf.Positional[pathlib.Path]
+    answers: tyro.conf.Positional[pathlib.Path]
+    """File of the answers, JSON Lines."""
+    by_sight: pathlib.Path | None = None
+    """File of the answers given the picture alone, which define which questions are a conflict."""
+
+    def run(self) -> int:
+        items = read_items(self.items)
+        read = lambda path: scoring.read_answers(read_lines(path), items, str(path))
+        answers = read(self.answers)
+        table = Table("metric", "", "95 %, over objects", "values", "meaning")
+        for row in scoring.metric_rows(items, answers, None if self.by_sight is None else read(self.by_sight)):
+            spec, span = row.metric.format, row.interval
+            interval = f"{span.low:{spec}} – {span.high:{spec}}"
+            table.add_row(row.metric.title, format(span.mean, spec), interval, str(row.values), row.metric.meaning)
+        OUT.print(table)
+        OUT.print(f"parsed {100 * scoring.parsed_share(answers):.1f} %; {scoring.average_line(items, answers)}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AnnotateSheets:
+    """Write a blank sheet for each of two annotators, the objects in an order of its own."""
+
+    records: Records
+    out: pathlib.Path
+    """Folder for the sheets, a.csv and b.csv."""
+    seed: int = 0
+
+    def run(self) -> int:
+        objects = sorted(RecordStore(self.records).objects)
+        annotate.write_blank([str(self.out / name) for name in ("a.csv", "b.csv")], objects, self.seed)
+        OUT.print(f"{len(objects)} objects in {self.out / 'a.csv'} and b.csv; fill them in independently")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Annotate:
+    """Join two sheets: agreement, disagreements, final labels, and labels that the measurements contradict.
+
+    While disagreements are open they are written to FOLDER/open.csv and the exit status is 1.
+    """
+
+    records: Records
+    folder: tyro.conf.Positional[pathlib.Path]
+    """Folder of the sheets; the labels are written to labels.json in it."""
+
+    def run(self) -> int:
+        store = RecordStore(self.records)
+        a, b = (annotate.read_labels(str(self.folder / name), sorted(store.objects)) for name in ("a.csv", "b.csv"))
+        table = Table("attribute", "objects", "κ", "κ, quadratic", "equal")
+        for row in annotate.agreement(a, b):
+            kappas = ["–" if k is None else f"{k:.2f}" for k in (row.kappa, row.weighted)]
+            table.add_row(row.attribute, str(row.objects), *kappas, f"{100 * row.exact:.1f} %")
+        OUT.print(table)
+        sheet, cases = self.folder / "open.csv", annotate.open_cases(a, b)
+        if cases and not sheet.exists():
+            annotate.write_open(str(sheet), a, b)
+            OUT.print(f"{len(cases)} labels differ: decide them in {sheet}")
+            return 1
+        labels = annotate.adjudicate(a, b, annotate.read_decisions(str(sheet), a, b) if cases else {})
+        splits = ("train", "val", "test", "unlabelled")
+        with _contact_bar(store, *splits) as advance:
+            contacts = [c for split in splits for c in measure_split(store, split, advance).contacts]
+        for doubt in annotate.doubtful_labels(labels, contacts):
+            against = ", ".join(doubt.sensors)
+            OUT.print(f"check again: {doubt.object}, {doubt.attribute} {doubt.label}, contradicted by {against}")
+        for (name, sensor), rho in annotate.rank_correlations(labels, contacts).items():
+            OUT.print(f"{name} and {annotate.PHYSICAL[name]} by {sensor}: ρ = {rho:.2f}")
+        write_json(self.folder / "labels.json", labels)
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AuditSheet:
+    """Draw a sample of items for a blind audit: a sheet to fill in, and a key that the judge does not see."""
+
+    items: tyro.conf.Positional[pathlib.Path]
+    records: Records
+    out: pathlib.Path
+    """File for the sheet; its key is written next to it, to a file that ends in .key.json."""
+    count: int = 2000
+    seed: int = 0
+
+    def run(self) -> int:
+        items, store = read_items(self.items), RecordStore(self.records)
+        key = audit.sample(items, min(self.count, len(items)), self.seed)
+        with _contact_bar(store, "test") as advance:
+            contacts = measure_split(store, "test", advance).by_touch()
+        audit.write_blank(str(self.out), items, key, contacts)
+        write_json(self.out.with_suffix(".key.json"), key)
+        OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
+        return 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Audit:
+    """Score filled-in sheets: the pass rates with intervals, and κ if two judges filled in the same sample."""
+
+    items: tyro.conf.Positional[pathlib.Path]
+    key: tyro.conf.Positional[pathlib.Path]
+    """The key of the sample."""
+    sheets: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    """One or two filled-in sheets."""
+
+    def run(self) -> int:
+        if not 1 <= len(self.sheets) <= 2:
+            raise SheetError(f"sheets holds {len(self.sheets)}: must be one or two; score judges in pairs")
+        items = read_items(self.items)
+        key = audit.read_key(self.key, items)
+        judged = [audit.read_judgement(str(sheet), key) for sheet in self.sheets]
+        for sheet, judgement in zip(self.sheets, judged, strict=True):
+            table = Table("axis", "items", "passed", "95 %", "95 %, by object", title=sheet.name)
+            for row in audit.pass_rates(judgement, key, items):
+                spans = [f"{100 * i.low:.1f}–{100 * i.high:.1f}" for i in (row.rate, row.by_object)]
+                table.add_row(row.axis, str(row.items), f"{100 * row.rate.mean:.1f} %", *spans)
+            OUT.print(table)
+        if len(judged) == 2:
+            for axis, kappa in audit.judge_agreement(*judged).items():
+                OUT.print(f"{axis}: κ = {'undefined' if kappa is None else f'{kappa:.2f}'}")
+        return 0
+
+
+@contextlib.contextmanager
+def _contact_bar(store: RecordStore, *splits: str) -> Iterator[Callable[[], None]]:
+    """A progress bar over the contacts of some splits; yields the function to call after each."""
+    total, done = sum(len(store.contacts_of_split(split)) for split in splits), itertools.count(1)
+    with progress_bar("contacts") as show:
+        yield lambda: show(next(done), total)
+
+
+def _publish(path: pathlib.Path, found: FilteredItems, source: BenchSource) -> int:
+    """Print the removed candidates and the data card, and write the items if all checks pass."""
+    OUT.print("removed: " + ", ".join(f"{rule} {count}" for rule, count in found.counts.items()))
+    if not found.kept:
+        raise card.CardError("no item is left; look at the rules that removed them")
+    checks = card.checks(found.kept, source.bench, source.train)
+    table = Table("check", "measured", "bound", "")
+    for c in checks:
+        table.add_row(c.name, f"{c.measured:.3g} {c.unit}", f"{c.bound:g}", "ok" if c.passed else "FAILED")
+    OUT.print(table)
+    card.require(checks)
+    write_items(path, found.kept)
+    OUT.print(f"{len(found.kept)} items in {path}")
+    return 0
+
 
 Command = (
     Annotated[GenerateItems, tyro.conf.subcommand("generate")]
@@ -35,24 +266,12 @@ Command = (
     | Annotated[Audit, tyro.conf.subcommand("audit")]
 )
 
-KNOWN_ERRORS = (
-    CardError,
-    QuotaError,
-    ContactError,
-    ItemError,
-    LinesError,
-    SheetError,
-    UserError,
-    OSError,
-)
-"""Whose message says all that a user needs."""
 
-
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; known errors become one line on stderr and exit status 1.
 
     Args:
-      arguments: the command line; None takes that of the process.
+      arguments: the command line; that of the process by default.
     """
     command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
     try:

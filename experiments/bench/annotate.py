@@ -1,7 +1,8 @@
-"""Labels by two people who do not see each other's: agreement, adjudication, and what force and deformation say.
+"""Labels by two annotators: blank sheets, agreement, adjudication, and labels that the measurements contradict.
 
-Each annotator fills in a sheet of their own, in an order of its own; where they differ a third decides.  A label is
-doubted where, for most sensors, the object's own measurement lies nearer to the opposite level's than to its level's.
+Each annotator fills in a sheet without seeing the other's, the objects in an order of its own; a third person decides
+where they differ.  A label is doubtful if for most sensors the object's measurement is nearer to the median of the
+opposite level than to that of its own.
 """
 
 import dataclasses
@@ -12,24 +13,21 @@ from scipy import stats
 
 from experiments.bench.contacts import MeasuredContact
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
+from experiments.bench.wording import level_words
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.agreement import cohens_kappa
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.text.language import TOUCH_LANGUAGE
 
 KEY, CASE, DECISION = "object", "case", "decision"
 
 PHYSICAL: Mapping[str, str] = {"hardness": "stiffness", "roughness": "fine texture", "protrusion": "coarse texture"}
-"""The measured quantity that an ordinal label is held against: force over deformation, energies of the relief."""
+"""The measured quantity that an ordinal label is compared with: force over deformation, energies of the relief."""
 
 LEAST_RHO = 0.3
-"""Spearman's ρ, of either sign, between labels and quantity below which a sensor has no say about a label."""
+"""Least |Spearman's ρ| between labels and quantity for a sensor to have a vote on a label."""
 
-WORDS: Mapping[str, tuple[str, ...]] = {
-    name: tuple(words[0] for words in TOUCH_LANGUAGE.attributes[TOUCH_LANGUAGE.attribute_index(name)].levels)
-    for name in ATTRIBUTES
-}
-"""How the levels are called on a sheet."""
+WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(level_words(name)) for name in ATTRIBUTES}
+"""Words for the levels on a sheet."""
 
 Labels = Mapping[str, Mapping[str, int]]
 """Object → attribute → level."""
@@ -37,7 +35,7 @@ Labels = Mapping[str, Mapping[str, int]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AnnotatorAgreement:
-    """Of two annotators about one attribute: κ, κ with quadratic weights where it is ordinal, share of equal labels.
+    """Agreement of two annotators on one attribute: κ, κ with quadratic weights if ordinal, share of equal labels.
 
     κ is `None` where both gave one and the same label throughout.
     """
@@ -51,7 +49,7 @@ class AnnotatorAgreement:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DoubtfulLabel:
-    """A label that most sensors' measurements contradict."""
+    """A label that the measurements of most sensors contradict."""
 
     object: str
     attribute: str
@@ -60,10 +58,10 @@ class DoubtfulLabel:
 
 
 def write_blank(paths: Sequence[str], objects: Sequence[str], seed: int) -> None:
-    """One blank sheet for each annotator, the objects in an order of its own.
+    """Write one blank sheet for each annotator, the objects in an order of its own.
 
     Raises:
-      SheetError: a sheet that exists.
+      SheetError: a sheet exists.
     """
     for n, path in enumerate(paths):
         order = np.random.default_rng([seed, n]).permutation(len(objects))
@@ -71,7 +69,7 @@ def write_blank(paths: Sequence[str], objects: Sequence[str], seed: int) -> None
 
 
 def read_labels(path: str, objects: Sequence[str]) -> dict[str, dict[str, int]]:
-    """A filled-in sheet, as levels.
+    """A filled-in sheet as levels.
 
     Raises:
       SheetError: as `read_sheet`.
@@ -81,7 +79,7 @@ def read_labels(path: str, objects: Sequence[str]) -> dict[str, dict[str, int]]:
 
 
 def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
-    """How far two annotators agree about the same objects, attribute by attribute."""
+    """Agreement of two annotators on the same objects, by attribute."""
     found = []
     for name in ATTRIBUTES:
         x, y = (np.array([labels[o][name] for o in sorted(a)]) for labels in (a, b))
@@ -98,47 +96,34 @@ def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
     return tuple(found)
 
 
-def open_cells(a: Labels, b: Labels) -> dict[str, list[str]]:
-    """Object → attributes in which the two differ, for the adjudicator."""
-    differing = {o: [name for name in ATTRIBUTES if a[o][name] != b[o][name]] for o in sorted(a)}
-    return {o: names for o, names in differing.items() if names}
+def open_cases(a: Labels, b: Labels) -> dict[str, tuple[str, str]]:
+    """The disagreements: name of the case → object and attribute."""
+    return {f"{o}: {name}": (o, name) for o in sorted(a) for name in ATTRIBUTES if a[o][name] != b[o][name]}
 
 
 def write_open(path: str, a: Labels, b: Labels) -> None:
-    """The sheet of the adjudicator: one row per disagreement, what was said in a drawn order, the decision blank.
+    """Write the sheet of the adjudicator: one row for each disagreement, both labels, the decision blank.
 
     Raises:
       SheetError: the sheet exists.
     """
     rows = []
-    for case, (o, name) in _cases(a, b).items():
-        said = sorted(WORDS[name][labels[o][name]] for labels in (a, b))  # sorted, so that nobody knows whose
-        rows.append({CASE: case, "said": " or ".join(said)})
-    write_sheet(path, (CASE, "said", DECISION), rows)
-
-
-def adjudicate(a: Labels, b: Labels, decided: Mapping[tuple[str, str], int]) -> dict[str, dict[str, int]]:
-    """The final labels: where both agree, theirs, elsewhere the decision.
-
-    Raises:
-      KeyError: a disagreement that nobody decided.
-    """
-    return {
-        o: {name: a[o][name] if a[o][name] == b[o][name] else decided[o, name] for name in ATTRIBUTES}
-        for o in sorted(a)
-    }
+    for case, (o, name) in open_cases(a, b).items():
+        both = sorted(WORDS[name][labels[o][name]] for labels in (a, b))  # sorted: the order does not reveal the author
+        rows.append({CASE: case, "labels": " or ".join(both)})
+    write_sheet(path, (CASE, "labels", DECISION), rows)
 
 
 def read_decisions(path: str, a: Labels, b: Labels) -> dict[tuple[str, str], int]:
     """The adjudicator's sheet: (object, attribute) → level.
 
     Raises:
-      SheetError: as `read_sheet`, or a decision that is no level of its attribute.
+      SheetError: as `read_sheet`, or a decision that is not a level of its attribute.
     """
-    cases = _cases(a, b)
-    every = sorted({word for words in WORDS.values() for word in words})
+    cases = open_cases(a, b)
+    words = sorted({word for words in WORDS.values() for word in words})
     decided = {}
-    for case, row in read_sheet(path, CASE, {DECISION: every}, cases).items():
+    for case, row in read_sheet(path, CASE, {DECISION: words}, cases).items():
         o, name = cases[case]
         if row[DECISION] not in WORDS[name]:
             raise SheetError(
@@ -149,48 +134,54 @@ def read_decisions(path: str, a: Labels, b: Labels) -> dict[tuple[str, str], int
     return decided
 
 
-def _cases(a: Labels, b: Labels) -> dict[str, tuple[str, str]]:
-    """What the adjudicator's rows are called → object and attribute."""
-    return {f"{o}: {name}": (o, name) for o, names in open_cells(a, b).items() for name in names}
+def adjudicate(a: Labels, b: Labels, decided: Mapping[tuple[str, str], int]) -> dict[str, dict[str, int]]:
+    """The final labels: those that both annotators gave, elsewhere the decision.
+
+    Raises:
+      KeyError: a disagreement without a decision.
+    """
+    return {
+        o: {name: a[o][name] if a[o][name] == b[o][name] else decided[o, name] for name in ATTRIBUTES}
+        for o in sorted(a)
+    }
 
 
 def rank_correlations(labels: Labels, contacts: Sequence[MeasuredContact]) -> dict[tuple[str, str], float]:
-    """Spearman's ρ of each ordinal label and its quantity, by attribute and sensor, over the objects measured."""
+    """Spearman's ρ between each ordinal label and its quantity over the measured objects, by attribute and sensor."""
     found = {}
     for name in ORDINAL:
         for sensor in _sensors(contacts):
-            values = _values(labels, contacts, sensor, name)
+            values = _means(labels, contacts, sensor, name)
             levels = [labels[o][name] for o in values]
             if len(set(levels)) > 1 and len(set(values.values())) > 1:
                 found[name, sensor] = float(stats.spearmanr(list(values.values()), levels).statistic)
     return found
 
 
-def doubts(labels: Labels, contacts: Sequence[MeasuredContact]) -> tuple[DoubtfulLabel, ...]:
-    """Labels of the lowest or highest level whose measurement lies nearer to the median of the opposite one.
+def doubtful_labels(labels: Labels, contacts: Sequence[MeasuredContact]) -> tuple[DoubtfulLabel, ...]:
+    """Labels of the lowest or highest level whose measurement is nearer to the median of the opposite level.
 
-    A sensor that measured no object of either end, or whose quantity does not follow the labels, has no say; most of
-    the others must agree.
+    A sensor that measured no object of either end, or whose quantity does not follow the labels, has no vote; of the
+    others most must agree.
     """
-    found, follows = [], rank_correlations(labels, contacts)
+    found, rho = [], rank_correlations(labels, contacts)
     for name in ORDINAL:
-        says: dict[str, list[tuple[str, bool]]] = {}
+        votes: dict[str, list[tuple[str, bool]]] = {}
+        ends = (0, LEVELS[name] - 1)
         for sensor in _sensors(contacts):
-            values = _values(labels, contacts, sensor, name)
-            ends = (0, LEVELS[name] - 1)
+            values = _means(labels, contacts, sensor, name)
             of_level = [[v for o, v in values.items() if labels[o][name] == end] for end in ends]
-            if not all(of_level) or abs(follows.get((name, sensor), 0.0)) < LEAST_RHO:
+            if not all(of_level) or abs(rho.get((name, sensor), 0.0)) < LEAST_RHO:
                 continue
             medians = [float(np.median(of)) for of in of_level]
             for o in (o for o in values if labels[o][name] in ends):
                 own, opposite = medians if labels[o][name] == 0 else medians[::-1]
-                says.setdefault(o, []).append((sensor, abs(values[o] - opposite) < abs(values[o] - own)))
-        for o, votes in sorted(says.items()):
-            against = tuple(sensor for sensor, beyond in votes if beyond)
-            if 2 * len(against) > len(votes):
-                found.append(
-                    DoubtfulLabel(object=o, attribute=name, label=WORDS[name][labels[o][name]], sensors=against)
-                )
+                votes.setdefault(o, []).append((sensor, abs(values[o] - opposite) < abs(values[o] - own)))
+        for o, cast in sorted(votes.items()):
+            against = tuple(sensor for sensor, contradicts in cast if contradicts)
+            if 2 * len(against) > len(cast):
+                label = WORDS[name][labels[o][name]]
+                found.append(DoubtfulLabel(object=o, attribute=name, label=label, sensors=against))
     return tuple(found)
 
 
@@ -198,7 +189,7 @@ def _sensors(contacts: Sequence[MeasuredContact]) -> list[str]:
     return sorted({sensor for contact in contacts for sensor in contact.measured})
 
 
-def _values(labels: Labels, contacts: Sequence[MeasuredContact], sensor: str, name: str) -> dict[str, float]:
+def _means(labels: Labels, contacts: Sequence[MeasuredContact], sensor: str, name: str) -> dict[str, float]:
     """Mean of an attribute's quantity over the contacts of each labelled object, by one sensor."""
     quantity, found = PHYSICAL[name], dict[str, list[float]]()
     for contact in contacts:

@@ -19,11 +19,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.bench import card, planted_errors
+from experiments.bench import card
 from experiments.bench.card_charts import answer_shares
 from experiments.bench.draw import Quota
 from experiments.bench.generate import BenchSource, generate, read_source, share_at_odds
-from experiments.bench.rules import FilteredItems
+from experiments.bench.rules import FilteredItems, count_found_errors
 from experiments.core.context import Context
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
@@ -54,7 +54,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
     )
     store = RecordStore(prepare_records(where, context))
     with context.timed("measure"), context.progress("measuring contacts", _contacts(store)) as advance:
-        source = read_source(store, tell=advance)
+        source = read_source(store, after_each=advance)
     with context.timed("generate"):
         found, again = (
             generate(source, config.quota, config.seed) for _ in context.each("making the bench twice", range(2))
@@ -65,7 +65,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
     with context.timed("faults"):
         step = max(1, len(found.kept) // config.faulty)
         sound = found.kept[::step]
-        caught = planted_errors.caught(context.each("planted faults", sound), source.bench.by_touch())
+        caught = count_found_errors(context.each("planted faults", sound), source.bench.by_touch())
     return _findings(
         config, source, found, checks, {rule: n / len(sound) for rule, n in caught.items()}, again == found
     )
@@ -201,12 +201,12 @@ def _rules(found: FilteredItems, caught: dict[str, float]) -> Table:
 
 def _readings(source: BenchSource) -> Table:
     rows = []
-    for (sensor, attribute), scale in sorted(source.readings.scales.items()):
+    for (sensor, attribute), scale in sorted(source.reader.thresholds.items()):
         right: dict[int, list[bool]] = {}
         for contact in source.bench.contacts:
-            if attribute in contact.labels and source.readings.can_read(contact, sensor, attribute):
+            if attribute in contact.labels and source.reader.can_read(contact, sensor, attribute):
                 label = contact.labels[attribute]
-                right.setdefault(label, []).append(source.readings.level(contact, sensor, attribute) == label)
+                right.setdefault(label, []).append(source.reader.level(contact, sensor, attribute) == label)
         held_out = sum(sum(hits) / len(hits) for hits in right.values()) / len(right) if right else None
         cuts = " and ".join(f"{cut:.3g}" for cut in scale.cuts)
         direction = "rises" if scale.rising else "falls"

@@ -1,74 +1,146 @@
-"""From records to items: draw the questions, word them, sift them, hold them to the data card."""
+"""From records to items: draw the questions, word them by rule or by another author, keep those that pass the rules.
+
+Another author, such as a language model, works on files of JSON Lines.  A request holds everything that the author may
+know,
+
+    id, kind, attributes, sensors, task, answer, choices, touches: [{object, site, motion, trial, measured: {sensor:
+    {quantities: {name: {value, unit}}, at, box}}}]
+
+and a candidate has `id`, `question`, `answer`, `rationale` and `evidence`, as in `touchr1_jax.bench.items`.  The right
+answers are in the requests, but are drawn anew when candidates come back, so that no file can change them.
+"""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
-from experiments.bench.contacts import ContactError, SplitContacts, measure_split
+from experiments.bench.contacts import ContactError, MeasuredContact, SplitContacts, measure_split
 from experiments.bench.draw import Quota, draw
 from experiments.bench.rationales import compose_item
 from experiments.bench.rules import CandidateItem, FilteredItems, apply_rules
 from experiments.bench.thresholds import ThresholdReader, fit_thresholds
-from experiments.bench.wording import answer_words, slots_of, understand
+from experiments.bench.wording import answer_choices, answer_words, read_answer, slots_of
+from sensors_io.measures import UNITS, Measured
 from sensors_io.records import RecordStore
-from touchr1_jax.bench.items import Ask, Item
+from touchr1_jax.bench.items import KINDS, Ask, Item, Touch, citation_of
+from touchr1_jax.bench.json_lines import LinesError
+
+TASK = (
+    "Write one question about what the sensors felt, and its rationale. The rationale has three segments, "
+    "<perceive> … </perceive> <compare> … </compare> <conclude> … </conclude>: what each named sensor measured and "
+    "what it suggests, what all of them say together, the answer in exactly the given words. Ground it in the measured "
+    "quantities, with numbers and units, and list each that you use as evidence with its touch, sensor, quantity, "
+    "value, unit and place. Use no number that is not given, and do not give the answer away in the question."
+)
+"""Instructions to the author of a candidate."""
+
+CANDIDATE_FIELDS = ("id", "question", "answer", "rationale", "evidence")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BenchSource:
-    """What questions are made from: the contacts to ask about, those that tell how to read numbers, the sensors."""
+    """Contacts to ask about, training contacts, thresholds fitted on these, and the sensors of the data set."""
 
     bench: SplitContacts
     train: SplitContacts
-    readings: ThresholdReader
+    reader: ThresholdReader
     sensors: tuple[str, ...]
 
 
-def read_source(store: RecordStore, split: str = "test", tell: Callable[[], None] = lambda: None) -> BenchSource:
-    """Measure the contacts of the bench's split and of the training split.
-
-    Args:
-      store: the records.
-      split: the bench's; its objects are in no other.
-      tell: called after every contact.
+def read_source(store: RecordStore, after_each: Callable[[], None] = lambda: None) -> BenchSource:
+    """Measure the contacts of the test and of the training split; `after_each` is called after every contact.
 
     Raises:
-      FactsError: no labelled contact to ask about, or too few training contacts to read numbers by.
+      ContactError: no labelled test contact, or too few training contacts to fit thresholds on.
     """
-    bench, train = measure_split(store, split, tell), measure_split(store, "train", tell)
+    bench, train = measure_split(store, "test", after_each), measure_split(store, "train", after_each)
     if not bench.objects():
-        raise ContactError(f"split is {split!r}: holds no labelled contact that measured something; choose another")
-    return BenchSource(bench=bench, train=train, readings=fit_thresholds(train.contacts), sensors=store.meta.sensors)
+        raise ContactError("split is 'test': must hold labelled contacts that could be measured; use other records")
+    return BenchSource(bench=bench, train=train, reader=fit_thresholds(train.contacts), sensors=store.meta.sensors)
 
 
-def ask_about(source: BenchSource, quota: Quota, seed: int) -> tuple[Ask, ...]:
-    """The questions of a seed, drawn anew from the records, so that no file can change what is right."""
+def draw_questions(source: BenchSource, quota: Quota, seed: int) -> tuple[Ask, ...]:
+    """The questions of a seed, drawn from the records."""
     return draw(source.bench.contacts, source.sensors, quota, seed)
 
 
 def generate(source: BenchSource, quota: Quota, seed: int) -> FilteredItems:
     """Items worded by rule; the same records, quota and seed give the same bytes."""
     contacts = source.bench.by_touch()
-    items = [compose_item(ask, contacts, source.readings) for ask in ask_about(source, quota, seed)]
-    return apply_rules([_candidate(item) for item in items], contacts)
+    items = [compose_item(ask, contacts, source.reader) for ask in draw_questions(source, quota, seed)]
+    return apply_rules(map(CandidateItem.of, items), contacts)
 
 
-def share_at_odds(items: tuple[Item, ...]) -> float:
-    """Share of the items in which the sensors' numbers together do not say the answer; they stay in the bench.
+def share_at_odds(items: Sequence[Item]) -> float:
+    """Share of the items whose `compare` segment does not give the right answer.
 
-    To remove them would leave only what a threshold on one number can answer.
+    They stay in the bench: without them it would hold only what a threshold on one number can answer.
     """
     odd = 0
     for item in items:
-        reading, _ = understand(item.ask, item.rationale)
+        reading, _ = read_answer(item.ask, item.rationale)
         odd += tuple(reading.compare[slot] for slot in slots_of(item.ask)) != item.ask.answer
     return odd / len(items)
 
 
-def _candidate(item: Item) -> CandidateItem:
-    return CandidateItem(
-        ask=item.ask,
-        question=item.question,
-        answer=answer_words(item.ask),
-        rationale=item.rationale,
-        evidence=item.evidence,
-    )
+def author_requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContact]) -> Iterator[dict[str, Any]]:
+    """One request for each question."""
+    for ask in asks:
+        touches = [
+            dataclasses.asdict(touch) | {"measured": {s: _measured(contacts[touch].measured[s]) for s in ask.sensors}}
+            for touch in ask.touches
+        ]
+        yield {
+            "id": ask.id,
+            "kind": ask.kind,
+            "meaning": KINDS[ask.kind].meaning,
+            "attributes": list(ask.attributes),
+            "sensors": list(ask.sensors),
+            "task": TASK,
+            "answer": answer_words(ask),
+            "choices": answer_choices(ask),
+            "touches": touches,
+        }
+
+
+def _measured(measured: Measured) -> dict[str, Any]:
+    quantities = {
+        name: {"value": float(f"{value:.4g}"), "unit": UNITS[name]} for name, value in measured.quantities.items()
+    }
+    return {"quantities": quantities, "at": list(measured.at), "box": list(measured.box)}
+
+
+def read_candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask]) -> Iterator[CandidateItem]:
+    """The candidates of a file in its order; questions without a candidate are left out.
+
+    Args:
+      rows: line numbers and objects, as `read_lines` gives them.
+      asks: the questions of the requests.
+
+    Raises:
+      LinesError: missing or additional fields, a field of another type, an unknown id, or one that occurs twice.
+    """
+    known, seen = {ask.id: ask for ask in asks}, set[str]()
+    for number, row in rows:
+        if set(row) != set(CANDIDATE_FIELDS):
+            raise LinesError(
+                f"line {number} has fields {sorted(row)}: must be {', '.join(CANDIDATE_FIELDS)}; correct it"
+            )
+        if row["id"] not in known or row["id"] in seen:
+            fix = "answer each request once" if row["id"] in seen else "use the records, quota and seed of the requests"
+            raise LinesError(f"line {number}: id is {row['id']!r}: must be that of an open request; {fix}")
+        seen.add(row["id"])
+        try:
+            evidence = tuple(citation_of(citation) for citation in row["evidence"])
+            texts = {name: str.strip(row[name]) for name in ("question", "answer", "rationale")}
+        except (TypeError, KeyError, ValueError) as error:
+            raise LinesError(f"line {number}: {error}; texts and a list of evidence are needed") from error
+        yield CandidateItem(
+            ask=known[row["id"]], question=question, answer=answer, rationale=rationale, evidence=evidence
+        )
+
+
+def rejected_rows(removed: Iterable[tuple[CandidateItem, str]]) -> Iterator[dict[str, Any]]:
+    """Removed candidates with the rule that each broke, for their author."""
+    for c, rule in removed:
+        yield {"id": c.ask.id, "rule": rule, "question": c.question, "answer": c.answer, "rationale": c.rationale}

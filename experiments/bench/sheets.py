@@ -12,10 +12,10 @@ class SheetError(ValueError):
 
 
 def write_sheet(path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
-    """Replace a sheet in one step; columns that a row lacks stay blank.
+    """Write a sheet in one step; columns that a row lacks stay blank.
 
     Raises:
-      SheetError: the file exists and somebody may have filled it in.
+      SheetError: the file exists, and may be filled in.
     """
     path = pathlib.Path(path)
     if path.exists():
@@ -42,8 +42,8 @@ def read_sheet(
       wanted: the keys that must be there, each once.
 
     Raises:
-      SheetError: no such file, one that is no text, another key, one missing or twice, a column missing, or a word that
-        is none of the allowed ones.
+      SheetError: a file that is missing or not text, a key that is unknown, missing or there twice, a missing column,
+        or a word that is not allowed.
     """
     path, names = pathlib.Path(path), set(wanted)
     rows: dict[str, dict[str, str]] = {}
@@ -73,7 +73,7 @@ def _text(path: pathlib.Path) -> str:
 
 
 def _word(where: str, column: str, cell: str | None, words: Sequence[str]) -> str:
-    said = (cell or "").strip().lower()
-    if said not in words:
+    word = (cell or "").strip().lower()
+    if word not in words:
         raise SheetError(f"{where}: {column} is {cell!r}: must be one of {', '.join(words)}; fill it in")
-    return said
+    return word

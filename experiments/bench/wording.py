@@ -1,7 +1,8 @@
-"""The words of the bench: the answer language of each kind of question, and what a text answers.
+"""Words of the bench: the wordings of the questions, the answer language of each kind, and the reading of answers.
 
-Single touches are answered in the language of the policies; comparisons and orders in the same three segments, with
-"first" and "second", or an order such as "second first third", from the least to the most, as the levels.
+No wording depends on the answer, and each kind has several, so that none of them is the task.  Questions about a single
+touch are answered in the language of the policies; comparisons and orders in the same three segments, with "first" and
+"second", or an order such as "second first third", from the least to the most, in place of levels.
 """
 
 from collections.abc import Mapping
@@ -12,57 +13,27 @@ from touchr1_jax.text.language import SENSORS, TOUCH_LANGUAGE, Attribute, Langua
 from touchr1_jax.text.oracle import Reading, read
 
 PLACES = ("first", "second", "third")
-"""How the touches of a question are called."""
+"""Names of the touches of a question, by position."""
 
-COMPARISON = Language(
+COMPARISON_LANGUAGE = Language(
     attributes=(Attribute(name="more", levels=((PLACES[0],), (PLACES[1],)), ordinal=False),), sensors=SENSORS
 )
-ORDER = Language(
+ORDER_LANGUAGE = Language(
     attributes=(
         Attribute(name="order", levels=tuple((" ".join(PLACES[t] for t in order),) for order in ORDERS), ordinal=False),
     ),
     sensors=SENSORS,
 )
 
-
-def language_of(kind: str) -> Language:
-    """The language that a kind of question is answered in."""
-    return {"compare": COMPARISON, "order": ORDER}.get(kind, TOUCH_LANGUAGE)
-
-
-def slots_of(ask: Ask) -> list[int]:
-    """Where the levels of an answer stand on the A axis of its language."""
-    language = language_of(ask.kind)
-    if language is not TOUCH_LANGUAGE:
-        return [0]
-    return [language.attribute_index(name) for name in ask.attributes]
-
-
-def understand(ask: Ask, text: str) -> tuple[Reading, tuple[int, ...]]:
-    """What an answer in three segments says: everything, and the levels that it concludes, −1 for ⊥."""
-    reading = read(language_of(ask.kind), text)
-    return reading, tuple(reading.conclude[slot] for slot in slots_of(ask))
-
-
-def answer_words(ask: Ask) -> str:
-    """The right answer in words, such as "soft" or "second first third"."""
-    attributes = language_of(ask.kind).attributes
-    levels = zip(slots_of(ask), ask.answer, strict=True)
-    return " ".join(attributes[slot].levels[level][0] for slot, level in levels)
-
-
-def choices(ask: Ask) -> list[list[str]]:
-    """The words among which each part of the answer is chosen."""
-    attributes = language_of(ask.kind).attributes
-    return [[words[0] for words in attributes[slot].levels] for slot in slots_of(ask)]
-
+WORDINGS = 4
+"""Number of wordings of every kind of question."""
 
 ADJECTIVE: Mapping[str, tuple[str, str]] = {
     "hardness": ("hard", "harder"),
     "roughness": ("rough", "rougher"),
     "protrusion": ("protruding", "more protruding"),
 }
-"""An ordinal attribute as an adjective, and compared."""
+"""Adjective of each ordinal attribute, and its comparative."""
 
 SINGLE: Mapping[str, tuple[str, ...]] = {
     "hardness": (
@@ -90,7 +61,7 @@ SINGLE: Mapping[str, tuple[str, ...]] = {
         "Name the material that the sensors feel.",
     ),
 }
-"""For one property of one touch."""
+"""Questions about one property of one touch."""
 
 SCALE = (
     "On the scale {scale}, where does its {attribute} lie?",
@@ -113,7 +84,7 @@ COMPARE = (
     "One of two objects is {more}. Is it the first or the second?",
 )
 
-ORDERING = (
+ORDER = (
     "Three objects are touched. Order them from the least {adjective} to the most.",
     "Which order of the three touches goes from the least to the most {adjective}?",
     "Sort first, second and third by how {adjective} they feel, the least at the front.",
@@ -134,28 +105,56 @@ CONFLICT = (
     "Does touch bear out what it looks like? {question}",
 )
 
-WORDINGS = 4
-"""Of every kind."""
+
+def level_words(attribute: str) -> list[str]:
+    """The word for each level of an attribute."""
+    return [words[0] for words in TOUCH_LANGUAGE.attributes[TOUCH_LANGUAGE.attribute_index(attribute)].levels]
 
 
 def question(ask: Ask) -> str:
-    """The question in the wording that it was drawn with."""
+    """The question in the wording that was drawn for it."""
     wording, name = ask.phrasing % WORDINGS, ask.attributes[0]
-    if ask.kind == "identify":
-        return SINGLE[name][wording]
-    if ask.kind == "scale":
-        levels = TOUCH_LANGUAGE.attributes[TOUCH_LANGUAGE.attribute_index(name)].levels
-        return SCALE[wording].format(scale=" – ".join(words[0] for words in levels), attribute=name)
-    if ask.kind == "compose":
-        return COMPOSE[wording].format(attributes=_listed(ask.attributes))
-    if ask.kind == "compare":
-        return COMPARE[wording].format(more=ADJECTIVE[name][1])
-    if ask.kind == "order":
-        return ORDERING[wording].format(adjective=ADJECTIVE[name][0])
-    templates = {"one_sensor": ALONE, "conflict": CONFLICT}[ask.kind]
-    return templates[wording].format(question=SINGLE[name][wording])
+    match ask.kind:
+        case "identify":
+            return SINGLE[name][wording]
+        case "scale":
+            return SCALE[wording].format(scale=" – ".join(level_words(name)), attribute=name)
+        case "compose":
+            *others, last = ask.attributes
+            listed = f"{', '.join(others)} and {last}" if others else last
+            return COMPOSE[wording].format(attributes=listed)
+        case "compare":
+            return COMPARE[wording].format(more=ADJECTIVE[name][1])
+        case "order":
+            return ORDER[wording].format(adjective=ADJECTIVE[name][0])
+        case _:
+            templates = {"one_sensor": ALONE, "conflict": CONFLICT}[ask.kind]
+            return templates[wording].format(question=SINGLE[name][wording])
 
 
-def _listed(names: tuple[str, ...]) -> str:
-    """ "a and b", "a, b and c"."""
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+def language_of(kind: str) -> Language:
+    """The answer language of a kind of question."""
+    return {"compare": COMPARISON_LANGUAGE, "order": ORDER_LANGUAGE}.get(kind, TOUCH_LANGUAGE)
+
+
+def slots_of(ask: Ask) -> list[int]:
+    """Positions of the answer's levels on the attribute axis of its language."""
+    language = language_of(ask.kind)
+    return [language.attribute_index(name) for name in ask.attributes] if language is TOUCH_LANGUAGE else [0]
+
+
+def read_answer(ask: Ask, text: str) -> tuple[Reading, tuple[int, ...]]:
+    """The parsed answer, and the levels that it concludes, −1 where none could be parsed."""
+    reading = read(language_of(ask.kind), text)
+    return reading, tuple(reading.conclude[slot] for slot in slots_of(ask))
+
+
+def answer_choices(ask: Ask) -> list[list[str]]:
+    """The words among which each part of the answer is chosen."""
+    attributes = language_of(ask.kind).attributes
+    return [[words[0] for words in attributes[slot].levels] for slot in slots_of(ask)]
+
+
+def answer_words(ask: Ask) -> str:
+    """The right answer in words, such as "soft" or "second first third"."""
+    return " ".join(words[level] for words, level in zip(answer_choices(ask), ask.answer, strict=True))

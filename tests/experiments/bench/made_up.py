@@ -47,6 +47,6 @@ def source() -> BenchSource:
     return BenchSource(
         bench=SplitContacts(contacts=contacts("test", 0), skipped={}),
         train=SplitContacts(contacts=train, skipped={}),
-        readings=fit_thresholds(train),
+        reader=fit_thresholds(train),
         sensors=SENSORS,
     )

@@ -5,12 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.bench import adapter, planted_errors
-from experiments.bench.generate import generate, share_at_odds
+from experiments.bench.generate import author_requests, generate, read_candidates, rejected_rows, share_at_odds
 from experiments.bench.rationales import compose_item
-from experiments.bench.rules import RULES, CandidateItem, apply_rules, broken_rule
+from experiments.bench.rules import RULES, CandidateItem, apply_rules, broken_rule, count_found_errors
 from experiments.bench.thresholds import LevelThresholds, fit_thresholds
-from experiments.bench.wording import WORDINGS, answer_words, understand
+from experiments.bench.wording import WORDINGS, answer_words, read_answer
 from tests.experiments.bench import made_up
 from touchr1_jax.bench.items import Ask, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError
@@ -26,10 +25,10 @@ def test_cuts_by_hand():
 
 def test_the_quantity_that_follows_the_level_is_found(source):
     wanted = {"hardness": "stiffness", "roughness": "fine texture", "protrusion": "relief"}
-    for (_, attribute), scale in source.readings.scales.items():
+    for (_, attribute), scale in source.reader.thresholds.items():
         assert scale.quantity == wanted[attribute]
         assert scale.rising
-        right = [source.readings.level(c, "xense", attribute) == c.labels[attribute] for c in source.train.contacts]
+        right = [source.reader.level(c, "xense", attribute) == c.labels[attribute] for c in source.train.contacts]
         assert np.mean(right) == pytest.approx(scale.accuracy)  # levels are as many each
         assert scale.accuracy > 0.9
 
@@ -55,10 +54,10 @@ def test_a_rationale_by_hand(source, items):
 
 def test_every_rationale_is_an_answer_in_the_language(items):
     for item in items:
-        reading, concluded = understand(item.ask, item.rationale)
+        reading, concluded = read_answer(item.ask, item.rationale)
         assert reading.formatted
         assert concluded == item.ask.answer
-    answers = {item.ask.id: understand(item.ask, item.rationale)[1] for item in items}
+    answers = {item.ask.id: read_answer(item.ask, item.rationale)[1] for item in items}
     table = {name: scores.mean() for name, scores in score([item.ask for item in items], answers).items()}
     assert table["omae"] == 0
     assert table["csc"] == table["sfd"] == table["l2_em"] == 100
@@ -72,11 +71,11 @@ def test_other_numbers_stand_beside_the_one_that_is_read(source):
     }
     seen = dataclasses.replace(contact, measured=wide)
     scale = LevelThresholds(quantity="contact area", cuts=(5.0, 6.0), rising=True, accuracy=1.0)
-    scales = {key: scale if key[1] == "hardness" else known for key, known in source.readings.scales.items()}
+    scales = {key: scale if key[1] == "hardness" else known for key, known in source.reader.thresholds.items()}
     ask = Ask(
         id="x", kind="identify", attributes=("hardness",), touches=(contact.touch,), sensors=("xense",), answer=(0,)
     )
-    item = compose_item(ask, {contact.touch: seen}, dataclasses.replace(source.readings, scales=scales))
+    item = compose_item(ask, {contact.touch: seen}, dataclasses.replace(source.reader, thresholds=scales))
     assert [c.quantity for c in item.evidence] == ["contact area", "stiffness", "force"]
     assert "xense contact area 7 %, stiffness " in item.rationale
     assert ": hard </perceive>" in item.rationale
@@ -88,23 +87,23 @@ def test_a_sensor_that_cannot_be_read_still_says_what_it_measured(source):
     ask = Ask(
         id="x", kind="identify", attributes=("hardness",), touches=(contact.touch,), sensors=("xense",), answer=(0,)
     )
-    item = compose_item(ask, {contact.touch: dataclasses.replace(contact, measured=blunt)}, source.readings)
+    item = compose_item(ask, {contact.touch: dataclasses.replace(contact, measured=blunt)}, source.reader)
     assert (
         "xense contact at 1.5 N: no reading of hardness </perceive> <compare> no reading </compare>" in item.rationale
     )
     assert [c.quantity for c in item.evidence] == ["force"]
-    assert understand(ask, item.rationale)[1] == (0,)
+    assert read_answer(ask, item.rationale)[1] == (0,)
 
 
 def test_perceived_levels_are_those_of_the_readings(source, items):
     item = next(i for i in items if i.ask.kind == "compose")
-    reading, _ = understand(item.ask, item.rationale)
+    reading, _ = read_answer(item.ask, item.rationale)
     contact = source.bench.by_touch()[item.ask.touches[0]]
     for sensor in (1, 2):  # xense and tac3d in the language
         said = [reading.perceive[sensor][a] for a in range(3)]
         name = ("", "xense", "tac3d")[sensor]
         wanted = [
-            source.readings.level(contact, name, a) if a in item.ask.attributes else -1
+            source.reader.level(contact, name, a) if a in item.ask.attributes else -1
             for a in ("hardness", "roughness", "protrusion")
         ]
         assert said == wanted
@@ -135,17 +134,7 @@ def test_rules_remove_nothing_that_is_sound_and_all_planted_faults(source, found
     assert not found.removed
     assert found.counts == dict.fromkeys(RULES, 0)
     some = found.kept[::9]
-    assert planted_errors.caught(some, source.bench.by_touch()) == dict.fromkeys(RULES, len(some))
-
-
-def sound(item) -> CandidateItem:
-    return CandidateItem(
-        ask=item.ask,
-        question=item.question,
-        answer=answer_words(item.ask),
-        rationale=item.rationale,
-        evidence=item.evidence,
-    )
+    assert count_found_errors(some, source.bench.by_touch()) == dict.fromkeys(RULES, len(some))
 
 
 @pytest.mark.parametrize(
@@ -158,12 +147,12 @@ def sound(item) -> CandidateItem:
     ],
 )
 def test_what_is_missing_is_named(source, items, change, rule):
-    candidate = dataclasses.replace(sound(items[0]), **change)
+    candidate = dataclasses.replace(CandidateItem.of(items[0]), **change)
     assert broken_rule(candidate, source.bench.by_touch()) == rule
 
 
 def test_evidence_must_be_of_what_is_shown(source, items):
-    contacts, candidate = source.bench.by_touch(), sound(items[0])
+    contacts, candidate = source.bench.by_touch(), CandidateItem.of(items[0])
     cited = candidate.evidence[0]
     for change, rule in (
         ({"sensor": "dmtac_x"}, "outside contact"),
@@ -185,16 +174,16 @@ def test_labels_that_changed_or_tie_conflict(source, items):
     pair = next(i for i in items if i.ask.kind == "compare")
     name, (one, other) = pair.ask.attributes[0], pair.ask.touches
     tied = contacts | {one: dataclasses.replace(contacts[one], labels=contacts[other].labels)}
-    assert broken_rule(sound(pair), tied) == "label conflict"
+    assert broken_rule(CandidateItem.of(pair), tied) == "label conflict"
     unlabelled = contacts | {one: dataclasses.replace(contacts[one], labels={})}
-    assert broken_rule(sound(pair), unlabelled) == "label conflict"
+    assert broken_rule(CandidateItem.of(pair), unlabelled) == "label conflict"
     assert name in contacts[one].labels
 
 
 def test_another_author_by_files(source, items):
     """Requests hold what is needed to write sound items; candidates come back in any number and order."""
     asks, contacts = [item.ask for item in items], source.bench.by_touch()
-    sent = list(adapter.requests(asks, contacts))
+    sent = list(author_requests(asks, contacts))
     assert [r["id"] for r in sent] == [ask.id for ask in asks]
     first = sent[0]["touches"][0]["measured"]["xense"]
     assert first["quantities"]["stiffness"]["unit"] == "N/mm"
@@ -212,10 +201,10 @@ def test_another_author_by_files(source, items):
         for n, i in enumerate(reversed(items[:40]), 1)
     ]
     rows[3][1]["answer"] = "no idea"
-    back = apply_rules(adapter.candidates(rows, asks), contacts)
+    back = apply_rules(read_candidates(rows, asks), contacts)
     assert len(back.kept) == 39
     assert back.counts["missing answer"] == 1
-    (removed,) = adapter.rejected(back.removed)
+    (removed,) = rejected_rows(back.removed)
     assert (removed["id"], removed["rule"]) == (rows[3][1]["id"], "missing answer")
 
 
@@ -231,10 +220,10 @@ def test_another_author_by_files(source, items):
 def test_what_another_author_gets_wrong_is_named(items, change, message):
     row = {"id": items[0].ask.id, "question": "?", "answer": "x", "rationale": "y", "evidence": []} | change
     with pytest.raises(LinesError, match=message):
-        list(adapter.candidates([(1, row)], [item.ask for item in items]))
+        list(read_candidates([(1, row)], [item.ask for item in items]))
 
 
 def test_a_request_is_answered_once(items):
     row = {"id": items[0].ask.id, "question": "?", "answer": "x", "rationale": "y", "evidence": []}
     with pytest.raises(LinesError, match="answer each request once"):
-        list(adapter.candidates([(1, row), (2, row)], [items[0].ask]))
+        list(read_candidates([(1, row), (2, row)], [items[0].ask]))

@@ -81,7 +81,7 @@ def test_agreement_by_hand():
 
 def test_disagreements_are_decided_by_a_third(tmp_path):
     a, b = labels(), labels(cup=(1, 0, 2, 1))
-    assert annotate.open_cells(a, b) == {"cup": ["hardness", "protrusion"]}
+    assert list(annotate.open_cases(a, b).values()) == [("cup", "hardness"), ("cup", "protrusion")]
     path = tmp_path / "open.csv"
     annotate.write_open(str(path), a, b)
     assert "firm or soft" in path.read_text()
@@ -98,10 +98,10 @@ def test_disagreements_are_decided_by_a_third(tmp_path):
 def test_labels_that_force_and_deformation_contradict_are_doubted(source):
     contacts = source.bench.contacts
     given = {c.touch.object: dict(c.labels) for c in contacts}
-    assert annotate.doubts(given, contacts) == ()
+    assert annotate.doubtful_labels(given, contacts) == ()
     hard = next(o for o, levels in given.items() if levels["hardness"] == 2)
     given[hard]["hardness"] = 0
-    (doubt,) = annotate.doubts(given, contacts)
+    (doubt,) = annotate.doubtful_labels(given, contacts)
     assert (doubt.object, doubt.attribute, doubt.label) == (hard, "hardness", "soft")
     assert doubt.sensors == ("tac3d", "xense")
     rho = annotate.rank_correlations(given, contacts)
@@ -139,7 +139,7 @@ def test_pass_rates_by_hand(items, source, tmp_path):
     assert rows["fits the labels"].rate.low < 0.95  # forty do not prove all
     assert rows["all three"].rate.mean == 38 / 40
     assert rows["all three"].by_object.low <= 0.95 <= rows["all three"].by_object.high
-    agree = audit.judges_agree(judged, {n: row | {"grounded": True} for n, row in judged.items()})
+    agree = audit.judge_agreement(judged, {n: row | {"grounded": True} for n, row in judged.items()})
     assert agree == {"grounded": pytest.approx(0), "fits the labels": None, "self-consistent": 1.0}
 
 
