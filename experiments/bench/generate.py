@@ -135,9 +135,7 @@ def read_candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequenc
             texts = {name: str.strip(row[name]) for name in ("question", "answer", "rationale")}
         except (TypeError, KeyError, ValueError) as error:
             raise LinesError(f"line {number}: {error}; texts and a list of evidence are needed") from error
-        yield CandidateItem(
-            ask=known[row["id"]], question=question, answer=answer, rationale=rationale, evidence=evidence
-        )
+        yield CandidateItem(ask=known[row["id"]], evidence=evidence, **texts)
 
 
 def rejected_rows(removed: Iterable[tuple[CandidateItem, str]]) -> Iterator[dict[str, Any]]:
