@@ -109,11 +109,13 @@ class NewCommand:
         """Write the files, print the next steps, and return the exit status."""
         folders = (path.name for path in (self.root / "experiments").glob("*/"))
         try:
-            written = write_new(self.root, self.name, reward=self.reward, taken={*COMMANDS, *folders, *find(package)})
+            made, changed = write_new(
+                self.root, self.name, reward=self.reward, taken={*COMMANDS, *folders, *find(package)}
+            )
         except (NewError, OSError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
-        lines = [f"made     {path}" for path in written.made] + [f"changed  {path}" for path in written.changed]
+        lines = [f"made     {path}" for path in made] + [f"changed  {path}" for path in changed]
         print_lines(*lines, "", "The experiment runs as it is.  Next:", *(f"  {step}" for step in self._next_steps()))
         return 0
 

@@ -1,8 +1,7 @@
-"""New experiments and rewards from templates: files that run as they are, and the reward's entry in the dictionary."""
+"""New experiments and rewards from templates that run as they are."""
 
 import ast
 import bisect
-import dataclasses
 import keyword
 import re
 from collections.abc import Collection, Mapping
@@ -13,13 +12,13 @@ import jinja2
 from experiments.core.artifacts import write_text
 
 DICTIONARY = Path("touchr1_jax/rewards/__init__.py")
-"""Where every reward has its import and its entry."""
+"""The file with an import and an entry for every reward."""
 
 EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")
-"""What the test of a reward takes its answers and targets from."""
+"""Answers and targets of the tests of rewards."""
 
 MAKER = "make_rewards"
-"""The function there that returns the dictionary."""
+"""The function that returns the dictionary."""
 
 FAMILY = Path("experiments/paper")
 """The folder of a new experiment: it begins as an ablation, and lies with the others."""
@@ -33,21 +32,13 @@ _NAME = re.compile(r"[a-z][a-z0-9_]*")
 
 
 class NewError(ValueError):
-    """Something new that cannot be made; nothing was written."""
+    """A new experiment or reward that cannot be made; nothing was written."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Written:
-    """Files that were made, and those that were changed; paths relative to the checkout."""
-
-    made: tuple[Path, ...]
-    changed: tuple[Path, ...] = ()
-
-
-def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) -> Written:
+def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) -> tuple[list[Path], list[Path]]:
     """Write an experiment; with `reward` also a reward, its test, and its two lines in the dictionary.
 
-    Everything is checked before the first file is written, and all is taken back if a file cannot be.
+    Everything is checked before the first file is written; if one cannot be written, the others are removed.
 
     Args:
       root: top of a checkout.
@@ -55,10 +46,16 @@ def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) ->
       reward: whether it tries a new reward.
       taken: names that an experiment cannot have.
 
+    Returns:
+      the new files and the changed ones, relative to the checkout.
+
     Raises:
       NewError: a name that is no lower-case Python name or taken, a file that exists, or no checkout.
     """
-    checked_name(name, taken)
+    if _NAME.fullmatch(name) is None or keyword.iskeyword(name):
+        raise NewError(f"name is {name!r}: must be a lower-case Python name such as 'short_answers'; rename it")
+    if name in taken:
+        raise NewError(f"name is {name!r}: it is taken by an experiment, a command or a package; choose another")
     fill = lambda template: SOURCES.get_template(f"{template}.py.jinja").render(name=name, reward=reward)
     texts = {FAMILY / f"{name}.py": fill("experiment")}
     changed: dict[Path, str] = {}
@@ -73,19 +70,7 @@ def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) ->
         if (root / path).exists():
             raise NewError(f"{path} exists: nothing is overwritten; choose another name, or move the file away")
     _write(root, texts, changed)
-    return Written(made=tuple(texts), changed=tuple(changed))
-
-
-def checked_name(name: str, taken: Collection[str]) -> None:
-    """Hold a name against what Python and the command line allow.
-
-    Raises:
-      NewError: it is no lower-case name, a keyword, or taken.
-    """
-    if _NAME.fullmatch(name) is None or keyword.iskeyword(name):
-        raise NewError(f"name is {name!r}: must be a lower-case Python name such as 'short_answers'; rename it")
-    if name in taken:
-        raise NewError(f"name is {name!r}: it is taken by an experiment, a command or a package; choose another")
+    return list(texts), list(changed)
 
 
 def with_entry(source: str, name: str) -> str:

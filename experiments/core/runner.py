@@ -146,35 +146,26 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     The scale is picked out first, since it chooses the defaults that everything else overrides.
 
     Raises:
-      SystemExit: code 2 after an answer to a typo, 0 after help.
+      SystemExit: code 2 after the correction of a typo, 0 after help.
     """
     configs = experiment.configs()
+    scale = _scale(arguments, configs)
     command = dataclasses.make_dataclass(
         "Command",
         [
-            ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Set of defaults.")]),
-            ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")]),
-            ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)]),
-            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")]),
-            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")]),
-            ("launch", Annotated[Launch, tyro.conf.arg(name="")]),
-            ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")]),
+            ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Set of defaults.")], scale),
+            ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")], False),
+            ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)], False),
+            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")], Path("runs")),
+            ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")], Path("data")),
+            ("launch", Annotated[Launch, tyro.conf.arg(name="")], Launch()),
+            ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")], configs[scale]),
         ],
         kw_only=True,
         frozen=True,
     )
-    scale = _scale(arguments, configs)
-    default = command(
-        scale=scale,
-        fresh=False,
-        tensorboard=False,
-        runs_dir=Path("runs"),
-        cache_dir=Path("data"),
-        launch=Launch(),
-        config=configs[scale],
-    )
     prog = f"{PROG} {experiment.name}"
-    return tyro.cli(command, args=arguments, default=default, prog=prog, description=about)
+    return tyro.cli(command, args=arguments, default=command(), prog=prog, description=about)
 
 
 def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
@@ -192,13 +183,12 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
         require_accelerators(command.scale, experiment.needs.get(command.scale))
         chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
         directory = Path(chosen)
-        with stopping.listening(), _locked(directory, processes), compilations_kept(command.cache_dir / COMPILED):
+        lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
+        with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
             if processes.writes:
                 runs.point_latest(directory)
                 _announce(directory, resumed)
-                _run(experiment, command, directory, about, stopping, processes)
-            else:
-                _follow(experiment, command, directory, stopping, processes)
+            _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
         print_error(f"{type(error).__name__}: {error}")
         if directory is not None:
@@ -212,11 +202,6 @@ def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -
     return 0
 
 
-def _locked(directory: Path, processes: ProcessGroup) -> contextlib.AbstractContextManager[None]:
-    """The lock of the run, held by the process that writes."""
-    return runs.locked(directory) if processes.writes else contextlib.nullcontext()
-
-
 def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[str, bool]:
     """The run's directory, and whether it is that of an unfinished run."""
     config = jsonable(command.config, where="config")
@@ -227,34 +212,24 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
 
 
-def _follow(
-    experiment: Experiment[Any], command: Any, directory: Path, stopping: Stopping, processes: ProcessGroup
-) -> None:
-    """Compute together with the process that writes."""
-    devices = select_devices(command.launch)
-    context = Context(directory, command.cache_dir, Console(quiet=True), (), stopping, processes, devices)
-    with contextlib.closing(context):
-        experiment.run(command.config, context)
-
-
-def _run(
+def _compute(
     experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, processes: ProcessGroup
 ) -> None:
-    """Compute and publish; an error that ends the run is shown on its page."""
+    """Compute and, in the process that writes, publish; an error that ends the run is shown on its page."""
+    place = (directory, command.cache_dir)
+    if not processes.writes:
+        context = Context(*place, Console(quiet=True), (), stopping, processes, select_devices(command.launch))
+        with contextlib.closing(context):
+            experiment.run(command.config, context)
+        return
     description = read_json(directory / "config.json")
-    page = LivePage(
-        directory,
-        about=about,
-        description=description,
-        curves=experiment.curves,
-        usual_s=seconds_of_last(directory.parent, description["config"]),
-    )
+    usual_s = seconds_of_last(directory.parent, description["config"])
+    page = LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
+    watchers: list[Watcher] = [page]
     try:
-        watchers: list[Watcher] = [page]
         if command.tensorboard:
             watchers.append(events.Events(directory / EVENTS))
-        devices = select_devices(command.launch)
-        context = Context(directory, command.cache_dir, Console(), watchers, stopping, processes, devices)
+        context = Context(*place, Console(), watchers, stopping, processes, select_devices(command.launch))
         with contextlib.closing(context), context.timed("total"):
             results = experiment.run(command.config, context)
         _publish(results, context, description, about)
