@@ -296,10 +296,12 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.grid(axis="y", visible=False)
     for rule in panel.rules:
         _draw_rule(axes, rule)
-    axes.set_xlim(*panel.x_limits)
+    if panel.x_limits != (None, None):  # else it would end the autoscaling of an axis that panels share
+        axes.set_xlim(*panel.x_limits)
     _set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks, panel.x_format)
     if not panel.rows:
-        axes.set_ylim(*panel.y_limits)
+        if panel.y_limits != (None, None):
+            axes.set_ylim(*panel.y_limits)
         _set_ticks(axes.yaxis, panel.y_scale, panel.y_ticks, panel.y_format)
 
 

@@ -3,7 +3,7 @@
 import dataclasses
 
 from experiments.engine.attention import Flash
-from experiments.engine.size import JobSize
+from experiments.engine.peers import JobSize
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 

@@ -12,11 +12,11 @@ import tempfile
 import time
 from typing import Any
 
-from experiments.engine.harness import CLIP, PAD_ID, PeerJob, answer
+from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer
 
 
 def main(job: PeerJob) -> str:
-    """Train for the iterations of the job; the line to print."""
+    """Train for the iterations of the job, and return the line to print."""
     import datasets
     import torch
     import transformers
@@ -48,7 +48,7 @@ def main(job: PeerJob) -> str:
         )
         trainer.train()
     versions = {m.__name__: m.__version__ for m in (trl, torch, transformers)}
-    return answer(job, starts, versions | {"threads": str(torch.get_num_threads())})
+    return format_answer(job, starts, versions | {"threads": str(torch.get_num_threads())})
 
 
 def save_policy(job: PeerJob, folder: str) -> None:
@@ -100,10 +100,10 @@ def settings(job: PeerJob, folder: str) -> dict[str, Any]:
         "temperature": 1.0,
         "top_p": 1.0,
         "top_k": 0,
-        "beta": job.beta,
+        "beta": BETA,
         "epsilon": CLIP,
         "loss_type": "grpo",
-        "learning_rate": job.learning_rate,
+        "learning_rate": LEARNING_RATE,
         "lr_scheduler_type": "constant",
         "max_grad_norm": 0.0,
         "shuffle_dataset": False,

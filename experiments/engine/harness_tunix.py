@@ -11,7 +11,7 @@ import sys
 import time
 from typing import Any
 
-from experiments.engine.harness import CLIP, PAD_ID, PeerJob, answer
+from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer
 
 
 class IdTokenizer:
@@ -37,7 +37,7 @@ class IdTokenizer:
 
 
 def main(job: PeerJob) -> str:
-    """Train for the iterations of the job; the line to print."""
+    """Train for the iterations of the job, and return the line to print."""
     import jax
     import numpy as np
     import tunix
@@ -62,14 +62,14 @@ def main(job: PeerJob) -> str:
         algo_config=GRPOConfig(
             num_generations=job.size.group,
             num_iterations=1,
-            beta=job.beta,
+            beta=BETA,
             epsilon=CLIP,
             kl_loss_mode="low_var_kl",  # k3, as TRL and this project's default
         ),
     )
     texts = [[" ".join(map(str, ids)) for ids in batch] for batch in job.prompts()]
     learner.train([{"prompts": np.array(batch)} for batch in texts])
-    return answer(job, starts, {"tunix": tunix.__version__, "jax": jax.__version__})
+    return format_answer(job, starts, {"tunix": tunix.__version__, "jax": jax.__version__})
 
 
 def make_cluster(job: PeerJob) -> Any:
@@ -91,7 +91,7 @@ def make_cluster(job: PeerJob) -> Any:
             rollout_engine="vanilla",
             offload_to_cpu=False,
             training_config=rl_cluster.RLTrainingConfig(
-                actor_optimizer=optax.adamw(job.learning_rate),
+                actor_optimizer=optax.adamw(LEARNING_RATE),
                 eval_every_n_steps=10**9,  # never
                 max_steps=job.iterations,
                 mini_batch_size=job.size.prompts,

@@ -1,8 +1,9 @@
-"""The job that GRPO engines are timed on: the same decoder, prompts, completions and update for all of them.
+"""The job that GRPO engines are timed on: one decoder, one set of prompts, completions and updates for all of them.
 
 8 prompts × 8 rollouts × 64 new tokens, no end token among them; a decoder of the Qwen2 shape with 1.05 million
 parameters (4 layers, width 128, 4 heads over 2 key heads of 32, MLP 512, vocabulary 512, tied embedding) in float32;
-one on-policy update by AdamW with β = .04 to a reference.  The reward of a completion is its share of low token ids.
+one on-policy AdamW update with a KL of weight .04 to a reference.  The reward of a completion is its share of token ids
+in the lower half of the vocabulary.
 """
 
 import dataclasses
@@ -14,20 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from experiments.engine.size import BETA, LEARNING_RATE, JobSize
+from experiments.engine.peers import BETA, LEARNING_RATE, JobSize
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 
 VIEW, TOUCH = 4, 8
-"""Prompt tokens that are embeddings of a view and of the touch of the one sensor; the others are text."""
+"""Prompt tokens that are embeddings of the view and of the touch of the one sensor; the others are text."""
 
 
 class Job:
@@ -37,10 +38,10 @@ class Job:
       size: the decoder and the numbers of prompts, rollouts and tokens.
       prefix: prompt tokens.
       config: the step.
-      repeated: encode the prefix for every rollout: as many prompts of one rollout each.
+      repeated: encode the prefix for every rollout, as if each were a prompt of its own.
       host: compute the reward in Python.
-      end_share: share of the vocabulary that ends a completion, so that a fresh policy's have 1/share tokens on
-        average; 0 lets none end.
+      end_share: share of the vocabulary that ends a completion, so that an untrained policy's completions have 1/share
+        tokens on average; at 0 none ends early.
       learning_rate: AdamW's; 0 keeps the policy as it is.
       seed: of the prompts and of the sampling.
     """
@@ -71,7 +72,7 @@ class Job:
         self._state = start_state(params, optimizer, jax.random.key(seed), config)
 
     def step(self) -> dict[str, jax.Array]:
-        """One iteration; the state moves on."""
+        """Run one iteration, which replaces the state."""
         self._state, metrics = self._step(self._state, self.batch, self.frozen)
         return metrics
 
@@ -82,11 +83,11 @@ class Job:
 
     @property
     def compilations(self) -> int:
-        """How many programs the steps so far took."""
+        """Number of programs that the steps so far compiled."""
         return self._step._cache_size()
 
     def lowered(self) -> jax.stages.Lowered:
-        """The step as it is handed to the compiler."""
+        """The step before compilation."""
         return self._step.lower(self._state, self.batch, self.frozen)
 
 
@@ -94,7 +95,7 @@ class Job:
 def engine(
     size: JobSize, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
 ) -> tuple[PolicyFns, optax.GradientTransformation, Any]:
-    """Policy, optimizer and compiled step, made once for all seeds."""
+    """Policy, optimizer and jitted step, made once for all seeds."""
     fns = make_fns(size, prefix, end_share)
     score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
     optimizer = optax.adamw(learning_rate)
@@ -102,19 +103,25 @@ def engine(
 
 
 def config_of(size: JobSize, micro_prompts: int = 1) -> GRPOConfig:
-    """The step that the job asks for: plain GRPO with a reference, nothing else."""
+    """Plain GRPO with a reference policy."""
+    return grpo_config(size, micro_prompts, Paper(beta=BETA, gamma=0.0))
+
+
+def grpo_config(size: JobSize, micro_prompts: int, algorithm: AnyAlgorithm, **options: Any) -> GRPOConfig:
+    """A step of the job's size by any algorithm; `options` are further fields of `GRPOConfig`."""
     return GRPOConfig(
         prompts=size.prompts,
         group=size.group,
         length=size.length,
         micro_prompts=micro_prompts,
-        algorithm=Paper(beta=BETA, gamma=0.0),
+        algorithm=algorithm,
         inverse_draws=True,
+        **options,
     )
 
 
 def decoder_config(size: JobSize) -> DecoderConfig:
-    """The decoder of a size; three eighths of the rotary frequencies each for row and column, the rest for time."""
+    """The decoder; row and column get three eighths of the rotary frequencies each, time the rest."""
     names = {f.name for f in dataclasses.fields(DecoderConfig)}
     half = size.head_dim // 2
     sections = (half - 2 * (3 * half // 8), 3 * half // 8, 3 * half // 8)
@@ -123,7 +130,7 @@ def decoder_config(size: JobSize) -> DecoderConfig:
 
 
 def make_fns(size: JobSize, prefix: int, end_share: float = 0.0) -> PolicyFns:
-    """A policy of the given decoder whose prompts have `prefix` tokens; the highest ids end a completion."""
+    """A policy whose prompts have `prefix` tokens and whose highest token ids end a completion."""
     policy = Policy(
         PolicyConfig(
             tactile=TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1),
@@ -161,10 +168,7 @@ def make_batch(size: JobSize, prefix: int, prompts: int, seed: int = 0) -> GRPOB
 
 
 def init_decoder(fns: PolicyFns, batch: GRPOBatch) -> Params:
-    """N(0, .02²) weights and unit scales, drawn in NumPy: compiling an initialisation would count as the job's memory.
-
-    The shapes come from tracing one forward pass.
-    """
+    """N(0, .02²) weights and unit scales, drawn in NumPy: compiling an initialiser would add to the memory."""
     one = jax.tree.map(lambda x: x[0], batch)
 
     def forward(module: Policy) -> jax.Array:
@@ -187,28 +191,28 @@ def low_ids(vocab_size: int) -> ScoreFn:
 
     def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
         del target
-        return jnp.mean(tokens < vocab_size // 2), {}, nothing_said(tokens)
+        return jnp.mean(tokens < vocab_size // 2), {}, parsed_without_tags(tokens)
 
     return score
 
 
 def low_ids_on_host(vocab_size: int) -> ScoreFn:
-    """The same as a Python function, to see what leaving the device costs."""
+    """The same reward computed in Python, to measure the cost of leaving the device."""
 
     def reward(tokens: np.ndarray, parsed: Parsed, target: Target) -> dict[str, float]:
         del parsed, target
         return {"low": float(np.mean(tokens < vocab_size // 2))}
 
-    return make_host_score(nothing_said, reward, ("low",))
+    return make_host_score(parsed_without_tags, reward, ("low",))
 
 
-def nothing_said(tokens: jax.Array) -> Parsed:
-    """What a text without any tags says."""
-    nothing = jnp.full(1, -1)
+def parsed_without_tags(tokens: jax.Array) -> Parsed:
+    """The parsed form of a text without tags."""
+    none = jnp.full(1, -1)
     return Parsed(
-        perceive=nothing[None],
-        compare=nothing,
-        conclude=nothing,
+        perceive=none[None],
+        compare=none,
+        conclude=none,
         formatted=jnp.array(False),
         truncated=jnp.array(True),
         length=jnp.int32(tokens.shape[0]),

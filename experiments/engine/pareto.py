@@ -1,109 +1,77 @@
-"""Which of the defaults is dominated: is anything measured here both faster and more exact than what is used?
+"""Is any default dominated: was another method measured to be better on one axis and worse on none?
 
     make experiment EXP=pareto [ARGS="--others DIR"]
 
-Gathers the charts of the newest finished run of every experiment that measures speed against error, and of those that
-show where methods break, and holds each default against all that was measured beside it.  One that another method beats
-on some axis and on none falls behind is dominated.  It measures nothing itself: run those experiments first.
+Reads the newest finished run of every experiment that measures speed against error, compares each default with the
+other rows of its table, and shows the charts of these runs, with those of the experiments that measure where methods
+break.  It measures nothing itself: run those experiments first.
 
 Cost: a second.
 
-Expected: no default is dominated but where another rule chose it, such as the smallest of what is fast enough.
+Expected: no default is dominated except where another rule chose it, such as the smallest of those fast enough.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 from experiments.core.context import Context
+from experiments.core.errors import require
 from experiments.core.history import PastRun, runs_of, summary
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.results import Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
-from experiments.engine.fronts import Axis, Point, dominators, front, points_of
 from experiments.fields import dense_accuracy, marker_accuracy
 from experiments.mechanics.tangential_tables import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
 GRPO_DEFAULT = "paper (default)"
-"""How `pareto_grpo` marks the preset and group size that the studies use; the mark stands on one row."""
+"""Row of `pareto_grpo` for the preset and group size that the studies use."""
+
+Axes = Mapping[str, Literal["lower", "higher"]]
+"""Beginning of a column's name → which of its figures are better."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class JudgedDefault:
-    """A default, and where it was measured.
+class JudgedDefault(NamedTuple):
+    """A default and the table that measures it.
 
     Attributes:
-      what: what it is the default of.
-      experiment: whose runs hold the table.
-      table: what the titles of the tables begin with; each of them judges.
-      default: row of the default.
-      axes: what it is judged by.
+      what: component that has the default.
+      experiment: name of the experiment with the table.
+      table: beginning of the table's title; every table whose title begins so is judged.
+      default: beginning of the default's row.
+      axes: figures that are compared.
     """
 
     what: str
     experiment: str
     table: str
     default: str
-    axes: tuple[Axis, ...]
+    axes: Axes
 
-
-TIME = Axis(column="time", better="lower")
 
 DEFAULTS: tuple[JudgedDefault, ...] = (
     JudgedDefault(
-        what="contact solver",
-        experiment="pareto_contact",
-        table="Tiers at",
-        default="nested 1e-3",
-        axes=(TIME, Axis(column="slope median", better="lower")),
+        "contact solver", "pareto_contact", "Tiers at", "nested 1e-3", {"time": "lower", "slope median": "lower"}
+    ),
+    JudgedDefault("friction", "pareto_tangential", "", FRICTION, {"time": "lower", "median error": "lower"}),
+    JudgedDefault(
+        "markers",
+        "pareto_fields",
+        "Markers under known motion",
+        marker_accuracy.MAIN,
+        {"time": "lower", "95 %": "lower"},
     ),
     JudgedDefault(
-        what="friction",
-        experiment="pareto_tangential",
-        table="",
-        default=FRICTION,
-        axes=(TIME, Axis(column="median error", better="lower")),
+        "dense field", "pareto_fields", "Dense displacement", dense_accuracy.MAIN, {"time": "lower", "95 %": "lower"}
     ),
-    JudgedDefault(
-        what="markers",
-        experiment="pareto_fields",
-        table="Markers under known motion",
-        default=marker_accuracy.MAIN,
-        axes=(Axis(column="time", better="lower"), Axis(column="95 %", better="lower")),
-    ),
-    JudgedDefault(
-        what="dense field",
-        experiment="pareto_fields",
-        table="Dense displacement",
-        default=dense_accuracy.MAIN,
-        axes=(TIME, Axis(column="95 %", better="lower")),
-    ),
-    JudgedDefault(
-        what="storage",
-        experiment="pareto_storage",
-        table="Codecs:",
-        default=OWN,
-        axes=(Axis(column="of raw", better="lower"), Axis(column="read", better="higher")),
-    ),
-    JudgedDefault(
-        what="encoder",
-        experiment="pareto_encoder",
-        table="Variants",
-        default=STUDIED,
-        axes=(Axis(column="a prompt", better="lower"), Axis(column="mean", better="higher")),
-    ),
-    JudgedDefault(
-        what="GRPO",
-        experiment="pareto_grpo",
-        table="Cost and gain",
-        default=GRPO_DEFAULT,
-        axes=(Axis(column="a step", better="lower"), Axis(column="score", better="higher")),
-    ),
+    JudgedDefault("storage", "pareto_storage", "Codecs:", OWN, {"of raw": "lower", "read": "higher"}),
+    JudgedDefault("encoder", "pareto_encoder", "Variants", STUDIED, {"a prompt": "lower", "mean": "higher"}),
+    JudgedDefault("GRPO", "pareto_grpo", "Cost and gain", GRPO_DEFAULT, {"a step": "lower", "score": "higher"}),
 )
-"""Every default that a table of speed and error was measured for."""
 
-ALSO = (
+CHARTS_ONLY = (
     "pareto_chooser",
     "speed_grpo",
     "scaling",
@@ -114,136 +82,173 @@ ALSO = (
     "stability_grpo",
     "stability_devices",
 )
-"""Experiments whose charts stand on the page without a default to judge."""
-
-MEDIA = ("svg", "png")
+"""Experiments whose charts are shown without a default to judge."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GatherConfig:
-    """Where the other experiments' runs are."""
+    """Location of the other experiments' runs."""
 
     others: Path | None = None
-    """Folder of the runs; by default the one that this run lies in."""
+    """Folder of the runs; by default the one that holds this run."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ParetoPoint:
+    """A method and its figures on each axis, signed so that lower is better."""
+
+    name: str
+    at: tuple[float, ...]
+
+    def beats(self, other: "ParetoPoint") -> bool:
+        """Whether it is better on one axis and worse on none."""
+        return all(a <= b for a, b in zip(self.at, other.at, strict=True)) and self.at != other.at
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DefaultJudgement:
-    """A default on one table: the points that were measured and those that beat it, `None` where it is not there."""
+    """A default on one table: all measured points, and those that dominate it (`None`: it was not measured)."""
 
     judged: JudgedDefault
     title: str
-    run: PastRun
-    points: tuple[Point, ...]
-    beaten_by: tuple[Point, ...] | None
+    points: tuple[ParetoPoint, ...]
+    dominated_by: tuple[ParetoPoint, ...] | None
 
 
 def run(config: GatherConfig, context: Context) -> Results:
     """Find the runs, judge the defaults, show the charts."""
     home = context.directory.parent.parent if config.others is None else config.others
-    names = dict.fromkeys([*(judged.experiment for judged in DEFAULTS), *ALSO])
-    found = {name: newest(home / name) for name in names}
-    ran = {name: past for name, past in found.items() if past is not None}
-    judgements = [j for judged in DEFAULTS if judged.experiment in ran for j in judge(judged, ran[judged.experiment])]
-    missing = [name for name in names if name not in ran]
-    beaten = [j for j in judgements if j.beaten_by]
+    names = dict.fromkeys([*(judged.experiment for judged in DEFAULTS), *CHARTS_ONLY])
+    newest = {name: newest_run(home / name) for name in names}
+    runs = {name: past for name, past in newest.items() if past is not None}
+    missing = [name for name in names if name not in runs]
+    judgements = [j for judged in DEFAULTS if judged.experiment in runs for j in judge(judged, runs[judged.experiment])]
+    dominated = sum(bool(j.dominated_by) for j in judgements)
+    count = Requirement(name="defaults that are dominated", measured=dominated, bound=0, better="lower")
     return Results(
         verdict=verdict(judgements, missing),
-        requirements=(Requirement(name="defaults that are dominated", measured=len(beaten), bound=0, better="lower"),)
-        if judgements
-        else (),
-        tables=(default_table(judgements), run_table(ran)),
-        pictures=tuple(p for name, past in ran.items() for p in charts(name, past)),
+        requirements=(count,) if judgements else (),
+        tables=(
+            default_table(judgements),
+            named_table("Runs", [{"experiment": name, "run": summary(past)} for name, past in runs.items()]),
+        ),
+        pictures=tuple(picture for name, past in runs.items() for picture in charts(name, past)),
         settings={"runs": str(home), "not run yet": ", ".join(missing) or "none"},
     )
 
 
-def newest(home: Path) -> PastRun | None:
-    """The newest finished run of an experiment; one at another scale than `smoke` goes before all that are."""
+def newest_run(home: Path) -> PastRun | None:
+    """The newest finished run of an experiment; any scale is preferred to `smoke`."""
     finished = [past for past in runs_of(home) if past.results is not None]
     return min(finished, key=lambda past: past.description["scale"] == "smoke", default=None)
 
 
 def judge(judged: JudgedDefault, past: PastRun) -> list[DefaultJudgement]:
-    """A default on every table of a run that begins as it says and has its row."""
-    tables = [] if past.results is None else past.results["tables"]
+    """Compare a default with the other rows on every matching table of a run."""
     judgements = []
-    for table in tables:
-        rows = {str(row[0]) for row in table["rows"]}
-        default = next((row for row in rows if row.startswith(judged.default)), None)
+    for table in [] if past.results is None else past.results["tables"]:
+        default = next((str(row[0]) for row in table["rows"] if str(row[0]).startswith(judged.default)), None)
         if table["title"].startswith(judged.table) and default is not None:
             points = points_of(table, judged.axes)
             beaten_by = dominators(default, points)
             judgements.append(
-                DefaultJudgement(judged=judged, title=table["title"], run=past, points=points, beaten_by=beaten_by)
+                DefaultJudgement(judged=judged, title=table["title"], points=points, dominated_by=beaten_by)
             )
     return judgements
 
 
+def points_of(table: Mapping[str, Any], axes: Axes) -> tuple[ParetoPoint, ...]:
+    """The rows of a table of `results.json` that have a number on every axis.
+
+    Args:
+      table: `columns` and `rows`; the first column names the row.
+      axes: of several columns whose names begin as given, the first is taken.
+
+    Raises:
+      ResultsError: the table has no column for an axis.
+    """
+    names = [column["name"] for column in table["columns"]]
+    signs: dict[int, float] = {}
+    for axis, better in axes.items():
+        found = [i for i, name in enumerate(names) if name.startswith(axis)]
+        require(bool(found), f"axis of table {table['title']!r}", axis, f"must begin one of {names}", "rename it")
+        signs[found[0]] = 1.0 if better == "lower" else -1.0
+    return tuple(
+        ParetoPoint(name=str(row[0]), at=tuple(sign * float(row[i]) for i, sign in signs.items()))
+        for row in table["rows"]
+        if all(isinstance(row[i], int | float) and not isinstance(row[i], bool) for i in signs)
+    )
+
+
+def front(points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, ...]:
+    """The points that no other point beats, in their order."""
+    return tuple(p for p in points if not any(other.beats(p) for other in points))
+
+
+def dominators(name: str, points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, ...] | None:
+    """The points that beat the named one, those of the front first; `None` where it was not measured."""
+    named = next((p for p in points if p.name == name), None)
+    if named is None:
+        return None
+    best = front(points)
+    return tuple(sorted((p for p in points if p.beats(named)), key=lambda p: p not in best))
+
+
 def verdict(judgements: Sequence[DefaultJudgement], missing: Sequence[str]) -> tuple[str, ...]:
-    """Which defaults are dominated, by what, and what has not run."""
-    said = []
-    for j in judgements:
-        if j.beaten_by:
-            names = ", ".join(p.name for p in j.beaten_by)
-            said.append(f"The default of {j.judged.what}, {j.judged.default}, is dominated in '{j.title}' by {names}.")
-    if judgements and not said:
-        said.append(f"None of {len(judgements)} judgements finds a default dominated.")
+    """Name the dominated defaults, the methods that dominate them, and the experiments that have not run."""
+    sentences = [
+        f"The default of {j.judged.what}, {j.judged.default}, is dominated in '{j.title}' by {_names(j.dominated_by)}."
+        for j in judgements
+        if j.dominated_by
+    ]
+    if judgements and not sentences:
+        sentences.append(f"None of {len(judgements)} judgements finds a default dominated.")
     if missing:
-        said.append(f"Not run yet, so not judged: {', '.join(missing)}.")
-    return tuple(said)
+        sentences.append(f"Not run yet, so not judged: {', '.join(missing)}.")
+    return tuple(sentences)
+
+
+def _names(points: Sequence[ParetoPoint]) -> str:
+    return ", ".join(p.name for p in points)
 
 
 def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
     """Every default on every table that judges it."""
-    rows: list[tuple[Cell, ...]] = [
-        (
-            j.judged.what,
-            j.judged.default,
-            j.title,
-            ", ".join(f"{axis.column} ({axis.better})" for axis in j.judged.axes),
-            len(j.points),
-            len(front(j.points)),
-            "not measured" if j.beaten_by is None else ", ".join(p.name for p in j.beaten_by) or "nothing",
-        )
-        for j in judgements
-    ]
-    return Table(
-        title="Defaults",
-        columns=(
-            Column(name="default of"),
-            Column(name="what is used"),
-            Column(name="table"),
-            Column(name="judged by"),
-            Column(name="measured", format="d", meaning="rows that have a number on every axis"),
-            Column(name="on the front", format="d", meaning="rows that no other one beats"),
-            Column(name="dominated by"),
-        ),
-        rows=tuple(rows),
-    )
-
-
-def run_table(ran: Mapping[str, PastRun]) -> Table:
-    """Which runs the page is made of."""
-    return Table(
-        title="Runs",
-        columns=(Column(name="experiment"), Column(name="run")),
-        rows=tuple((name, summary(past)) for name, past in ran.items()),
+    return named_table(
+        "Defaults",
+        [
+            {
+                "default of": j.judged.what,
+                "what is used": j.judged.default,
+                "table": j.title,
+                "judged by": ", ".join(f"{column} ({better})" for column, better in j.judged.axes.items()),
+                "measured": len(j.points),
+                "on the front": len(front(j.points)),
+                "dominated by": "not measured" if j.dominated_by is None else _names(j.dominated_by) or "nothing",
+            }
+            for j in judgements
+        ],
+        formats={"measured": "d", "on the front": "d"},
+        meanings={
+            "measured": "rows that have a number on every axis",
+            "on the front": "rows that no other row dominates",
+        },
     )
 
 
 def charts(name: str, past: PastRun) -> list[Picture]:
-    """All pictures of a run, as they lie in its folder."""
-    files = sorted(path for kind in MEDIA for path in (past.directory / "plots").glob(f"*.{kind}"))
+    """All charts in a run's folder."""
+    kinds: tuple[Literal["svg", "png"], ...] = ("svg", "png")
+    files = [(path, kind) for kind in kinds for path in sorted((past.directory / "plots").glob(f"*.{kind}"))]
     return [
         Picture(
             name=f"{name}-{path.stem}",
             title=f"{name}: {path.stem.replace('_', ' ')}",
             caption=f"From {past.directory.name}, {past.description['scale']} scale, code {past.code}.",
             content=path.read_bytes(),
-            kind="svg" if path.suffix == ".svg" else "png",
+            kind=kind,
         )
-        for path in files
+        for path, kind in sorted(files)
     ]
 
 

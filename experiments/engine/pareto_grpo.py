@@ -1,36 +1,39 @@
-"""Which algorithm and group size reach a set score in the least time, and what does a step of each cost?
+"""Which GRPO algorithm and group size reach a given score in the least time, and how long does a step of each take?
 
     make experiment EXP=pareto_grpo [ARGS="--scale smoke"]
 
 Every preset at every group size learns to write low token ids (see `experiments.engine.job`) from the same decoder and
-prompts at one learning rate, with a fixed number of rollouts and of steps: a larger group has fewer prompts.  The
-score is the mean reward over the last tenth of the steps; the target is reached where the mean reward of a step first
-passes it.  Time is the median step of that program, measured in rounds with all other programs, times the steps taken,
-so that neither compilation nor a busy machine counts.
+prompts, at one learning rate, with the same number of rollouts and steps: a larger group has fewer prompts.  The score
+is the mean reward over the last tenth of the steps; a run reaches the target at the first step whose mean reward passes
+it.  Time is the number of steps times the median seconds of a step, which is measured in rounds with all other
+programs, so that neither compilation nor other load on the machine counts.
 
-Cost: about ten minutes on one core, most of it compiling for the first time; `--scale smoke` under one.
+Cost: about ten minutes on one core, most of it compilation; `--scale smoke` under one.
 
-Expected: on policy all clipped surrogates have the same gradient, so that presets differ by how they average and weigh:
-Dr. GRPO and the token means coincide with GRPO up to scale where all completions have one length; dynamic sampling pays
-twice the rollouts for groups that differ anyhow; the controls of `stable` cost time and bring nothing to a task
-without touch.
+Expected: on policy all clipped surrogates have the same gradient, so presets differ only in their averages and weights:
+Dr. GRPO and the token means equal GRPO up to scale where all completions have one length; dynamic sampling draws twice
+the rollouts although the rewards of few groups are equal here; the controls of `stable` take time and bring nothing to
+a task without touch.
 """
 
 import dataclasses
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
 
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
+from experiments.core.curves import running_mean
+from experiments.core.look import colours
 from experiments.core.progress import Advance
-from experiments.core.results import Cell, Column, Picture, Results, Table
+from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
-from experiments.engine.job import Job
-from experiments.engine.pareto_charts import Key, LearningCurves, cost_and_gain, reward_over_time
-from experiments.engine.size import JobSize
+from experiments.engine.job import Job, grpo_config
+from experiments.engine.peers import JobSize
 from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable
 
 ALGORITHMS: Mapping[str, AnyAlgorithm] = {
@@ -42,16 +45,19 @@ ALGORITHMS: Mapping[str, AnyAlgorithm] = {
     "CISPO": Cispo(),
 }
 
+Key = tuple[str, int]
+"""Algorithm and group size."""
+
 DEFAULT_KEY: Key = ("paper", GRPOConfig().group)
-"""What the studies use, marked in charts and tables."""
+"""Setting of the studies, marked in charts and tables."""
 
-
-FEW = 4  # names that a sentence can hold
+MOST_NAMES = 4
+"""Settings that a sentence of the verdict lists by name."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ParetoGrpoConfig:
-    """Rollouts of a step, how they are grouped, how long a run is, and what it should come to."""
+    """Rollouts of a step, group sizes, length of a run, and the reward to reach."""
 
     groups: tuple[int, ...] = (4, 8, 16)
     rollouts: int = 32
@@ -71,8 +77,39 @@ class ParetoGrpoConfig:
             raise ValueError(f"groups holds {uneven}: must divide rollouts = {self.rollouts}; choose divisors of it")
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LearningCurves:
+    """Runs of one algorithm and group size: mean reward of every step, [seeds, steps], and seconds of a step."""
+
+    rewards: np.ndarray
+    step_s: float
+
+    @property
+    def score(self) -> float:
+        """Mean reward over the last tenth of the steps and over the seeds."""
+        return float(self.rewards[:, -max(1, self.rewards.shape[1] // 10) :].mean())
+
+    def steps_to(self, target: float) -> np.ndarray:
+        """Steps until each seed's reward first passes the target, [seeds]; ∞ where it never does."""
+        passed = self.rewards >= target
+        return np.where(passed.any(1), passed.argmax(1) + 1.0, np.inf)
+
+    def seconds_to(self, target: float) -> float:
+        """Median time to the target over the seeds that reach it; NaN where none does."""
+        steps = self.steps_to(target)
+        reached = steps[np.isfinite(steps)]
+        return float(np.median(reached)) * self.step_s if len(reached) else np.nan
+
+    def all_reach(self, target: float) -> bool:
+        """Whether every seed reaches the target."""
+        return bool(np.isfinite(self.steps_to(target)).all())
+
+
+Curves = Mapping[Key, LearningCurves]
+
+
 def run(config: ParetoGrpoConfig, context: Context) -> Results:
-    """Every algorithm at every group size."""
+    """Train every algorithm at every group size, then time their steps in turn."""
     rewards, last = {}, {}
     keys = tuple(itertools.product(ALGORITHMS, config.groups))
     with context.progress("seeds", len(keys) * config.seeds) as advance:
@@ -82,14 +119,14 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
             context.print(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
     calls = {f"{name} {group}": job.step for (name, group), job in last.items()}
     seconds = interleaved(calls, context.rounds("timing steps", config.timed))
-    courses = {
+    curves = {
         (name, group): LearningCurves(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
-        for name, group in rewards
+        for name, group in keys
     }
     return Results(
-        verdict=verdict(config, courses),
-        tables=(table(config, courses),),
-        pictures=pictures(config, courses),
+        verdict=verdict(config, curves),
+        tables=(cost_table(config.target, curves),),
+        pictures=pictures(config.target, curves),
         settings={
             "learning_rate": config.learning_rate,
             "rollouts a step": config.rollouts,
@@ -103,14 +140,7 @@ def learn(config: ParetoGrpoConfig, algorithm: AnyAlgorithm, group: int, advance
     """Mean reward of every seed's steps, [seeds, steps], and the last seed's job; `advance` is called after a seed."""
     prompts = config.rollouts // group
     size = dataclasses.replace(config.size, prompts=prompts, group=group)
-    step = GRPOConfig(
-        prompts=prompts,
-        group=group,
-        length=size.length,
-        micro_prompts=1,
-        algorithm=algorithm,
-        inverse_draws=True,
-    )
+    step = grpo_config(size, 1, algorithm)
     rewards = []
     for seed in range(config.seeds):
         job = Job(size, config.prefix, step, learning_rate=config.learning_rate, seed=seed)
@@ -119,69 +149,112 @@ def learn(config: ParetoGrpoConfig, algorithm: AnyAlgorithm, group: int, advance
     return np.array(rewards), job
 
 
-def pictures(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> tuple[Picture, ...]:
-    """Cost against gain, and the courses."""
+def verdict(config: ParetoGrpoConfig, curves: Curves) -> tuple[str, ...]:
+    """Name the fastest setting whose every seed reaches the target, the default's time, and the settings that fail."""
+    seconds = {key: c.seconds_to(config.target) for key, c in curves.items() if c.all_reach(config.target)}
+    late = [f"{name} in groups of {group}" for name, group in curves if (name, group) not in seconds]
+    sentences = []
+    if seconds:
+        first = min(seconds, key=lambda key: seconds[key])
+        sentences.append(f"{first[0]} in groups of {first[1]} is first at {config.target}, in {seconds[first]:.1f} s.")
+        if DEFAULT_KEY in seconds and first != DEFAULT_KEY:
+            name, group = DEFAULT_KEY
+            sentences.append(f"The default, {name} in groups of {group}, takes {seconds[DEFAULT_KEY]:.1f} s.")
+    if late:
+        which = ", ".join(late) if len(late) <= MOST_NAMES else f"{len(late)} of {len(curves)} (see the table)"
+        sentences.append(f"Not every seed passed {config.target} within {config.steps} steps with {which}.")
+    return tuple(sentences)
+
+
+def cost_table(target: float, curves: Curves) -> Table:
+    """Seconds a step, score, steps and seconds to the target."""
+    rows: list[dict[str, Cell]] = []
+    for (name, group), c in curves.items():
+        steps, all_reach = c.steps_to(target), c.all_reach(target)
+        rows.append(
+            {
+                "algorithm": name + (" (default)" if (name, group) == DEFAULT_KEY else ""),
+                "group": group,
+                "a step": 1e3 * c.step_s,
+                "score": c.score,
+                "steps to the target": float(np.median(steps)) if all_reach else None,
+                "to the target": c.seconds_to(target) if all_reach else None,
+                "seeds there": f"{np.isfinite(steps).sum()} of {len(steps)}",
+            }
+        )
+    return named_table(
+        "Cost and gain",
+        rows,
+        formats={"group": "d", "a step": ".1f", "score": ".3f", "steps to the target": ".0f"},
+        units={"a step": "ms", "to the target": "s"},
+        meanings={
+            "group": "rollouts of a prompt",
+            "a step": "median, in rounds with all others",
+            "score": "mean reward over the last tenth of the steps and the seeds",
+            "steps to the target": "median over seeds, where every seed passed it",
+            "to the target": "steps times seconds a step",
+        },
+    )
+
+
+def pictures(target: float, curves: Curves) -> tuple[Picture, ...]:
+    """Cost against gain, and reward over time."""
     return (
         Picture(
             name="pareto_grpo",
             title="Step time, score, and time to the target",
             caption="Left: score over the time of a step; right: time until the mean reward of a step passes the "
-            "target, median over seeds, hollow where not every seed passed it.  A shape for each group size; the "
-            "ring marks what the studies use.",
-            content=cost_and_gain(courses, config.target, DEFAULT_KEY),
+            "target, median over seeds, hollow where not every seed passed it.  Numbers are group sizes; the ring "
+            "marks the setting of the studies.",
+            content=cost_and_gain(target, curves),
         ),
         Picture(
             name="courses",
             title="Reward over time",
             caption="Mean over the seeds; the dotted line is the target.",
-            content=reward_over_time(courses, config.target),
+            content=reward_over_time(target, curves),
         ),
     )
 
 
-def table(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> Table:
-    """Seconds a step, score, steps and seconds to the target."""
-    rows: list[tuple[Cell, ...]] = []
-    for (name, group), c in courses.items():
-        reached = c.reached(config.target)
-        there = np.isfinite(reached)
-        steps = float(np.median(reached)) if there.all() else None
-        mark = " (default)" if (name, group) == DEFAULT_KEY else ""
-        seconds = None if steps is None else steps * c.step_s
-        rows.append((name + mark, group, 1e3 * c.step_s, c.score, steps, seconds, f"{there.sum()} of {len(reached)}"))
-    return Table(
-        title="Cost and gain",
-        columns=(
-            Column(name="algorithm"),
-            Column(name="group", format="d", meaning="rollouts of a prompt"),
-            Column(name="a step", unit="ms", format=".1f", meaning="median, in rounds with all others"),
-            Column(name="score", format=".3f", meaning="mean reward over the last tenth of the steps and the seeds"),
-            Column(name="steps to the target", format=".0f", meaning="median over seeds, where every seed passed it"),
-            Column(name="to the target", unit="s", meaning="steps times seconds a step"),
-            Column(name="seeds there"),
-        ),
-        rows=tuple(rows),
-    )
+def cost_and_gain(target: float, curves: Curves) -> bytes:
+    """Draw score over the time of a step, and time to the target by algorithm."""
+    names = list(dict.fromkeys(name for name, _ in curves))
+    colour = colours(names)
+    left, right = [], []
+    for (name, group), c in curves.items():
+        look: dict[str, Any] = {"name": name, "colour": colour[name], "marker": "o", "line": "", "labels": [str(group)]}
+        left.append(Series(**look, x=[1e3 * c.step_s], y=[c.score]))
+        row = [names.index(name)]
+        right.append(Series(**look, x=[c.seconds_to(target)], y=row, hollow=not c.all_reach(target)))
+        if (name, group) == DEFAULT_KEY:
+            ring: dict[str, Any] = {"colour": "black", "marker": "o", "line": "", "size": 170.0, "hollow": True}
+            left.append(Series(**ring, x=[1e3 * c.step_s], y=[c.score]))
+            right.append(Series(**ring, x=[c.seconds_to(target)], y=row))
+    label = f"time to a mean reward of {target:g}, s"
+    panels = [
+        Panel(left, x_label="a step, ms", y_label="score: mean reward at the end", rules=[Rule(y=target)]),
+        Panel(right, x_label=label, x_limits=(0, None), rows=names),
+    ]
+    return draw(panels, size=(9.0, 4.2))
 
 
-def verdict(config: ParetoGrpoConfig, courses: Mapping[Key, LearningCurves]) -> tuple[str, ...]:
-    """The fastest of those that every seed of which arrived, the default beside it, and who did not arrive."""
-    steps = {key: float(np.median(c.reached(config.target))) for key, c in courses.items()}
-    whole = [key for key, c in courses.items() if np.isfinite(c.reached(config.target)).all()]
-    late = [f"{name} in groups of {group}" for name, group in courses if (name, group) not in whole]
-    said = []
-    if whole:
-        name, group = first = min(whole, key=lambda key: steps[key] * courses[key].step_s)
-        said.append(
-            f"{name} in groups of {group} is first at {config.target}, in {steps[first] * courses[first].step_s:.1f} s."
-        )
-        if DEFAULT_KEY in whole and first != DEFAULT_KEY:
-            took = steps[DEFAULT_KEY] * courses[DEFAULT_KEY].step_s
-            said.append(f"The default, {DEFAULT_KEY[0]} in groups of {DEFAULT_KEY[1]}, takes {took:.1f} s.")
-    if late:
-        which = ", ".join(late) if len(late) <= FEW else f"{len(late)} of {len(courses)} (see the table)"
-        said.append(f"Not every seed passed {config.target} within {config.steps} steps with {which}.")
-    return tuple(said) or ("Every seed passed the target at once.",)
+def reward_over_time(target: float, curves: Curves) -> bytes:
+    """Draw mean reward over seconds, a panel for each algorithm and a line for each group size."""
+    panels = []
+    for name in dict.fromkeys(name for name, _ in curves):
+        lines = [
+            Series(
+                f"groups of {group}",
+                x=c.step_s * np.arange(1, c.rewards.shape[1] + 1),
+                y=running_mean(c.rewards.mean(0)),
+                marker="",
+            )
+            for (algorithm, group), c in curves.items()
+            if algorithm == name
+        ]
+        panels.append(Panel(lines, title=name, x_label="time, s", y_label="mean reward", rules=[Rule(y=target)]))
+    return draw(panels, share_x=True, share_y=True)
 
 
 DEFAULT = ParetoGrpoConfig()

@@ -15,7 +15,7 @@ from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
-from experiments.engine.size import JobSize
+from experiments.engine.peers import JobSize
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
 from touchr1_jax.text.language import TOUCH_LANGUAGE

@@ -39,7 +39,7 @@ from experiments.engine.gpu_pieces import (
     ways,
 )
 from experiments.engine.gpu_tables import TimedWorkload, time_table
-from experiments.engine.size import JobSize
+from experiments.engine.peers import JobSize
 from touchr1_jax.distributed.memory import Compiled
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig

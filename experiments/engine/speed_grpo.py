@@ -29,11 +29,9 @@ import jax
 from experiments.core.context import Context
 from experiments.core.results import Picture, Results
 from experiments.core.runner import Experiment
-from experiments.engine.harness import PeerJob, PeerTimes
 from experiments.engine.job import config_of
-from experiments.engine.peers import PeerFailed, installed_peers
+from experiments.engine.peers import BETA, JobSize, PeerFailed, PeerJob, PeerTimes, installed_peers
 from experiments.engine.processes import in_own_process
-from experiments.engine.size import BETA, JobSize
 from experiments.engine.speed import (
     LongRun,
     Option,

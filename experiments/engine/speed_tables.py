@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.core.results import Cell, Column, Requirement, Table
-from experiments.engine.harness import PeerTimes
-from experiments.engine.size import JobSize
+from experiments.engine.peers import JobSize, PeerTimes
 from experiments.engine.speed import LongRun, ProcessTiming
 
 LIMITS_S = {64: 0.55, 512: 1.3}

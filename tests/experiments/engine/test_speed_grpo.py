@@ -10,11 +10,9 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.engine import speed_grpo
-from experiments.engine.harness import PeerTimes
 from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
-from experiments.engine.peers import PeerFailed
+from experiments.engine.peers import JobSize, PeerFailed, PeerTimes
 from experiments.engine.processes import in_own_process
-from experiments.engine.size import JobSize
 from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
 from experiments.engine.speed_tables import steadiness
 
@@ -24,26 +22,6 @@ TINY = speed_grpo.SMOKE.size
 def test_the_decoder_has_its_advertised_size():
     fns, batch = make_fns(JobSize(), 64), make_batch(JobSize(), 64, 1)
     assert sum(x.size for x in jax.tree.leaves(init_decoder(fns, batch))) == 1_050_752
-
-
-def test_work_by_hand():
-    """One layer of width 2 with one head of 2, MLP 2, vocabulary 2: 16 + 12 weights, 4 to the vocabulary."""
-    size = JobSize(
-        prompts=1,
-        group=1,
-        length=1,
-        vocab_size=2,
-        hidden_size=2,
-        num_layers=1,
-        num_heads=1,
-        num_kv_heads=1,
-        head_dim=2,
-        intermediate_size=2,
-    )
-    weights, pair = 8 + 8 + 12, 4
-    prompt, completion = 3 * weights + pair * 6, weights + 4 + pair * (3 + 1)
-    assert size.gflop(3) == pytest.approx(2 * 5 * (prompt + completion) / 1e9)
-    assert size.gflop(3, 0.0) == pytest.approx(2 * 4 * (prompt + completion) / 1e9)
 
 
 @pytest.mark.slow
