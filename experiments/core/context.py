@@ -110,7 +110,8 @@ class Context:
         self.devices = devices or SingleDevice()
         self._opened = time.monotonic()
         self._watchers = watchers
-        self._loops: list[Loop] = []
+        self.loops: list[Loop] = []
+        """The loops in progress, the outermost first."""
         self._log = MetricLog(directory / "metrics.jsonl", watchers) if processes.writes else None
 
     def print(self, text: str) -> None:
@@ -146,14 +147,14 @@ class Context:
           completed: steps done before this session.
           still: redraw this bar and those inside with each step only, so that they take no time from what is timed.
         """
-        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self._loops))
-        self._loops.append(loop)
+        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops))
+        self.loops.append(loop)
         try:
             self._looping()
             with progress(self.console, loop, self._looping) as advance:
                 yield advance
         finally:
-            self._loops.remove(loop)
+            self.loops.remove(loop)
         self._looping()
 
     def each(self, title: str, items: Iterable[T], *, still: bool = False) -> Iterator[T]:
@@ -204,7 +205,7 @@ class Context:
 
     def _looping(self) -> None:
         for watcher in self._watchers:
-            watcher.looping(self._loops)
+            watcher.looping(self.loops)
 
     def checkpoint_dir(self, stage: str) -> Path:
         """The directory of a stage's checkpoints, created."""

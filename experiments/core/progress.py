@@ -113,13 +113,16 @@ class Watcher:
 
 
 @contextlib.contextmanager
-def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: None) -> Iterator[Advance]:
+def progress(
+    console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, every_s: float = PLAIN_EVERY_S
+) -> Iterator[Advance]:
     """Show the progress of one loop.
 
     Args:
-      console: a terminal gets a live bar, anything else a line every `PLAIN_EVERY_S` seconds and one at the end.
+      console: a terminal gets a live bar, anything else a line every `every_s` seconds and one at the end.
       loop: advanced by the function that this yields.
       after: called after each advance.
+      every_s: see `console`.
     """
     if console.is_terminal:
         with _bar(console, loop.still) as bar:
@@ -127,7 +130,7 @@ def progress(console: Console, loop: Loop, after: Callable[[], None] = lambda: N
             draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
             yield _advance(loop, draw, after)
     else:
-        lines = _PlainLines(console, loop)
+        lines = _PlainLines(console, loop, every_s)
         yield _advance(loop, lines.look, after)
         if lines.completed != loop.completed:
             lines.print()
@@ -169,13 +172,13 @@ def _bar(console: Console, still: bool) -> Progress:
 class _PlainLines:
     """The same figures as lines of text; `completed` is that of the last line."""
 
-    def __init__(self, console: Console, loop: Loop) -> None:
-        self._console, self._loop = console, loop
+    def __init__(self, console: Console, loop: Loop, every_s: float) -> None:
+        self._console, self._loop, self._every_s = console, loop, every_s
         self._printed_s = time.monotonic()
         self.completed: int | None = None
 
     def look(self) -> None:
-        if time.monotonic() - self._printed_s >= PLAIN_EVERY_S:
+        if time.monotonic() - self._printed_s >= self._every_s:
             self.print()
 
     def print(self) -> None:

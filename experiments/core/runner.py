@@ -130,14 +130,25 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
         raise ValueError(
             f"{module.__name__} names its experiment {module.EXPERIMENT.name!r}: must be {name!r}; rename it"
         )
+    return run_experiment(module.EXPERIMENT, rest, module.__doc__ or name)
+
+
+def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> int:
+    """Run or continue an experiment; returns the exit code.
+
+    Args:
+      experiment: with its configurations.
+      arguments: of the command line after its name.
+      about: its docstring, whose first line is the question.
+    """
     try:
-        command = parse(module.EXPERIMENT, rest, module.__doc__ or name)
+        command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")
     except ValueError as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
-    with compiled_quickly() if command.scale in module.EXPERIMENT.quick else contextlib.nullcontext():
-        return execute(module.EXPERIMENT, command, module.__doc__ or name, shlex.join([*PROG.split(), *arguments]))
+    with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
+        return execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:

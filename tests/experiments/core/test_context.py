@@ -12,13 +12,6 @@ from experiments.core.artifacts import DamagedFileError
 from experiments.core.context import Context, MetricLog, read_metrics
 
 
-@pytest.fixture
-def context(tmp_path):
-    made = Context(tmp_path, tmp_path / "cache", Console(file=io.StringIO()))
-    yield made
-    made.close()
-
-
 def log_steps(path, stage, steps):
     log = MetricLog(path)
     for step in steps:
@@ -53,8 +46,10 @@ def test_several_lines_of_one_step_are_kept(context):
 def test_a_diverged_scalar_is_named(context):
     with pytest.raises(ValueError, match=r"grpo/paid/0 step 7\.kl is nan"):
         context.log("grpo/paid/0", 7, kl=float("nan"))
+    log = MetricLog(context.directory / "other.jsonl")
     with pytest.raises(ValueError, match="step"):
-        context._log.append("sft/0", 0, {"step": 1})
+        log.append("sft/0", 0, {"step": 1})
+    log.close()
 
 
 @pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
@@ -87,12 +82,11 @@ def test_the_time_of_a_run_counts_what_came_before_an_interruption(context):
     assert 1000 < context.elapsed_s < 1060
 
 
-def test_progress_writes_plain_lines_where_there_is_no_terminal(context, monkeypatch):
-    monkeypatch.setattr(progress, "PLAIN_EVERY_S", 0.0)
-    with context.progress("sft [0]", 4, completed=2) as advance:
+def test_progress_writes_plain_lines_where_there_is_no_terminal(console):
+    with progress.progress(console, progress.Loop("sft [0]", 4, completed=2), every_s=0.0) as advance:
         advance(1, "loss 0.5")
         advance()
-    first, last = context.console.file.getvalue().splitlines()
+    first, last = console.file.getvalue().splitlines()
     assert first.startswith("sft [0]: 3/4")
     assert " left" in first
     assert first.endswith("loss 0.5")
@@ -124,50 +118,40 @@ def test_progress_draws_a_bar_on_a_terminal():
     assert "reward 0.5" in console.file.getvalue()
 
 
-def test_rounds_are_drawn_between_them_alone(tmp_path):
-    """A bar that draws itself ten times a second would take time of what is timed."""
+def test_bars_that_are_still_and_those_inside_are_drawn_with_their_steps_alone(tmp_path):
+    """A bar that draws itself ten times a second would take time from what is timed."""
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
     context = Context(tmp_path, tmp_path / "cache", console)
-    for _ in context.rounds("timing", 2):
-        before = console.file.getvalue()
-        time.sleep(0.3)
-        assert console.file.getvalue() == before
-    assert "2/2" in console.file.getvalue()
-    context.close()
-
-
-def test_bars_within_a_still_one_are_drawn_with_their_steps_alone(tmp_path):
-    console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    context = Context(tmp_path, tmp_path / "cache", console)
-    for _ in context.each("pieces", "a", still=True):
+    for _ in context.rounds("timing", 1):
         for step in context.each("programs", range(2)):
             before = console.file.getvalue()
             assert f"{step}/2" in before
             time.sleep(0.3)
             assert console.file.getvalue() == before
+    assert "1/1" in console.file.getvalue()
     context.close()
 
 
-def test_a_loop_that_tells_of_itself_is_shown_from_its_first_word(context):
-    with context.progress_callback("contacts") as tell:
-        assert not context._loops
-        tell(4, 10)  # an earlier session's
-        (loop,) = context._loops
+def test_a_loop_that_reports_by_callback_is_shown_from_its_first_report(context):
+    with context.progress_callback("contacts") as report:
+        assert not context.loops
+        report(4, 10)  # an earlier session's
+        (loop,) = context.loops
         assert (loop.completed, loop.total, loop.rate) == (4, 10, 0.0)
-        tell(7, 10)
-        tell(7, 10)
+        report(7, 10)
+        report(7, 10)
         assert loop.completed == 7
         assert loop.rate > 0
-    assert not context._loops
+    assert not context.loops
     assert "contacts: 7/10" in context.console.file.getvalue()
 
 
-def test_bytes_are_told_in_megabytes_and_end_at_all_of_them():
-    told: list[tuple[int, int]] = []
-    tell = progress.in_megabytes(lambda *word: told.append(word))
+def test_bytes_are_reported_in_megabytes_and_end_at_all_of_them():
+    reports: list[tuple[int, int]] = []
+    report = progress.in_megabytes(lambda *word: reports.append(word))
     for done in (0, 1, 2_000_000, 2_500_000):
-        tell(done, 2_500_000)
-    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+        report(done, 2_500_000)
+    assert reports == [(0, 3), (1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])
@@ -180,7 +164,7 @@ def test_a_log_with_a_flipped_byte_is_named(context, flipped):
 
 
 def test_items_one_after_the_other_count_when_the_next_is_asked_for(context):
-    seen = [(item, context._loops[0].completed) for item in context.each("panels", "abc")]
+    seen = [(item, context.loops[0].completed) for item in context.each("panels", "abc")]
     assert seen == [("a", 0), ("b", 1), ("c", 2)]
-    assert not context._loops
+    assert not context.loops
     assert "panels: 3/3" in context.console.file.getvalue()

@@ -19,7 +19,7 @@ from experiments.core.machine import (
     compiled_quickly,
     require_accelerators,
 )  # fmt: skip
-from experiments.core.runner import Experiment, main
+from experiments.core.runner import Experiment, run_experiment
 from tests.experiments.fakes import coin
 
 ONE = Accelerators(number=1, memory_gib=70.0)
@@ -48,10 +48,9 @@ def test_accelerators_are_those_of_all_processes_with_the_least_memory_of_this_o
     assert accelerators() == Accelerators(number=3, memory_gib=70.0)
 
 
-def test_a_run_is_refused_before_it_begins(monkeypatch, tmp_path, capsys):
+def test_a_run_is_refused_before_it_begins(tmp_path, capsys):
     experiment = dataclasses.replace(coin.EXPERIMENT, needs={"smoke": ONE})
-    monkeypatch.setattr(coin, "EXPERIMENT", experiment)
-    assert main(["coin", "--scale", "smoke", "--runs-dir", str(tmp_path)], "tests.experiments.fakes") == 1
+    assert run_experiment(experiment, ["--scale", "smoke", "--runs-dir", str(tmp_path)], "Why?") == 1
     assert "needs 1 accelerator" in "".join(capsys.readouterr())
     assert list(tmp_path.iterdir()) == []
 

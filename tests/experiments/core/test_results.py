@@ -1,4 +1,4 @@
-"""Results refuse what must not be published; estimates agree with hand values."""
+"""Results refuse what must not be published, and say whether bounds are kept."""
 
 import dataclasses
 import math
@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from experiments.core.errors import ResultsError
-from experiments.core.results import Comparison, Estimate, Results
-from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.core.results import Column, Comparison, Estimate, Picture, Requirement, Results, Table, named_table
 from tests.experiments.fakes import coin
-from touchr1_jax.bench.metrics import accuracy, ordinal_mae
 
 GOOD = Estimate(mean=50.0, ci95=(40.0, 60.0), per_seed=(45.0, 55.0))
 SETTINGS = {"preset": "paper", "lr_scale": 100.0}
+FAST = Requirement(name="frame", measured=2.0, bound=2.5, better="lower", unit="ms")
+SLOW = Requirement(name="rate", measured=399.0, bound=400.0, better="higher", unit="records/s", note="one core")
+CHART = Picture(name="a", title="", caption="", content=b"")
 COMPARED = Comparison(metric="acc", arm="a", against="b", difference=1.0, ci95=(0.5, 1.5), over="seeds", n=2)
 
 
@@ -42,6 +43,9 @@ def changed(**changes):
         ({"comparisons": (dataclasses.replace(COMPARED, against="c"),)}, "'c'"),
         ({"comparisons": (dataclasses.replace(COMPARED, metric="x"),)}, "'x'"),
         ({"comparisons": (dataclasses.replace(COMPARED, p_value=1.5),)}, "p_value"),
+        ({"arms": {}}, "verdict is .*: must hold a sentence"),
+        ({"requirements": (dataclasses.replace(FAST, measured=math.nan),)}, "requirement 'frame'"),
+        ({"pictures": (CHART, CHART)}, "names of their own"),
     ],
 )
 def test_bad_results_are_named(changes, message):
@@ -49,18 +53,33 @@ def test_bad_results_are_named(changes, message):
         results(**changes)
 
 
+def test_a_bound_is_kept_on_its_own_side():
+    assert FAST.met
+    assert not SLOW.met
+    assert dataclasses.replace(SLOW, measured=400.0).met
+    assert not dataclasses.replace(FAST, measured=2.51).met
+
+
 def test_results_json_has_the_agreed_shape():
-    description = {
-        "experiment": "coin",
-        "scale": "smoke",
-        "config": {"steps": 3},
-        "git": {"commit": "ab", "dirty": True},
-    }
-    written = results(comparisons=(COMPARED,), baselines={"blind": {"acc": GOOD}}).to_json(description)
+    git = {"commit": "ab", "dirty": True}
+    description = {"experiment": "coin", "scale": "smoke", "config": {"steps": 3}, "git": git}
+    table = named_table("Tiers", [{"tier": "spg", "ms": -2.0, "ok": True}, {"tier": "winkler", "ok": False}])
+    changes = {"requirements": (FAST, SLOW), "tables": (table,), "pictures": (CHART,), "verdict": ("It is fast.",)}
+    written = results(comparisons=(COMPARED,), baselines={"blind": {"acc": GOOD}}, **changes).to_json(description)
     assert written["arms"]["a"]["acc"] == {"mean": 50.0, "ci95": [40.0, 60.0], "per_seed": [45.0, 55.0]}
     assert written["git"] == "ab-dirty"
-    assert {"experiment", "git", "arms", "baselines", "timing", "data", "config", "comparisons"} <= set(written)
-    assert "examples" not in written
+    assert [r["met"] for r in written["requirements"]] == [True, False]
+    assert written["tables"][0]["rows"] == [["spg", -2.0, True], ["winkler", None, False]]
+    assert {"experiment", "baselines", "timing", "data", "config", "comparisons"} <= set(written)
+    assert not {"examples", "pictures"} & set(written)
+    assert "arms" not in Results(**changes).to_json(description)
+
+
+def test_a_table_refuses_a_missing_cell_and_the_format_of_no_column():
+    with pytest.raises(ResultsError, match="must have 2 cells"):
+        Table(title="t", columns=(Column(name="a"), Column(name="b")), rows=(("x",),))
+    with pytest.raises(ResultsError, match="must name columns"):
+        named_table("t", [{"a": 1}], formats={"b": ".1f"})
 
 
 def test_slots_of_an_example_must_lie_in_its_trace_and_apart():
@@ -68,37 +87,3 @@ def test_slots_of_an_example_must_lie_in_its_trace_and_apart():
         dataclasses.replace(coin.example(), slots=((11, 21, "perceive"), (20, 24, "compare")))
     with pytest.raises(ResultsError, match=r"frames\[xense\]"):
         dataclasses.replace(coin.example(), frames={"xense": np.zeros((4, 8, 8, 3), np.float32)})
-
-
-OBJECTS = np.array(["a", "a", "b"])
-LABEL = np.array([0, 1, 2])
-
-
-def test_estimate_averages_seeds_and_resamples_objects():
-    seeds = [accuracy(LABEL, LABEL), accuracy(np.array([0, 1, 0]), LABEL)]
-    made = estimate(seeds, OBJECTS)
-    assert made.per_seed == (100.0, pytest.approx(200 / 3))
-    assert made.mean == pytest.approx(250 / 3)
-    assert made.ci95 == (50.0, 100.0)  # two objects, so the ends are theirs
-
-
-def test_comparison_over_seeds_by_hand():
-    a = dataclasses.replace(GOOD, per_seed=(1.0, 2.0, 3.0))
-    b = dataclasses.replace(GOOD, per_seed=(0.0, 0.0, 0.0))
-    made = compare_over_seeds("omae", "a", "b", a, b)
-    half = 4.302653 * 1.0 / math.sqrt(3)
-    assert made.difference == 2.0
-    assert made.ci95 == pytest.approx((2 - half, 2 + half), rel=1e-6)
-    assert (made.p_value, made.improvement, made.n) == (0.25, 0.0, 3)  # a larger OMAE is no improvement
-    assert compare_over_seeds("middle_rate", "a", "b", a, b).improvement is None
-    with pytest.raises(ResultsError, match="same seeds"):
-        compare_over_seeds("acc", "a", "b", a, GOOD)
-
-
-def test_comparison_over_objects_is_paired():
-    a = [ordinal_mae(np.array([[0], [1], [0]]), LABEL[:, None], np.array([3]))]
-    b = [ordinal_mae(np.array([[1], [2], [0]]), LABEL[:, None], np.array([3]))]
-    made = compare_over_objects("omae", "a", "b", a, b, OBJECTS)
-    assert (made.difference, made.ci95, made.n) == (pytest.approx(-2 / 3), (-1.0, 0.0), 2)
-    with pytest.raises(ResultsError, match="same answers"):
-        compare_over_objects("omae", "a", "b", a, [accuracy(LABEL[:2], LABEL[:2])], OBJECTS)
