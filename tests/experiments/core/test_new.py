@@ -79,8 +79,7 @@ def test_a_name_that_cannot_be_is_refused_and_nothing_written(checkout, capsys, 
 
 
 def test_a_file_in_the_way_is_kept(checkout, capsys):
-    kept = checkout / "touchr1_jax/rewards/brevity.py"
-    kept.write_text("mine")
+    (checkout / "touchr1_jax/rewards/brevity.py").write_text("mine")
     before = contents(checkout)
     assert main(["new", "brevity", "--reward", "--root", str(checkout)]) == 1
     assert "brevity.py exists: nothing is overwritten" in capsys.readouterr().err

@@ -3,21 +3,36 @@
 import base64
 import dataclasses
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 
 import cv2
 import numpy as np
 import pytest
 
-from experiments.core import curves
 from experiments.core.artifacts import write_text
 from experiments.core.pages import pieces, png, strip
 from experiments.core.report import is_best, write_report
-from experiments.core.results import Comparison, Estimate, Results
+from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
+from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
 
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+ASK = """<script>window.addEventListener("load", () => {
+  const images = [...document.images], root = document.documentElement;
+  document.body.dataset.seen = JSON.stringify({
+    images: images.length, broken: images.filter(i => !i.naturalWidth || !i.width).length,
+    wide: root.scrollWidth > root.clientWidth, requests: performance.getEntriesByType("resource")
+      .filter(e => !e.name.startsWith("data:")).length,
+    marks: document.querySelectorAll(".rollout mark").length, instead: document.querySelectorAll("td .trace").length});
+});</script>"""
+"""Asks the browser what it shows; only the copy that the test opens has it."""
+
 VOID = {"meta", "img", "br", "hr", "link", "input"}
+SVG = b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>'
 HOSTILE = '<script>alert("x")</script>&"\''
 DESCRIPTION = {
     "experiment": "coin",
@@ -69,8 +84,20 @@ def compared(metric: str, arm: str, against: str, low: float, high: float) -> Co
     )
 
 
+TABLE = named_table(
+    "Tiers",
+    [{"tier": "spg", "time": -2.0, "ok": True}, {"tier": "winkler", "ok": False}],
+    formats={"time": ".2f"},
+    units={"time": "ms"},
+    meanings={"time": "median"},
+)
+CHART = Picture(name="pareto", title="Speed", caption="left is faster", content=SVG)
+
+
 @pytest.fixture
 def results() -> Results:
+    instead = {c: Trace(text=coin.TRACE, slots=coin.example().slots) for c in ("drop", "noise")}
+    fields = {"xense": np.zeros((192, 192, 3), np.uint8)}
     return Results(
         arms={"paid": row(60.0), "unpaid": row(50.0)},
         baselines={"blind": row(30.0)},
@@ -79,7 +106,10 @@ def results() -> Results:
         verdict=("Being paid helps.",),
         data={"objects": {"train": 10}},
         timing={"sft/0": 1.0, "sft/1": 3.0},
-        examples=(coin.example(),),
+        examples=(dataclasses.replace(coin.example(), fields=fields, instead=instead),),
+        requirements=(FAST, SLOW),
+        tables=(TABLE,),
+        pictures=(CHART,),
     )
 
 
@@ -95,12 +125,17 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert all(load.startswith("data:image/") for load in reader.loads)
     assert not re.search(r"https?://|@import|url\(", page)
     assert not {"script", "link", "iframe"} & reader.seen
-    for text in ("Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss"):
+    for text in (
+        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss",
+        "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
+    ):  # fmt: skip
         assert text in reader.text or text in page
+    assert page.count('class="trace"') == 3  # the answer, and those without touch
     for metric in METRICS.values():
         assert metric.title in reader.text
         assert metric.meaning in reader.text
     assert (tmp_path / "plots" / "curves_sft.svg").exists()
+    assert (tmp_path / "plots" / "pareto.svg").read_bytes() == SVG
 
 
 def test_hostile_text_stays_text(tmp_path, results):
@@ -119,6 +154,7 @@ def test_hostile_text_stays_text(tmp_path, results):
         data={HOSTILE: HOSTILE},
         timing={HOSTILE: 1.0},
         examples=(example,),
+        requirements=(dataclasses.replace(SLOW, note=HOSTILE),),
     )
     page = write(tmp_path, hostile, about=HOSTILE, description={**DESCRIPTION, "experiment": HOSTILE})
     reader = read(page)
@@ -169,26 +205,6 @@ def test_a_strip_holds_every_frame_in_its_true_colours(tmp_path, results):
     assert base64.b64decode(embedded[1]) == png(strip(coin.example().frames["xense"]))
 
 
-def test_curves_are_sorted_by_phase_arm_and_seed():
-    lines = [
-        {"stage": "grpo/paid/1", "step": 1, "reward": 0.5},
-        {"stage": "grpo/paid/1", "step": 0, "reward": 0.25, "note": "text"},
-        {"stage": "sft/0", "step": 0, "loss": 1},
-    ]
-    found = curves.curves_by_phase(lines)
-    steps, values = found["grpo"]["reward"]["paid", "1"]
-    assert (steps.tolist(), values.tolist()) == ([0, 1], [0.25, 0.5])
-    assert list(found["sft"]["loss"]) == [("", "0")]
-    assert "note" not in found["grpo"]
-
-
-def test_running_mean_keeps_lines_and_short_series():
-    line = np.arange(100.0)
-    assert curves.running_mean(line)[10:90] == pytest.approx(line[10:90])
-    assert curves.running_mean(np.array([1.0, 5.0])).tolist() == [1.0, 5.0]
-    assert curves.running_mean(np.array([2.0])).tolist() == [2.0]
-
-
 def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
     def section(*groups: str) -> str:
         examples = tuple(dataclasses.replace(coin.example(), group=group) for group in groups)
@@ -202,3 +218,19 @@ def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
     assert grouped.index("far off") > grouped.rindex("alert(")
     assert "<script>" not in grouped
     assert "<details" not in section("")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
+def test_a_browser_shows_all_of_it(tmp_path, results):
+    asked = tmp_path / "asked.html"
+    asked.write_text(write(tmp_path, results).replace("</body>", f"{ASK}</body>"), encoding="utf-8")
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1000,2000", "--virtual-time-budget=5000"]
+    command = [str(CHROMIUM), *flags, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", asked.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    (seen,) = re.findall(r'data-seen="([^"]*)"', done.stdout)
+    found = dict(re.findall(r"&quot;(\w+)&quot;:(\w+)", seen))
+    assert int(found["images"]) >= 6  # view, frames, fields, charts
+    assert found["broken"] == found["requests"] == "0"
+    assert found["wide"] == "false"
+    assert (int(found["marks"]), found["instead"]) == (9, "2")
