@@ -64,7 +64,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         os.replace(temporary, path)
     except OSError as error:
         raise UnwrittenError(
-            f"{path} cannot be written ({error}): free some space or make its folder writable, then go on"
+            f"{path} cannot be written ({error}): free some space or make its folder writable, then continue"
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -90,7 +90,7 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DamagedFileError(
-            f"{path} is damaged ({error}): put a copy back, or move the run that it belongs to away and start it anew"
+            f"{path} is damaged ({error}): put a copy back, or move its run away and start a new one"
         ) from error
 
 

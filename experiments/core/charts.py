@@ -45,9 +45,6 @@ LONG_AXIS = 300.0
 ITERATIONS = 200
 """Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
 
-BEHIND: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
-"""Ground of a label, which keeps it legible on lines that it crosses."""
-
 Values = Sequence[float] | np.ndarray
 """Numbers [N]."""
 
@@ -83,8 +80,7 @@ class Series:
       x, y: positions [N]; in a panel of rows, `y` defaults to the rows from the top.
       low, high: ends of the interval of each y, in a panel of rows of each x; one alone reaches from the point.
       band: whether the intervals are one filled band.
-      bar: in a panel of rows, bars from 0 to `x`; several such series lie beside each other, or on a `stacked` panel
-        end to end.
+      bar: in a panel of rows, bars from 0 to `x`; several series are side by side, on a `stacked` panel end to end.
       line: matplotlib's style; "" for points alone, which panels of rows always have.
       marker: matplotlib's; `None` for the name's own, "" for none.
       colour: one, or one per point; `None` for the name's own.
@@ -193,7 +189,7 @@ def draw(
             wide = int(figure.get_figwidth() * 13) // (max(map(len, entries)) + 6)  # some 13 letters an inch
             figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=max(1, wide))
         if any(series.labels for panel in panels for series in panel.series):
-            figure.draw_without_rendering()  # settles the layout, in which labels have no say
+            figure.draw_without_rendering()  # settles the layout, which ignores labels
             figure.set_layout_engine("none")
             for axes, panel in zip(grid, panels, strict=False):
                 _write_labels(axes, panel)
@@ -217,18 +213,14 @@ def bars(
       bounds: drawn as dotted lines.
       logarithmic: whether equal distances are equal ratios.
     """
-    figures = (*values.values(), *bounds)
+    figures, series = (*values.values(), *bounds), Series(x=list(values.values()), bar=True)
     limits = (min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, 1.12 * max(figures))
-    panel = Panel(
-        [Series(x=list(values.values()), bar=True)],
-        rows=list(values),
-        x_label=label,
-        x_scale="log" if logarithmic else "linear",
-        x_limits=limits,
-        rules=[Rule(x=bound) for bound in bounds],
-        written=written,
+    scale: Scale = "log" if logarithmic else "linear"
+    rules = [Rule(x=bound) for bound in bounds]
+    rows = list(values)
+    return draw(
+        [Panel([series], rows=rows, x_label=label, x_scale=scale, x_limits=limits, rules=rules, written=written)]
     )
-    return draw([panel])
 
 
 Point = tuple[str, float, float, float]
@@ -244,7 +236,7 @@ def speed_against_error(
       groups: points by kind; those of a kind are joined in the order given.
       error: label of the error axis.
       goal: time and error that must be kept, drawn as a corner; `None` for none.
-      legend: of the kinds; without one the names of the points must say it.
+      legend: of the kinds; without one the names of the points must show them.
     """
     series = []
     for kind, points in groups.items():
@@ -284,8 +276,8 @@ def _size(panels: Sequence[Panel], columns: int, lines: int) -> tuple[float, flo
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title, fontsize=9.5, loc="left")
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
-    axes.set_xscale(panel.x_scale, **({"linthresh": panel.linear_to} if panel.x_scale == "symlog" else {}))
-    axes.set_yscale(panel.y_scale, **({"linthresh": panel.linear_to} if panel.y_scale == "symlog" else {}))
+    for set_scale, scale in ((axes.set_xscale, panel.x_scale), (axes.set_yscale, panel.y_scale)):
+        set_scale(scale, **({"linthresh": panel.linear_to} if scale == "symlog" else {}))
     _draw_bars(axes, panel)
     for series in panel.series:
         if not series.bar:
@@ -387,6 +379,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 
 def _write_labels(axes: Axes, panel: Panel) -> None:
     texts, points = [], []
+    behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # legible on lines that it crosses
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
             if not np.isfinite((x, y)).all():
@@ -394,7 +387,7 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
             points.append((x, y))
             if series.labels and series.labels[i]:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
-                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
+                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=behind))
     if texts:
         line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
         adjust_text(

@@ -301,7 +301,7 @@ def _row(line: str, path: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path, how: str) -> DamagedFileError:
-    return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start the run anew with --fresh")
+    return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start a new run with --fresh")
 
 
 def _before(row: dict[str, Any], stage: str, step: int) -> bool:

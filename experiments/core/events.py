@@ -1,4 +1,4 @@
-"""TensorBoard's event files beside `metrics.jsonl`, a folder for every stage.
+"""TensorBoard's event files of a run, a folder for every stage.
 
 python -m experiments NAME --tensorboard
 tensorboard --logdir runs/NAME/latest/events

@@ -47,7 +47,7 @@ def heatmaps(
     mark: float | None = None,
     size: tuple[float, float] | None = None,
 ) -> bytes:
-    """Draw matrices beside each other on one scale of colours, as SVG.
+    """Draw matrices side by side on one scale of colours, as SVG.
 
     Args:
       maps: one at least.

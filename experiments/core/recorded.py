@@ -1,7 +1,7 @@
 """The table of results in the README, written from runs that are kept in the repository.
 
     python -m experiments.core.recorded record RUN        # keep the results of a finished run
-    python -m experiments.core.recorded fill              # write the table anew
+    python -m experiments.core.recorded fill              # write the table again
 
 A figure of a row is `{KEY > KEY > … | FORMAT}`: the path of a value in `experiments/recorded/EXPERIMENT.json` and the
 format of its number.  A key names an entry of an object; of a list, the entry with that `name` or `title`; of a table,
@@ -169,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("record", help="keep a finished run's results").add_argument("run", type=Path)
-    commands.add_parser("fill", help="write the table of the README anew")
+    commands.add_parser("fill", help="write the table of the README again")
     chosen = parser.parse_args(arguments)
     try:
         readme = checkout() / "README.md"

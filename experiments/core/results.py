@@ -82,7 +82,7 @@ def named_table(
 
     Args:
       title: heading.
-      rows: column → cell; columns stand in the order in which rows first name them, a cell that a row lacks is `None`.
+      rows: column → cell; columns are in the order in which rows first name them; a missing cell is `None`.
       formats, units, meanings: column → format of its numbers (".3g" by default), unit, explanation.
       note: a sentence above the table.
 
@@ -180,7 +180,7 @@ class RolloutExample:
     """One answer to look at, with the touch behind it.
 
     Args:
-      arm, object_id: who answered, about what.
+      arm, object_id: policy and object.
       question, label, trace: text.
       slots: the parsed pieces of the trace, in order and disjoint.
       reward: the value of each term; `total` their weighted sum.
@@ -188,8 +188,8 @@ class RolloutExample:
       force_n: sensor → float [F, 3].
       view: uint8 [H, W, 3] RGB picture of the object, or `None`.
       fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
-      instead: what stood in the place of the touch → what was then said.
-      group: heading under which it stands with its neighbours of the same one; none by default.
+      instead: replacement of the touch → the answer to it.
+      group: heading that it shares with its neighbours; none by default.
     """
 
     arm: str

@@ -159,7 +159,7 @@ def test_a_log_with_a_flipped_byte_is_named(context, flipped):
     context.log("sft/0", 0, loss=1.0)
     path = context.directory / "metrics.jsonl"
     path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
-    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start the run anew with --fresh"):
+    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start a new run with --fresh"):
         read_metrics(context.directory)
 
 

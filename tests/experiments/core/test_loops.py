@@ -120,5 +120,5 @@ def test_no_run_ends_with_a_part_of_its_log(tmp_path, capsys, kept):
     assert run(tmp_path) != 0
     said = capsys.readouterr().err
     assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in said
-    assert "put a copy back, or start the run anew with --fresh" in said
+    assert "put a copy back, or start a new run with --fresh" in said
     assert not (directory / "results.json").exists()
