@@ -15,8 +15,8 @@ from experiments.bench.contacts import MeasuredContact
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
 from experiments.bench.wording import level_words
 from sensors_io.schema import ATTRIBUTES, LEVELS
-from touchr1_jax.bench.agreement import cohens_kappa
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.statistics import cohens_kappa
 
 KEY, CASE, DECISION = "object", "case", "decision"
 

@@ -15,9 +15,8 @@ import numpy as np
 from experiments.bench.contacts import MeasuredContact
 from experiments.bench.sheets import SheetError, read_sheet, write_sheet
 from experiments.bench.wording import answer_words, level_words
-from touchr1_jax.bench.agreement import cohens_kappa, wilson_interval
 from touchr1_jax.bench.items import Item, Touch
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, cohens_kappa, wilson_interval
 
 AXES = ("grounded", "fits the labels", "self-consistent")
 """Is the rationale grounded in tactile evidence, does it fit the human labels, is its reasoning consistent?"""

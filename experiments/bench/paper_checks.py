@@ -19,7 +19,7 @@ from experiments.bench.paper_arithmetic import (
     perfect_average,
 )
 from experiments.study import paper_numbers as paper
-from touchr1_jax.bench.agreement import wilson_interval
+from touchr1_jax.bench.statistics import wilson_interval
 
 Verdict = Literal["contradiction", "not given", "unsupported", "holds"]
 

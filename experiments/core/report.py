@@ -81,7 +81,7 @@ def _metric_groups(results: Results) -> dict[str, dict[str, Any]]:
     """Heading → the measured metrics under it; the main ones have no heading."""
     present = {name for row in (*results.arms.values(), *results.baselines.values()) for name in row}
     groups = {
-        title: {name: metric for name, metric in REPORTED.items() if metric.beside == beside and name in present}
+        title: {name: metric for name, metric in REPORTED.items() if metric.secondary == beside and name in present}
         for title, beside in (("", False), ("Further metrics", True))
     }
     return {title: metrics for title, metrics in groups.items() if metrics}

@@ -5,7 +5,7 @@
 From the frames of a press up to t, and for one of the two predictors also the picture of the object, to the frame 3 and
 5 levels of force later, in [0, 1] pixels of 112², by four sensors; scored on objects that training never saw, every t.
 Beside L1 and SSIM (11 × 11 Gaussian) stands the distance of a tactile encoder's features; LPIPS needs weights that
-nobody may ship: `--lpips-weights FILE.npz` adds it (see `touchr1_jax.bench.lpips`).
+nobody may ship: `--lpips-weights FILE.npz` adds it (see `touchr1_jax.bench.image_similarity`).
 
 Cost: about nine minutes on one core, `--scale smoke` under one.
 
@@ -42,7 +42,7 @@ from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from experiments.study.pretrained import PretrainedEncoder, load_encoder
 from sensors_io.scenes.config import SceneConfig
-from touchr1_jax.bench.lpips import check_weights
+from touchr1_jax.bench.image_similarity import check_weights
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig

@@ -12,8 +12,7 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch
-from touchr1_jax.bench.lpips import lpips
-from touchr1_jax.bench.ssim import ssim
+from touchr1_jax.bench.image_similarity import lpips, ssim
 from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
 from touchr1_jax.training.video import (

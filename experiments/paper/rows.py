@@ -9,7 +9,7 @@ from experiments.study.estimates import estimate
 from touchr1_jax.bench.averages import AVERAGED, touch_average
 from touchr1_jax.bench.items import Ask
 from touchr1_jax.bench.metrics import Scores
-from touchr1_jax.bench.scoring import Answers, score
+from touchr1_jax.bench.scoring import ItemAnswers, score
 from touchr1_jax.bench.statistics import draw_clusters, drawn_means
 
 RESAMPLES = 2_000
@@ -17,7 +17,7 @@ RESAMPLES = 2_000
 
 
 def bench_row(
-    asks: Sequence[Ask], answers: Sequence[Answers], by_sight: Sequence[Answers] | None = None
+    asks: Sequence[Ask], answers: Sequence[ItemAnswers], by_sight: Sequence[ItemAnswers] | None = None
 ) -> dict[str, Estimate]:
     """Every metric of the bench that the questions define, and their average where all of it is there.
 
@@ -28,7 +28,7 @@ def bench_row(
       answers: those of every seed.
       by_sight: what pictures alone suggest, for every seed.
     """
-    seen: Sequence[Answers | None] = [None] * len(answers) if by_sight is None else by_sight
+    seen: Sequence[ItemAnswers | None] = [None] * len(answers) if by_sight is None else by_sight
     tables = [score(asks, said, prior) for said, prior in zip(answers, seen, strict=True)]
     objects = np.array([ask.cluster for ask in asks])
     several = lambda scores: len(np.unique(objects[scores.items])) > 1

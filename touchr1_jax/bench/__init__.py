@@ -1,1 +1,1 @@
-"""What is reported about a policy: metrics of its answers, and intervals and tests on those metrics (NumPy)."""
+"""Metrics of a policy's answers, the items of the touch bench, and intervals and tests (NumPy)."""

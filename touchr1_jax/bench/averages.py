@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 
 AVERAGED = ("h_acc", "r_acc", "p_acc", "mat_acc", "omae", "l2_em", "sfd", "soi_rho", "csc")
-"""What the average of the touch bench is made of."""
+"""Metrics that the average of the touch bench is made of."""
 
 VTV = ("hardness", "protrusion", "elasticity", "friction", "combined", "sfd", "soi", "osc", "tsa")
 """The nine tasks of the VTV protocol, each a share of exact matches in percent.
@@ -21,7 +21,7 @@ def touch_average(metrics: Mapping[str, float]) -> float:
     """Avg = mean(H, R, P, Mat, 100(1 − OMAE/2), L2-EM, SFD, 100·max(ρ, 0), CSC), 0 to 100.
 
     The paper prints an Avg whose formula it does not give, and no weighting of its columns reproduces it; this one is
-    ours and must not be set beside it.
+    ours and must not be compared with it.
 
     Args:
       metrics: `AVERAGED` → value, shares in percent, OMAE in levels, ρ in −1..1.

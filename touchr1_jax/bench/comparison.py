@@ -1,4 +1,4 @@
-"""Metrics of questions about several objects: which of two has more of something, and how three are ordered.
+"""Metrics of questions about several objects: which of two has more of a property, and the order of three.
 
 N questions.  An answer of −1 is ⊥, unparsable, and counts against the policy.
 """
@@ -24,12 +24,12 @@ def which_has_more(answer: np.ndarray, label: np.ndarray) -> Scores:
 
 
 def swap_consistency(answer: np.ndarray, pair: np.ndarray, swapped: np.ndarray) -> Scores:
-    """100·mean over pairs of 1[the same object is named in both orders]; who always says "first" gets 0.
+    """100·mean over pairs of 1[the same object is named in both orders]; always answering "first" scores 0.
 
     Args:
       answer: int [N], 0 for the first object, 1 for the second.
       pair: [N], the pair that each question is about; every pair has one question in each order.
-      swapped: bool [N], whether the question shows the pair in its second order.
+      swapped: bool [N], true where the question shows the pair in its second order.
 
     Returns:
       One value per pair, belonging to the question in the first order.

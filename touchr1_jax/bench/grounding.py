@@ -1,7 +1,7 @@
-"""Metrics of whether touch is used: what is lost without it, and who is believed when sight and touch differ.
+"""Metrics of the use of touch: the loss without it, and the answers when sight and touch disagree.
 
-The controls of touch: `drop` takes the streams away, `shuffle` permutes their frames, `noise` puts noise of the
-sensor's statistics in their place, `swapped` another object's touch.
+Controls of touch: `drop` removes the streams, `shuffle` permutes their frames, `noise` replaces them by noise of the
+sensor's statistics, `swapped` by another object's touch.
 """
 
 import dataclasses
@@ -13,10 +13,10 @@ from touchr1_jax.bench.metrics import BOTTOM, Scores, accuracy, check_same_shape
 from touchr1_jax.bench.statistics import Interval, draw_clusters, drawn_means
 
 CONTROLS = ("drop", "shuffle", "noise", "swapped")
-"""What may stand in for the touch."""
+"""Replacements of the touch."""
 
 SHUFFLE = "shuffle"
-"""The control that says something only where the answer lies in the order of the frames."""
+"""The control that applies only where the answer depends on the order of the frames."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,12 +60,12 @@ def least_tactile_use(
 
     A shuffled press still shows its peak, so `shuffle` counts only where `ordered` says so, and not at all where no
     question does.  The interval takes the minimum anew in each resample of the objects; it is pessimistic where
-    several controls gain alike, and says of the policy what it claims: no control does better.
+    several controls gain alike, which suits the claim that no control does better.
 
     Args:
       real: as for `tactile_use_gain`.
       controls: one of `CONTROLS` → its scores.
-      ordered: bool [N], whether the answer lies in the order of the frames.
+      ordered: bool [N], true where the answer depends on the order of the frames.
       objects: [N], the object of each question.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The questions of the touch bench: what an item is, and the JSON Lines that hold it.
+"""The questions of the touch bench, and the JSON Lines that store them.
 
 Four tiers of seven kinds.  A file has one item per line, an object with these fields and no others:
 
@@ -10,9 +10,9 @@ Four tiers of seven kinds.  A file has one item per line, an object with these f
     sensors     names of the sensors whose streams are shown of every touch
     view        whether the picture of the object is shown
     phrasing    number of the wording, where several are in use
-    group       what belongs together: the two orders of a pair, the sensors of one touch; "" where nothing does
+    group       name shared by items that belong together: the two orders of a pair, the sensors of one touch; or ""
     position    place in the group
-    deceptive   whether the object was made to look like what it is not; null where unknown
+    deceptive   true if the object was made to look like another one; null where unknown
     answer      levels of the attributes; for "compare" [0] or [1], the touch that has more; for "order" [k], the
                 position in `comparison.ORDERS` of the touches from the least to the most
     question, rationale
@@ -37,7 +37,7 @@ class ItemError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Kind:
-    """A kind of question: its tier, the number of touches shown, whether the object's picture is, what it tests."""
+    """A kind of question: tier, number of touches shown, `view` if the object's picture is shown, meaning."""
 
     tier: int
     touches: int
@@ -59,7 +59,7 @@ KINDS: Mapping[str, Kind] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True, order=True)
 class Touch:
-    """One contact of one object, as its records name it."""
+    """A contact of an object, named as in its records."""
 
     object: str
     site: int
@@ -69,7 +69,7 @@ class Touch:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Citation:
-    """One measurement that a rationale rests on; `touch` counts from 0, `at` is (x, y) as shares of the window."""
+    """A measurement that a rationale cites; `touch` counts from 0, `at` is (x, y) as shares of the window."""
 
     touch: int
     sensor: str
@@ -81,7 +81,7 @@ class Citation:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ask:
-    """What is asked, and the right answer, before anybody words it; fields as in the module."""
+    """A question and its right answer, not yet in words; fields as in the module."""
 
     id: str
     kind: str
@@ -129,7 +129,7 @@ class Ask:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Item:
-    """A question in words, its answer and why."""
+    """A question in words, its answer and the rationale."""
 
     ask: Ask
     question: str

@@ -1,4 +1,4 @@
-"""Files of JSON Lines that are whole or not there."""
+"""Files of JSON Lines, written completely or not at all."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class LinesError(ValueError):
-    """A file that is absent or no JSON Lines; the message names it, and the line."""
+    """A file that is missing or not JSON Lines; the message names it and the line."""
 
 
 def write_lines(path: str | os.PathLike[str], trees: Iterable[Mapping[str, Any]]) -> None:

@@ -1,4 +1,4 @@
-"""The metrics of every table: what each one means, and the small functions that compute it.
+"""The metrics of every table, and the functions that compute them.
 
 Dimensions: N questions (contacts), A attributes, S sensors, M scored values.  An answer of −1 is ⊥, unparsable.  A
 label of −1 means *not scored*: the attribute was not asked, or nobody annotated it; such entries count nowhere.
@@ -18,7 +18,7 @@ BOTTOM = -1
 """⊥ among answers; among labels: not scored."""
 
 PREFIX: Mapping[str, str] = {"hardness": "h", "roughness": "r", "protrusion": "p", "material": "mat"}
-"""What the metric names of an attribute start with."""
+"""Beginning of an attribute's metric names."""
 
 ORDINAL = ("hardness", "roughness", "protrusion")
 """The attributes of `acc`, `omae` and `middle_rate`."""
@@ -26,9 +26,9 @@ ORDINAL = ("hardness", "roughness", "protrusion")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Metric:
-    """How one metric is named, read and printed; `format` is a format specification such as ".1f".
+    """Title, unit and meaning of a metric; `format` is a format specification such as ".1f".
 
-    `beside` marks the metrics that only explain others and stand in a second table.
+    `secondary` marks metrics that only explain others; they are printed in a second table.
     """
 
     title: str
@@ -36,29 +36,28 @@ class Metric:
     better: Literal["higher", "lower", "none"]
     format: str
     meaning: str
-    beside: bool = False
+    secondary: bool = False
 
 
-def _share(title: str, better: Literal["higher", "none"], meaning: str, beside: bool = False) -> Metric:
-    return Metric(title=title, unit="%", better=better, format=".1f", meaning=meaning, beside=beside)
+def share_metric(
+    title: str, meaning: str, better: Literal["higher", "none"] = "higher", *, secondary: bool = False
+) -> Metric:
+    """A metric in percent with one decimal."""
+    return Metric(title=title, unit="%", better=better, format=".1f", meaning=meaning, secondary=secondary)
 
+
+_RIGHT = "{} answers that are right; unparsable is wrong"
+_BALANCED = "balanced {} accuracy: mean over the levels of the accuracy on each"
 
 METRICS: Mapping[str, Metric] = {
-    "acc": _share("Acc", "higher", "mean of H-, R- and P-Acc"),
-    "h_acc": _share("H-Acc", "higher", "hardness answers that are right; unparsable is wrong"),
-    "r_acc": _share("R-Acc", "higher", "roughness answers that are right; unparsable is wrong"),
-    "p_acc": _share("P-Acc", "higher", "protrusion answers that are right; unparsable is wrong"),
-    "mat_acc": _share("Mat-Acc", "higher", "material answers that are right, nine ways; unparsable is wrong"),
-    "h_bacc": _share(
-        "H-bAcc", "higher", "balanced hardness accuracy: mean over the levels of the accuracy on each", beside=True
-    ),
-    "r_bacc": _share(
-        "R-bAcc", "higher", "balanced roughness accuracy: mean over the levels of the accuracy on each", beside=True
-    ),
-    "p_bacc": _share(
-        "P-bAcc", "higher", "balanced protrusion accuracy: mean over the levels of the accuracy on each", beside=True
-    ),
-    "mat_bacc": _share("Mat-bAcc", "higher", "balanced material accuracy: mean over the materials", beside=True),
+    "acc": share_metric("Acc", "mean of H-, R- and P-Acc"),
+    **{f"{PREFIX[a]}_acc": share_metric(f"{PREFIX[a].upper()}-Acc", _RIGHT.format(a)) for a in ORDINAL},
+    "mat_acc": share_metric("Mat-Acc", "material answers that are right, nine ways; unparsable is wrong"),
+    **{
+        f"{PREFIX[a]}_bacc": share_metric(f"{PREFIX[a].upper()}-bAcc", _BALANCED.format(a), secondary=True)
+        for a in ORDINAL
+    },
+    "mat_bacc": share_metric("Mat-bAcc", "balanced material accuracy: mean over the materials", secondary=True),
     "omae": Metric(
         title="OMAE",
         unit="levels",
@@ -66,15 +65,18 @@ METRICS: Mapping[str, Metric] = {
         format=".3f",
         meaning="mean distance in levels over hardness, roughness and protrusion answers; unparsable counts K−1",
     ),
-    "csc": _share("CSC", "higher", "pairs of sensors whose conclusions, each given one sensor alone, are both right"),
-    "csc_agree": _share(
-        "CSC-agree", "none", "pairs of sensors whose conclusions agree, right or not; a constant gets 100", beside=True
+    "csc": share_metric("CSC", "pairs of sensors whose conclusions, each given one sensor alone, are both right"),
+    "csc_agree": share_metric(
+        "CSC-agree",
+        "pairs of sensors whose conclusions agree, right or not; a constant gets 100",
+        "none",
+        secondary=True,
     ),
-    "csc_slot": _share(
-        "CSC-slot", "none", "pairs of perceive slots of one answer that name the same level", beside=True
+    "csc_slot": share_metric(
+        "CSC-slot", "pairs of perceive slots of one answer that name the same level", "none", secondary=True
     ),
-    "parse_rate": _share("Parsed", "higher", "answers that are formatted and whose asked conclusions parse"),
-    "middle_rate": _share("Middle", "none", "ordinal answers that name the middle level", beside=True),
+    "parse_rate": share_metric("Parsed", "answers that are formatted and whose asked conclusions parse"),
+    "middle_rate": share_metric("Middle", "ordinal answers that name the middle level", "none", secondary=True),
     "reward": Metric(
         title="Reward", unit="", better="higher", format=".3f", meaning="mean total reward of the greedy answers"
     ),
@@ -116,7 +118,7 @@ class Scores:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Answers:
-    """Everything a policy said about N questions, as arrays.
+    """The answers of a policy to N questions, as arrays.
 
     Args:
       conclude: int [N, A], the answers given all sensors.
@@ -124,7 +126,7 @@ class Answers:
       formatted: bool [N].
       reward: float [N], total reward of each answer.
       streams: bool [N, S], the sensors that were there.
-      perceive: int [N, S, A], what the answer says each sensor feels.
+      perceive: int [N, S, A], the level that the answer reports for each sensor.
       alone: int [N, S, A], the answers given sensor s alone, or `None` where that was not run.
     """
 
@@ -255,11 +257,11 @@ def evaluate(answers: Answers, attributes: tuple[str, ...], levels: tuple[int, .
     if unknown:
         raise ValueError(f"attributes holds {unknown}: metrics exist for {', '.join(PREFIX)}; add them to PREFIX")
     ordinal = [i for i, a in enumerate(attributes) if a in ORDINAL]
-    said, label, levels_a = answers.conclude[:, ordinal], answers.label[:, ordinal], np.asarray(levels)[ordinal]
+    concluded, label, levels_a = answers.conclude[:, ordinal], answers.label[:, ordinal], np.asarray(levels)[ordinal]
     table = {
-        "acc": mean_accuracy(said, label),
-        "omae": ordinal_mae(said, label, levels_a),
-        "middle_rate": middle_rate(said, label, levels_a),
+        "acc": mean_accuracy(concluded, label),
+        "omae": ordinal_mae(concluded, label, levels_a),
+        "middle_rate": middle_rate(concluded, label, levels_a),
         "parse_rate": parse_rate(answers.formatted, answers.conclude, answers.label),
         "reward": keep_scored(np.asarray(answers.reward, float), np.ones(len(answers.reward), bool)),
         "csc_slot": cross_sensor_agreement(answers.perceive, answers.label, answers.streams),

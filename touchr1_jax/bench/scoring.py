@@ -1,4 +1,4 @@
-"""From answers to the items of the touch bench to its metrics."""
+"""Metrics of the touch bench from answers to its items."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -8,23 +8,21 @@ from touchr1_jax.bench import metrics
 from touchr1_jax.bench.comparison import order_correlation, swap_consistency, which_has_more
 from touchr1_jax.bench.grounding import conflict_accuracy, revision_rate
 from touchr1_jax.bench.items import Ask
-from touchr1_jax.bench.metrics import BOTTOM, METRICS, ORDINAL, PREFIX, Metric, Scores
+from touchr1_jax.bench.metrics import BOTTOM, METRICS, ORDINAL, PREFIX, Metric, Scores, share_metric
 
 LEVELS = 3
 """K of every ordinal attribute."""
-
-
-def _share(title: str, meaning: str, *, beside: bool = False) -> Metric:
-    return Metric(title=title, unit="%", better="higher", format=".1f", meaning=meaning, beside=beside)
 
 
 BENCH_METRICS: Mapping[str, Metric] = {
     **{f"{p}_acc": METRICS[f"{p}_acc"] for p in PREFIX.values()},
     **{f"{p}_bacc": METRICS[f"{p}_bacc"] for p in PREFIX.values()},
     "omae": METRICS["omae"],
-    "l2_em": _share("L2-EM", "questions for several properties all of which are right"),
-    "sfd": _share("SFD", "pairs of which the one that has more is named; chance 50"),
-    "sfd_swap": _share("SFD-swap", "pairs of which the same one is named in both orders, right or not", beside=True),
+    "l2_em": share_metric("L2-EM", "questions for several properties all of which are right"),
+    "sfd": share_metric("SFD", "pairs of which the one that has more is named; chance 50"),
+    "sfd_swap": share_metric(
+        "SFD-swap", "pairs of which the same one is named in both orders, right or not", secondary=True
+    ),
     "soi_rho": Metric(
         title="SOI-ρ",
         unit="",
@@ -34,8 +32,8 @@ BENCH_METRICS: Mapping[str, Metric] = {
     ),
     "csc": METRICS["csc"],
     "csc_agree": METRICS["csc_agree"],
-    "deceptive_acc": _share("Deceptive", "questions about objects that look like others which are right"),
-    "conflict_acc": _share("Conflict", "of those, the ones that sight alone gets wrong which are right"),
+    "deceptive_acc": share_metric("Deceptive", "questions about objects that look like others which are right"),
+    "conflict_acc": share_metric("Conflict", "of those, the ones that sight alone gets wrong which are right"),
     "avg": Metric(
         title="Avg",
         unit="",
@@ -44,13 +42,11 @@ BENCH_METRICS: Mapping[str, Metric] = {
         meaning="mean of H, R, P, Mat, 100(1 − OMAE/2), L2-EM, SFD, 100·max(ρ, 0) and CSC; not the paper's, which no "
         "formula gives; a constant has about 29",
     ),
-    "revision_rate": Metric(
-        title="Revised",
-        unit="%",
-        better="none",
-        format=".1f",
-        meaning="of the latter, those whose answer differs from that by sight alone, right or not",
-        beside=True,
+    "revision_rate": share_metric(
+        "Revised",
+        "of the latter, those whose answer differs from that by sight alone, right or not",
+        "none",
+        secondary=True,
     ),
 }
 """Every metric of the bench, in the order of its table."""
@@ -58,20 +54,20 @@ BENCH_METRICS: Mapping[str, Metric] = {
 REPORTED: Mapping[str, Metric] = {**METRICS, **BENCH_METRICS}
 """Every metric that a report may show: of answers about single touches, and of the bench."""
 
-Answers = Mapping[str, Sequence[int]]
+ItemAnswers = Mapping[str, Sequence[int]]
 """Id of an item → the levels that were read in its answer, −1 for ⊥."""
 
 
-def score(asks: Sequence[Ask], answers: Answers, by_sight: Answers | None = None) -> dict[str, Scores]:
+def score(asks: Sequence[Ask], answers: ItemAnswers, by_sight: ItemAnswers | None = None) -> dict[str, Scores]:
     """The metrics that the items define, keyed as `BENCH_METRICS`; one without an item is left out.
 
     Accuracies are of the kind "identify"; OMAE of all answers about one touch by all its sensors but those of
-    "conflict"; CSC of "one_sensor".  `Scores.items` counts the questions given, `clusters` tells their objects.
+    "conflict"; CSC of "one_sensor".  `Scores.items` counts the questions given, `clusters` gives their objects.
 
     Args:
       asks: the bench's questions.
       answers: to all of them.
-      by_sight: to those of "conflict", given the picture alone; they say what the visual prior is.
+      by_sight: to those of "conflict", given the picture alone; they are the visual prior.
 
     Raises:
       ValueError: an item without an answer, or with too few or too many levels.
@@ -98,41 +94,41 @@ def clusters(asks: Sequence[Ask], scores: Scores) -> np.ndarray:
 _Parts = list[tuple[str, Scores]]
 
 
-def _identify(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+def _identify(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     parts: _Parts = []
     for attribute, prefix in PREFIX.items():
         of = [i for i in rows if asks[i].attributes == (attribute,)]
         if of:
-            said, label = _first(asks, of, answers)
-            parts.append((f"{prefix}_acc", _at(of, metrics.accuracy(said, label))))
-            parts.append((f"{prefix}_bacc", _at(of, metrics.balanced_accuracy(said, label))))
+            answer, label = _first(asks, of, answers)
+            parts.append((f"{prefix}_acc", _at(of, metrics.accuracy(answer, label))))
+            parts.append((f"{prefix}_bacc", _at(of, metrics.balanced_accuracy(answer, label))))
     return parts
 
 
-def _compose(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+def _compose(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     width = max(len(asks[i].attributes) for i in rows)
-    said, label = np.full((2, len(rows), width), BOTTOM)
+    answer, label = np.full((2, len(rows), width), BOTTOM)
     for n, i in enumerate(rows):
         count = len(asks[i].answer)
-        said[n, :count], label[n, :count] = answers[asks[i].id], asks[i].answer
-    return [("l2_em", _at(rows, metrics.exact_match(said, label)))]
+        answer[n, :count], label[n, :count] = answers[asks[i].id], asks[i].answer
+    return [("l2_em", _at(rows, metrics.exact_match(answer, label)))]
 
 
-def _compare(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
-    said, label = _first(asks, rows, answers)
+def _compare(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
+    answer, label = _first(asks, rows, answers)
     pair = np.array([asks[i].group for i in rows])
     swapped = np.array([asks[i].position == 1 for i in rows])
     return [
-        ("sfd", _at(rows, which_has_more(said, label))),
-        ("sfd_swap", _at(rows, swap_consistency(said, pair, swapped))),
+        ("sfd", _at(rows, which_has_more(answer, label))),
+        ("sfd_swap", _at(rows, swap_consistency(answer, pair, swapped))),
     ]
 
 
-def _order(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+def _order(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     return [("soi_rho", _at(rows, order_correlation(*_first(asks, rows, answers))))]
 
 
-def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     groups: dict[str, list[int]] = {}
     for i in rows:
         groups.setdefault(asks[i].group, []).append(i)
@@ -150,20 +146,22 @@ def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Part
     ]
 
 
-def _conflict(asks: Sequence[Ask], rows: list[int], answers: Answers) -> _Parts:
+def _conflict(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     return [("deceptive_acc", _at(rows, metrics.accuracy(*_first(asks, rows, answers))))]
 
 
-def _against_sight(asks: Sequence[Ask], rows: list[int], answers: Answers, by_sight: Answers) -> dict[str, Scores]:
-    said, label = _first(asks, rows, answers)
+def _against_sight(
+    asks: Sequence[Ask], rows: list[int], answers: ItemAnswers, by_sight: ItemAnswers
+) -> dict[str, Scores]:
+    answer, label = _first(asks, rows, answers)
     prior, _ = _first(asks, rows, by_sight)
     return {
-        "conflict_acc": _at(rows, conflict_accuracy(said, label, prior)),
-        "revision_rate": _at(rows, revision_rate(said, label, prior)),
+        "conflict_acc": _at(rows, conflict_accuracy(answer, label, prior)),
+        "revision_rate": _at(rows, revision_rate(answer, label, prior)),
     }
 
 
-_SCORED: Mapping[str, Callable[[Sequence[Ask], list[int], Answers], _Parts]] = {
+_SCORED: Mapping[str, Callable[[Sequence[Ask], list[int], ItemAnswers], _Parts]] = {
     "identify": _identify,
     "scale": lambda asks, rows, answers: [],  # its answers count in OMAE
     "compose": _compose,
@@ -174,34 +172,34 @@ _SCORED: Mapping[str, Callable[[Sequence[Ask], list[int], Answers], _Parts]] = {
 }
 
 
-def _distance(asks: Sequence[Ask], rows: list[int], answers: Answers) -> Scores:
+def _distance(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> Scores:
     triples = [
-        (i, said, label)
+        (i, answer, label)
         for i in rows
-        for name, said, label in zip(asks[i].attributes, answers[asks[i].id], asks[i].answer, strict=True)
+        for name, answer, label in zip(asks[i].attributes, answers[asks[i].id], asks[i].answer, strict=True)
         if name in ORDINAL
     ]
-    at, said, label = (
+    at, answer, label = (
         (np.array(column, int) for column in zip(*triples, strict=True)) if triples else [np.zeros(0, int)] * 3
     )
-    return _at(at.tolist(), metrics.ordinal_mae(said[:, None], label[:, None], np.array([LEVELS])))
+    return _at(at.tolist(), metrics.ordinal_mae(answer[:, None], label[:, None], np.array([LEVELS])))
 
 
-def _first(asks: Sequence[Ask], rows: list[int], answers: Answers) -> tuple[np.ndarray, np.ndarray]:
-    """What was said and what is right, of items with one answer, int [rows] each."""
-    said = np.array([answers[asks[i].id][0] for i in rows])
-    return said, np.array([asks[i].answer[0] for i in rows])
+def _first(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> tuple[np.ndarray, np.ndarray]:
+    """Answer and label of items with one answer, int [rows] each."""
+    answer = np.array([answers[asks[i].id][0] for i in rows])
+    return answer, np.array([asks[i].answer[0] for i in rows])
 
 
 def _at(rows: Sequence[int], scores: Scores) -> Scores:
-    """The same scores, counted among all items."""
+    """The scores with indices among all items."""
     return Scores(values=scores.values, items=np.asarray(rows, int)[scores.items], strata=scores.strata)
 
 
-def _check(asks: Sequence[Ask], answers: Answers) -> None:
+def _check(asks: Sequence[Ask], answers: ItemAnswers) -> None:
     for ask in asks:
         if ask.id not in answers:
-            raise ValueError(f"answers lacks {ask.id!r}: every item needs one; give −1 where nothing was said")
+            raise ValueError(f"answers lacks {ask.id!r}: every item needs one; give −1 where nothing was answered")
         got, want = len(answers[ask.id]), len(ask.answer)
         if got != want:
             raise ValueError(f"answers[{ask.id!r}] has {got} levels: must have {want}; give −1 for what is missing")
