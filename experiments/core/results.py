@@ -43,6 +43,16 @@ class Requirement:
         return dataclasses.asdict(self) | {"met": self.met}
 
 
+def at_most(name: str, measured: float, bound: float, unit: str = "", note: str = "") -> Requirement:
+    """A figure that must not exceed its bound."""
+    return Requirement(name=name, measured=float(measured), bound=bound, better="lower", unit=unit, note=note)
+
+
+def at_least(name: str, measured: float, bound: float, unit: str = "", note: str = "") -> Requirement:
+    """A figure that must not fall below its bound."""
+    return Requirement(name=name, measured=float(measured), bound=bound, better="higher", unit=unit, note=note)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Column:
     """One column of a table: heading, unit, format of its numbers, what it means."""
@@ -71,7 +81,7 @@ class Table:
 
 def named_table(
     title: str,
-    rows: Sequence[Mapping[str, Cell]],
+    rows: Sequence[Mapping[str, Any]],
     *,
     formats: Mapping[str, str] = {},
     units: Mapping[str, str] = {},

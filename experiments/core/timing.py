@@ -22,3 +22,10 @@ def interleaved(calls: Mapping[str, Callable[[], Any]], rounds: Iterable[object]
             jax.block_until_ready(call())
             seconds[name].append(time.perf_counter() - began)
     return {name: np.array(s) for name, s in seconds.items()}
+
+
+def median_ms(calls: Mapping[str, Callable[[], Any]], rounds: Iterable[object]) -> dict[str, float]:
+    """Milliseconds of every call, median over interleaved rounds; each call is first run once without timing."""
+    for call in calls.values():
+        jax.block_until_ready(call())
+    return {name: 1e3 * float(np.median(s)) for name, s in interleaved(calls, rounds).items()}

@@ -22,7 +22,7 @@ from experiments.core.history import PastRun, runs_of, summary
 from experiments.core.results import Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
-from experiments.fields import dense_accuracy, marker_accuracy
+from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
 from experiments.mechanics.tangential_tables import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
@@ -60,11 +60,11 @@ DEFAULTS: tuple[JudgedDefault, ...] = (
         "markers",
         "pareto_fields",
         "Markers under known motion",
-        marker_accuracy.MAIN,
+        MARKER_DEFAULT,
         {"time": "lower", "95 %": "lower"},
     ),
     JudgedDefault(
-        "dense field", "pareto_fields", "Dense displacement", dense_accuracy.MAIN, {"time": "lower", "95 %": "lower"}
+        "dense field", "pareto_fields", "Dense displacement", DENSE_DEFAULT, {"time": "lower", "95 %": "lower"}
     ),
     JudgedDefault("storage", "pareto_storage", "Codecs:", OWN, {"of raw": "lower", "read": "higher"}),
     JudgedDefault("encoder", "pareto_encoder", "Variants", STUDIED, {"a prompt": "lower", "mean": "higher"}),

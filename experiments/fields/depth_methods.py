@@ -1,9 +1,8 @@
-"""Ways from colour to slope and from slope to depth that the package's own are measured against.
+"""Methods that reconstruct depth: maps from colour to slope, and integrators from slope to depth.
 
-The maps: a table of colours, polynomials of colour alone, random Fourier features (a kernel), a small perceptron of
-colour and position (the size of gs_sdk's), and the package's.  All are trained on the same pixels of the same presses
-with the same normals, so that they differ in nothing else.  The integrators: those of gs_sdk and gsrobotics as
-published, and of GelSlim.
+The maps are the package's polynomial, a polynomial of colour alone, a table of colours, random Fourier features (a
+kernel) and a small perceptron of colour and position (the size of gs_sdk's).  All train on the same pixels of the same
+presses with the same normals.  The integrators are the package's and those that gs_sdk, gsrobotics and GelSlim ship.
 """
 
 import dataclasses
@@ -15,26 +14,29 @@ import numpy as np
 import optax
 from scipy import fft, ndimage
 
+from sensors_io.calibration.circles import find_circles
 from sensors_io.calibration.fit import fit_map
 from sensors_io.calibration.presses import BallPresses, Touches
+from sensors_io.fields.depth import ZeroConfig, zero_level
+from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader, change, colour_powers, to_slopes
+from sensors_io.fields.types import Calibration
 
 Slopes = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From a picture, uint8 [H, W, 3], to ∂z/∂x and ∂z/∂y, float32 [H, W]."""
 
-BINS = 48
-"""Of the table along each channel, over changes of ±128 grey levels; 135 leave nearly every cell empty."""
+Integrator = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
+"""From ∂z/∂x, ∂z/∂y [H, W] and the pitch in mm/px to depth in mm [H, W]."""
 
-FEATURES, WIDTH = 384, 32
-"""Random Fourier features; units of each of the two hidden layers."""
-
+_BINS = 48  # of the colour table along each channel, over changes of ±128 grey levels; 135 leave most cells empty
+_FEATURES, _WIDTH = 384, 32  # random Fourier features; units of each of the perceptron's two hidden layers
 _RIDGE = 1e-3
-_STEPS, _BATCH, _RATE = 1500, 4096, 3e-3
+_STEPS, _BATCH, _RATE = 1500, 4096, 3e-3  # of the perceptron's training
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainingPixels:
-    """Pixels that maps are trained on: changes [n, 3], positions in −1 … 1 [n, 2], in-plane normals [n, 2]."""
+    """Training pixels of a map: changes of colour [n, 3], positions in −1 … 1 [n, 2], in-plane normals [n, 2]."""
 
     change: np.ndarray
     position: np.ndarray
@@ -61,20 +63,32 @@ def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> TrainingPixe
 
 
 def package_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
-    """The package's: polynomial of colour whose constants vary over the picture."""
+    """The package's polynomial of colour, whose constants vary over the picture."""
     colours, _, _ = fit_map(presses, touches, seed=seed)
     return SlopeReader(colours, presses.background)
 
 
+def calibrated(presses: BallPresses, seed: int) -> Calibration:
+    """The package's calibration, made with all presses, whose circles are found without labels."""
+    colours, _, _ = fit_map(presses, find_circles(presses).touches, seed=seed)
+    return Calibration(
+        sensor="gelsight_mini",
+        background=presses.background,
+        mm_per_px=presses.mm_per_px,
+        colours=colours,
+        made_from={},
+    )
+
+
 def table_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
-    """A table of colours, the mean normal of each cell, empty cells taking that of the nearest full one."""
+    """A table of colours: each cell holds its mean normal, an empty cell that of the nearest full one."""
     pixels = pixels_of(presses, touches, seed)
     cell = _cells(pixels.change)
-    count = np.bincount(cell, minlength=BINS**3)
-    mean = np.stack([np.bincount(cell, n, BINS**3) for n in pixels.normal.T], -1) / np.maximum(count, 1)[:, None]
-    empty = (count == 0).reshape(BINS, BINS, BINS)
+    count = np.bincount(cell, minlength=_BINS**3)
+    mean = np.stack([np.bincount(cell, n, _BINS**3) for n in pixels.normal.T], -1) / np.maximum(count, 1)[:, None]
+    empty = (count == 0).reshape(_BINS, _BINS, _BINS)
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
-    filled = mean.reshape(BINS, BINS, BINS, 2)[tuple(nearest)].reshape(-1, 2).astype(np.float32)
+    filled = mean.reshape(_BINS, _BINS, _BINS, 2)[tuple(nearest)].reshape(-1, 2).astype(np.float32)
 
     def normals(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
         del place
@@ -94,8 +108,8 @@ def colour_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
 def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
     """Ridge on random Fourier features of a Gaussian kernel over colour and position (Rahimi & Recht 2007)."""
     pixels, rng = pixels_of(presses, touches, seed), np.random.default_rng(seed)
-    directions = rng.standard_normal((5, FEATURES)) * np.array([1.0, 1.0, 1.0, 0.8, 0.8])[:, None]
-    phases = rng.uniform(0, 2 * np.pi, FEATURES)
+    directions = rng.standard_normal((5, _FEATURES)) * np.array([1.0, 1.0, 1.0, 0.8, 0.8])[:, None]
+    phases = rng.uniform(0, 2 * np.pi, _FEATURES)
     spread, offset = directions.astype(np.float32), phases.astype(np.float32)
 
     def features(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -106,11 +120,11 @@ def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
 
 
 def perceptron_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
-    """Two hidden layers of colour and position, by Adam on the squared error of the normal."""
+    """A perceptron of colour and position with two hidden layers, trained by Adam on the normal's squared error."""
     pixels = pixels_of(presses, touches, seed)
     inputs = jnp.asarray(np.concatenate([pixels.change, pixels.position], -1), jnp.float32)
     targets = jnp.asarray(pixels.normal, jnp.float32)
-    sizes, key = (5, WIDTH, WIDTH, 2), jax.random.key(seed)
+    sizes, key = (5, _WIDTH, _WIDTH, 2), jax.random.key(seed)
     params = [
         (jax.random.normal(k, (a, b)) * np.sqrt(2 / a), jnp.zeros(b))
         for k, a, b in zip(jax.random.split(key, 3), sizes, sizes[1:], strict=False)
@@ -142,9 +156,9 @@ MAPS: dict[str, Callable[[BallPresses, Touches, int], Slopes]] = {
 
 
 def published_poisson(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: float) -> np.ndarray:
-    """Cosine-transform integration with eigenvalues indexed from 1, as gs_sdk and gsrobotics ship it.
+    """Cosine-transform integration as gs_sdk and gsrobotics ship it, reimplemented.
 
-    Written anew from what it computes: central differences of the slopes, DCT-II, λ of indices 1 … N, mean 0.
+    Central differences of the slopes, DCT-II, eigenvalues λ of indices 1 … N instead of 0 … N − 1, mean 0.
     """
     height, width = slope_x.shape
     source = np.gradient(slope_x, axis=1) + np.gradient(slope_y, axis=0)
@@ -154,7 +168,7 @@ def published_poisson(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: float
 
 
 def one_sided_dirichlet(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: float) -> np.ndarray:
-    """Sine-transform integration of one-sided differences, zero at the border, as GelSlim ships it; written anew."""
+    """Sine-transform integration of one-sided differences, 0 at the border, as GelSlim ships it, reimplemented."""
     height, width = slope_x.shape
     source = np.zeros_like(slope_x)
     source[:-1, 1:] += slope_x[:-1, 1:] - slope_x[:-1, :-1]
@@ -164,6 +178,21 @@ def one_sided_dirichlet(slope_x: np.ndarray, slope_y: np.ndarray, mm_per_px: flo
     modes = fft.dstn(source[1:-1, 1:-1], type=1, norm="ortho") / (rows[:, None] + columns)
     depth[1:-1, 1:-1] = fft.idstn(modes, type=1, norm="ortho") * mm_per_px
     return depth
+
+
+INTEGRATORS: dict[str, Integrator] = {
+    "this, Neumann": neumann,
+    "this, Dirichlet": dirichlet,
+    "as gs_sdk and gsrobotics": published_poisson,
+    "as GelSlim": one_sided_dirichlet,
+}
+
+
+def depth_by(read: Slopes, picture: np.ndarray, mm_per_px: float, integrate: Integrator = neumann) -> np.ndarray:
+    """Depth of one picture by a map, an integrator and the package's zero level, mm [H, W]."""
+    slope_x, slope_y = read(picture)
+    depth = integrate(slope_x, slope_y, mm_per_px)
+    return depth - zero_level(depth, np.hypot(slope_x, slope_y), mm_per_px, ZeroConfig())
 
 
 def _reader(normals: Callable[[np.ndarray, np.ndarray], np.ndarray], presses: BallPresses) -> Slopes:
@@ -180,8 +209,8 @@ def _reader(normals: Callable[[np.ndarray, np.ndarray], np.ndarray], presses: Ba
 
 
 def _cells(seen: np.ndarray) -> np.ndarray:
-    index = np.clip((seen + 2) / 4 * BINS, 0, BINS - 1).astype(np.int64)
-    return (index[:, 0] * BINS + index[:, 1]) * BINS + index[:, 2]
+    index = np.clip((seen + 2) / 4 * _BINS, 0, _BINS - 1).astype(np.int64)
+    return (index[:, 0] * _BINS + index[:, 1]) * _BINS + index[:, 2]
 
 
 def _ridge(design: np.ndarray, targets: np.ndarray) -> np.ndarray:

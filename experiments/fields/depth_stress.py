@@ -1,28 +1,31 @@
-"""Where depth breaks: generated presses of a ball under seven kinds of stress, each from harmless to hopeless.
+"""Depth under stress: generated presses of a ball, under seven kinds of stress from harmless to hopeless.
 
-The pictures are those of the generator's optics, whose depth is known at every pixel.  A reading is wrong from an error
-of `BROKEN_DEPTH` of the press's depth, root mean square over the contact.
+The pictures come from the optics that calibration assumes, and their depth is known at every pixel.
 """
 
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.fields.depth_balls import calibrated
-from experiments.fields.depth_methods import published_poisson, table_map
-from experiments.fields.generated_presses import GEL, WINDOW_MM, WINDOW_PX, fitted_optics, generated_presses
-from experiments.fields.tracking_stress import Stress, StressOutcome
+from experiments.fields.depth_methods import calibrated, depth_by, published_poisson, table_map
+from experiments.fields.generated_presses import (
+    AXIS_MM,
+    NOISE_GREY,
+    WINDOW_MM,
+    ball_profiles,
+    fitted_optics,
+    generated_presses,
+    to_bytes,
+)
+from experiments.fields.stress import Stress, StressOutcome
 from sensors_io.calibration.circles import find_circles
-from sensors_io.fields.depth import ZeroConfig, zero_level
 from sensors_io.fields.extract import Extractor
-from sensors_io.fields.poisson import dirichlet, neumann
+from sensors_io.fields.poisson import dirichlet
 from sensors_io.fields.slopes import SlopeReader
-from sensors_io.fields.types import Calibration
-from sensors_io.scenes import fitting
 from sensors_io.schema import Flag
 
 BROKEN_DEPTH = 0.2
@@ -38,54 +41,55 @@ DEPTH_STRESSES = (
     Stress(name="contact, radii of a ball of 6.31 mm", levels=(0.3, 0.5, 0.7, 0.8, 0.9)),
 )
 
-_SMALL_MM, _LARGE_MM = 6.31, 30.0  # diameters
-_CONTACT_MM, _NOISE = 1.6, 1.2  # of a press without stress: contact radius, grey levels
-_ALONE = Flag.REFUSED  # says nothing about depth: the gel is bare
-
-Read = Callable[[np.ndarray], tuple[np.ndarray, Flag]]
-"""From a picture to its depth, mm, and the flags that warn of it."""
+_SMALL_MM, _LARGE_MM, _CONTACT_MM = 6.31, 30.0, 1.6  # diameters of the balls; contact radius without stress
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StressedPress:
-    """A stressed press: diameter, touch (x, y, contact radius, mm from the centre), noise, gain, drift in levels."""
+    """A press: the ball's diameter, touch (x, y, contact radius; mm from the centre), noise, gain, drift in levels."""
 
     diameter_mm: float = _SMALL_MM
     touch: tuple[float, float, float] = (0.0, 0.0, _CONTACT_MM)
-    noise: float = _NOISE
+    noise: float = NOISE_GREY
     gain: float = 1.0
     drift: float = 0.0
 
 
 def attempt_depth(
-    presses: int, seeds: int, seed: int, context: Context
-) -> dict[str, dict[tuple[str, float], list[StressOutcome]]]:
-    """Outcomes of every way to depth under every stress; `error_px` is relative.
+    presses: int, seeds: int, seed: int, context: Context, stresses: Sequence[Stress] = DEPTH_STRESSES
+) -> Iterator[tuple[str, str, float, StressOutcome]]:
+    """Method, stress, level and outcome, of all methods under all stresses.
 
     Args:
       presses: that the calibration is made with.
       seeds: presses under each level.
       seed: of the calibration's presses; places and noise follow it.
-      context: shows how far it is.
+      context: shows progress.
+      stresses: kinds and levels.
     """
     methods = _methods(presses, seed)
-    outcomes: dict[str, dict[tuple[str, float], list[StressOutcome]]] = {}
-    every = [(stress.name, level) for stress in DEPTH_STRESSES for level in stress.levels]
+    every = [(stress.name, level) for stress in stresses for level in stress.levels]
     for (stress, level), i in context.each("depth", itertools.product(every, range(seeds))):
-        picture, truth, inside = _shown(_stressed(stress, level, seed + i), seed + 1 + i)
+        picture, truth, inside = _shown(stressed_press(stress, level, seed + i), seed + 1 + i)
         for name, read in methods.items():
-            outcome = _outcome(*read(picture), truth, inside)
-            outcomes.setdefault(name, {}).setdefault((stress, level), []).append(outcome)
-    return outcomes
+            depth, flags = read(picture)
+            yield name, stress, level, depth_outcome(depth, flags, truth, inside)
 
 
-def _outcome(depth: np.ndarray, flags: Flag, truth: np.ndarray, inside: np.ndarray) -> StressOutcome:
+def depth_outcome(depth: np.ndarray, flags: Flag, truth: np.ndarray, inside: np.ndarray) -> StressOutcome:
+    """Root mean square error over the contact as a share of the press depth; wrong from `BROKEN_DEPTH` on.
+
+    Args:
+      depth, truth: [H, W], in the same unit.
+      flags: of the reading.
+      inside: bool [H, W], pixels of the contact.
+    """
     off = float(np.sqrt(np.mean((depth - truth)[inside] ** 2)) / truth.max())
-    return StressOutcome(error_px=off, wrong=float(off > BROKEN_DEPTH), flags=flags)
+    return StressOutcome(error=off, wrong=float(off > BROKEN_DEPTH), flags=flags)
 
 
-def _stressed(stress: str, level: float, seed: int) -> StressedPress:
-    """The press of one level of one stress, at a place of its own near the centre."""
+def stressed_press(stress: str, level: float, seed: int) -> StressedPress:
+    """The press of one level of one stress, by default at a place near the centre that the seed draws."""
     x, y = np.random.default_rng(seed).uniform(-1, 1, 2)
     usual = StressedPress(touch=(x, y, _CONTACT_MM))
     match stress.split(",")[0]:
@@ -105,57 +109,36 @@ def _stressed(stress: str, level: float, seed: int) -> StressedPress:
 
 def _shown(press: StressedPress, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Picture uint8 [N, N, 3], its depth and the pixels of the contact, [N, N]."""
-    axis = (np.arange(WINDOW_PX) - (WINDOW_PX - 1) / 2) * WINDOW_MM / WINDOW_PX
-    touch, profiles = np.array(press.touch), _profiles(press.diameter_mm / 2)
-    clean = 255 * press.gain * fitted_optics(profiles, touch, axis)
-    clean += press.drift * (axis / WINDOW_MM)[:, None] * np.array([1.0, -0.5, 0.5])  # along x, by colour
+    touch, profiles = np.array(press.touch), ball_profiles(press.diameter_mm)
+    clean = 255 * press.gain * fitted_optics(profiles, touch, AXIS_MM)
+    clean += press.drift * (AXIS_MM / WINDOW_MM)[:, None] * np.array([1.0, -0.5, 0.5])  # along x, by colour
     noisy = clean + press.noise * np.random.default_rng(seed).standard_normal(clean.shape)
-    truth, _, _ = profiles.field(touch, axis[None, :], axis[:, None])
-    inside = np.hypot(axis[None, :] - touch[0], axis[:, None] - touch[1]) < touch[2]
-    return np.clip(noisy, 0, 255).round().astype(np.uint8), truth, inside
+    truth, _, _ = profiles.field(touch, AXIS_MM[None, :], AXIS_MM[:, None])
+    inside = np.hypot(AXIS_MM[None, :] - touch[0], AXIS_MM[:, None] - touch[1]) < touch[2]
+    return to_bytes(noisy), truth, inside
 
 
-@functools.lru_cache(maxsize=4)
-def _profiles(radius_mm: float) -> fitting.Profiles:
-    return fitting.ball_profiles(GEL, radius_mm)
-
-
-def _methods(presses: int, seed: int) -> dict[str, Read]:
-    """The package's way first, with its flags; the others have none."""
+def _methods(presses: int, seed: int) -> dict[str, Callable[[np.ndarray], tuple[np.ndarray, Flag]]]:
+    """Method → from a picture to its depth, mm, and the flags that warn of it; only the package has flags."""
     balls = generated_presses(_SMALL_MM, presses, seed, fitted_optics)
     made = calibrated(balls, seed)
-    return {
-        "this": _package(made),
-        "this, Dirichlet": _plain(SlopeReader(made.colours, made.background), made, dirichlet),
-        "as gs_sdk: Poisson from 1, median 0": _peer(SlopeReader(made.colours, made.background), made),
-        "colour table": _plain(table_map(balls, find_circles(balls).touches, seed), made, neumann),
-    }
+    slopes, extractor = SlopeReader(made.colours, made.background), Extractor(made.background, made.mm_per_px, made)
+    colours = table_map(balls, find_circles(balls).touches, seed)
 
-
-def _package(made: Calibration) -> Read:
-    extractor = Extractor(made.background, made.mm_per_px, made)
-
-    def read(picture: np.ndarray) -> tuple[np.ndarray, Flag]:
+    def package(picture: np.ndarray) -> tuple[np.ndarray, Flag]:
         fields = extractor.read(picture)
         assert fields.depth_mm is not None
-        return fields.depth_mm[0], Flag(int(fields.flags[0])) & ~_ALONE
+        bare = Flag.REFUSED  # only says that the gel has no markers
+        return fields.depth_mm[0], Flag(int(fields.flags[0])) & ~bare
 
-    return read
+    def published(picture: np.ndarray) -> np.ndarray:
+        depth = published_poisson(*slopes(picture), made.mm_per_px)
+        return depth - np.median(depth)
 
-
-def _plain(slopes: Callable, made: Calibration, integrate: Callable) -> Read:
-    def read(picture: np.ndarray) -> tuple[np.ndarray, Flag]:
-        x, y = slopes(picture)
-        depth = integrate(x, y, made.mm_per_px)
-        return depth - zero_level(depth, np.hypot(x, y), made.mm_per_px, ZeroConfig()), Flag.NONE
-
-    return read
-
-
-def _peer(slopes: Callable, made: Calibration) -> Read:
-    def read(picture: np.ndarray) -> tuple[np.ndarray, Flag]:
-        x, y = slopes(picture)
-        depth = published_poisson(x, y, made.mm_per_px)
-        return depth - np.median(depth), Flag.NONE
-
-    return read
+    without_flags: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "this, Dirichlet": lambda picture: depth_by(slopes, picture, made.mm_per_px, dirichlet),
+        "as gs_sdk: Poisson from 1, median 0": published,
+        "colour table": lambda picture: depth_by(colours, picture, made.mm_per_px),
+    }
+    plain = lambda read, picture: (read(picture), Flag.NONE)
+    return {"this": package, **{name: functools.partial(plain, read) for name, read in without_flags.items()}}

@@ -1,4 +1,4 @@
-"""Generated presses of a ball: by optics such as calibration supposes, and by lamps that it does not know."""
+"""Generated presses of a ball, under the optics that calibration assumes and under lamps that it cannot model."""
 
 import functools
 from collections.abc import Callable
@@ -14,14 +14,19 @@ from sensors_io.scenes.fitting import Profiles
 WINDOW_PX, WINDOW_MM = 160, 15.2
 """Side of the pictures."""
 
+AXIS_MM = (np.arange(WINDOW_PX) - (WINDOW_PX - 1) / 2) * (WINDOW_MM / WINDOW_PX)
+"""Centres of the pixels along a side, from the window's centre."""
+
 GEL = Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5)
 
-_NOISE = 1.2  # grey levels, as fitted to the real camera
+NOISE_GREY = 1.2
+"""Standard deviation of the camera's noise in grey levels, fitted to the real camera."""
+
 _WIDEST_RADII, _WIDEST_MM = 0.6, 2.2  # contact radius, in ball radii and at all
 
 Optics = Callable[[Profiles, np.ndarray | None, np.ndarray], np.ndarray]
-"""From the ball's profiles, a touch (x, y, contact radius; `None` at rest) and the pixels' axis [N], mm, to a clean
-picture [N, N, 3], 1 the brightest that the camera tells.
+"""From the ball's profiles, a touch (x, y, contact radius; `None` at rest) and the pixels' axis [N], mm, to a picture
+[N, N, 3] without noise, in which 1 is the brightest value of the camera.
 """
 
 LAMP_ROWS = ((90.0, (1.0, 0.08, 0.05)), (210.0, (0.10, 1.0, 0.10)), (330.0, (0.05, 0.12, 1.0)))
@@ -34,7 +39,7 @@ _FLAT, _GAMMA, _BLUR_PX = 0.35, 1.4, 1.0  # brightness of the untouched centre, 
 
 
 def fitted_optics(profiles: Profiles, touch: np.ndarray | None, axis_mm: np.ndarray) -> np.ndarray:
-    """The generator's: linear in (n_x, n_y, n_x², n_x n_y, n_y², u) at every place, fitted to a real GelSight Mini."""
+    """Optics of the generator, linear in (n_x, n_y, n_x², n_x n_y, n_y², u) and fitted to a real GelSight Mini."""
     flat = photometric.fields(photometric.MINI, len(axis_mm), WINDOW_MM)[0].transpose(1, 2, 0)
     return flat if touch is None else flat + fitting.change(photometric.MINI, profiles, touch, axis_mm, WINDOW_MM)
 
@@ -44,8 +49,9 @@ def near_lamps(profiles: Profiles, touch: np.ndarray | None, axis_mm: np.ndarray
 
         I = (v Σ_lamps colour (max(0, n·l) + g max(0, n·h)^m) / d²)^(1/γ)
 
-    n the normal, l and d direction and distance of a lamp from the *indented* surface, h half-way between l and the
-    view, v the vignette.  Neither linear in the normal nor polynomial in the place; sides that face away are black.
+    n is the normal, l and d are direction and distance of a lamp from the *indented* surface, h lies half-way between
+    l and the view, v is the vignette.  I is neither linear in n nor polynomial in the place; sides that face away are
+    black.
     """
     x, y = axis_mm[None, :], axis_mm[:, None]
     depth, d_x, d_y = np.zeros((3, len(axis_mm), len(axis_mm))) if touch is None else profiles.field(touch, x, y)
@@ -59,7 +65,7 @@ def near_lamps(profiles: Profiles, touch: np.ndarray | None, axis_mm: np.ndarray
 
 
 def _light(at_mm: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """What a surface at points […, 3] with unit normals […, 3] sends to the camera, […, 3] colours."""
+    """Light in three colours […, 3] from points […, 3] with unit normals […, 3] to the camera."""
     total = np.zeros(at_mm.shape)
     for degrees, colour in LAMP_ROWS:
         out = np.array([np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))])
@@ -76,7 +82,7 @@ def _light(at_mm: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def generated_presses(diameter_mm: float, count: int, seed: int, optics: Optics = fitted_optics) -> BallPresses:
-    """Presses all over the window, the gel's shape by the solved layer.
+    """Presses at random places of the window; the gel's shape is that of the solved elastic layer.
 
     Args:
       diameter_mm: of the ball.
@@ -85,28 +91,28 @@ def generated_presses(diameter_mm: float, count: int, seed: int, optics: Optics 
       optics: of the sensor.
     """
     rng = np.random.default_rng(seed)
-    pitch = WINDOW_MM / WINDOW_PX
-    axis = (np.arange(WINDOW_PX) - (WINDOW_PX - 1) / 2) * pitch
-    profiles = _profiles(diameter_mm / 2)
+    profiles = ball_profiles(diameter_mm)
     widest = min(_WIDEST_RADII * diameter_mm / 2, _WIDEST_MM)
 
     def picture() -> np.ndarray:
         touch = np.array([*rng.uniform(-5, 5, 2), rng.uniform(0.8, 1.0) * widest])
-        shaded = 255 * optics(profiles, touch, axis)
-        return _bytes(shaded + _NOISE * rng.standard_normal(shaded.shape))
+        shaded = 255 * optics(profiles, touch, AXIS_MM)
+        return to_bytes(shaded + NOISE_GREY * rng.standard_normal(shaded.shape))
 
     return BallPresses(
         pictures=np.stack([picture() for _ in range(count)]),
-        background=_bytes(255 * optics(profiles, None, axis)),
+        background=to_bytes(255 * optics(profiles, None, AXIS_MM)),
         radius_mm=diameter_mm / 2,
-        mm_per_px=pitch,
+        mm_per_px=WINDOW_MM / WINDOW_PX,
     )
 
 
 @functools.lru_cache(maxsize=8)
-def _profiles(radius_mm: float) -> Profiles:
-    return fitting.ball_profiles(GEL, radius_mm)
+def ball_profiles(diameter_mm: float) -> Profiles:
+    """Shapes of the gel under a ball at every contact radius, solved once for each ball."""
+    return fitting.ball_profiles(GEL, diameter_mm / 2)
 
 
-def _bytes(picture: np.ndarray) -> np.ndarray:
+def to_bytes(picture: np.ndarray) -> np.ndarray:
+    """Grey levels as a camera stores them, uint8."""
     return np.clip(picture, 0, 255).round().astype(np.uint8)

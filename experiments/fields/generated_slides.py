@@ -1,4 +1,4 @@
-"""Presses, slides and twists on generated gels, with every field known: what acts, what it moves, what is measured."""
+"""Presses, slides and twists on generated gels, with the true fields and the measured ones."""
 
 import dataclasses
 import functools
@@ -17,17 +17,20 @@ NODES = 20
 """Rows and columns of the measured fields, as in the records of generated scenes."""
 
 _PER_NODE = 4  # contact pixels along a node's side
-LOST_NODES = 0.004
-"""Share of nodes that a frame cannot read, as in generated scenes."""
+_LOST_NODES = 0.004  # share of nodes that a frame cannot read, as in generated scenes
+_LEAST_FORCE_N = 0.5  # frames that press less have hardly any shear
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Slide:
-    """One sequence of F frames on the node grid [F, h, w, …]: what is measured, and the truth behind it.
+    """One sequence of F frames on the node grid [F, h, w, …], measured and true.
 
-    Measured: `deformation_mm`, `depth_mm` of the marker plane and `valid`, with the sensor's noise and lost nodes.
-    True: `shear_mm` (the part of the displacement that traction makes), `traction_mpa` on the gel (x, y, z), `force_n`
-    [F, 3] and `moment_nmm` [F, 3].
+    Args:
+      motion, kind: of the contact and of the object.
+      deformation_mm, depth_mm, valid: measured in the marker plane, with the sensor's noise and lost nodes.
+      shear_mm: true, the part of the displacement that traction causes.
+      traction_mpa: true, on the gel, (x, y, z).
+      force_n, moment_nmm: true, [F, 3].
     """
 
     motion: str
@@ -42,12 +45,17 @@ class Slide:
 
     @property
     def moving(self) -> np.ndarray:
-        """Frames [F] in which something pulls along the gel."""
+        """Bool [F], frames with any shear."""
         return np.linalg.norm(self.shear_mm, axis=-1).max((1, 2)) > 0
 
 
+def pressing(slide: Slide) -> np.ndarray:
+    """Indices of the frames in which the object presses."""
+    return np.flatnonzero(-slide.force_n[:, 2] > _LEAST_FORCE_N)
+
+
 def node_grid(sensor: SensorModel) -> NodeGrid:
-    """The nodes of a sensor's fields; both displacement and depth are those of its marker plane."""
+    """The nodes of a sensor's fields; displacement and depth are both those of its marker plane."""
     pitch = sensor.window_mm / NODES
     depth = sensor.marker_depth_mm
     if depth is None:
@@ -110,7 +118,7 @@ def _measured(
         kind=kind,
         deformation_mm=seen[..., :2],
         depth_mm=seen[..., 2],
-        valid=rng.uniform(size=seen.shape[:-1]) >= LOST_NODES,
+        valid=rng.uniform(size=seen.shape[:-1]) >= _LOST_NODES,
         shear_mm=nodes["shear"],
         traction_mpa=nodes["load"],
         force_n=true["force"],

@@ -1,23 +1,100 @@
-"""Known motion on a real picture of a gel: what moves where, and the picture that a camera would take of it.
+"""Known motion of marker gels: gels at rest, real and generated, and the pictures that a camera takes as they move.
 
-A displacement b(y) says where the gel at y came from, so that the picture at y is the picture at rest at y − b(y), and
-a point p moves by f(p) = b(p + f(p)).  Both are exact: b is a formula, the picture at rest a cubic spline.  (OpenCV's
-cubic `remap` rounds coordinates to a thirty-second of a pixel, which is as large as the errors that are measured here.)
+A displacement b(y) says where the gel at y came from, so the picture at y is the picture at rest at y − b(y), and a
+point p moves by f(p) = b(p + f(p)).  Both are exact: b is a formula, the picture at rest a cubic spline.  (OpenCV's
+cubic `remap` rounds coordinates to 1/32 pixel, which is as large as the errors that are measured here.)
 """
 
 import dataclasses
+import pathlib
 
+import cv2
+import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
+from experiments.fields.published import load
+from sensors_io.fields.deformation import DeformationReader
+from sensors_io.scenes import optics
+from sensors_io.scenes.sensors import DMTAC_X, XENSE, SensorModel
+from sensors_io.scenes.units import unit_of
+
+PEAK_PX, JUMP_PX = 12.0, 28.0
+"""Greatest displacement of a motion and of a jump, on a picture 320 pixels wide."""
+
+NOISE_GREY = 2.0
+"""Standard deviation of the camera's noise, grey levels."""
+
+FIRST_SEED = 400
+"""Of motions and noise in reports: settings were chosen on motions of the seeds 0 to 3, on other pictures."""
+
 REST_PICTURES = 16
-"""Pictures that the background is the mean of: one alone would add its noise to that of every later one."""
+"""Pictures whose mean is the background: one alone would add its noise to that of every later one."""
 
 _FIXED_POINT, _UNCHANGED_PX = 80, 1e-9  # iterations of f = b(p + f) at most, and the change that ends them
 _LIGHT_GREY, _LIGHT_WIDTH = 25.0, 0.18  # coloured shading of a contact: grey levels, and share of the shorter side
-_SETTLED = 0.55, 0.45  # centre of the contact, over width and height
+_CENTRE = 0.55, 0.45  # of the contact, over width and height
 
 MotionCoefficients = tuple[float, float, float, float, float, float]
+
+REAL_GELS = {
+    "GelSight Mini": ("FOTS/marker_calib/data/1.png", 0),
+    "GelSlim": ("gelslim/test_data/sample_13.jpg", 0),
+    "GelSlim 2": ("gelsight_heightmap/test_data/sample_34.jpg", 0),
+    "GelSight bench": ("gelsight_driver/track_markers/video.avi", 24),
+    "GelSight gripper": ("letac_mpc/hard_rubber/*dp_1_*/*000001.jpg", 0),
+}
+"""Gel → pattern in the data directory, and frame of a video, of the picture that stands for the gel at rest.
+
+The tracker's settings, the windows and the number of rest pictures were chosen on others: `marker_calib/data/3.png`,
+the two `ref.jpg`, frame 0 of the video and the first picture of `letac_mpc/gel`.
+"""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GelAtRest:
+    """A gel at rest: its name, RGB uint8 [H, W, 3], whether a camera took it."""
+
+    name: str
+    picture: np.ndarray
+    real: bool
+
+
+def gels(data_dir: pathlib.Path | None) -> list[GelAtRest]:
+    """The real gels in the data directory, and the generated ones.
+
+    Raises:
+      FileNotFoundError: a data directory that holds none of the pictures.
+    """
+    generated = [
+        GelAtRest(name="Xense, generated", picture=_generated(XENSE, 240, 1), real=False),
+        GelAtRest(name="DM-Tac, generated", picture=_generated(DMTAC_X, 240, 3), real=False),
+    ]
+    if data_dir is None:
+        return generated
+    found = [(name, frame, sorted(data_dir.glob(pattern))) for name, (pattern, frame) in REAL_GELS.items()]
+    real = [GelAtRest(name=name, picture=load(paths[0], frame), real=True) for name, frame, paths in found if paths]
+    if not real:
+        wanted = ", ".join(pattern for pattern, _ in REAL_GELS.values())
+        raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
+    return [*real, *generated]
+
+
+def _generated(sensor: SensorModel, side_px: int, order: int) -> np.ndarray:
+    """The gel of a generated sensor at rest, without noise."""
+    if sensor.render is None:
+        raise ValueError(f"{sensor.name} exposes no camera: it has no picture; choose another sensor")
+    still = jnp.zeros((side_px, side_px))
+    gel = optics.DeformedGel(
+        depth_mm=still, marker_x_mm=still, marker_y_mm=still, marker_depth_mm=still, window_mm=sensor.window_mm
+    )
+    picture = np.asarray(sensor.render(gel, unit_of(0, order, 0).light))
+    return np.round(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+
+
+def grey(picture: np.ndarray) -> np.ndarray:
+    """RGB uint8 [H, W, 3] → uint8 [H, W]."""
+    return cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,10 +146,10 @@ def pressed(shape: tuple[int, ...], peak_px: float, rng: np.random.Generator | N
     Args:
       shape: of the picture.
       peak_px: greatest |b| over the picture.
-      rng: draws place, width and mixture; `None` takes the mixture that published figures were measured with.
+      rng: draws place, width and coefficients; `None` takes those that published figures were measured with.
     """
     height, width = shape[:2]
-    bump, drift, centre, share = (0.7, 0.25, -0.25, 0.4, 0.25, 0.25), (0.1, -0.05), _SETTLED, 0.22
+    bump, drift, centre, share = (0.7, 0.25, -0.25, 0.4, 0.25, 0.25), (0.1, -0.05), _CENTRE, 0.22
     if rng is not None:
         drawn = rng.normal(0, 1, 8) * (0.6, 0.3, 0.3, 0.6, 0.3, 0.3, 0.1, 0.1)
         bump, drift = tuple(map(float, drawn[:6])), (float(drawn[6]), float(drawn[7]))  # type: ignore[assignment]
@@ -106,7 +183,7 @@ class GelCamera:
         self._light = _contact_light(rest.shape)
 
     def at_rest(self, pictures: int = REST_PICTURES) -> np.ndarray:
-        """The unmoved gel, the mean of some pictures as a background is recorded, RGB uint8."""
+        """The gel at rest, the mean of some pictures as a background is recorded, RGB uint8."""
         seen = [self.exposed(self._rest) for _ in range(pictures)]
         return np.asarray(np.round(np.mean(seen, 0)), np.uint8)
 
@@ -114,14 +191,14 @@ class GelCamera:
         """The gel under a motion, RGB uint8.
 
         Args:
-          motion: where everything goes.
+          motion: of the gel.
           light: strength of the contact's coloured shading.
           exposure: factor of all brightness.
         """
         return self.exposed(exposure * self.clean(motion, light))
 
     def clean(self, motion: GelMotion, light: float) -> np.ndarray:
-        """The same without noise and rounding, float64."""
+        """The gel under a motion without noise and rounding, float64."""
         source = self._pixels - motion.backward(self._pixels)
         at = [source[..., 1], source[..., 0]]
         planes = [map_coordinates(s, at, order=3, prefilter=False, mode="nearest") for s in self._splines]
@@ -133,6 +210,51 @@ class GelCamera:
         return np.round(np.clip(noisy, 0, 255)).astype(np.uint8)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackedGel:
+    """A gel as the package tracks it.
+
+    Args:
+      rest: the gel.
+      points_px: that are tracked [P, 2].
+      half_px: half side of their windows.
+      dot_radius_px: radius of a dot; on a dense pattern, half the side of a window.
+    """
+
+    rest: GelAtRest
+    points_px: np.ndarray
+    half_px: int
+    dot_radius_px: float
+
+    @property
+    def unit(self) -> float:
+        """Pixels per pixel of a picture 320 wide."""
+        return self.rest.picture.shape[1] / 320
+
+    def motion(self, peak_px: float, seed: int | None) -> GelMotion:
+        """A motion of a peak on a picture 320 wide; without a seed the one of published figures."""
+        rng = None if seed is None else np.random.default_rng(seed)
+        return pressed(self.rest.picture.shape, peak_px * self.unit, rng)
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Bool [P], points whose window lies in the picture."""
+        height, width = self.rest.picture.shape[:2]
+        margin = self.half_px + 1
+        return np.all((points >= margin) & (points <= np.array([width, height]) - 1 - margin), -1)
+
+
+def tracked(rest: GelAtRest) -> TrackedGel:
+    """The points, windows and dots that the package finds on a gel."""
+    reader = DeformationReader(rest.picture, mm_per_px=1.0)
+    dots, half = reader.evidence.markers, reader.tracker.half_px
+    return TrackedGel(
+        rest=rest,
+        points_px=reader.tracker.points_px,
+        half_px=half,
+        dot_radius_px=float(half) if dots is None else dots.radius_px,
+    )
+
+
 def _pixels(shape: tuple[int, ...]) -> np.ndarray:
     """Pixel centres (x, y) [H, W, 2]."""
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
@@ -141,7 +263,7 @@ def _pixels(shape: tuple[int, ...]) -> np.ndarray:
 
 def _contact_light(shape: tuple[int, ...]) -> np.ndarray:
     """Grey levels that a contact's slopes add to the three colours, lamps a third of a turn apart, [H, W, 3]."""
-    away = _pixels(shape) - np.array(_SETTLED) * np.array(shape[1::-1])
+    away = _pixels(shape) - np.array(_CENTRE) * np.array(shape[1::-1])
     width = _LIGHT_WIDTH * min(shape[:2])
     bell = np.exp(-(away**2).sum(-1) / (2 * width**2))
     angle = np.arctan2(away[..., 1], away[..., 0])

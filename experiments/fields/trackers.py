@@ -1,7 +1,7 @@
-"""How others follow the dots of a gel, written anew for comparison; each is told where the dots lie at rest.
+"""Methods that track the dots of a gel: the package's, and reimplementations of those in common use.
 
-A follower is made from the picture at rest and the points; called with the next picture, it returns the points,
-(x, y) [P, 2], NaN where it says itself that a point is lost.
+A follower is made from the picture at rest and the points at rest.  Called with the next picture, it returns the points
+(x, y) [P, 2], NaN where it reports a point as lost.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class Follower(Protocol):
 
 
 Make = Callable[[np.ndarray, np.ndarray, int], Follower]
-"""From picture at rest, points and half side of the windows."""
+"""From the picture at rest, the points and the half side of the windows to a follower."""
 
 
 def ours(affine: bool, smooth: bool) -> Make:
@@ -64,7 +64,7 @@ def dense_inverse_search(preset: int) -> Make:
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
         del half_px
         flow = cv2.DISOpticalFlow.create(preset)
-        return lambda grey: points + read(flow.calc(rest, grey, None), points)  # type: ignore[call-overload]
+        return lambda grey: points + _at_points(flow.calc(rest, grey, None), points)  # type: ignore[call-overload]
 
     return make
 
@@ -74,19 +74,19 @@ def farneback(window_px: int) -> Make:
 
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
         del half_px
-        return lambda grey: points + read(farneback_flow(rest, grey, window_px), points)
+        return lambda grey: points + _at_points(farneback_flow(rest, grey, window_px), points)
 
     return make
 
 
 def farneback_flow(rest: np.ndarray, grey: np.ndarray, window_px: int) -> np.ndarray:
-    """As shear estimators commonly set it, [H, W, 2]."""
+    """Farnebäck's flow with the settings that shear estimators commonly use, [H, W, 2]."""
     start = np.zeros((*rest.shape, 2), np.float32)
     return cv2.calcOpticalFlowFarneback(rest, grey, start, 0.5, 3, window_px, 3, 5, 1.2, 0)
 
 
 def nearest_dot(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
-    """Dots are detected in every picture; each point takes the nearest one that takes it in turn."""
+    """Dots are detected in every picture; a point and a dot are paired where each is the other's nearest."""
     del rest, half_px
     state = {"points": points.copy()}
 
@@ -106,7 +106,7 @@ def nearest_dot(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
 def mean_shift(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
     """Each point moves to the centroid of the dark pixels in a window around where it was, a few times.
 
-    The method of gsrobotics' `marker_tracker`, whose windows are fixed in pixels; here they suit the dots.
+    The method of gsrobotics' `marker_tracker`, with windows of the dots' size in place of a fixed one.
     """
     del rest
     state = {"points": points.copy()}
@@ -143,17 +143,17 @@ FOLLOWERS: dict[str, Make] = {
     "dots, nearest": nearest_dot,
     "mean shift": mean_shift,
 }
-"""Every method by its name in tables and charts."""
+"""Name in tables and charts → method."""
 
 
-def read(flow: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _at_points(flow: np.ndarray, points: np.ndarray) -> np.ndarray:
     """A flow [H, W, 2] at points (x, y) [P, 2]."""
     x, y = (np.ascontiguousarray(points[:, i : i + 1], np.float32) for i in (0, 1))
     return cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
 
 
 def _lucas_kanade(source: np.ndarray, target: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """As marker trackers commonly set it, from no motion, [P, 2]."""
+    """Pyramidal Lucas–Kanade with the settings that marker trackers commonly use, from no motion, [P, 2]."""
     moved, _, _ = cv2.calcOpticalFlowPyrLK(
         source, target, points[:, None], points[:, None].copy(), winSize=(15, 15), maxLevel=2, criteria=(3, 10, 0.03)
     )

@@ -5,6 +5,8 @@ import re
 
 import numpy as np
 import pytest
+from experiments.fields.gels_at_rest import GelAtRest
+from experiments.fields.tracked_gels import TrackedGel, subject
 
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
@@ -18,9 +20,7 @@ from experiments.fields import (
     pareto_fields,
 )
 from experiments.fields.depth_methods import MAPS
-from experiments.fields.gels_at_rest import GelAtRest
 from experiments.fields.generated_presses import WINDOW_PX, fitted_optics, generated_presses, near_lamps
-from experiments.fields.tracked_gels import TrackedGel, subject
 from sensors_io.calibration.circles import find_circles
 
 TINY = dataclasses.replace(pareto_fields.EXPERIMENT.scales["smoke"], rounds=2)

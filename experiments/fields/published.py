@@ -1,0 +1,196 @@
+"""The published recordings of real sensors: where their files lie in a data directory, and what is known about them."""
+
+import dataclasses
+import pathlib
+import re
+
+import cv2
+import numpy as np
+
+from sensors_io.calibration.presses import BallPresses
+from sensors_io.fields.sources import read_picture, read_pictures
+
+SIM2REAL = "gelsight_sim2real/quantitative_real_gan"
+SIM2REAL_MM = 0.0592593
+"""Pitch of gelsight_sim2real, mm/px, as its code gives it."""
+
+_SPHERE_MM, _SPHERE_PX, _KEPT = 2.92, (208, 166), 0.85  # radius, centre, share of the contact radius that is scored
+_PRISM_PX = ((172, 114), (242, 220))
+_TRIANGLE_PX = ((161, 137), (212, 132), (250, 193))
+_WIDEST_PX = 480  # wider pictures are reduced: their pixels are finer than their optics
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordingFolder:
+    """Pictures of one sensor in one folder.
+
+    Args:
+      path: of the folder in the data directory.
+      pattern: glob of its pictures.
+      background: the picture of the gel at rest.
+      mm_per_px: pitch.
+      ball_diameter_mm: of the ball that pressed the gel, `None` where other objects did.
+      remark: what the reader of its fields must know.
+    """
+
+    path: str
+    pattern: str
+    background: str
+    mm_per_px: float
+    ball_diameter_mm: float | None = None
+    remark: str = ""
+
+
+FOLDERS = {
+    "gelslam": RecordingFolder(
+        path="gelslam", pattern="6.310mm/*/gelsight.png", background="background.png",
+        mm_per_px=0.0634, ball_diameter_mm=6.31,
+    ),
+    "gelsight sim2real": RecordingFolder(
+        path=SIM2REAL, pattern="calib_*.png", background="background_real.png",
+        mm_per_px=SIM2REAL_MM, ball_diameter_mm=2 * _SPHERE_MM,
+    ),
+    "FOTS Mini": RecordingFolder(
+        path="FOTS/mlp_calib", pattern="gelsight/*.png", background="0000.png",
+        mm_per_px=1 / 19.58, ball_diameter_mm=4.70,
+        remark="The gel slopes over the whole window, so there is no zero level: depth is known up to a tilt and a "
+        "constant",
+    ),
+    "ShapeMap3D Mini": RecordingFolder(
+        path="gsmini_shapemap/calib_ball", pattern="frame_*.jpg", background="frame_0.png",
+        mm_per_px=0.08, ball_diameter_mm=4.0,
+        remark="Lens and light differ from the gel at rest along the whole border, so there is no zero level: absolute "
+        "depth and the outlines in the corners mean nothing",
+    ),
+    "FOTS DIGIT": RecordingFolder(
+        path="FOTS", pattern="mlp_calib/digit/*.png", background="assets/gel/digit_bg.png", mm_per_px=0.0657,
+    ),
+    "GelSlim": RecordingFolder(
+        path="gelslim/test_data", pattern="sample_*.jpg", background="ref.jpg",
+        mm_per_px=0.10577, ball_diameter_mm=7.6,
+        remark="The outlines at the upper and lower border are not contacts: the lamps there have drifted since the "
+        "gel at rest was recorded, and no threshold that keeps a light second touch removes them",
+    ),
+    "GelSlim heightmap": RecordingFolder(
+        path="gelsight_heightmap/test_data", pattern="sample_*.jpg", background="ref.jpg",
+        mm_per_px=0.10577, ball_diameter_mm=7.6,
+    ),
+    "wedge": RecordingFolder(
+        path="wyh5625_wedge/calibration", pattern="ball-*.jpg", background="bg-0.jpg",
+        mm_per_px=0.1, ball_diameter_mm=3.96,
+    ),
+    "GelSight bench": RecordingFolder(
+        path="gelsight_driver/calibration/cali_180110", pattern="Im_*.jpg", background="frame0.jpg",
+        mm_per_px=0.0254, ball_diameter_mm=3.96,
+    ),
+    "FeelAnyForce, untouched": RecordingFolder(
+        path="feelanyforce", pattern="tactile/*.png", background="background.png", mm_per_px=0.0634,
+    ),
+    "gs_sdk objects": RecordingFolder(
+        path="gs_sdk/data", pattern="[bks]e*.png", background="background.png", mm_per_px=0.0634,
+    ),
+}  # fmt: skip
+"""Name → folder; pitches and diameters as the authors' code gives them."""
+
+
+def read_folder(folder: RecordingFolder, root: pathlib.Path) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """Pictures uint8 [N, H, W, 3], their names, and the background [H, W, 3] at the size of the pictures.
+
+    Raises:
+      FileNotFoundError: no picture of that pattern.
+    """
+    base = root / folder.path
+    paths = sorted(path for path in base.glob(folder.pattern) if path != base / folder.background)
+    if not paths:
+        raise FileNotFoundError(f"{base} holds no {folder.pattern}: must hold the recording; copy it whole")
+    frames = np.stack([read_picture(path) for path in paths])
+    background = read_picture(base / folder.background)
+    if background.shape != frames.shape[1:]:
+        background = cv2.resize(background, frames.shape[2:0:-1], interpolation=cv2.INTER_AREA)
+    return frames, tuple(str(path.relative_to(base)) for path in paths), background
+
+
+def ball_presses(name: str, root: pathlib.Path) -> BallPresses:
+    """Presses of the ball of one of `FOLDERS`.
+
+    Raises:
+      ValueError: the folder's objects are not balls of one diameter.
+      FileNotFoundError: as `read_folder`.
+    """
+    folder = FOLDERS[name]
+    if folder.ball_diameter_mm is None:
+        raise ValueError(f"{name} has no ball_diameter_mm: must be pressed by one ball; choose another folder")
+    frames, _, background = read_folder(folder, root)
+    return BallPresses(
+        pictures=frames, background=background, radius_mm=folder.ball_diameter_mm / 2, mm_per_px=folder.mm_per_px
+    )
+
+
+def gelslam(root: pathlib.Path) -> BallPresses:
+    """44 presses of a ball of 6.31 mm into a GelSight Mini, by number: published figures have folds in this order."""
+    pictures = read_pictures([root / "gelslam" / "6.310mm"], "gelsight_mini").frames
+    background = read_picture(root / "gelslam" / "background.png")
+    return BallPresses(pictures=pictures, background=background, radius_mm=6.31 / 2, mm_per_px=0.0634)
+
+
+def feelanyforce_rows(root: pathlib.Path) -> np.ndarray:
+    """Force and torque in the rows of FeelAnyForce's table, float64 [N, 6], NaN where a row is empty."""
+    (table,) = (root / "feelanyforce").glob("*.csv")
+    cells = [line.rstrip("\n").split(",")[-1].split() for line in table.read_text().splitlines()[1:]]
+    return np.array([[float(c) for c in row] if len(row) == 6 else [np.nan] * 6 for row in cells])
+
+
+def known_depths(root: pathlib.Path) -> dict[tuple[str, float], np.ndarray]:
+    """(Shape, depth in mm) → picture, of the presses of gelsight_sim2real at known depth."""
+    found = {}
+    for path in sorted((root / SIM2REAL).glob("*_real.png")):
+        name = re.fullmatch(r"(sphere|prism|triangle)_([\d.]+)_real", path.stem)
+        if name:
+            found[name[1], float(name[2])] = read_picture(path)
+    return found
+
+
+def known_truth(shape: str, depth_mm: float, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Depth of the rigid indenter, mm [H, W], and the pixels that the authors' evaluation scores, bool [H, W]."""
+    mask = np.zeros(size, np.uint8)
+    truth = np.full(size, depth_mm)
+    if shape == "sphere":
+        y, x = np.mgrid[: size[0], : size[1]]
+        square = ((x - _SPHERE_PX[0]) ** 2 + (y - _SPHERE_PX[1]) ** 2) * SIM2REAL_MM**2
+        edge = _SPHERE_MM**2 - (_SPHERE_MM - depth_mm) ** 2
+        cv2.circle(mask, _SPHERE_PX, int(_KEPT * np.sqrt(edge) / SIM2REAL_MM), 1, -1)
+        cap = np.sqrt(np.maximum(_SPHERE_MM**2 - square, 0)) - (_SPHERE_MM - depth_mm)
+        truth = np.where(square < edge, cap, 0)
+    elif shape == "prism":
+        cv2.rectangle(mask, *_PRISM_PX, 1, -1)
+    else:
+        cv2.fillPoly(mask, [np.array(_TRIANGLE_PX, np.int32)], 1)
+    return truth, mask.astype(bool)
+
+
+def load(path: pathlib.Path, frame: int = 0) -> np.ndarray:
+    """A picture, or one frame of a video, RGB uint8, at most 480 pixels wide by averaging.
+
+    Raises:
+      ValueError: a file that OpenCV cannot read.
+    """
+    picture = cv2.imread(str(path))
+    if picture is None:
+        reader = cv2.VideoCapture(str(path))
+        try:
+            for _ in range(frame + 1):
+                read, picture = reader.read()
+        finally:
+            reader.release()
+        if not read or picture is None:
+            raise ValueError(f"{path} is no picture and no video of {frame + 1} frames that OpenCV reads; replace it")
+    return cv2.cvtColor(reduced(picture), cv2.COLOR_BGR2RGB)
+
+
+def reduced(picture: np.ndarray) -> np.ndarray:
+    """A picture [H, W, 3] at most 480 pixels wide, by averaging over whole pixels."""
+    factor = -(-picture.shape[1] // _WIDEST_PX)
+    if factor == 1:
+        return picture
+    size = (picture.shape[1] // factor, picture.shape[0] // factor)
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)

@@ -1,0 +1,162 @@
+"""Methods under growing stress: the level at which each one breaks, and whether a flag warns of it."""
+
+import collections
+import dataclasses
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.core.charts import Panel, Rule, Series, draw
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Picture, Requirement, Table, at_most, named_table
+from experiments.fields.sections import FieldSection
+from sensors_io.fields.deformation import LOST_SHARE
+from sensors_io.schema import Flag
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stress:
+    """One kind of stress: its name with the unit, and its levels, mild to severe."""
+
+    name: str
+    levels: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StressOutcome:
+    """One frame read by one method under one level of one stress.
+
+    Args:
+      error: summary of the distance from the truth, in the unit of the chart; infinite where the method gives nothing.
+      wrong: share of the frame that is given and wrong.
+      flags: those that warn of the frame.
+    """
+
+    error: float
+    wrong: float
+    flags: Flag
+
+    @property
+    def broken(self) -> bool:
+        """More of the frame is wrong than a frame may lose."""
+        return self.wrong > LOST_SHARE
+
+    @property
+    def silent(self) -> bool:
+        """Broken without any flag."""
+        return self.broken and not self.flags
+
+
+StressOutcomes = Mapping[str, Mapping[tuple[str, float], Sequence[StressOutcome]]]
+"""Method → (stress, level) → outcomes of all frames."""
+
+
+def gathered(attempts: Iterable[tuple[str, str, float, StressOutcome]]) -> StressOutcomes:
+    """Sort attempts (method, stress, level, outcome) by method, stress and level."""
+    outcomes: dict[str, dict[tuple[str, float], list[StressOutcome]]] = {}
+    for method, stress, level, outcome in attempts:
+        outcomes.setdefault(method, {}).setdefault((stress, level), []).append(outcome)
+    return outcomes
+
+
+def silent_frames(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]]) -> int:
+    """Number of frames of one method that are broken without a flag."""
+    return sum(outcome.silent for frames in by_level.values() for outcome in frames)
+
+
+def silence(outcomes: StressOutcomes, ours: str, things: str, fault: str) -> tuple[str, Requirement]:
+    """A sentence on the silent failures of every method, and the requirement that `ours` has none."""
+    silent = {method: silent_frames(by_level) for method, by_level in outcomes.items()}
+    total = sum(map(len, outcomes[ours].values()))
+    counts = ", ".join(f"{method} {count}" for method, count in silent.items())
+    requirement = at_most(f"{ours}: {fault} and not flagged", silent[ours], 0)
+    return f"Of {total} {things} under stress, {fault} and not flagged: {counts}.", requirement
+
+
+def stress_section(
+    field: str, outcomes: StressOutcomes, stresses: Sequence[Stress], tolerance: float, unit: str, caption: str
+) -> FieldSection:
+    """Table of first breaks and curves of the error of all methods.
+
+    Args:
+      field: `tracking`, `shear` or `depth`.
+      outcomes: of every level of every stress.
+      stresses: one panel of the chart each.
+      tolerance: error from which a reading is wrong.
+      unit: of the errors.
+      caption: of the chart.
+    """
+    picture = Picture(
+        name=f"stability_{field}",
+        title=f"Where {field} breaks",
+        caption=caption,
+        content=_curves(outcomes, stresses, tolerance, unit),
+    )
+    return FieldSection(tables=(break_table(field, outcomes, stresses),), pictures=(picture,))
+
+
+def break_table(field: str, outcomes: StressOutcomes, stresses: Sequence[Stress]) -> Table:
+    """First broken level of every method under every stress, with the flags of the broken frames of all levels."""
+
+    def cell(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]], stress: Stress) -> str:
+        broken = [(level, o) for level in stress.levels for o in by_level[stress.name, level] if o.broken]
+        if not broken:
+            return "–"
+        names = (" + ".join(str(f.name).lower() for f in Flag if f & o.flags) or "silent" for _, o in broken)
+        counts = collections.Counter(names)
+        return f"{broken[0][0]:.3g}: " + ", ".join(f"{name} {count}" for name, count in counts.items())
+
+    return named_table(
+        f"Where {field} breaks first",
+        [{"method": m, **{s.name: cell(by_level, s) for s in stresses}} for m, by_level in outcomes.items()],
+        note="First level at which any gel and motion breaks; then the number of broken frames over all levels by the "
+        "flags that they carry.",
+    )
+
+
+def _curves(outcomes: StressOutcomes, stresses: Sequence[Stress], tolerance: float, unit: str) -> bytes:
+    """The worst error of every method by level, one panel a stress, clipped to two decades around the tolerance."""
+    colours = dict(zip(outcomes, itertools.cycle((*PALETTE, SHARED)), strict=False))
+    first = next(iter(outcomes))
+    panels = []
+    for i, stress in enumerate(stresses):
+        series, marks = [], collections.defaultdict[str, list[tuple[int, float, str]]](list)
+        for method in reversed(tuple(outcomes)):  # the first method is drawn last, over the others
+            levels = [outcomes[method][stress.name, level] for level in stress.levels]
+            error = np.clip([max(o.error for o in frames) for frames in levels], 0.01 * tolerance, 100 * tolerance)
+            width = 2.4 if method == first else 1.1
+            series.append(Series(method, x=range(len(levels)), y=error, marker="", colour=colours[method], width=width))
+            for x, frames in enumerate(levels):
+                if all(o.flags for o in frames):
+                    marks["flagged in every frame"].append((x, error[x], colours[method]))
+            broken = [x for x, frames in enumerate(levels) if any(o.broken for o in frames)]
+            if broken:
+                silent = any(o.silent for o in levels[broken[0]])
+                name = "breaks here without a flag" if silent else "breaks here with a flag"
+                marks[name].append((broken[0], error[broken[0]], colours[method]))
+        for name, (marker, size, hollow) in _MARKS.items():
+            if marks[name]:
+                at, height, colour = zip(*marks[name], strict=True)
+                look: dict[str, Any] = {"line": "", "marker": marker, "size": size, "hollow": hollow}
+                series.append(Series(name, x=at, y=height, colour=colour, **look))
+        panel = Panel(
+            series,
+            title=stress.name,
+            y_label="" if i % 4 else f"error, {unit}",
+            y_scale="log",
+            y_limits=(0.01 * tolerance, 130 * tolerance),
+            x_ticks={x: f"{level:.3g}" for x, level in enumerate(stress.levels)},
+            rules=[Rule(y=tolerance)],
+        )
+        panels.append(panel)
+    rows = -(-len(stresses) // 4)
+    return draw(panels, columns=4, size=(2.75 * min(4, len(stresses)) + 0.6, 2.45 * rows + 0.8), share_y=True)
+
+
+_MARKS = {
+    "flagged in every frame": ("o", 25, True),
+    "breaks here without a flag": ("X", 64, False),
+    "breaks here with a flag": ("s", 64, True),
+}

@@ -1,0 +1,275 @@
+"""Tracking of markers and dense displacement fields under known motion: error, survival of a jump, time."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from experiments.core.charts import Point, speed_against_error
+from experiments.core.context import Context
+from experiments.core.results import Cell, Column, Picture, Table, at_least, at_most
+from experiments.core.timing import median_ms
+from experiments.fields.known_motion import (
+    FIRST_SEED,
+    JUMP_PX,
+    NOISE_GREY,
+    PEAK_PX,
+    REST_PICTURES,
+    GelCamera,
+    TrackedGel,
+    grey,
+)
+from experiments.fields.sections import FieldSection
+from experiments.fields.trackers import FOLLOWERS, Follower, farneback_flow
+from sensors_io.fields.deformation import DeformationReader
+from sensors_io.fields.spline import Densifier
+
+MARKER_DEFAULT, UNSMOOTHED = "this", "this, affine alone"
+DENSE_DEFAULT = "this: markers, affine, spline"
+LOST_PX = 1.0
+_STEPS = 10  # pictures in which a motion is made, for methods that go from frame to frame
+_MARGIN = 0.1  # of height and width: within, the markers surround every pixel
+
+DenseField = Callable[[np.ndarray], np.ndarray]
+"""From a picture, RGB, to its displacement field in pixels, [H, W, 2]."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MarkerConfig:
+    """Motions drawn for each gel in addition to the published one; rounds of timing."""
+
+    motions: int = 4
+    rounds: int = 15
+
+    def __post_init__(self) -> None:
+        for name in ("motions", "rounds"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
+
+
+def marker_errors(gel: TrackedGel, seeds: Sequence[int | None]) -> dict[str, np.ndarray]:
+    """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost."""
+    found: dict[str, list[np.ndarray]] = {name: [] for name in FOLLOWERS}
+    for seed in seeds:
+        motion = gel.motion(PEAK_PX, seed)
+        camera = GelCamera(gel.rest.picture, NOISE_GREY, FIRST_SEED if seed is None else seed)
+        rest = grey(camera.at_rest())
+        shares = [step / _STEPS for step in range(1, _STEPS + 1)]
+        pictures = [grey(camera.under(motion.times(share), share)) for share in shares]
+        true = gel.points_px + motion.forward(gel.points_px)
+        for name, make in FOLLOWERS.items():
+            follow = make(rest, gel.points_px, gel.half_px)
+            points = [follow(picture) for picture in pictures][-1]
+            error = np.hypot(*(points - true).T)[gel.inside(true)]
+            found[name].append(np.where(np.isfinite(error), error, np.inf))
+    return {name: np.concatenate(errors) for name, errors in found.items()}
+
+
+def marker_ms(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, float]:
+    """Milliseconds of every method for a picture under motion."""
+    camera = GelCamera(gel.rest.picture, NOISE_GREY, 1)
+    rest, motion = grey(camera.at_rest()), gel.motion(PEAK_PX / 2, None)
+    pictures = [grey(camera.under(motion.times(s), s)) for s in (0.9, 1.0)]
+
+    def both(follow: Follower) -> None:
+        for picture in pictures:
+            follow(picture)
+
+    calls = {name: functools.partial(both, make(rest, gel.points_px, gel.half_px)) for name, make in FOLLOWERS.items()}
+    return {name: ms / len(pictures) for name, ms in median_ms(calls, rounds).items()}
+
+
+def jump_losses(gel: TrackedGel, seeds: Sequence[int | None]) -> dict[str, list[float]]:
+    """Share of points that are lost or more than a pixel off after one jump from rest, by method and motion."""
+    shares: dict[str, list[float]] = {name: [] for name in FOLLOWERS}
+    for seed in seeds:
+        motion = gel.motion(JUMP_PX, seed)
+        camera = GelCamera(gel.rest.picture, NOISE_GREY, 3)
+        rest, picture = grey(camera.at_rest()), grey(camera.under(motion))
+        true = gel.points_px + motion.forward(gel.points_px)
+        for name, make in FOLLOWERS.items():
+            error = np.hypot(*(make(rest, gel.points_px, gel.half_px)(picture) - true).T)[gel.inside(true)]
+            shares[name].append(float(np.mean(~(error <= LOST_PX))))
+    return shares
+
+
+def dense_fields(rest: np.ndarray) -> dict[str, DenseField]:
+    """Every method of dense displacement from a picture at rest."""
+    still, reader = grey(rest), DeformationReader(rest, mm_per_px=1.0)
+    methods: dict[str, DenseField] = {DENSE_DEFAULT: lambda picture: reader.read(picture).displacement_mm}
+    presets = {
+        "DIS ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+        "DIS fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
+        "DIS medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+    }
+    inverse_search = lambda flow, picture: flow.calc(still, grey(picture), None)
+    for name, preset in presets.items():
+        methods[name] = functools.partial(inverse_search, cv2.DISOpticalFlow.create(preset))
+    polynomial = lambda window, picture: farneback_flow(still, grey(picture), window)
+    for window in (15, 45):
+        methods[f"Farnebäck {window}"] = functools.partial(polynomial, window)
+    return methods
+
+
+def dense_errors(
+    gel: TrackedGel, seeds: Sequence[int | None], rounds: Iterable[object]
+) -> dict[str, tuple[float, float, float]]:
+    """Mean error and 95th percentile in px within the margin, and milliseconds, of every dense method."""
+    height, width = gel.rest.picture.shape[:2]
+    rows, columns = (slice(int(_MARGIN * n), n - int(_MARGIN * n)) for n in (height, width))
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64)
+    errors: dict[str, list[np.ndarray]] = {}
+    for seed in seeds:
+        motion = gel.motion(PEAK_PX, seed)
+        camera = GelCamera(gel.rest.picture, NOISE_GREY, 4)
+        methods, picture = dense_fields(camera.at_rest()), camera.under(motion)
+        true = motion.forward(pixels[rows, columns])
+        for name, dense in methods.items():
+            wrong = np.linalg.norm(dense(picture)[rows, columns] - true, axis=-1)
+            errors.setdefault(name, []).append(wrong.ravel())
+    ms = median_ms({name: functools.partial(dense, picture) for name, dense in methods.items()}, rounds)
+    pooled = {name: np.concatenate(e) for name, e in errors.items()}
+    return {name: (float(e.mean()), float(np.quantile(e, 0.95)), ms[name]) for name, e in pooled.items()}
+
+
+def spline_hertz(gel: TrackedGel, rounds: int) -> float:
+    """Dense fields in a second from markers that are tracked already, at the picture's size."""
+    tracker = DeformationReader(gel.rest.picture, mm_per_px=1.0).tracker
+    densify = Densifier(tracker.spline, gel.rest.picture.shape[:2])
+    moved = gel.motion(PEAK_PX, None).forward(gel.points_px)
+    return 1e3 / median_ms({"": functools.partial(densify, moved)}, range(max(rounds, 30)))[""]
+
+
+def marker_section(config: MarkerConfig, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+    """Errors and speeds of every method on every gel; a jump."""
+    seeds = [None, *range(FIRST_SEED, FIRST_SEED + config.motions)]
+    errors = {g.rest.name: marker_errors(g, seeds) for g in context.each("following", gels)}
+    ms = {g.rest.name: marker_ms(g, context.rounds(f"timing on {g.rest.name}", config.rounds)) for g in gels}
+    losses = {g.rest.name: jump_losses(g, seeds) for g in context.each("jumping", gels)}
+    median, high = _quantiles(np.concatenate([errors[g.rest.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
+    first = gels[0].rest.name
+    return FieldSection(
+        verdict=(
+            f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px "
+            f"at the 95th percentile of the markers, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
+        ),
+        requirements=(
+            at_most("marker error, median", median, 0.04, "px"),
+            at_most("marker error, 95th percentile", high, 0.11, "px"),
+            at_most(
+                "28 px jump: markers lost or > 1 px off, worst gel",
+                max(shares[MARKER_DEFAULT][0] for shares in losses.values()),
+                0.0,
+            ),
+        ),
+        tables=(_marker_table(errors, ms), _jump_table(losses)),
+        pictures=(_marker_picture(errors[first], ms[first], first),),
+    )
+
+
+def dense_section(motions: int, rounds: int, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+    """Errors and speeds of dense fields on every gel, and the speed of the spline alone."""
+    seeds: list[int | None] = [None, *range(FIRST_SEED, FIRST_SEED + motions)]
+    measured = {g.rest.name: dense_errors(g, seeds, range(rounds)) for g in context.each("gels", gels)}
+    error = float(np.mean([measured[g.rest.name][DENSE_DEFAULT][0] / g.unit for g in _real(gels)]))
+    hertz, first = spline_hertz(gels[0], rounds), gels[0].rest.name
+    points: dict[str, list[Point]] = {}
+    for method, (mean, high, ms) in measured[first].items():
+        points.setdefault(method.split(" ")[0].rstrip(":"), []).append((method, ms, mean, high))
+    table = _gel_table(
+        "Dense displacement under known motion",
+        measured,
+        _accuracy_columns("mean"),
+        note="Over the inner four fifths of height and width; the time is that from picture to field.",
+    )
+    picture = Picture(
+        name="fields_dense",
+        title=f"Dense field: speed against error, {first}",
+        caption="Mean distance from the truth; bars reach to the 95th percentile.",
+        content=speed_against_error(points, "error, px", None, legend=False),
+    )
+    return FieldSection(
+        verdict=(
+            f"Between the markers the mean error of the thin-plate spline is {error:.3f} px; it takes "
+            f"{1e3 / hertz:.2f} ms.",
+        ),
+        requirements=(
+            at_most("dense field, mean error", error, 0.05, "px"),
+            at_least("markers → dense field", hertz, 1000, "Hz"),
+        ),
+        tables=(table,),
+        pictures=(picture,),
+    )
+
+
+def finite_quantiles(error: np.ndarray) -> tuple[float | None, float | None]:
+    """Median and 95th percentile, `None` where a method reports so many points as lost."""
+    median, high = (value if np.isfinite(value) else None for value in _quantiles(error))
+    return median, high
+
+
+def _quantiles(error: np.ndarray) -> tuple[float, float]:
+    return float(np.median(error)), float(np.quantile(error, 0.95, method="lower"))
+
+
+def _real(gels: Sequence[TrackedGel]) -> list[TrackedGel]:
+    """The real gels, or the generated ones if there are none."""
+    return [g for g in gels if g.rest.real] or list(gels)
+
+
+def _marker_table(errors: Mapping[str, Mapping[str, np.ndarray]], ms: Mapping[str, Mapping[str, float]]) -> Table:
+    return _gel_table(
+        "Markers under known motion",
+        {gel: {m: (*finite_quantiles(e), ms[gel][m]) for m, e in by.items()} for gel, by in errors.items()},
+        _accuracy_columns("median"),
+        note=f"Peak {PEAK_PX:g} px on a picture 320 wide, shading of a contact, noise of {NOISE_GREY:g} grey levels, "
+        f"at rest the mean of {REST_PICTURES} pictures; empty where a method reports more than 5 % as lost.",
+    )
+
+
+def _jump_table(losses: Mapping[str, Mapping[str, list[float]]]) -> Table:
+    lost = "markers lost or more than 1 px off, published motion"
+    return _gel_table(
+        f"A jump of {JUMP_PX:g} px in one frame",
+        {gel: {m: (s[0], float(np.mean(s))) for m, s in by.items()} for gel, by in losses.items()},
+        (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
+    )
+
+
+def _accuracy_columns(middle: str) -> tuple[Column, ...]:
+    return (
+        Column(name=middle, unit="px", format=".3f"),
+        Column(name="95 %", unit="px", format=".3f"),
+        Column(name="time", unit="ms", format=".2f"),
+    )
+
+
+def _gel_table(
+    title: str, cells: Mapping[str, Mapping[str, Sequence[Cell]]], columns: Sequence[Column], note: str = ""
+) -> Table:
+    """A row per method and a group of columns per gel, of which the first names the gel; cells by gel and method."""
+    headings = [Column(name="method")]
+    for gel in cells:
+        headings += [dataclasses.replace(columns[0], name=f"{gel}: {columns[0].name}"), *columns[1:]]
+    methods = next(iter(cells.values()))
+    rows = tuple((m, *(value for by_method in cells.values() for value in by_method[m])) for m in methods)
+    return Table(title=title, columns=tuple(headings), rows=rows, note=note)
+
+
+def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], gel: str) -> Picture:
+    groups: dict[str, list[Point]] = {}
+    for method in FOLLOWERS:
+        median, high = _quantiles(errors[method])
+        if np.isfinite(median) and method != UNSMOOTHED:  # which coincides with the smoothed one
+            kind = "this package" if method.startswith("this") else method.split(" ")[0].rstrip(",")
+            top = high if np.isfinite(high) else 10 * median
+            groups.setdefault(kind, []).append((method, ms[method], median, top))
+    return Picture(
+        name="fields_markers",
+        title=f"Markers: speed against error, {gel}",
+        caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile. "
+        "Without smoothing this package's point does not move.",
+        content=speed_against_error(groups, "error, px", None, legend=False),
+    )
