@@ -1,0 +1,57 @@
+"""Known motion, the errors that are measured under it, and their lower bound."""
+
+import numpy as np
+import pytest
+
+from experiments.fields.known_motion import NOISE_GREY, GelAtRest, GelCamera, TrackedGel, gels, pressed, tracked
+from experiments.fields.marker_drift import DriftConfig, bound_px, drift_section
+from experiments.fields.tracking_accuracy import finite_quantiles
+
+
+def test_known_motion_is_exact():
+    """The picture at p + f(p) shows what lay at p; a camera without noise reproduces a gel at rest."""
+    motion = pressed((120, 160), 6.0, np.random.default_rng(1))
+    points = np.random.default_rng(2).uniform(20, 100, (50, 2))
+    moved = points + motion.forward(points)
+    np.testing.assert_allclose(moved - motion.backward(moved), points, atol=1e-9)
+    y, x = np.mgrid[:120, :160].astype(float)
+    smooth = np.stack([100 + 0.5 * x, 80 + 0.4 * y, 0 * x + 90], -1).round().astype(np.uint8)
+    still = GelCamera(smooth, 0.0, 0)
+    assert np.abs(still.under(motion.times(0.0), 0.0).astype(int) - smooth).max() == 0
+
+
+def test_the_peak_is_the_greatest_displacement():
+    motion = pressed((120, 160), 6.0)
+    y, x = np.mgrid[:120, :160].astype(float)
+    assert np.linalg.norm(motion.backward(np.stack([x, y], -1)), axis=-1).max() == pytest.approx(6.0)
+
+
+def test_a_lost_point_has_no_error():
+    error = np.append(np.linspace(0, 1, 19), [np.inf, np.inf])
+    assert finite_quantiles(error) == (pytest.approx(10 / 18), None)
+
+
+def test_the_bound_of_a_window_is_that_of_its_gradient():
+    """On g (|x − c| + |y − c|): Σ I_x² = Σ I_y² = g² 2h (2h + 1), Σ I_x I_y = 0; both pictures are noisy."""
+    slope, half = 2, 8
+    y, x = np.mgrid[:48, :320]
+    grey = 40 + slope * (np.minimum(np.abs(x - 24), 20) + np.minimum(np.abs(y - 24), 20))
+    rest = GelAtRest(name="roof", picture=np.repeat(grey[..., None], 3, -1).astype(np.uint8), real=False)
+    roof = TrackedGel(rest=rest, points_px=np.array([[24.0, 24.0]]), half_px=half, dot_radius_px=8.0)
+    noise = (NOISE_GREY**2 + 1 / 12) * (0.299**2 + 0.587**2 + 0.114**2) + 1 / 12
+    expected = np.sqrt(np.log(2) * 2 * 2 * noise / (slope**2 * 2 * half * (2 * half + 1)))
+    assert bound_px(roof, light_and_strain=False) == pytest.approx(expected, rel=1e-3)
+    assert bound_px(roof, light_and_strain=True) > expected
+
+
+def test_points_anchored_to_the_picture_at_rest_do_not_drift():
+    section = drift_section(DriftConfig(cycles=(1, 10), pairs=3), [tracked(gels(None)[0])], period=6)
+    assert section.requirements[1].met
+    ours, alone, *_, frame_to_frame = section.tables[0].rows
+    assert ours[2] < alone[2]
+    assert frame_to_frame[2] - frame_to_frame[1] > 3 * abs(ours[2] - ours[1])
+
+
+def test_drift_needs_the_cycles_that_are_compared():
+    with pytest.raises(ValueError, match="must hold 1 and 10"):
+        DriftConfig(cycles=(1, 2))
