@@ -1,31 +1,31 @@
-"""Is the bench of questions fit to score anybody on: no leak, no free answers, every rationale borne out?
+"""Is the bench of questions fit to score anybody on: no leak, no free answers, every rationale supported?
 
     make experiment EXP=dataset_card
     make experiment EXP=dataset_card ARGS="--data records --data-dir RECORDS"
 
-Makes the bench of 4,800 questions about the 200 test objects of a thousand, four tiers and seven kinds, words it from
-what was measured, sifts it by the rules, and holds it to the data card.  A check that fails ends the run with an error.
-Faults of every kind are then planted, which the rules must catch, and the bench is made twice.  It lies in the run as
-`items.jsonl`; `python -m experiments.bench --help` makes, words, annotates and audits others.
+Makes the bench of 4,800 questions about the 200 test objects of a thousand, in four tiers and seven kinds, words it
+from the measurements, filters it by the rules and checks it against the data card.  A check that fails ends the run
+with an error.  Errors of every kind are then planted, which the rules must find, and the bench is made twice.  It is
+written to the run as `items.jsonl`; `python -m experiments.bench --help` makes, words, annotates and audits others.
 
-Cost: some three minutes on one core, most of it for the scenes; `--scale smoke` a few seconds.
+Cost: about three minutes on one core, most of it for the scenes; `--scale smoke` a few seconds.
 
-Expected: all checks pass; no constant beats chance by three points.  The sensors' numbers, read by one threshold each,
-say what the label says for about half of the questions, material least.
+Expected: all checks pass; no constant beats chance by three points.  The sensors' numbers, each read by its thresholds,
+give the right answer to about half of the questions, material least.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from experiments.bench import card
-from experiments.bench.card_charts import answer_shares
 from experiments.bench.draw import Quota
 from experiments.bench.generate import BenchSource, generate, read_source, share_at_odds
 from experiments.bench.rules import FilteredItems, count_found_errors
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Column, Picture, Requirement, Results, Table
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.study.sources import Source, SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
@@ -36,7 +36,7 @@ from touchr1_jax.bench.items import KINDS, Item, write_items
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DatasetCardConfig:
-    """Which records, how many questions, how many of them get faults planted."""
+    """The records, the number of questions, and `faulty`, the number of items in which errors are planted."""
 
     data: Source = "generated"
     data_dir: Path | None = None
@@ -49,12 +49,13 @@ class DatasetCardConfig:
 
 def run(config: DatasetCardConfig, context: Context) -> Results:
     """Make the bench, check it, report."""
-    where = SourceConfig(
+    records = SourceConfig(
         kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
     )
-    store = RecordStore(prepare_records(where, context))
-    with context.timed("measure"), context.progress("measuring contacts", _contacts(store)) as advance:
-        source = read_source(store, after_each=advance)
+    store = RecordStore(prepare_records(records, context))
+    contacts = sum(len(store.contacts_of_split(split)) for split in ("test", "train"))
+    with context.timed("measure"), context.progress("measuring contacts", contacts) as advance:
+        source = read_source(store, advance)
     with context.timed("generate"):
         found, again = (
             generate(source, config.quota, config.seed) for _ in context.each("making the bench twice", range(2))
@@ -63,48 +64,27 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
     card.require(checks)
     write_items(context.directory / "items.jsonl", found.kept)
     with context.timed("faults"):
-        step = max(1, len(found.kept) // config.faulty)
-        sound = found.kept[::step]
-        caught = count_found_errors(context.each("planted faults", sound), source.bench.by_touch())
-    return _findings(
-        config, source, found, checks, {rule: n / len(sound) for rule, n in caught.items()}, again == found
-    )
-
-
-def _contacts(store: RecordStore) -> int:
-    return sum(len(store.contacts_of_split(split)) for split in ("test", "train"))
-
-
-def _findings(
-    config: DatasetCardConfig,
-    source: BenchSource,
-    found: FilteredItems,
-    checks: Sequence[card.CardCheck],
-    caught: dict[str, float],
-    same: bool,
-) -> Results:
-    items, odd = found.kept, share_at_odds(found.kept)
+        sound = found.kept[:: max(1, len(found.kept) // config.faulty)]
+        counts = count_found_errors(context.each("planted errors", sound), source.bench.by_touch())
+        caught = {rule: n / len(sound) for rule, n in counts.items()}
+    items, least = found.kept, 100 * min(caught.values())
     shown = {touch.object for item in items for touch in item.ask.touches}
     return Results(
         verdict=(
             f"{len(items):,} questions about {len(shown)} objects that no training contact shows pass all "
             f"{len(checks)} checks; the rules removed {len(found.removed)}.",
-            f"Of {len(items[:: max(1, len(items) // config.faulty)])} items with a planted fault each rule names at "
-            f"least {100 * min(caught.values()):.1f} %.",
-            f"In {100 * odd:.0f} % of the questions the sensors' numbers, each read by one threshold, do not say the "
-            "answer: these stay, or the bench would hold only what a threshold can answer.",
+            f"Of {len(sound)} items with a planted error each rule finds at least {least:.1f} %.",
+            f"In {100 * share_at_odds(items):.0f} % of the questions the sensors' numbers, each read by its "
+            "thresholds, do not give the answer: these questions stay, or the bench would hold only what a threshold "
+            "can answer.",
         ),
         requirements=(
             Requirement(
                 name="questions", measured=len(items), bound=config.quota.total, better="higher", note="of the quota"
             ),
-            Requirement(name="made twice, the same bytes", measured=float(same), bound=1, better="higher"),
+            Requirement(name="made twice, the same bytes", measured=float(again == found), bound=1, better="higher"),
             Requirement(
-                name="planted faults caught, the worst rule",
-                measured=100 * min(caught.values()),
-                bound=100,
-                better="higher",
-                unit="%",
+                name="planted faults caught, the worst rule", measured=least, bound=100, better="higher", unit="%"
             ),
             *(
                 Requirement(
@@ -114,146 +94,147 @@ def _findings(
             ),
         ),
         tables=(
-            _kinds(items),
-            _shares(items),
-            _rules(found, caught),
-            _readings(source),
-            _coverage(source),
-            _samples(items),
+            _question_table(items),
+            _answer_table(items),
+            _rule_table(found, caught),
+            _threshold_table(source),
+            named_table(
+                "Objects of the bench",
+                [
+                    {"attribute": name, "objects by level": ", ".join(f"{k}: {n}" for k, n in counts.items())}
+                    for name, counts in card.coverage(source.bench)
+                ],
+            ),
+            _sample_table(items),
         ),
         pictures=(
             Picture(
                 name="answers",
                 title="Answers",
                 caption="Each bar is a kind and an attribute; colours are levels in their order, from the left.",
-                content=answer_shares(card.shares(items)),
+                content=answer_chart(card.shares(items)),
             ),
         ),
-        data=_data(source),
+        data={
+            "test_objects": len(source.bench.objects()),
+            "test_contacts": len(source.bench.contacts),
+            "training_objects": len(source.train.objects()),
+            "training_contacts": len(source.train.contacts),
+            "recordings_without_contact": sum(source.bench.skipped.values()) + sum(source.train.skipped.values()),
+        },
     )
 
 
-def _data(source: BenchSource) -> dict[str, Any]:
-    return {
-        "test_objects": len(source.bench.objects()),
-        "test_contacts": len(source.bench.contacts),
-        "training_objects": len(source.train.objects()),
-        "training_contacts": len(source.train.contacts),
-        "recordings_without_contact": sum(source.bench.skipped.values()) + sum(source.train.skipped.values()),
-    }
-
-
-def _kinds(items: Sequence[Item]) -> Table:
+def _question_table(items: Sequence[Item]) -> Table:
     rows = []
     for kind, about in KINDS.items():
-        of = [item for item in items if item.ask.kind == kind]
-        if of:
-            objects = {touch.object for item in of for touch in item.ask.touches}
-            odd = 100 * share_at_odds(tuple(of))
-            rows.append((kind, about.tier, len(of), len(objects), about.view, odd, about.meaning))
-    return Table(
-        title="Questions",
-        columns=(
-            Column(name="kind"),
-            Column(name="tier"),
-            Column(name="questions"),
-            Column(name="objects"),
-            Column(name="picture shown"),
-            Column(name="at odds", unit="%", format=".0f", meaning=_ODD),
-            Column(name="asks for"),
-        ),
-        rows=tuple(rows),
+        if of := [item for item in items if item.ask.kind == kind]:
+            row: dict[str, Cell] = {
+                "kind": kind,
+                "tier": about.tier,
+                "questions": len(of),
+                "objects": len({touch.object for item in of for touch in item.ask.touches}),
+                "picture shown": about.view,
+                "at odds": 100 * share_at_odds(of),
+                "asks for": about.meaning,
+            }
+            rows.append(row)
+    meaning = "questions whose answer the sensors' numbers, each read by its thresholds, do not give together"
+    return named_table(
+        "Questions", rows, formats={"at odds": ".0f"}, units={"at odds": "%"}, meanings={"at odds": meaning}
     )
 
 
-_ODD = "questions whose answer the sensors' numbers, each read by one threshold, do not say together"
+def _answer_table(items: Sequence[Item]) -> Table:
+    rows: list[dict[str, Cell]] = [
+        {
+            "kind": share.kind,
+            "attribute": share.attribute,
+            "questions": share.questions,
+            "answers": " ".join(map(str, share.counts)),
+            "commonest": 100 * max(share.counts) / share.questions,
+        }
+        for share in card.shares(items)
+    ]
+    meanings = {"answers": "how often each level is right, in the order of the levels"}
+    return named_table("Answers", rows, formats={"commonest": ".1f"}, units={"commonest": "%"}, meanings=meanings)
 
 
-def _shares(items: Sequence[Item]) -> Table:
-    rows = card.shares(items)
-    return Table(
-        title="Answers",
-        columns=(
-            Column(name="kind"),
-            Column(name="attribute"),
-            Column(name="questions"),
-            Column(name="answers", meaning="how often each level is right, in the order of the levels"),
-            Column(name="commonest", unit="%", format=".1f"),
-        ),
-        rows=tuple(
-            (r.kind, r.attribute, r.questions, " ".join(map(str, r.counts)), 100 * max(r.counts) / r.questions)
-            for r in rows
-        ),
+def _rule_table(found: FilteredItems, caught: Mapping[str, float]) -> Table:
+    share = "planted faults caught"
+    return named_table(
+        "Rules",
+        [{"rule": rule, "removed": n, share: 100 * caught[rule]} for rule, n in found.counts.items()],
+        formats={share: ".1f"},
+        units={share: "%"},
+        meanings={"removed": "of the questions worded by rule"},
     )
 
 
-def _rules(found: FilteredItems, caught: dict[str, float]) -> Table:
-    return Table(
-        title="Rules",
-        columns=(
-            Column(name="rule"),
-            Column(name="removed", meaning="of the questions worded by rule"),
-            Column(name="planted faults caught", unit="%", format=".1f"),
-        ),
-        rows=tuple((rule, count, 100 * caught[rule]) for rule, count in found.counts.items()),
-    )
-
-
-def _readings(source: BenchSource) -> Table:
-    rows = []
-    for (sensor, attribute), scale in sorted(source.reader.thresholds.items()):
+def _threshold_table(source: BenchSource) -> Table:
+    rows: list[dict[str, Cell]] = []
+    for (sensor, attribute), thresholds in sorted(source.reader.thresholds.items()):
         right: dict[int, list[bool]] = {}
         for contact in source.bench.contacts:
             if attribute in contact.labels and source.reader.can_read(contact, sensor, attribute):
                 label = contact.labels[attribute]
                 right.setdefault(label, []).append(source.reader.level(contact, sensor, attribute) == label)
-        held_out = sum(sum(hits) / len(hits) for hits in right.values()) / len(right) if right else None
-        cuts = " and ".join(f"{cut:.3g}" for cut in scale.cuts)
-        direction = "rises" if scale.rising else "falls"
+        unseen = sum(sum(hits) / len(hits) for hits in right.values()) / len(right) if right else None
         rows.append(
-            (
-                f"{attribute}, {sensor}",
-                scale.quantity,
-                f"{direction}, {cuts}",
-                100 * scale.accuracy,
-                None if held_out is None else 100 * held_out,
-            )
+            {
+                "attribute and sensor": f"{attribute}, {sensor}",
+                "quantity": thresholds.quantity,
+                "cuts": f"{'rises' if thresholds.rising else 'falls'}, "
+                + " and ".join(f"{cut:.3g}" for cut in thresholds.cuts),
+                "training": 100 * thresholds.accuracy,
+                "bench": None if unseen is None else 100 * unseen,
+            }
         )
-    return Table(
-        title="What one number tells",
-        columns=(
-            Column(name="attribute and sensor"),
-            Column(
-                name="quantity", meaning="the one that tells most of training contacts, of those that can speak for it"
-            ),
-            Column(name="cuts"),
-            Column(name="training", unit="%", format=".1f", meaning="balanced accuracy; chance 33.3"),
-            Column(name="bench", unit="%", format=".1f", meaning="the same on objects that fitted nothing"),
-        ),
-        rows=tuple(rows),
-        note="Two cuts on one number of one sensor, fitted on training objects: what rationales cite.",
+    return named_table(
+        "What one number tells",
+        rows,
+        formats={"training": ".1f", "bench": ".1f"},
+        units={"training": "%", "bench": "%"},
+        meanings={
+            "quantity": "the one of the best accuracy on training contacts, of those that the attribute may be read "
+            "from",
+            "training": "balanced accuracy; chance 33.3",
+            "bench": "the same on objects that fitted nothing",
+        },
+        note="Two cuts on one number of one sensor, fitted on training objects: rationales cite them.",
     )
 
 
-def _coverage(source: BenchSource) -> Table:
-    return Table(
-        title="Objects of the bench",
-        columns=(Column(name="attribute"), Column(name="objects by level")),
-        rows=tuple(
-            (name, ", ".join(f"{level}: {count}" for level, count in counts.items()))
-            for name, counts in card.coverage(source.bench)
-        ),
-    )
-
-
-def _samples(items: Sequence[Item]) -> Table:
+def _sample_table(items: Sequence[Item]) -> Table:
     first = {item.ask.kind: item for item in reversed(items)}
-    rows = [(kind, first[kind].question, first[kind].rationale) for kind in KINDS if kind in first]
-    return Table(
-        title="One of each",
-        columns=(Column(name="kind"), Column(name="question"), Column(name="rationale")),
-        rows=tuple(rows),
+    return named_table(
+        "One of each",
+        [
+            {"kind": kind, "question": first[kind].question, "rationale": first[kind].rationale}
+            for kind in KINDS
+            if kind in first
+        ],
     )
+
+
+def answer_chart(shares: Sequence[card.AnswerShare]) -> bytes:
+    """Share of every answer of every kind and attribute as stacked bars, with marks where equal shares would end."""
+    levels = max(len(share.counts) for share in shares)
+    part = lambda share, k: 100 * share.counts[k] / share.questions if k < len(share.counts) else 0.0
+    answers = [
+        Series(x=[part(share, k) for share in shares], bar=True, alpha=0.75, colour=PALETTE[k % len(PALETTE)])
+        for k in range(levels)
+    ]
+    ends = [(100 * k / len(s.counts), row) for row, s in enumerate(shares) for k in range(1, len(s.counts))]
+    x, y = zip(*ends, strict=True)
+    panel = Panel(
+        [*answers, Series(x=x, y=y, marker="$|$", size=90.0, colour=SHARED)],
+        rows=[f"{share.kind}, {share.attribute}" for share in shares],
+        x_label="share of the answers, %; marks: equal shares",
+        x_limits=(0, 100),
+        stacked=True,
+    )
+    return draw([panel])
 
 
 DEFAULT = DatasetCardConfig()

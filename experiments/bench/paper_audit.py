@@ -2,31 +2,41 @@
 
     make experiment EXP=paper_audit
 
-Every number of the paper that a conclusion hangs on is typed in `study/paper_numbers.py` under the table or section it
-stands in; every inconsistency is a check that computes anew what follows from them, with rounding granted.  Nothing is
-trained and no data is read.
+Every number of the paper on which a conclusion rests is typed in `study/paper_numbers.py` under the table or section
+where it is printed; every inconsistency is a check that recomputes what follows from these numbers, with rounding
+granted.  Nothing is trained and no data is read.
 
 Cost: seconds.
 
-Expected: fourteen statements that its own numbers contradict, do not support or leave open, beside ten that they bear
-out.  So results here are held to the directions of the paper, never to its values.
+Expected: fourteen statements that its own numbers contradict, do not support or leave open, and ten that they confirm.
+So results here are compared with the directions of the paper, never with its values.
 """
 
 import dataclasses
 
-from experiments.bench.paper_arithmetic import best_weighting, columns_as_scores, error_and_distance, gain_interval
-from experiments.bench.paper_arithmetic import impossible_distances as impossible
-from experiments.bench.paper_charts import average_against_mean, distance_against_error
-from experiments.bench.paper_checks import StatementCheck, holding, inconsistencies
+import numpy as np
+
+from experiments.bench.paper_checks import (
+    StatementCheck,
+    best_weighting,
+    columns_as_scores,
+    confirmed,
+    error_and_distance,
+    gain_interval,
+    impossible_distances,
+    inconsistencies,
+)
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Column, Picture, Requirement, Results, Table
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.study import paper_numbers as paper
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PaperAuditConfig:
-    """Nothing to choose but how many questions a property of VTV150K's test set has."""
+    """The number of questions about each property in VTV150K's test set."""
 
     vtv_items: int = paper.VTV_ITEMS
 
@@ -38,113 +48,133 @@ class PaperAuditConfig:
 def run(config: PaperAuditConfig, context: Context) -> Results:
     """Compute every check."""
     del context
-    wrong, right = inconsistencies(), holding()
-    standing = [check for check in wrong if check.verdict == "holds"]
-    broken = [check for check in right if check.verdict != "holds"]
+    wrong, right = inconsistencies(), confirmed()
+    unseen, failed = (sum((c.verdict == "holds") == holds for c in cs) for cs, holds in ((wrong, True), (right, False)))
     count = {name: sum(c.verdict == name for c in wrong) for name in ("contradiction", "unsupported", "not given")}
     return Results(
         verdict=(
-            f"{len(wrong)} statements do not stand: {count['contradiction']} are contradicted by the paper's own "
-            f"numbers, {count['unsupported']} are not supported by them, {count['not given']} lack what is needed to "
-            "tell.",
-            f"{len(right)} others are borne out to the rounding: gains over other models, VTV150K's averages, the size "
+            f"{len(wrong)} statements do not hold: {count['contradiction']} are contradicted by the paper's own "
+            f"numbers, {count['unsupported']} are not supported by them, for {count['not given']} the paper lacks what "
+            "is needed to decide.",
+            f"{len(right)} others are confirmed to the rounding: gains over other models, VTV150K's averages, the size "
             "of the data set.",
         ),
         requirements=(
-            Requirement(name="known inconsistencies that do not show", measured=len(standing), bound=0, better="lower"),
-            Requirement(name="statements taken to hold that fail", measured=len(broken), bound=0, better="lower"),
+            Requirement(name="known inconsistencies that do not show", measured=unseen, bound=0, better="lower"),
+            Requirement(name="statements taken to hold that fail", measured=failed, bound=0, better="lower"),
         ),
         tables=(
-            _checks("What does not stand", wrong),
-            _checks("What holds", right),
-            _averages(),
-            _distances(),
-            _vtv(config),
+            _statement_table("What does not stand", wrong),
+            _statement_table("What holds", right),
+            _average_table(),
+            named_table(
+                "OMAE and its bound",
+                [
+                    {"row": name, "1 − Acc": error, "OMAE": omae, "possible": name not in impossible_distances()}
+                    for name, (error, omae) in error_and_distance().items()
+                ],
+                formats={"1 − Acc": ".3f", "OMAE": ".2f"},
+                meanings={"1 − Acc": "of the mean of H-, R- and P-Acc: least possible OMAE"},
+            ),
+            _vtv_table(config),
         ),
         pictures=(
             Picture(
                 name="distance",
                 title="OMAE against the error rate",
                 caption="Each wrong answer is at least one level off, so no row can lie below the diagonal; Touch-R1 "
-                "and the upper rungs of its ablation do.",
-                content=distance_against_error(),
+                "and the upper steps of its ablation do.",
+                content=distance_chart(),
             ),
             Picture(
                 name="average",
                 title="Avg against the mean of its columns",
                 caption="OMAE as 100(1 − OMAE/2), ρ as 100ρ.",
-                content=average_against_mean(),
+                content=average_chart(),
             ),
         ),
     )
 
 
-def _checks(title: str, checks: tuple[StatementCheck, ...]) -> Table:
-    return Table(
-        title=title,
-        columns=(
-            Column(name="statement, and where"),
-            Column(name="verdict"),
-            Column(name="published"),
-            Column(name="recomputed"),
-        ),
-        rows=tuple((f"{c.title} ({c.where})", c.verdict, c.published, c.recomputed) for c in checks),
-    )
+def _statement_table(title: str, checks: tuple[StatementCheck, ...]) -> Table:
+    rows: list[dict[str, Cell]] = [
+        {
+            "statement, and where": f"{c.title} ({c.where})",
+            "verdict": c.verdict,
+            "published": c.published,
+            "recomputed": c.recomputed,
+        }
+        for c in checks
+    ]
+    return named_table(title, rows)
 
 
-def _averages() -> Table:
+def _average_table() -> Table:
     low, high, average = columns_as_scores()
-    best = best_weighting(sum_to_one=True)
-    middle = (low + high) / 2
-    return Table(
-        title="Avg",
-        columns=(
-            Column(name="model"),
-            Column(name="printed", format=".1f"),
-            Column(name="mean of nine", format=".1f"),
-            Column(name="best weights", format=".1f", meaning="the mean whose weights miss least, and are ≥ 0"),
-        ),
-        rows=tuple(
-            (name, float(a), float(m.mean()), float(m @ best.weights))
-            for name, a, m in zip(paper.MAIN, average, middle, strict=True)
-        ),
-        note="Best weights: "
-        + ", ".join(f"{c} {w:.2f}" for c, w in zip(paper.COLUMNS, best.weights, strict=True) if w > 0.005),
+    weights, _ = best_weighting()
+    rows: list[dict[str, Cell]] = [
+        {"model": name, "printed": float(a), "mean of nine": float(m.mean()), "best weights": float(m @ weights)}
+        for name, a, m in zip(paper.MAIN, average, (low + high) / 2, strict=True)
+    ]
+    used = [f"{column} {w:.2f}" for column, w in zip(paper.COLUMNS, weights, strict=True) if w > 0.005]
+    return named_table(
+        "Avg",
+        rows,
+        formats=dict.fromkeys(("printed", "mean of nine", "best weights"), ".1f"),
+        meanings={"best weights": "the mean with weights ≥ 0 whose largest miss is smallest"},
+        note=f"Best weights: {', '.join(used)}",
     )
 
 
-def _distances() -> Table:
-    below = set(impossible())
-    return Table(
-        title="OMAE and its bound",
-        columns=(
-            Column(name="row"),
-            Column(name="1 − Acc", format=".3f", meaning="of the mean of H-, R- and P-Acc: least possible OMAE"),
-            Column(name="OMAE", format=".2f"),
-            Column(name="possible"),
-        ),
-        rows=tuple((name, error, omae, name not in below) for name, (error, omae) in error_and_distance().items()),
-    )
-
-
-def _vtv(config: PaperAuditConfig) -> Table:
-    ours, theirs = paper.VTV["Ours"][0], paper.VTV["VTV-LLM-7B"][0]
-    rows = []
-    for column, a, b in list(zip(paper.VTV_COLUMNS, ours, theirs, strict=True))[:5]:
+def _vtv_table(config: PaperAuditConfig) -> Table:
+    rows: list[dict[str, Cell]] = []
+    for column, a, b in list(zip(paper.VTV_COLUMNS, paper.VTV["Ours"][0], paper.VTV["VTV-LLM-7B"][0], strict=True))[:5]:
         gain, half, p = gain_interval(a, b, config.vtv_items)
-        rows.append((column, a, b, gain, f"[{gain - half:.1f}, {gain + half:.1f}]", p))
-    return Table(
-        title=f"Gains on VTV150K, {config.vtv_items} questions a property",
-        columns=(
-            Column(name="property"),
-            Column(name="Touch-R1", unit="%", format=".1f"),
-            Column(name="VTV-LLM", unit="%", format=".1f"),
-            Column(name="gain", unit="points", format=".1f"),
-            Column(name="95 %", meaning="unpaired: the answers are not published"),
-            Column(name="p", format=".2f"),
-        ),
-        rows=tuple(rows),
+        span = f"[{gain - half:.1f}, {gain + half:.1f}]"
+        rows.append({"property": column, "Touch-R1": a, "VTV-LLM": b, "gain": gain, "95 %": span, "p": p})
+    return named_table(
+        f"Gains on VTV150K, {config.vtv_items} questions a property",
+        rows,
+        formats={"Touch-R1": ".1f", "VTV-LLM": ".1f", "gain": ".1f", "p": ".2f"},
+        units={"Touch-R1": "%", "VTV-LLM": "%", "gain": "points"},
+        meanings={"95 %": "unpaired: the answers are not published"},
     )
+
+
+def distance_chart() -> bytes:
+    """OMAE over the error rate of the same row; no answers can lie below the diagonal."""
+    impossible, ends = impossible_distances(), np.array([0.25, 0.75])
+    diagonal = Series("OMAE = 1 − Acc; below it is impossible", x=ends, y=ends, marker="", line=":", colour=SHARED)
+    shaded = Series(x=ends, y=ends, low=[0, 0], band=True, marker="", line="", colour=PALETTE[1], alpha=0.4)
+    series = [shaded, diagonal]
+    for table, marker in (("main table", "o"), ("ablation", "D")):
+        rows = {
+            name: row for name, row in error_and_distance().items() if name.endswith("(ablation)") == (marker == "D")
+        }
+        x, y = zip(*rows.values(), strict=True)
+        labels = [name if name in impossible and not name.startswith("+") else "" for name in rows]
+        colour = [PALETTE[1] if name in impossible else PALETTE[0] for name in rows]
+        series.append(Series(table, x=x, y=y, marker=marker, line="", colour=colour, labels=labels))
+    panel = Panel(
+        series,
+        x_label="1 − mean of H-, R-, P-Acc",
+        y_label="OMAE, levels",
+        x_limits=(0.25, 0.75),
+        y_limits=(0.15, 0.95),
+    )
+    return draw([panel])
+
+
+def average_chart() -> bytes:
+    """Printed Avg and the plain mean of the nine columns, for every model."""
+    low, high, average = columns_as_scores()
+    mean = ((low + high) / 2).mean(1)
+    joined = Series(
+        x=average, low=np.minimum(average, mean), high=np.maximum(average, mean), marker="", colour="#cfd4da"
+    )
+    printed = Series("Avg as printed", x=average, colour=PALETTE[1], marker="o")
+    plain = Series("mean of the nine columns", x=mean, colour=PALETTE[0], marker="o")
+    return draw([Panel([joined, printed, plain], rows=list(paper.MAIN), x_label="points")])
 
 
 DEFAULT = PaperAuditConfig()

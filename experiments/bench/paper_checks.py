@@ -1,34 +1,128 @@
-"""What the printed numbers of Touch-R1 say about one another, each statement computed anew.
+"""Statements of Touch-R1 checked against its own printed numbers, and the arithmetic of these checks.
 
-A check holds what is printed against what follows from the rest of it.
+A printed number stands for every number that rounds to it.
 """
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Literal
 
-from experiments.bench.paper_arithmetic import (
-    SHARE_ROUNDING,
-    TOUCHES,
-    attainable,
-    best_weighting,
-    columns_as_scores,
-    error_and_distance,
-    gain_interval,
-    impossible_distances,
-    perfect_average,
-)
+import numpy as np
+from scipy import optimize, special
+
 from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.statistics import wilson_interval
 
 Verdict = Literal["contradiction", "not given", "unsupported", "holds"]
 
+MainTable = Mapping[str, tuple[paper.Row, float]]
+"""Model → the nine columns of the main table, and Avg."""
+
 OURS = "Touch-R1-7B"
 
+SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005
+"""Half of the last digit of a percentage, and of OMAE and ρ."""
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+SOLVER_ERROR = 1e-6
+"""Points; a smaller miss counts as none."""
+
+SAME_MODELS = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
+"""Models of the main table → their names in the ablation tables."""
+
+
+def columns_as_scores(main: MainTable = paper.MAIN) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least and greatest columns that round to the printed ones, as scores of 0–100 [models, 9], and Avg [models].
+
+    OMAE counts as 100(1 − OMAE/2), ρ as 100ρ.
+    """
+    printed = np.array([row for row, _ in main.values()])
+    rounding = np.full(len(paper.COLUMNS), SHARE_ROUNDING)
+    omae, rho = paper.COLUMNS.index("OMAE"), paper.COLUMNS.index("SOI-ρ")
+    printed[:, omae], rounding[omae] = 100 - 50 * printed[:, omae], 50 * LEVEL_ROUNDING
+    printed[:, rho], rounding[rho] = 100 * printed[:, rho], 100 * LEVEL_ROUNDING
+    return printed - rounding, printed + rounding, np.array([avg for _, avg in main.values()])
+
+
+def best_weighting(main: MainTable = paper.MAIN) -> tuple[np.ndarray, float]:
+    """The weighted mean of the columns that is closest to Avg: its weights [9], and its largest miss t in points.
+
+    Minimises t over w ≥ 0, Σ w = 1 with Σ w·low ≤ Avg + ½ digit + t and Σ w·high ≥ Avg − ½ digit − t for every model.
+    A miss of 0 means that some weighted mean of the unrounded columns gives every Avg.
+    """
+    low, high, average = columns_as_scores(main)
+    slack = -np.ones((len(average), 1))
+    found = optimize.linprog(
+        np.eye(low.shape[1] + 1)[-1],
+        A_ub=np.block([[low, slack], [-high, slack]]),
+        b_ub=np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average]),
+        A_eq=np.append(np.ones(low.shape[1]), 0)[None],
+        b_eq=np.ones(1),
+    )
+    return found.x[:-1], float(found.x[-1])
+
+
+def perfect_average(main: MainTable = paper.MAIN) -> float:
+    """The largest Avg 100 Σ w of a perfect model under any weights w ≥ 0 that give every printed Avg; a mean gives 100.
+
+    Raises:
+      ValueError: no weights give every Avg.
+    """
+    low, high, average = columns_as_scores(main)
+    found = optimize.linprog(
+        -np.ones(low.shape[1]),
+        A_ub=np.concatenate([low, -high]),
+        b_ub=np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average]),
+    )
+    if found.status != 0:
+        raise ValueError(f"main allows no weights: {found.message}; ask for `best_weighting` instead")
+    return -100.0 * float(found.fun)
+
+
+def error_and_distance() -> dict[str, tuple[float, float]]:
+    """1 − mean accuracy of the ordinal attributes, and OMAE, of every row with both; OMAE cannot be the smaller one."""
+    rows = {name: (1 - math.fsum(row[:3]) / 300, row[4]) for name, (row, _) in paper.MAIN.items()}
+    for name, (row, _) in paper.PER_ATTRIBUTE.items():
+        rows[f"{name} (ablation)"] = (1 - math.fsum(row[:3]) / 300, paper.LADDER[name][0])
+    return rows
+
+
+def impossible_distances() -> list[str]:
+    """Rows whose OMAE, rounding granted, is below the share of wrong answers."""
+    return [
+        name
+        for name, (error, omae) in error_and_distance().items()
+        if omae + LEVEL_ROUNDING < error - SHARE_ROUNDING / 100
+    ]
+
+
+def gain_interval(ours: float, theirs: float, items: int) -> tuple[float, float, float]:
+    """Difference of two shares in percent on n items each, the half width of its 95 % interval, two-sided p.
+
+    Unpaired, since the answers are not published: p̂₁ − p̂₂ ± 1.96 √(Σ p̂(1 − p̂)/n), p with the pooled share.
+    """
+    p, q = ours / 100, theirs / 100
+    pooled = (p + q) / 2
+    half = 1.96 * math.sqrt((p * (1 - p) + q * (1 - q)) / items)
+    z = (p - q) / math.sqrt(2 * pooled * (1 - pooled) / items)
+    return ours - theirs, 100 * half, float(2 * special.ndtr(-abs(z)))
+
+
+def attainable(share: float, items: int) -> bool:
+    """True if k/n, rounded or cut off to one decimal, prints as this percentage for some k.
+
+    Source: Brown and Heathers, The GRIM test, Soc. Psychol. Personal. Sci. 8 (2017).
+    """
+    near = round(share * items / 100)
+    return any(
+        share - SHARE_ROUNDING - 1e-9 <= 100 * k / items < share + 2 * SHARE_ROUNDING - 1e-9
+        for k in (near - 1, near, near + 1)
+    )
+
+
+@dataclasses.dataclass(frozen=True)
 class StatementCheck:
-    """One statement about the paper: where it stands, what is printed, what follows, and which of the two it is."""
+    """A statement about the paper, where it is made, what is printed, what follows from the numbers, the verdict."""
 
     title: str
     where: str
@@ -37,272 +131,249 @@ class StatementCheck:
     verdict: Verdict
 
 
+def _check(
+    title: str, where: str, published: str, recomputed: str, fails: bool, verdict: Verdict = "contradiction"
+) -> StatementCheck:
+    return StatementCheck(title, where, published, recomputed, verdict if fails else "holds")
+
+
 def inconsistencies() -> tuple[StatementCheck, ...]:
     """Every known inconsistency, in the order of the report."""
     return (
-        _average(),
-        _ladder_average(),
-        _two_tables(),
+        average_check(paper.MAIN),
+        *_averages(),
         _distance(),
-        _tactile_use(),
-        _hyperparameters(),
-        _conflict(),
+        *_method(),
         _subsets(),
         _backbones(),
         _noise(),
-        _seeds(),
+        _check(
+            "No seeds, no intervals",
+            "all tables",
+            "single numbers",
+            f"seeds {paper.SEEDS or 'not given'}, intervals or tests {paper.INTERVALS}",
+            paper.SEEDS is None and paper.INTERVALS == 0,
+            "not given",
+        ),
         _sequences(),
         _counts(),
         _pictures(),
     )
 
 
-def holding() -> tuple[StatementCheck, ...]:
-    """Statements of the paper that its numbers bear out."""
-    gains = [
-        StatementCheck(
-            title=f"{column} over {whom}",
-            where=where,
-            published=f"{gain:+.1f}",
-            recomputed=f"{_column(OURS, column) - _column(whom, column):+.1f} points",
-            verdict="holds" if abs(_column(OURS, column) - _column(whom, column) - gain) < SHARE_ROUNDING else _NO,
-        )
-        for where, column, whom, gain in paper.GAINS
-    ]
-    return (*gains, _vtv_average(), _frames(), _shared_rows(), _audit())
-
-
-_NO: Verdict = "contradiction"
-
-
-def _column(model: str, column: str) -> float:
-    row, average = paper.MAIN[model]
-    return average if column == "Avg" else row[paper.COLUMNS.index(column)]
-
-
-def _average() -> StatementCheck:
-    mean = best_weighting(sum_to_one=True)
-    low, high, average = columns_as_scores()
+def average_check(main: MainTable) -> StatementCheck:
+    """Avg of the main table against the weighted means of its columns."""
+    _, miss = best_weighting(main)
+    low, high, average = columns_as_scores(main)
     plain = ((low + high) / 2).mean(1)
-    return StatementCheck(
-        title="Avg is no mean of the columns",
-        where="main table, Avg “over the full metric set”",
-        published=f"Avg {average[-1]} for {OURS}",
-        recomputed=f"the plain mean is {plain[-1]:.1f}; every weighted one misses some model by {mean.miss:.2f} points "
-        f"or more, rounding granted; weights free to sum to anything fit the twelve rows, but give perfection "
-        f"{perfect_average():.0f} points at most",
-        verdict=_NO if mean.miss > TOUCHES else "holds",
+    return _check(
+        "Avg is no mean of the columns",
+        "main table, Avg “over the full metric set”",
+        f"Avg {average[-1]} for {OURS}",
+        f"the plain mean is {plain[-1]:.1f}; every weighted one misses some model by {miss:.2f} points or more, "
+        "rounding granted; weights free to sum to anything fit the twelve rows, but give perfection "
+        f"{perfect_average(main):.0f} points at most",
+        miss > SOLVER_ERROR,
     )
 
 
-def _ladder_average() -> StatementCheck:
+def _averages() -> tuple[StatementCheck, ...]:
     worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.PER_ATTRIBUTE.values())
     ladder = all(paper.LADDER[name][2] == avg for name, (_, avg) in paper.PER_ATTRIBUTE.items())
-    return StatementCheck(
-        title="Avg is the mean of four accuracies",
-        where="ablation tables (a) and (b)",
-        published="one Avg for main table and ablation",
-        recomputed=f"the mean of the four columns of (b) gives the Avg of (a) and (b) within {worst:.3f} in every row",
-        verdict=_NO if ladder and worst <= 2 * SHARE_ROUNDING else "holds",
-    )
-
-
-def _two_tables() -> StatementCheck:
-    pairs = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
     gaps = [
         abs(a - b)
-        for main, ablation in pairs.items()
+        for main, ablation in SAME_MODELS.items()
         for a, b in zip(paper.MAIN[main][0][:4], paper.PER_ATTRIBUTE[ablation][0], strict=True)
     ]
-    return StatementCheck(
-        title="The same models have two sets of accuracies",
-        where="main table against ablation table (b)",
-        published=f"{OURS} hardness {paper.MAIN[OURS][0][0]} and {paper.PER_ATTRIBUTE['Touch-R1'][0][0]}",
-        recomputed=f"all {len(gaps)} pairs differ, by {min(gaps):.1f} to {max(gaps):.1f} points",
-        verdict=_NO if min(gaps) > 2 * SHARE_ROUNDING else "holds",
+    return (
+        _check(
+            "Avg is the mean of four accuracies",
+            "ablation tables (a) and (b)",
+            "one Avg for main table and ablation",
+            f"the mean of the four columns of (b) gives the Avg of (a) and (b) within {worst:.3f} in every row",
+            ladder and worst <= 2 * SHARE_ROUNDING,
+        ),
+        _check(
+            "The same models have two sets of accuracies",
+            "main table against ablation table (b)",
+            f"{OURS} hardness {paper.MAIN[OURS][0][0]} and {paper.PER_ATTRIBUTE['Touch-R1'][0][0]}",
+            f"all {len(gaps)} pairs differ, by {min(gaps):.1f} to {max(gaps):.1f} points",
+            min(gaps) > 2 * SHARE_ROUNDING,
+        ),
     )
 
 
 def _distance() -> StatementCheck:
     rows, impossible = error_and_distance(), impossible_distances()
     error, omae = rows[OURS]
-    return StatementCheck(
-        title="OMAE lies below the error rate",
-        where="main table and ablation",
-        published=f"{OURS}: OMAE {omae}",
-        recomputed=f"a wrong answer is off by a level at least, so OMAE ≥ {error:.3f}; {len(impossible)} of "
-        f"{len(rows)} rows are below their bound",
-        verdict=_NO if OURS in impossible else "holds",
+    return _check(
+        "OMAE lies below the error rate",
+        "main table and ablation",
+        f"{OURS}: OMAE {omae}",
+        f"a wrong answer is off by a level at least, so OMAE ≥ {error:.3f}; {len(impossible)} of {len(rows)} rows are "
+        "below their bound",
+        OURS in impossible,
     )
 
 
-def _tactile_use() -> StatementCheck:
-    in_equations = {*paper.REWARD_WEIGHTS, *paper.ABLATED_TERMS}
-    gone = [term for term in paper.ADVERTISED_TERMS if term not in in_equations]
-    return StatementCheck(
-        title="The tactile-use reward is in no equation",
-        where="abstract, introduction; reward equations, ablation",
-        published=f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
-        recomputed=f"weights {sum(paper.REWARD_WEIGHTS.values()):g} in all, none for {', '.join(gone)}; no row of its "
-        "own",
-        verdict=_NO if gone else "holds",
-    )
-
-
-def _hyperparameters() -> StatementCheck:
-    gone = [name for name in paper.OBJECTIVE_NEEDS if name not in paper.HYPERPARAMETERS]
-    return StatementCheck(
-        title="The objective cannot be computed from what is given",
-        where="overall objective; implementation details",
-        published=", ".join(f"{name} {value:g}" for name, value in list(paper.HYPERPARAMETERS.items())[:2]),
-        recomputed=f"missing: {', '.join(gone)}",
-        verdict="not given" if gone else "holds",
-    )
-
-
-def _conflict() -> StatementCheck:
-    gone = [name for name in paper.ADVERTISED_MEASURES if name not in paper.MEASURED]
-    return StatementCheck(
-        title="Visual–tactile conflict is never measured",
-        where="abstract and introduction; metrics",
-        published=f"evaluates {', '.join(paper.ADVERTISED_MEASURES)}",
-        recomputed=f"no metric and no column for {', '.join(gone)}",
-        verdict="not given" if gone else "holds",
+def _method() -> tuple[StatementCheck, ...]:
+    """Terms, hyperparameters and measures that are announced and not given."""
+    terms = {*paper.REWARD_WEIGHTS, *paper.ABLATED_TERMS}
+    no_term = [term for term in paper.ADVERTISED_TERMS if term not in terms]
+    no_value = [name for name in paper.OBJECTIVE_NEEDS if name not in paper.HYPERPARAMETERS]
+    no_metric = [name for name in paper.ADVERTISED_MEASURES if name not in paper.MEASURED]
+    return (
+        _check(
+            "The tactile-use reward is in no equation",
+            "abstract, introduction; reward equations, ablation",
+            f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
+            f"weights {sum(paper.REWARD_WEIGHTS.values()):g} in all, none for {', '.join(no_term)}; no row of its own",
+            bool(no_term),
+        ),
+        _check(
+            "The objective cannot be computed from what is given",
+            "overall objective; implementation details",
+            ", ".join(f"{name} {value:g}" for name, value in list(paper.HYPERPARAMETERS.items())[:2]),
+            f"missing: {', '.join(no_value)}",
+            bool(no_value),
+            "not given",
+        ),
+        _check(
+            "Visual–tactile conflict is never measured",
+            "abstract and introduction; metrics",
+            f"evaluates {', '.join(paper.ADVERTISED_MEASURES)}",
+            f"no metric and no column for {', '.join(no_metric)}",
+            bool(no_metric),
+            "not given",
+        ),
     )
 
 
 def _subsets() -> StatementCheck:
-    asked = paper.SFT_QA + paper.RL_QA
+    questions = paper.SFT_QA + paper.RL_QA
     left = paper.RECORDS - paper.PRETRAIN_FRAMES
     training = round(paper.RECORDS * (1 - paper.HELD_OUT_OBJECTS / paper.OBJECTS)) - paper.PRETRAIN_FRAMES
-    return StatementCheck(
-        title="Disjoint subsets do not fit",
-        where="training data and protocol",
-        published=f"{paper.PRETRAIN_FRAMES:,} frames, then {asked:,} questions on other data",
-        recomputed=f"{left:,} frames are left, {training:,} without the held-out objects: "
-        f"{asked / training:.0f} questions about each",
-        verdict=_NO if asked > left else "holds",
+    return _check(
+        "Disjoint subsets do not fit",
+        "training data and protocol",
+        f"{paper.PRETRAIN_FRAMES:,} frames, then {questions:,} questions on other data",
+        f"{left:,} frames are left, {training:,} without the held-out objects: {questions / training:.0f} questions "
+        "about each",
+        questions > left,
     )
 
 
 def _backbones() -> StatementCheck:
+    sizes = lambda billions: ", ".join(f"{size}B" for size in billions)
     unknown = [size for size in paper.BACKBONES if size not in paper.RELEASED_BACKBONES]
-    return StatementCheck(
-        title="A backbone that does not exist",
-        where="scaling figure",
-        published=", ".join(f"{size}B" for size in paper.BACKBONES),
-        recomputed=f"Qwen2.5-VL was released with {', '.join(f'{s}B' for s in paper.RELEASED_BACKBONES)}; no "
-        + ", ".join(f"{size}B" for size in unknown),
-        verdict=_NO if unknown else "holds",
+    return _check(
+        "A backbone that does not exist",
+        "scaling figure",
+        sizes(paper.BACKBONES),
+        f"Qwen2.5-VL was released with {sizes(paper.RELEASED_BACKBONES)}; no {sizes(unknown)}",
+        bool(unknown),
     )
 
 
 def _noise() -> StatementCheck:
-    gains = [
-        gain_interval(a, b, paper.VTV_ITEMS)
-        for a, b in zip(paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5], strict=True)
-    ]
-    return StatementCheck(
-        title="Gains on VTV150K are within one run's noise",
-        where=f"VTV150K table, {paper.VTV_ITEMS} questions a property",
-        published=f"{min(g for g, _, _ in gains):+.1f} to {max(g for g, _, _ in gains):+.1f} points",
-        recomputed=f"95 % intervals of ± {min(h for _, h, _ in gains):.0f} to {max(h for _, h, _ in gains):.0f} "
-        f"points, p ≥ {min(p for _, _, p in gains):.2f} (unpaired)",
-        verdict="unsupported" if all(half > gain for gain, half, _ in gains) else "holds",
-    )
-
-
-def _seeds() -> StatementCheck:
-    return StatementCheck(
-        title="No seeds, no intervals",
-        where="all tables",
-        published="single numbers",
-        recomputed=f"seeds {paper.SEEDS or 'not given'}, intervals or tests {paper.INTERVALS}",
-        verdict="not given" if paper.SEEDS is None and paper.INTERVALS == 0 else "holds",
+    pairs = zip(paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5], strict=True)
+    gains, halves, p = zip(*(gain_interval(a, b, paper.VTV_ITEMS) for a, b in pairs), strict=True)
+    return _check(
+        "Gains on VTV150K are within one run's noise",
+        f"VTV150K table, {paper.VTV_ITEMS} questions a property",
+        f"{min(gains):+.1f} to {max(gains):+.1f} points",
+        f"95 % intervals of ± {min(halves):.0f} to {max(halves):.0f} points, p ≥ {min(p):.2f} (unpaired)",
+        all(half > gain for gain, half in zip(gains, halves, strict=True)),
+        "unsupported",
     )
 
 
 def _sequences() -> StatementCheck:
     each = paper.SENSORS * paper.MOTIONS
-    return StatementCheck(
-        title="Sequences do not fit the protocol",
-        where="overview and acquisition",
-        published=f"{paper.SEQUENCES:,} sequences of {paper.OBJECTS:,}+ objects, {paper.SENSORS} sensors, a press and "
-        "six motions",
-        recomputed=f"that makes {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} are {paper.SEQUENCES / each:.0f} objects",
-        verdict=_NO if paper.OBJECTS * each > paper.SEQUENCES else "holds",
+    return _check(
+        "Sequences do not fit the protocol",
+        "overview and acquisition",
+        f"{paper.SEQUENCES:,} sequences of {paper.OBJECTS:,}+ objects, {paper.SENSORS} sensors, a press and six "
+        "motions",
+        f"that makes {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} are {paper.SEQUENCES / each:.0f} objects",
+        paper.OBJECTS * each > paper.SEQUENCES,
     )
 
 
 def _counts() -> StatementCheck:
     shares = {name: row[:4] for name, (row, _) in paper.VTV.items()}
     fit = {name: sum(attainable(share, paper.VTV_ITEMS) for share in row) for name, row in shares.items()}
-    peers = sum(fit.values()) - fit["Ours"]
-    return StatementCheck(
-        title="Shares that no count gives",
-        where=f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
-        published=f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
-        recomputed=f"{fit['Ours']} of its 4 are k/{paper.VTV_ITEMS} to a decimal; of the others' {4 * (len(fit) - 1)}, "
-        f"{peers}",
-        verdict="unsupported" if fit["Ours"] < 4 else "holds",
+    others = sum(fit.values()) - fit["Ours"]
+    return _check(
+        "Shares that no count gives",
+        f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
+        f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
+        f"{fit['Ours']} of its 4 are k/{paper.VTV_ITEMS} to a decimal; of the others' {4 * (len(fit) - 1)}, {others}",
+        fit["Ours"] < 4,
+        "unsupported",
     )
 
 
 def _pictures() -> StatementCheck:
     errors = [e for row in paper.VIDEO_L1.values() for e in row]
-    return StatementCheck(
-        title="L1 worse than a grey picture's",
-        where="video prediction table",
-        published=f"L1 {min(errors)} to {max(errors)}",
-        recomputed=f"a constant ½ is off by ½ at most on pictures in 0–1; {sum(e > 0.5 for e in errors)} of "
-        f"{len(errors)} are above, so their unit is not given",
-        verdict="not given" if min(errors) > 0.5 else "holds",
+    return _check(
+        "L1 worse than a grey picture's",
+        "video prediction table",
+        f"L1 {min(errors)} to {max(errors)}",
+        f"a constant ½ is off by ½ at most on pictures in 0–1; {sum(e > 0.5 for e in errors)} of {len(errors)} are "
+        "above, so their unit is not given",
+        min(errors) > 0.5,
+        "not given",
     )
 
 
-def _vtv_average() -> StatementCheck:
+def confirmed() -> tuple[StatementCheck, ...]:
+    """Statements of the paper that its numbers confirm."""
+
+    def cell(model: str, column: str) -> float:
+        row, average = paper.MAIN[model]
+        return average if column == "Avg" else row[paper.COLUMNS.index(column)]
+
+    gains = []
+    for where, column, model, claimed in paper.GAINS:
+        gain = cell(OURS, column) - cell(model, column)
+        wrong = not abs(gain - claimed) < SHARE_ROUNDING
+        gains.append(_check(f"{column} over {model}", where, f"{claimed:+.1f}", f"{gain:+.1f} points", wrong))
     worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.VTV.values())
-    return StatementCheck(
-        title="VTV150K's Average is the mean of its nine columns",
-        where="VTV150K table",
-        published=f"{len(paper.VTV)} averages",
-        recomputed=f"off by {worst:.2f} at the worst",
-        verdict="holds" if worst <= 2 * SHARE_ROUNDING else _NO,
+    differ = any(
+        tuple(cell(main, column) for column in ("OMAE", "CSC", "Avg")) != paper.LADDER[name]
+        for main, name in SAME_MODELS.items()
     )
-
-
-def _frames() -> StatementCheck:
-    return StatementCheck(
-        title="Records are sequences of 90 frames",
-        where="acquisition",
-        published=f"{paper.RECORDS:,}",
-        recomputed=f"{paper.SEQUENCES:,} × {paper.RECORDS / paper.SEQUENCES:g}",
-        verdict="holds" if paper.RECORDS % paper.SEQUENCES == 0 else _NO,
-    )
-
-
-def _shared_rows() -> StatementCheck:
-    pairs = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
-    same = all(
-        (_column(main, "OMAE"), _column(main, "CSC"), _column(main, "Avg")) == paper.LADDER[rung]
-        for main, rung in pairs.items()
-    )
-    return StatementCheck(
-        title="The ladder's ends are the main table's",
-        where="ablation table (a)",
-        published="OMAE, CSC, Avg of two models",
-        recomputed="equal" if same else "different",
-        verdict="holds" if same else _NO,
-    )
-
-
-def _audit() -> StatementCheck:
     passed = round(paper.AUDITED * paper.AUDIT_PASSED / 100)
     interval = wilson_interval(passed, paper.AUDITED)
-    return StatementCheck(
-        title="Audit of the questions",
-        where="QA generation and quality verification",
-        published=f"{paper.AUDIT_PASSED} % of {paper.AUDITED:,}",
-        recomputed=f"{passed:,} passed, 95 % interval {100 * interval.low:.1f}–{100 * interval.high:.1f} %",
-        verdict="holds" if attainable(paper.AUDIT_PASSED, paper.AUDITED) else _NO,
+    return (
+        *gains,
+        _check(
+            "VTV150K's Average is the mean of its nine columns",
+            "VTV150K table",
+            f"{len(paper.VTV)} averages",
+            f"off by {worst:.2f} at the worst",
+            worst > 2 * SHARE_ROUNDING,
+        ),
+        _check(
+            "Records are sequences of 90 frames",
+            "acquisition",
+            f"{paper.RECORDS:,}",
+            f"{paper.SEQUENCES:,} × {paper.RECORDS / paper.SEQUENCES:g}",
+            paper.RECORDS % paper.SEQUENCES != 0,
+        ),
+        _check(
+            "The ladder's ends are the main table's",
+            "ablation table (a)",
+            "OMAE, CSC, Avg of two models",
+            "different" if differ else "equal",
+            differ,
+        ),
+        _check(
+            "Audit of the questions",
+            "QA generation and quality verification",
+            f"{paper.AUDIT_PASSED} % of {paper.AUDITED:,}",
+            f"{passed:,} passed, 95 % interval {100 * interval.low:.1f}–{100 * interval.high:.1f} %",
+            not attainable(paper.AUDIT_PASSED, paper.AUDITED),
+        ),
     )

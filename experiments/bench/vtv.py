@@ -1,19 +1,19 @@
-"""The nine tasks of the VTV protocol over recordings with levels of four attributes, for whoever gives probabilities.
+"""The nine tasks of the VTV protocol over recordings with levels of four attributes, for any predictor of levels.
 
 VTV-LLM (Xie et al., arXiv 2505.22566) asks for hardness, protrusion, elasticity and friction of a recording, for all
 four at once (`combined`), which of two has more of an attribute (`sfd`), which of three has the most or the least
-(`soi`), which of three recordings is which of three named objects (`osc`), and which of two suits a scenario (`tsa`).
-Its questions are not published with levels; these are drawn over other recordings by the same rules.
+(`soi`), which of three recordings belongs to which of three named objects (`osc`), and which of two suits a scenario
+(`tsa`).  Its questions are published without levels; these are drawn over other recordings by the same rules.
 
-An answerer is log p [n, A, K].  A level is the likeliest; recordings are compared by the expected level, equal ones by
-their place; recordings are matched to names by the likeliest assignment, a name standing for the levels that it is
-known for.  Every pair is asked in both orders, every three in all three rotations or with each assignment right equally
-often, so that who tells nothing apart gets exactly the chance.
+A predictor gives log p [n, A, K].  Its level is the likeliest; recordings are compared by the expected level, equal
+ones by their place; recordings are matched to names by the likeliest assignment, where a name stands for the true
+levels of its object.  Every pair is asked in both orders, every three in all three rotations or with each assignment
+right equally often, so that a predictor that cannot distinguish recordings scores exactly at chance.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -33,25 +33,25 @@ CHANCE: Mapping[str, float] = {
     "osc": 100 / 6,
     "tsa": 100 / 2,
 }
-"""Percent that guessing gets."""
+"""Percent right by guessing."""
 
 ASSIGNMENTS = tuple(itertools.permutations(range(3)))
 """Assignment k gives name j to recording `ASSIGNMENTS[k][j]`."""
 
 RESAMPLES = 2_000
-"""Of each interval: its ends are then good to a tenth of its width."""
+"""Resamples of each interval: the error of its ends is about a tenth of its width."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UseScenario:
-    """A use, and what it asks of an object: attribute → +1 for more of it, −1 for less."""
+    """A use of an object: attribute → +1 if it needs more of it, −1 if less."""
 
     text: str
     wants: Mapping[str, int]
 
     @property
     def weights(self) -> Float[np.ndarray, "A"]:
-        """The same in the order of `ATTRIBUTES`."""
+        """`wants` in the order of `ATTRIBUTES`."""
         return np.array([self.wants.get(name, 0) for name in ATTRIBUTES], float)
 
 
@@ -63,7 +63,7 @@ SCENARIOS: tuple[UseScenario, ...] = (
     UseScenario(text="to give back the push of a spring", wants={"elasticity": 1}),
     UseScenario(text="to be found by its relief in the dark", wants={"protrusion": 1}),
 )
-"""Ours: those of the benchmark are not published."""
+"""Scenarios of this project: those of the benchmark are not published."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,9 +71,10 @@ class VTVTasks:
     """Questions over n recordings of different objects; every row of `pairs` and the like names recordings.
 
     Attributes:
-      label: right levels, int [n, A].
+      label: true levels, int [n, A].
       pairs: int [P, 2], two levels of the attribute `pair_of` [P]: which has more?
-      threes: int [T, 3], three levels of the attribute `three_of` [T]: which has the most, where `most` [T], or least?
+      threes: int [T, 3], three levels of the attribute `three_of` [T]: which has the most, or where `most` [T] is
+        false the least?
       names: int [M, 3], recordings whose names are to be matched, in the order of the names; they are shown in the
         order of `ASSIGNMENTS[shown]`, [M].
       fits: int [F, 2], one of which suits the scenario `scenario` [F] better.
@@ -92,7 +93,7 @@ class VTVTasks:
 
 
 def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks:
-    """`count` questions of each comparing task; attributes, levels, assignments and scenarios come in turn.
+    """Draw `count` questions of each comparing task; attributes, levels, assignments and scenarios take turns.
 
     Args:
       label: levels of the recordings.
@@ -109,10 +110,11 @@ def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks
         if missing:
             raise ValueError(f"label lacks levels {missing} of {name}: comparisons need all; use more objects")
     rng = np.random.default_rng(seed)
-    pairs = [turned for i in range(count // 2) for turned in _both_orders(_differing(label, i, 2, rng))]
-    threes = [turned for i in range(count // 3) for turned in _rotations(_differing(label, i, 3, rng))]
+    turns = lambda recordings: [np.roll(recordings, turn) for turn in range(len(recordings))]  # a pair's are its orders
+    pairs = [turned for i in range(count // 2) for turned in turns(_differing(label, i, 2, rng))]
+    threes = [turned for i in range(count // 3) for turned in turns(_differing(label, i, 3, rng))]
     scenario = np.arange(count) // 2 % len(SCENARIOS)
-    fits = [turned for which in scenario[::2] for turned in _both_orders(_unequal(label, int(which), rng))]
+    fits = [turned for which in scenario[::2] for turned in turns(_unequal(label, int(which), rng))]
     return VTVTasks(
         label=label,
         pairs=np.array(pairs),
@@ -127,23 +129,15 @@ def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks
     )
 
 
-def _both_orders(pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return pair, pair[::-1]
-
-
-def _rotations(three: np.ndarray) -> list[np.ndarray]:
-    return [np.roll(three, turn) for turn in range(3)]
-
-
 def _differing(label: np.ndarray, turn: int, count: int, rng: np.random.Generator) -> Int[np.ndarray, "n"]:
-    """Recordings of different levels of the attribute whose turn it is."""
+    """Recordings of different levels of the attribute whose turn it is, [count]."""
     column = label[:, turn % len(ATTRIBUTES)]
     levels = rng.permutation(LEVELS)[:count]
     return np.array([rng.choice(np.flatnonzero(column == level)) for level in levels])
 
 
 def _unlike(label: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Recordings no two of which have the same levels."""
+    """Recordings no two of which have the same levels, [count]."""
     _, kind = np.unique(label, axis=0, return_inverse=True)
     kinds = np.unique(kind)
     if len(kinds) < count:
@@ -163,8 +157,9 @@ def _unequal(label: np.ndarray, scenario: int, rng: np.random.Generator) -> Int[
 
 
 def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, Scores]:
-    """Percent right in every task, keyed as `averages.VTV`; `Scores.items` names a recording of each question,
-    the same one in all orders.
+    """Percent right in every task, keyed as `averages.VTV`.
+
+    `Scores.items` names a recording of each question, the same one in all orders.
 
     Args:
       tasks: the questions.
@@ -178,7 +173,7 @@ def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, S
     sign = np.where(tasks.most, 1, -1)
     found = {name: (right[:, a], own) for a, name in enumerate(ATTRIBUTES)}
     found["combined"] = right.all(1), own
-    same_more = lambda said, known, rows, column: _second(said, rows, column) == _second(known, rows, column)
+    same_more = lambda predicted, true, rows, column: _second(predicted, rows, column) == _second(true, rows, column)
     found["sfd"] = same_more(expected, label, tasks.pairs, tasks.pair_of), tasks.pairs.min(1)
     found["soi"] = _extreme(expected, tasks, sign) == _extreme(label, tasks, sign), tasks.threes.min(1)
     found["osc"] = _matched(log_probs, tasks) == tasks.shown, tasks.names.min(1)
@@ -190,24 +185,24 @@ def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, S
 
 
 def _worth(levels: np.ndarray) -> Float[np.ndarray, "n scenario"]:
-    """How well recordings suit each scenario; equal rows give equal numbers, unlike by a matrix product."""
+    """Suitability of recordings for each scenario; a matrix product would not give equal numbers for equal rows."""
     return np.stack([(levels * s.weights).sum(-1) for s in SCENARIOS], 1)
 
 
 def _second(value: np.ndarray, pairs: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Whether the second of each pair has more, bool; of equal ones the first is taken to have less."""
+    """True where the second of a pair has more, bool [P]; of equal ones the first is taken to have less."""
     return value[pairs[:, 1], column] >= value[pairs[:, 0], column]
 
 
 def _extreme(value: np.ndarray, tasks: VTVTasks, sign: np.ndarray) -> np.ndarray:
-    """The place of the most or the least of three."""
+    """Place of the most or the least of three."""
     return (sign[:, None] * value[tasks.threes, tasks.three_of[:, None]]).argmax(1)
 
 
 def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:
     """The likeliest assignment of three names to three recordings, as a position in `ASSIGNMENTS`."""
     order = np.argsort(np.array(ASSIGNMENTS), axis=1)[tasks.shown]
-    recordings = np.take_along_axis(tasks.names, order, 1)  # place p holds the recording of the name it was given
+    recordings = np.take_along_axis(tasks.names, order, 1)  # place p shows the recording of name order[p]
     levels = tasks.label[tasks.names]  # [M, name, A]
     attributes = np.arange(len(ATTRIBUTES))
     fit = log_probs[recordings[:, None, :, None], attributes, levels[:, :, None, :]].sum(-1)  # [M, name, place]
@@ -216,7 +211,7 @@ def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:
 
 
 def averaged(scores: Mapping[str, Scores], objects: np.ndarray) -> dict[str, Interval]:
-    """Every task and "average", with 95 % intervals from the same resamples of whole objects.
+    """Means of every task and of "average", with 95 % intervals from the same resamples of whole objects.
 
     Args:
       scores: as `score` gives them.
@@ -232,12 +227,7 @@ def averaged(scores: Mapping[str, Scores], objects: np.ndarray) -> dict[str, Int
 
 
 def prior_log_probs(label: Int[np.ndarray, "n A"]) -> Float[np.ndarray, "n A K"]:
-    """Who knows how common each level is and feels nothing: the same for every recording."""
+    """The predictor that knows only how common each level is: the same for every recording."""
     shares = np.stack([np.bincount(label[:, a], minlength=LEVELS) / len(label) for a in range(label.shape[1])])
-    floor = np.finfo(float).tiny  # of a level that nobody has
+    floor = np.finfo(float).tiny  # of a level that does not occur
     return np.tile(np.log(np.maximum(shares, floor)), (len(label), 1, 1))
-
-
-def joint(parts: Sequence[Float[np.ndarray, "n K"]]) -> Float[np.ndarray, "n A K"]:
-    """Attributes side by side."""
-    return np.stack(parts, 1)

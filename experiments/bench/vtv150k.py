@@ -1,22 +1,23 @@
-"""By the protocol of VTV150K, what do touch, force and guessing score, and what of that is left in the paper's table?
+"""What do touch, force and guessing score by the protocol of VTV150K, and what does that leave of the paper's table?
 
     make experiment EXP=vtv150k [ARGS="--scale smoke"]
 
 Nine tasks about recordings of unseen objects: hardness, protrusion, elasticity, friction, all four at once, which of
-two has more, which of three most or least, which recording is which object, which suits a scenario.  VTV150K's videos
-have published questions but no levels, and hand motions that nobody measured; here a recording is a slide and a press
-that is held and let go, of the same generated object, by four sensors.  Answered by linear probes on fixed features of
-each sensor, each object by probes that no recording of it trained, and by all sensors together; beside them the
-measured force with touch and alone, the object's true shape alone, how common the levels are, and guessing.
-
-No policy answers: its language has no word for elasticity and friction, which a press cannot tell either.
-
-Cost: some four minutes of one core, nearly all of it to make the recordings; `--scale smoke` half a minute.
-
-Expected: all sensors together well above guessing in every task; friction and elasticity told by motion, about half of
-their levels; hardness and protrusion three quarters.  The commonest levels lie a few points above guessing, since
-the protocol spares objects that stand out; in the paper's table no model that was not trained for touch reaches even
+two has more, which of three most or least, which recording belongs to which object, which suits a scenario.  VTV150K's
+videos have published questions but no levels, and hand motions that nobody measured; here a recording is a slide and a
+held press, which is then released, on the same generated object, by four sensors.  The predictors are linear probes on
+fixed features of each sensor, fitted without any recording of the object that they predict, and all sensors together;
+for comparison the measured force with touch and alone, the object's true shape alone, the frequency of the levels, and
 guessing.
+
+No policy answers: its language has no words for elasticity and friction, which a press does not reveal either.
+
+Cost: about four minutes of one core, nearly all of it to make the recordings; `--scale smoke` half a minute.
+
+Expected: all sensors together well above guessing in every task; about half of the levels of friction and elasticity,
+which the motions reveal; three quarters of those of hardness and protrusion.  The commonest levels lie a few points
+above guessing, since the protocol spares objects that stand out; in the paper's table no model that was not trained for
+touch even reaches guessing.
 """
 
 import dataclasses
@@ -27,12 +28,14 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.bench import vtv
-from experiments.bench.vtv import ATTRIBUTES, draw_tasks
-from experiments.bench.vtv_report import Rows, tasks_table, vtv_chart, vtv_table
+from experiments.bench.vtv import ATTRIBUTES, CHANCE
+from experiments.core.charts import Panel, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.errors import DataError
-from experiments.core.results import Picture, Results
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import bounds, interval
 from experiments.mechanics.identify_motions import MotionData, feel, rows_of
 from experiments.mechanics.identify_probes import transfer
 from experiments.study import paper_numbers as paper
@@ -41,10 +44,11 @@ from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.averages import VTV, vtv_average
+from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.evidence import ProbeConfig
 
 MOTIONS = ("slide_x", "hold")
-"""One that feels friction, one that feels what an object gives back; both feel the rest."""
+"""One that reveals friction, one that reveals the returned energy; both reveal the other attributes."""
 
 FUSED, WITH_FORCE, FORCE, SHAPE, PRIOR = (
     "all sensors",
@@ -54,23 +58,26 @@ FUSED, WITH_FORCE, FORCE, SHAPE, PRIOR = (
     "commonest",
 )
 
+Scored = Mapping[str, Mapping[str, Interval]]
+"""Predictor → task, and "average"."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VTVProtocolConfig:
-    """The protocol that recordings are taken from, how they are looked at, and how many questions compare them."""
+    """The scenes of the recordings, the frames read of each, the probes, and the number of questions."""
 
     scenes: SceneConfig = SceneConfig(objects=400, sequences=4 * 2800, frames=24, image_px=56, contact_grid=32)
     """Its protocol moves only objects that bear it: about three in ten have both motions, the flat ones more often."""
     moments: int = 8
-    """Frames of a motion that are looked at."""
+    """Frames of a motion that are read."""
     probe: ProbeConfig = ProbeConfig()
     questions: int = 960
-    """Of each task that compares recordings."""
+    """Questions of each task that compares recordings."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordingFeatures:
-    """n objects: features by each source, [n, D], right levels [n, A], names [n]."""
+    """n objects: features by source, [n, D], true levels [n, A], names [n]."""
 
     features: Mapping[str, Float[np.ndarray, "n D"]]
     label: np.ndarray
@@ -78,24 +85,27 @@ class RecordingFeatures:
 
 
 def run(config: VTVProtocolConfig, context: Context) -> Results:
-    """Make the recordings, probe, ask."""
+    """Make the recordings, fit the probes, score them."""
     with context.progress("planning", 1) as advance:
         rows = one_each(LiveScenes(config.scenes))
         advance()
     with context.timed("recordings"), context.progress("recordings", sum(map(len, rows.values()))) as advance:
         made = together([feel(config.scenes, name, config.moments, advance, rows[name]) for name in MOTIONS])
-    tasks = draw_tasks(made.label, config.questions, seed=0)
+    tasks = vtv.draw_tasks(made.label, config.questions, seed=0)
     with context.timed("probes"):
-        told = answers(made, config.probe, context)
-    scores = {name: vtv.score(tasks, log_probs) for name, log_probs in context.each("scoring", told.items())}
+        predicted = predictions(made, config.probe, context)
+    scores = {name: vtv.score(tasks, log_probs) for name, log_probs in context.each("scoring", predicted.items())}
     scored = {name: vtv.averaged(score, made.objects) for name, score in scores.items()}
-    counts = {task: len(score.values) for task, score in scores[FUSED].items()}
+    shares = {
+        name: [round(100 * float(np.mean(made.label[:, a] == level)), 1) for level in range(vtv.LEVELS)]
+        for a, name in enumerate(ATTRIBUTES)
+    }
     return Results(
         verdict=verdict(scored),
         tables=(
-            vtv_table(scored),
-            tasks_table(counts, {task: half_width(scored[FUSED][task].mean, paper.VTV_ITEMS) for task in VTV}),
-            differences_table(HERE),
+            score_table(scored),
+            task_table({task: len(score.values) for task, score in scores[FUSED].items()}, scored[FUSED]),
+            differences_table(DIFFERENCES),
         ),
         pictures=(
             Picture(
@@ -103,24 +113,14 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
                 title="Nine tasks",
                 caption="Share of right answers about objects that no probe was trained on, 95 % intervals over "
                 "objects; the paper's figures are of other recordings.",
-                content=vtv_chart(scored, FUSED, (FORCE, SHAPE, PRIOR)),
+                content=score_chart(scored),
             ),
         ),
         settings={
             "recordings": f"{len(made.objects)} objects, {' and '.join(MOTIONS)} each, by {len(SENSORS)} sensors"
         },
-        data={"objects": len(made.objects), "level shares (%)": shares(made.label)},
+        data={"objects": len(made.objects), "level shares (%)": shares},
     )
-
-
-HERE = (
-    ("recordings", "VTV150K: 100 objects in the hand, three sensors", "generated objects, a slide and a held press"),
-    ("levels", "given by people", "of the object's own friction, returned energy, modulus, relief"),
-    ("who answers", "a language model of 7 billion parameters", "linear probes on fixed features of a sensor"),
-    ("unseen objects", "not said", "every object, by probes that no recording of it trained"),
-    ("scenarios, names", "written for the benchmark", "six of ours; a name stands for the object's levels"),
-    ("intervals", "none", "whole objects resampled"),
-)
 
 
 def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
@@ -138,40 +138,36 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
     return {name: [rows[object_id] for object_id in shared] for name, rows in first.items()}
 
 
-def together(moved: Sequence[MotionData]) -> RecordingFeatures:
-    """Contacts of several motions with the same objects, side by side."""
-    beside = lambda parts: np.concatenate(list(parts), 1)
-    touch = {sensor: beside(m.touch[s] for m in moved) for s, sensor in enumerate(SENSORS)}
-    first = moved[0]
+def together(motions: Sequence[MotionData]) -> RecordingFeatures:
+    """Contacts of several motions with the same objects, their features joined."""
+    joined = lambda parts: np.concatenate(list(parts), 1)
+    touch = {sensor: joined(m.touch[s] for m in motions) for s, sensor in enumerate(SENSORS)}
+    force = joined(m.force.reshape(len(m.force), -1) for m in motions)
     return RecordingFeatures(
-        features={
-            **touch,
-            FORCE: beside(m.force.reshape(len(m.force), -1) for m in moved),
-            SHAPE: beside(m.shape for m in moved),
-        },
-        label=np.stack([first.levels[name] for name in ATTRIBUTES], 1),
-        objects=first.objects,
+        features={**touch, FORCE: force, SHAPE: joined(m.shape for m in motions)},
+        label=np.stack([motions[0].levels[name] for name in ATTRIBUTES], 1),
+        objects=motions[0].objects,
     )
 
 
-def answers(made: RecordingFeatures, config: ProbeConfig, context: Context) -> dict[str, Float[np.ndarray, "n A K"]]:
-    """log p of every level by every source; sensors together as if they erred independently."""
-    told = {}
+def predictions(
+    made: RecordingFeatures, config: ProbeConfig, context: Context
+) -> dict[str, Float[np.ndarray, "n A K"]]:
+    """log p of every level by every source; sensors are joined as if their errors were independent."""
+    found = {}
     with context.progress("probes", len(made.features) * len(ATTRIBUTES)) as advance:
         for source, x in made.features.items():
             parts = []
             for a in range(len(ATTRIBUTES)):
-                (said,) = transfer(x, [], made.label[:, a], made.objects, config)
-                parts.append(said.log_probs)
+                (predicted,) = transfer(x, [], made.label[:, a], made.objects, config)
+                parts.append(predicted.log_probs)
                 advance()
-            told[source] = vtv.joint(parts)
-    fused = np.sum([told[sensor] for sensor in SENSORS], axis=0)
+            found[source] = np.stack(parts, 1)
+    fused = np.sum([found[sensor] for sensor in SENSORS], axis=0)
     return {
         FUSED: fused,
-        WITH_FORCE: fused + told[FORCE],
-        **{sensor: told[sensor] for sensor in SENSORS},
-        FORCE: told[FORCE],
-        SHAPE: told[SHAPE],
+        WITH_FORCE: fused + found[FORCE],
+        **{source: found[source] for source in (*SENSORS, FORCE, SHAPE)},
         PRIOR: vtv.prior_log_probs(made.label),
     }
 
@@ -182,31 +178,124 @@ def half_width(share: float, questions: int) -> float:
     return 196 * math.sqrt(p * (1 - p) / questions)
 
 
-def shares(label: np.ndarray) -> dict[str, list[float]]:
-    """How common each level is, percent."""
-    return {
-        name: [round(100 * float(np.mean(label[:, a] == level)), 1) for level in range(vtv.LEVELS)]
-        for a, name in enumerate(ATTRIBUTES)
-    }
-
-
-def verdict(rows: Rows) -> tuple[str, ...]:
+def verdict(scored: Scored) -> tuple[str, ...]:
     """Touch against force, shape and guessing; and the paper's rows against guessing."""
-    average = {name: row["average"] for name, row in rows.items()}
-    fused, guess = average[FUSED], vtv_average(vtv.CHANCE)
-    attributes = ", ".join(f"{name} {rows[FUSED][name].mean:.0f}" for name in ATTRIBUTES)
+    average = {name: row["average"] for name, row in scored.items()}
+    guess = vtv_average(CHANCE)
+    attributes = ", ".join(f"{name} {scored[FUSED][name].mean:.0f}" for name in ATTRIBUTES)
     below = [name for name, (_, value) in paper.VTV.items() if value < guess]
     return (
-        f"All sensors together have an average of {fused.mean:.1f} [{fused.low:.1f}, {fused.high:.1f}] ({attributes} "
-        f"%), single ones {', '.join(f'{average[name].mean:.1f} ({name})' for name in SENSORS)}; force alone has "
+        f"All sensors together have an average of {interval(average[FUSED], '.1f')} ({attributes} %), single ones "
+        f"{', '.join(f'{average[name].mean:.1f} ({name})' for name in SENSORS)}; force alone has "
         f"{average[FORCE].mean:.1f}, true shape {average[SHAPE].mean:.1f}, the commonest levels "
         f"{average[PRIOR].mean:.1f}, guessing {guess:.1f}.",
-        f"{len(below)} of the paper's {len(paper.VTV)} rows lie below guessing ({', '.join(below)}), which no model "
-        "that always answers can do but by unlike questions or answers that could not be read; the paper says neither.",
-        f"Between its own two rows at the top lie {paper.VTV['Ours'][1] - paper.VTV['VTV-LLM-7B'][1]:.1f} points; with "
-        f"{paper.VTV_ITEMS} questions a property, one share alone is good to ± "
+        f"{len(below)} of the paper's {len(paper.VTV)} rows lie below guessing ({', '.join(below)}), which a model "
+        "that always answers can reach only if questions differ or answers could not be read; the paper reports "
+        "neither.",
+        f"The paper's two best rows differ by {paper.VTV['Ours'][1] - paper.VTV['VTV-LLM-7B'][1]:.1f} points; with "
+        f"{paper.VTV_ITEMS} questions a property, the 95 % interval of a single share is ± "
         f"{half_width(paper.VTV['Ours'][0][0], paper.VTV_ITEMS):.1f}.",
     )
+
+
+def score_table(scored: Scored) -> Table:
+    """Every predictor, guessing, and every row of the paper."""
+    span = "95 %"
+    row = lambda name, values, average: {
+        "row": name,
+        **dict(zip(paper.VTV_COLUMNS, values, strict=True)),
+        "Average": average,
+    }
+    rows: list[dict[str, Cell]] = [
+        row(name, [of[task].mean for task in VTV], of["average"].mean)
+        | {span: bounds(of["average"].low, of["average"].high, ".1f")}
+        for name, of in scored.items()
+    ]
+    rows.append(row("guessing", [CHANCE[task] for task in VTV], vtv_average(CHANCE)))
+    rows += [row(_published(name), values, average) for name, (values, average) in paper.VTV.items()]
+    return named_table(
+        "The nine tasks, ours and the paper's",
+        rows,
+        formats=dict.fromkeys((*paper.VTV_COLUMNS, "Average"), ".1f"),
+        meanings={
+            "Average": "plain mean of the nine",
+            span: "of the average, whole objects resampled; the paper gives none",
+        },
+        note="Percent right. Compare directions, not values: other objects, other questions, no language model. The "
+        "paper's caption says that SOI is no percentage, but its averages take it as one.",
+    )
+
+
+def _published(name: str) -> str:
+    return f"{'Touch-R1' if name == 'Ours' else name} (paper)"
+
+
+MEANINGS: Mapping[str, str] = {
+    "hardness": "its level, of three",
+    "protrusion": "its level, of three",
+    "elasticity": "its level, of three",
+    "friction": "its level, of three",
+    "combined": "all four levels",
+    "sfd": "which of two has more of an attribute",
+    "soi": "which of three has the most, or the least",
+    "osc": "which recording is which of three named objects",
+    "tsa": "which of two suits a scenario",
+}
+
+
+def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Table:
+    """Meaning, number of questions and chance of each task, and the interval that the benchmark's size would give.
+
+    Args:
+      counts: task → questions.
+      scored: task → share of right answers.
+    """
+    width = f"± of {paper.VTV_ITEMS}"
+    rows: list[dict[str, Cell]] = [
+        {
+            "task": task,
+            "asks for": MEANINGS[task],
+            "questions": counts[task],
+            "chance": CHANCE[task],
+            width: half_width(scored[task].mean, paper.VTV_ITEMS),
+        }
+        for task in VTV
+    ]
+    meaning = (
+        "half the 95 % interval of the first row's share if it were measured on the benchmark's number of questions "
+        "of a property, taken as independent"
+    )
+    formats, units = {"chance": ".1f", width: ".1f"}, {"chance": "%", width: "points"}
+    return named_table("Tasks", rows, formats=formats, units=units, meanings={width: meaning})
+
+
+DIFFERENCES = (
+    ("recordings", "VTV150K: 100 objects in the hand, three sensors", "generated objects, a slide and a held press"),
+    ("levels", "given by people", "of the object's own friction, returned energy, modulus, relief"),
+    ("who answers", "a language model of 7 billion parameters", "linear probes on fixed features of a sensor"),
+    ("unseen objects", "not stated", "every object, by probes that no recording of it trained"),
+    ("scenarios, names", "written for the benchmark", "six of this project; a name stands for the object's levels"),
+    ("intervals", "none", "whole objects resampled"),
+)
+
+
+def score_chart(scored: Scored) -> bytes:
+    """Every task: all sensors with intervals, other predictors and the paper's best as points, guessing as marks."""
+    tasks = (*VTV, "average")
+    chance = {**CHANCE, "average": vtv_average(CHANCE)}
+    series = [
+        Series("guessing", x=[chance[task] for task in tasks], marker="$|$", size=150.0, colour=SHARED),
+        estimates(FUSED, [scored[FUSED][task] for task in tasks], colour=PALETTE[0], marker="o", width=2.4),
+    ]
+    for name, colour in zip((FORCE, SHAPE, PRIOR), PALETTE[2:], strict=False):
+        x = [scored[name][task].mean for task in tasks]
+        series.append(Series(name, x=x, colour=colour, marker="s", size=20.0))
+    for name, marker in (("VTV-LLM-7B", "d"), ("Ours", "D")):
+        values, average = paper.VTV[name]
+        x = [*values, average]
+        series.append(Series(_published(name), x=x, colour=PALETTE[1], marker=marker, size=36.0, hollow=True))
+    rows = [*paper.VTV_COLUMNS, "Average"]
+    return draw([Panel(series, rows=rows, x_limits=(0, 100), x_label="right answers (%)")], size=(8.2, 4.6))
 
 
 DEFAULT = VTVProtocolConfig()

@@ -1,4 +1,4 @@
-"""The data card: a sound bench passes, and each way to spoil it fails the check that is for it."""
+"""The data card: a sound bench passes, and each fault fails its own check."""
 
 import dataclasses
 

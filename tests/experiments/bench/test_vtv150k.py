@@ -1,4 +1,4 @@
-"""The VTV protocol, shrunk: motions of a few objects, every source answers, the paper's rows stand beside."""
+"""The nine tasks of VTV150K: a perfect predictor is right, one without knowledge is at chance, exactly; the report."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -7,17 +7,93 @@ import numpy as np
 import pytest
 
 from experiments.bench import vtv150k
-from experiments.bench.vtv import ATTRIBUTES
+from experiments.bench.vtv import (
+    ASSIGNMENTS,
+    ATTRIBUTES,
+    CHANCE,
+    VTVTasks,
+    averaged,
+    draw_tasks,
+    prior_log_probs,
+    score,
+)
 from experiments.core.artifacts import read_json
 from experiments.mechanics.identify_motions import MotionData
 from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.training.evidence import ProbeConfig
 
 TINY = dataclasses.replace(vtv150k.EXPERIMENT.scales["smoke"], probe=ProbeConfig(folds=3, iterations=4), questions=24)
+N = 60
+LABEL = np.random.default_rng(3).integers(0, 3, (N, 4))
 
 
-def moved(objects: list[int], levels: list[int], shift: float) -> MotionData:
+@pytest.fixture(scope="module")
+def tasks():
+    return draw_tasks(LABEL, 240, seed=1)
+
+
+def certain(label: np.ndarray) -> np.ndarray:
+    return np.log(np.where(label[..., None] == np.arange(3), 0.98, 0.01))
+
+
+def test_the_true_levels_are_always_right(tasks):
+    assert {name: s.mean() for name, s in score(tasks, certain(LABEL)).items()} == dict.fromkeys(VTV, 100)
+
+
+def test_opposite_levels_are_wrong_in_every_comparison(tasks):
+    wrong = {name: s.mean() for name, s in score(tasks, certain(2 - LABEL)).items()}
+    assert (wrong["sfd"], wrong["soi"], wrong["combined"]) == (0, 0, 100 * float((LABEL == 1).all(1).mean()))
+
+
+def test_the_prior_is_at_chance_exactly(tasks):
+    blind = score(tasks, prior_log_probs(LABEL))
+    for task in ("sfd", "soi", "osc", "tsa"):
+        assert blind[task].mean() == pytest.approx(CHANCE[task])
+    for a, name in enumerate(ATTRIBUTES):
+        assert blind[name].mean() == pytest.approx(100 * np.bincount(LABEL[:, a]).max() / N)
+
+
+def test_questions_are_about_different_levels(tasks):
+    first, second = (LABEL[tasks.pairs[:, i], tasks.pair_of] for i in (0, 1))
+    assert (first != second).all()
+    assert np.array_equal(tasks.pairs[::2], tasks.pairs[1::2, ::-1])
+    three = LABEL[tasks.threes, tasks.three_of[:, None]]
+    assert np.array_equal(np.sort(three, 1), np.tile([0, 1, 2], (240, 1)))
+    for a in range(4):
+        assert set(tasks.most[tasks.three_of == a]) == {True, False}
+    assert all(len(np.unique(levels, axis=0)) == 3 for levels in LABEL[tasks.names])
+
+
+@pytest.mark.parametrize("k", range(len(ASSIGNMENTS)))
+def test_recordings_are_matched_to_names(k):
+    label = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [2, 2, 2, 2]])
+    one = np.zeros((1, 2), int)
+    tasks = VTVTasks(
+        label=label, pairs=one, pair_of=one[0, :1], threes=np.zeros((1, 3), int), three_of=one[0, :1],
+        most=np.array([True]), names=np.array([[0, 1, 2]]), shown=np.array([k]), fits=one, scenario=one[0, :1],
+    )  # fmt: skip
+    assert score(tasks, certain(label))["osc"].mean() == 100
+
+
+@pytest.mark.parametrize(
+    ("label", "count", "message"), [(LABEL, 100, "multiple of 24"), (np.zeros((9, 4), int), 24, "lacks levels")]
+)
+def test_questions_that_cannot_be_drawn(label, count, message):
+    with pytest.raises(ValueError, match=message):
+        draw_tasks(label, count, seed=0)
+
+
+def test_the_average_is_that_of_the_tasks_and_has_an_interval(tasks):
+    perfect, blind = (averaged(score(tasks, x), np.arange(N)) for x in (certain(LABEL), prior_log_probs(LABEL)))
+    span = blind["average"]
+    assert span.mean == pytest.approx(vtv_average({task: blind[task].mean for task in VTV}))
+    assert span.low < span.mean < span.high
+    assert perfect["average"].low == 100
+
+
+def motion_data(objects: list[int], levels: list[int], shift: float) -> MotionData:
     n = len(objects)
     return MotionData(
         touch=tuple(np.full((n, 2), s + shift) + np.arange(n)[:, None] for s in range(len(SENSORS))),
@@ -28,8 +104,8 @@ def moved(objects: list[int], levels: list[int], shift: float) -> MotionData:
     )
 
 
-def test_contacts_of_one_object_stand_side_by_side():
-    made = vtv150k.together([moved([2, 4], [1, 0], 0.0), moved([2, 4], [1, 0], 100.0)])
+def test_features_of_one_objects_motions_are_joined():
+    made = vtv150k.together([motion_data([2, 4], [1, 0], shift) for shift in (0.0, 100.0)])
     assert made.objects.tolist() == [2, 4]
     assert made.label.tolist() == [[1] * 4, [0] * 4]
     assert made.features[SENSORS[0]].tolist() == [[0, 0, 100, 100], [1, 1, 101, 101]]
@@ -49,13 +125,12 @@ def test_half_an_interval_by_hand():
 
 
 @pytest.mark.slow
-def test_every_source_stands_beside_the_paper(tmp_path):
+def test_every_source_and_the_papers_rows_are_reported(tmp_path):
     results = read_json(run_shrunk(vtv150k, TINY, tmp_path) / "results.json")
-    table, tasks, differs = results["tables"]
-    names = [row[0] for row in table["rows"]]
-    assert names[:2] == [vtv150k.FUSED, vtv150k.WITH_FORCE]
-    assert names[-1] == "Touch-R1 (paper)"
-    assert all(0 <= value <= 100 for row in table["rows"] for value in row[1:11])
-    assert len(tasks["rows"]) == 9
-    assert len(differs["rows"]) == 6
-    assert "lie below guessing" in results["verdict"][1]
+    scores, tasks, differences = ({row[0]: row[1:] for row in table["rows"]} for table in results["tables"])
+    assert list(scores)[:2] == [vtv150k.FUSED, vtv150k.WITH_FORCE]
+    assert all(0 <= value <= 100 for row in scores.values() for value in row[:10])
+    assert scores["guessing"][9] == pytest.approx(31.6, abs=0.05)
+    assert scores["Touch-R1 (paper)"][0] == 78.6
+    assert list(tasks) == list(VTV)
+    assert len(differences) == 6
