@@ -85,7 +85,7 @@ def read(args: list[str]) -> Any:
 
 
 def usage() -> Iterator[str]:
-    """How to call it, and every command with the first line of what it says of itself."""
+    """Usage, and every command with the first line of its description."""
     yield f"usage: {PROG} COMMAND …       {PROG} COMMAND --help"
     width = max(map(len, COMMANDS))
     for name, place in COMMANDS.items():

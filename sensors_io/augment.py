@@ -24,7 +24,7 @@ from sensors_io.schema import SchemaError, Sequence
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AugmentConfig:
-    """How recordings are changed at random; by default not at all.
+    """Random changes of recordings; by default none.
 
     Args:
       mirror: probability of a mirror image.
@@ -50,7 +50,7 @@ class AugmentConfig:
 
     @property
     def active(self) -> bool:
-        """Whether anything can change."""
+        """True if anything can change."""
         return self != AugmentConfig()
 
 
@@ -134,7 +134,7 @@ def jitter_exposure(images: np.ndarray, config: AugmentConfig, rng: np.random.Ge
 
 
 def draw_kept(present: np.ndarray, config: AugmentConfig, rng: np.random.Generator) -> np.ndarray:
-    """Which frames of each stream stay, bool [S, F], a subset of the present ones, never empty where any is present.
+    """Draw the frames of each stream that stay, bool [S, F]: a subset of those present, empty only where none is.
 
     Args:
       present: bool [S, F].

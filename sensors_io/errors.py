@@ -1,4 +1,4 @@
-"""What all errors have in common that are meant for a user."""
+"""Base class of all errors that are meant for a user."""
 
 
 class UserError(Exception):

@@ -65,7 +65,7 @@ class GravityModel:
         return self.first_moment_nmm / self.weight_n
 
     def contact(self, force_n: np.ndarray, moment_nmm: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is left of readings [..., 3] when bias and weight are taken off.
+        """Readings [..., 3] less bias and weight.
 
         Args:
           force_n, moment_nmm: as read.
@@ -132,7 +132,7 @@ def gravity_directions(force_n: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Mount:
-    """How the gel sits on the force sensor.
+    """Mounting of the gel on the force sensor.
 
     Args:
       rotation: turns the sensor's axes into the gel's (x right, y down, z out of the gel), [3, 3].

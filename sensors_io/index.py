@@ -33,7 +33,7 @@ class RecordsVersionError(RecordsError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordsMeta:
-    """What a data set is: where it comes from, under which licence, made by which config, seen by which sensors.
+    """Description of a data set: source, licence, hash of its config, sensors.
 
     `notes` is free JSON: the report of an import, the config of a generation.
     """

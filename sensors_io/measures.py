@@ -1,4 +1,4 @@
-"""What one sensor's recording of a contact measures: a few numbers with units, where, and on what part of the window.
+"""Measurements of one sensor's recording of a contact: numbers with units, their place, their part of the window.
 
     force                N      press force −Fz of the frame that is read, about 1.5 N
     indentation          mm     depth that 1 % of the readable nodes exceed
@@ -129,7 +129,7 @@ def slope(x: np.ndarray, y: np.ndarray) -> float | None:
 
 
 def _changes(sequence: Sequence, trusted: np.ndarray) -> np.ndarray:
-    """Where and how much the gel is touched in the trusted frames [n, h, w]: depth in mm, else the blurred change of
+    """Contact of the gel in the valid frames [n, h, w]: depth in mm, else the blurred change of
     the picture since the first frame in grey levels.
     """
     if sequence.depth_mm is not None:
@@ -151,7 +151,7 @@ def _in_contact(change: np.ndarray, sequence: Sequence) -> np.ndarray:
 def _quantities(
     sequence: Sequence, trusted: np.ndarray, best: int, force: np.ndarray | None, change: np.ndarray
 ) -> dict[str, float]:
-    """What the recording can carry, in the order of `UNITS`."""
+    """Quantities that the recording can provide, in the order of `UNITS`."""
     frame, found = int(trusted[best]), dict[str, float | None]()
     masks = [_in_contact(c, sequence) for c in change]
     area = np.array([100.0 * mask.mean() for mask in masks])
@@ -187,7 +187,7 @@ def _textures(sequence: Sequence, frame: int, contact: np.ndarray) -> dict[str, 
 
 
 def _readable(sequence: Sequence) -> np.ndarray:
-    """Which nodes of the fields may be read, bool [N, h, w]."""
+    """Mask of the nodes of the fields that are valid, bool [N, h, w]."""
     if sequence.valid is not None:
         return sequence.valid
     field = sequence.depth_mm if sequence.depth_mm is not None else sequence.deformation_mm

@@ -1,4 +1,4 @@
-"""How late each sensor is stamped, measured once at the bench and taken off every recording."""
+"""Delay of each sensor's timestamps, measured once and subtracted from every recording."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ class Offsets:
 
     @property
     def late_s(self) -> dict[str, float]:
-        """What is to be taken off the stamps of each sensor; 0 for the reference."""
+        """Delay to subtract from the timestamps of each sensor; 0 for the reference."""
         return {self.reference: 0.0} | {name: offset.late_s for name, offset in self.sensors.items()}
 
     def save(self, path: pathlib.Path) -> None:

@@ -39,7 +39,7 @@ class FlagCounts:
             self.flags[sequence.sensor, flag] += int(np.count_nonzero(sequence.flags & np.uint32(flag)))
 
     def cell(self, sensor: str, flag: Flag) -> str:
-        """How many frames carry a flag, of how many judged where those are not all, a dot where none was."""
+        """Number of frames with a flag, of the number judged if that is not all; a dot if none was judged."""
         count, judged = self.flags[sensor, flag], self.judged[sensor, flag]
         if judged == self.frames[sensor]:
             return str(count)
@@ -88,7 +88,7 @@ def flag_table(counts: FlagCounts, title: str = "flags") -> Table:
 
 
 def import_table(report: ImportReport) -> Table:
-    """What an import took in, then all that it did not: by name, or in one row where many have one reason."""
+    """Table of imported recordings, then of those left out: by name, or one row for many with one reason."""
     table = Table("what", "count or reason", title="import")
     table.add_row("contacts imported", str(report.contacts))
     for split, count in report.objects.items():

@@ -80,7 +80,7 @@ class ClipMemory:
 
 
 class Contacts(Protocol):
-    """Where contacts come from by number: `records.RecordStore`, or `live.LiveScenes` that makes them when asked."""
+    """Contacts by number: `records.RecordStore`, or `live.LiveScenes`, which generates them on request."""
 
     @property
     def contacts(self) -> tuple[ContactKey, ...]:

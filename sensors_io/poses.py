@@ -21,7 +21,7 @@ _LEAST_READINGS = 8  # in a stretch: fewer tell no spread
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PoseConfig:
-    """What counts as holding still.
+    """Criteria for a hand at rest.
 
     Args:
       hold_s: length of a stretch.

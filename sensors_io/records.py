@@ -234,12 +234,12 @@ class RecordStore:
 
     @property
     def meta(self) -> RecordsMeta:
-        """What the data set is."""
+        """Description of the data set."""
         return self._index.meta
 
     @property
     def complete(self) -> bool:
-        """Whether the writing has ended."""
+        """True once writing has ended."""
         return self._index.complete
 
     @property
@@ -304,7 +304,7 @@ def write_lock(root: pathlib.Path) -> IO[str]:
 
 
 def _content(root: pathlib.Path, index: Index) -> str:
-    """What an index lists, for whoever is about to write over it."""
+    """Contents of an index, for the message before it is overwritten."""
     state = "complete" if index.complete else "unfinished"
     when = datetime.datetime.fromtimestamp((root / INDEX).stat().st_mtime)
     return (

@@ -1,4 +1,4 @@
-"""What a tactile recording is: the names, shapes, units and frames of reference of everything that is stored.
+"""Schema of a tactile recording: names, shapes, units and frames of reference of everything that is stored.
 
 Frames of reference.  Image x points right, y down, z out of the gel towards the object.  `depth_mm` is the indentation
 into the gel, stored positive.  `force_n` is the force *on the gel*: pressing is Fz < 0 and a press target is −Fz.
@@ -45,7 +45,7 @@ SPLITS: tuple[str, ...] = ("train", "val", "test", "unlabelled")
 
 
 class Phase(enum.IntEnum):
-    """What the hand is doing in a frame."""
+    """Phase of the hand's motion in a frame."""
 
     APPROACH = 0
     LOAD = 1
@@ -183,7 +183,7 @@ class Sequence:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectCard:
-    """What is stored once per object: its RGB-D view, its labels with their annotator, its split.
+    """Entry stored once per object: its RGB-D view, its labels with their annotator, its split.
 
     `view` is uint8 [Hv, Wv, 3], `view_depth_mm` float32 [Hv, Wv]; both `None` where nobody photographed the object.
     `labels` maps an attribute to its level, `UNKNOWN` or absent where nobody annotated it.  `visual_lies` says that the

@@ -1,4 +1,4 @@
-"""Which frames of a sequence stand for it, and the images of a sequence that has fields and no camera frames."""
+"""Choice of the frames that represent a sequence, and images of a sequence that has fields but no camera frames."""
 
 import dataclasses
 import functools

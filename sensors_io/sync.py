@@ -53,7 +53,7 @@ class ClockMap:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Step:
-    """What one sample says about those before it.
+    """Relation of one sample to those before it.
 
     Args:
       missing: samples that never came between the last one and this; −1 takes back one that was counted in error.
@@ -79,7 +79,7 @@ class IndexGaps:
     """
 
     REMEMBERED = 1024
-    """How far back a sample may be late: half a second of a force sensor at 2 kHz, half a minute of a camera."""
+    """Longest delay of a sample: half a second of a force sensor at 2 kHz, half a minute of a camera."""
 
     def __init__(self, modulus: int | None = None):
         self._modulus = modulus

@@ -31,7 +31,7 @@ class Signal:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TapOffset:
-    """How far the clock of one signal is behind another's.
+    """Delay of one signal's clock relative to another's.
 
     Args:
       seconds: median over the taps of (time in b − time in a).

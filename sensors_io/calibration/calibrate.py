@@ -15,7 +15,7 @@ from sensors_io.fields.types import Calibration, CalibrationError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrateConfig:
-    """What a good set of presses is.
+    """Requirements on a set of presses.
 
     Args:
       least_presses: that remain after bad ones are left out.
@@ -51,7 +51,7 @@ class LeftOut:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """What a calibration is made from: presses kept and left out, their touches, what was chosen, held-out errors."""
+    """Origin of a calibration: presses used and left out, their contacts, chosen settings, errors on unseen presses."""
 
     kept: tuple[str, ...]
     left_out: tuple[LeftOut, ...]

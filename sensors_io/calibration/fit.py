@@ -163,7 +163,7 @@ def _gram(samples: Samples) -> Gram:
 
 
 def _kept(degree: int, position_degree: int) -> np.ndarray:
-    """Where the products of these degrees stand among those of the highest, int [J·K]."""
+    """Positions of the products of these degrees among those of the highest degree, int [J·K]."""
     top_colour, top_place = (max(d) for d in zip(*DEGREES, strict=True))
     all_terms = np.arange(len(position_terms(top_place)) * len(colour_terms(top_colour)))
     grid = all_terms.reshape(len(position_terms(top_place)), -1)

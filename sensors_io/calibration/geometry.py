@@ -39,7 +39,7 @@ class GeometryError(UserError, ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Where each pixel lies on the gel.
+    """Map from each pixel to a place on the gel.
 
     Args:
       size_px: rows and columns of the picture.

@@ -54,7 +54,7 @@ class BallPresses:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Touches:
-    """Where P presses are: centre and contact radius in pixels, float64 [P] each; x is the column."""
+    """Centres and contact radii of P presses in pixels, float64 [P] each; x is the column."""
 
     x_px: np.ndarray
     y_px: np.ndarray

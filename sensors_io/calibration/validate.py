@@ -1,4 +1,4 @@
-"""How good a calibration is, on presses that it has not seen: depth and radius of the ball it reconstructs."""
+"""Error of a calibration on unseen presses: depth and radius of the reconstructed ball."""
 
 import dataclasses
 from collections.abc import Callable

@@ -38,7 +38,7 @@ class Calibrate:
     mm_per_px: float | None = None
     """Pitch of the pixels; the geometry's where there is one, and measured where the press depths are known."""
     press_depths_mm: tuple[float, ...] = ()
-    """How far each picture's ball has gone down since it first touched, in the order of the pictures, or one depth for
+    """Indentation of each picture's ball since first contact, in the order of the pictures, or one depth for
     all: the pitch is then measured from the size of the contacts."""
     gel_thickness_mm: float = 4.5
     """Of the soft layer on its window, which decides how large a contact is at a depth."""
@@ -94,7 +94,7 @@ class Calibrate:
 
 
 def report_table(made: Calibration, report: CalibrationReport) -> Table:
-    """What was learnt, how well, and what was left out and why."""
+    """Table of the fit, its errors, and the presses left out with the reasons."""
     table = Table("what", "figure or reason", title=f"calibration of {made.sensor}")
     table.add_row("presses used", str(len(report.kept)))
     rows_mm, columns_mm = (side * made.mm_per_px for side in made.background.shape[:2])

@@ -79,7 +79,7 @@ class Check:
 
 
 def _left_out(store: RecordStore) -> collections.Counter[str]:
-    """How much was left out when the records were imported, by reason; nothing of records that were not."""
+    """Counts of recordings that the import left out, by reason; empty for records that were not imported."""
     report = store.meta.notes.get("report", {})
     return collections.Counter(skip["reason"] for skip in report.get("skipped", ()))
 

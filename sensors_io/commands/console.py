@@ -1,4 +1,4 @@
-"""What all commands print with: standard output, complaints, a progress bar."""
+"""Output shared by all commands: standard output, errors, a progress bar."""
 
 import contextlib
 import time

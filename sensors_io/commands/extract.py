@@ -99,7 +99,7 @@ def encoded(fields: Fields, names: tuple[str, ...], calibration: str) -> bytes:
 
 
 def summary(fields: Fields, refused: tuple[str, ...]) -> Table:
-    """What was written, what was refused, frames by flag."""
+    """Summary of written records, refused records, and frames by flag."""
     table = Table("what", "figure or reason", title=f"{len(fields)} frames")
     for name, array in fields.arrays().items():
         if array is not None and name != "flags":

@@ -12,7 +12,7 @@ from sensors_io.viewer.presenter import Channel
 
 
 class Extraction:
-    """What `view` and `record` extract live: the fields of the first sensor, from a picture of its gel at rest.
+    """Settings of live field extraction in `view` and `record`: the first sensor, from a picture of its gel at rest.
 
     Args:
       background: that picture; `None` extracts nothing.

@@ -32,7 +32,7 @@ class ForceZeroing(Bench):
     wait_s: float = 300.0
     """For all of them."""
     still: PoseConfig = dataclasses.field(default_factory=PoseConfig)
-    """What counts as holding still."""
+    """Criterion for a hand at rest."""
 
     def run(self) -> int:
         if self.poses < 4:
@@ -84,7 +84,7 @@ def _board(finder: PoseFinder, wanted: int, force_n: np.ndarray) -> Table:
 
 
 def report(zero: ForceZero, poses: list[Pose]) -> Table:
-    """What was found, and how well it explains the readings."""
+    """Report of the fit and its residuals."""
     model = zero.model
     table = Table("what", "figure", title="force sensor without contact")
     table.add_row("bias", f"{_vector(model.bias_n)} N, {_vector(model.bias_nmm)} N mm")

@@ -21,7 +21,7 @@ COLUMNS = (ID, *ATTRIBUTES, SPLIT, NAME)
 """Of a table of labels; all but the first may be missing, and a cell may be empty."""
 
 LEAST = {"hardness": "soft", "roughness": "smooth", "protrusion": "flat"}
-"""What level 0 of an attribute means."""
+"""Meaning of level 0 of an attribute."""
 
 Row = Mapping[str, str]
 

@@ -33,7 +33,7 @@ _VIEW_WAIT_S = 10.0  # for the first colour and depth pair of an RGB-D camera
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MountConfig:
-    """How the gel of the first sensor sits on the force sensor.
+    """Mounting of the first sensor's gel on the force sensor.
 
     Args:
       turn_deg: turns the force sensor's axes into the gel's (x right, y down, z out of the gel): about x, then y, then
@@ -78,7 +78,7 @@ class Record(Bench):
     sync: pathlib.Path | None = None
     """JSON of how late each sensor is stamped, made by `sync`; none takes their stamps as they are."""
     mount: MountConfig = dataclasses.field(default_factory=MountConfig)
-    """How the gel sits on the force sensor."""
+    """Mounting of the gel on the force sensor."""
     contact_mm: tuple[float, float, float] | None = None
     """Centre of the contact in the frame of an RGB-D camera, X right, Y down, Z ahead: stores where it shows."""
     window_mm: float = 20.0
@@ -125,7 +125,7 @@ class Record(Bench):
         return 0
 
     def session(self) -> SessionConfig:
-        """What is recorded, with everything that was measured at the bench."""
+        """Configuration of the recording, with everything that was measured beforehand."""
         zero = None if self.gravity is None else ForceZero.load(self.gravity)
         given: dict[str, Any] = {} if zero is None else {"gravity": zero.model, "down": zero.down}
         return SessionConfig(
@@ -190,7 +190,7 @@ class _Board:
 
 
 def drawn(status: Status) -> rich.console.RenderableType:
-    """What the hand sees: the prompt, the force against its target, what has been lost."""
+    """Display for the operator: the prompt, the force and its target, lost samples."""
     advice = status.advice
     top = max(advice.target_n * 1.25, 1.0)
     table = rich.table.Table.grid(padding=(0, 2))

@@ -14,7 +14,7 @@ _MADE_FROM = "geometry"  # entry of a calibration's `made_from` that names the g
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Straightening:
-    """What is done to every picture of a camera: nothing, or a view straight from above.
+    """Rectification of every picture of a camera: none, or a view from directly above.
 
     Args:
       view: of a measured geometry, if there is one.
@@ -59,7 +59,7 @@ class Straightening:
         return dataclasses.replace(calibration, made_from={**calibration.made_from, _MADE_FROM: self.geometry})
 
     def check(self, calibration: Calibration) -> None:
-        """Whether pictures are made straight as those of the calibration were.
+        """Check that pictures are rectified in the same way as those of the calibration.
 
         Raises:
           CalibrationError: by another geometry, or only one of the two.

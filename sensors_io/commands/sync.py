@@ -34,7 +34,7 @@ class Sync(Bench):
     seconds: float = 15.0
     """Of touching."""
     by: By = "taps"
-    """What is compared: when taps rose, or how presses went."""
+    """Events that are compared: the rise of taps, or the course of presses."""
 
     def run(self) -> int:
         parts = self.parts()
@@ -66,7 +66,7 @@ class Sync(Bench):
         return 0
 
     def _check(self, found: Offsets, stored: Offsets) -> int:
-        """What is left over with stored offsets; 1 if any is too much."""
+        """Report the delays that remain after stored offsets; exit status 1 if any is too large."""
         before = stored.late_s
         unknown = [name for name in found.late_s if name not in before]
         if unknown:
@@ -81,7 +81,7 @@ class Sync(Bench):
 
 
 def report(found: Offsets) -> Table:
-    """How late each sensor is stamped, and from what that is known."""
+    """Delay of each sensor's timestamps and its source."""
     table = Table("sensor", "late by", "spread of one tap", "known from", title=f"stamps against {found.reference}")
     for name, offset in found.sensors.items():
         spread = "–" if offset.spread_s is None else f"{1e3 * offset.spread_s:.1f} ms"

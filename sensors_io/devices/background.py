@@ -11,7 +11,7 @@ _CHANGED_SHARE = 0.005  # of the pixels: a contact of 1.4 mm on a window of 20 Ã
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Drift:
-    """How far the background has moved since it was first taken, in grey levels of 0..255.
+    """Change of the background since its first frames, in grey levels of 0..255.
 
     Args:
       mean: of the signed difference, per channel [3]: lamps and exposure.
@@ -60,7 +60,7 @@ class Background:
             self._first = self._mean.copy()
 
     def looks_touched(self, frame: np.ndarray) -> bool:
-        """Whether a frame [H, W, 3] differs from the background by a contact, where no force tells.
+        """True if a frame [H, W, 3] differs from the background as a contact does; used where no force is measured.
 
         More than one pixel in two hundred has changed by over 12 grey levels beyond the median change of its channel,
         which is that of the lamps.  Before there is a background nothing looks touched: start with a free gel.
@@ -82,7 +82,7 @@ class Background:
         return np.rint(self._mean).astype(np.uint8)
 
     def drift(self) -> Drift | None:
-        """How far it has moved since the first `memory` untouched frames; `None` before there were as many."""
+        """Change since the first `memory` frames without contact; `None` until there are that many."""
         if self._mean is None or self._first is None:
             return None
         moved = self._mean - self._first

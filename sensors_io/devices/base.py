@@ -14,7 +14,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Identity:
-    """Which device this is, and how it is set.
+    """Name, serial number and settings of a device.
 
     Args:
       sensor: canonical name in `schema.SENSORS`, or that of another kind of device, such as "netft".
@@ -39,7 +39,7 @@ class Identity:
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, slots=True)
 class Sample:
-    """What a device gives at one moment.
+    """One reading of a device.
 
     Args:
       host_time_ns: monotonic, right after the grab.
@@ -61,7 +61,7 @@ class Device(Protocol):
 
     @property
     def identity(self) -> Identity:
-        """Which device it is; complete once it is open."""
+        """Identity of the device; complete once it is open."""
         ...
 
     def __enter__(self) -> Self:

@@ -233,7 +233,7 @@ class Bridge:
         return process.stdout, process.stderr
 
     def _hear_rest(self) -> None:
-        """What a server that has ended says last, which may lie unread or still be on its way."""
+        """Read the last messages of a server that has ended, which may be unread or still in transit."""
         _, errors = self._pipes()
         deadline = time.monotonic() + _LAST_WORDS_S
         while select.select([errors], [], [], max(0.0, deadline - time.monotonic()))[0]:

@@ -1,4 +1,4 @@
-"""What can go wrong with a device; every message names the device, the problem and the fix."""
+"""Errors of devices; every message names the device, the problem and the fix."""
 
 from sensors_io.errors import UserError
 

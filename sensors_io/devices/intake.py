@@ -26,7 +26,7 @@ from sensors_io.sync import ClockMap, IndexGaps, PeriodGaps, Step
 
 @dataclasses.dataclass(kw_only=True)
 class Counts:
-    """Where all samples went.
+    """Counts of all samples by their fate.
 
     Args:
       arrived: handed over by the device.
@@ -202,13 +202,13 @@ class Intake:
 
     @property
     def counts(self) -> Counts:
-        """Where all samples went up to now, a copy."""
+        """A copy of the counts up to now."""
         with self._changed:
             return dataclasses.replace(self._counts)
 
     @property
     def overloaded(self) -> bool:
-        """Whether the consumer is more than half of the ring behind."""
+        """True if the consumer is more than half of the ring buffer behind."""
         return len(self._ring) > self._capacity // 2
 
     def _warn(self) -> None:
@@ -263,7 +263,7 @@ class Intake:
         return dataclasses.replace(by_period, restarted=sample.index is not None)
 
     def _same_picture(self, sample: Sample) -> bool:
-        """Whether a picture without a counter is the last one again: sensor noise never repeats itself."""
+        """True if a picture without a counter repeats the last one: sensor noise never repeats itself."""
         last = self._newest
         if last is None or last.frame is None or sample.frame is None or last.frame.shape != sample.frame.shape:
             return False

@@ -52,7 +52,7 @@ _TORQUE_UNIT_NMM: Mapping[int, float] = {
 
 
 class Command(enum.IntEnum):
-    """What the sensor is told."""
+    """Commands of the sensor."""
 
     STOP = 0x0000
     STREAM = 0x0002

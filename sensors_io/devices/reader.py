@@ -22,7 +22,7 @@ _SILENT_PERIODS = 3  # of a slow device: it may drop a sample or two without bei
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReaderConfig:
-    """How a device is read.
+    """Settings of a reader.
 
     Args:
       capacity: samples kept for a consumer that reads in order.
@@ -142,17 +142,17 @@ class Reader:
 
     @property
     def identity(self) -> Identity:
-        """Which device it is."""
+        """Identity of the device."""
         return self._device.identity
 
     @property
     def counts(self) -> Counts:
-        """Where all samples went up to now."""
+        """Counts of all samples up to now."""
         return self._intake.counts
 
     @property
     def overloaded(self) -> bool:
-        """Whether the consumer is more than half of the ring behind."""
+        """True if the consumer is more than half of the ring buffer behind."""
         return self._intake.overloaded
 
     def next(self, timeout_s: float) -> Sample:

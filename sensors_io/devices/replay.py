@@ -32,7 +32,7 @@ class Disconnect:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Faults:
-    """What goes wrong on the way from the device.
+    """Faults that a replay injects between device and reader.
 
     Args:
       drop_share: samples that never arrive.
@@ -66,7 +66,7 @@ class Faults:
 
 @dataclasses.dataclass(kw_only=True)
 class Truth:
-    """What really happened, in samples: `produced = given + dropped + away` once a replay has ended.
+    """True counts of a replay in samples: `produced = given + dropped + away` once it has ended.
 
     Args:
       produced: by the device.

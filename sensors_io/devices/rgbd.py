@@ -41,7 +41,7 @@ class Intrinsics:
 
 
 def contact_region(intrinsics: Intrinsics, centre_mm: np.ndarray, side_mm: float) -> tuple[int, int, int, int]:
-    """Where a square sensing window of some side shows in the view: (x, y, width, height) in px, cut to the picture.
+    """Region of the view that shows a square sensing window: (x, y, width, height) in px, cut to the picture.
 
     The window is taken as facing the camera: on an object at 300 mm a tilt of 30° changes its width by an eighth.
 
@@ -68,7 +68,7 @@ def contact_region(intrinsics: Intrinsics, centre_mm: np.ndarray, side_mm: float
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RgbdConfig:
-    """How colour and depth are joined.
+    """Settings for joining colour and depth.
 
     Args:
       intrinsics: of both, which the camera must have aligned.

@@ -1,4 +1,4 @@
-"""What a generated sensor sees, as a recording; the only source that computes, by JAX."""
+"""A generated sensor as a source of samples; the only source that computes with JAX."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from sensors_io.schema import FRAME_ARRAYS, SENSORS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneSource:
-    """What one generated sensor sees of the contacts of a config, one after the other.
+    """Samples of one generated sensor for the contacts of a config, one after the other.
 
     Contacts past the strain limit are given as they are, flagged; a data set replaces them.
 

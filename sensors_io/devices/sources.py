@@ -166,7 +166,7 @@ class RecordedContact:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tac3dRecording:
-    """What the Tac3D software saves: a folder of .npy files, or the same arrays in one .npz.
+    """A recording saved by the Tac3D software: a folder of .npy files, or the same arrays in one .npz.
 
     Times are those of the sensor's host, the counter is the sensor's, with its real gaps.
     """

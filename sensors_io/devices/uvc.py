@@ -27,7 +27,7 @@ from sensors_io.devices.errors import (
 
 
 class Capture(Protocol):
-    """What is used of `cv2.VideoCapture`."""
+    """The methods of `cv2.VideoCapture` that are used."""
 
     def isOpened(self) -> bool: ...
     def grab(self) -> bool: ...
@@ -135,7 +135,7 @@ _AUTOMATIC: Mapping[str, tuple[int, float]] = {
     "white_balance_k": (cv2.CAP_PROP_AUTO_WB, 0.0),
     "focus": (cv2.CAP_PROP_AUTOFOCUS, 0.0),
 }
-"""What must be switched off before a setting can be held."""
+"""Automatic controls that must be switched off before a setting can be fixed."""
 
 _SETTINGS: Mapping[str, int] = {
     "exposure": cv2.CAP_PROP_EXPOSURE,
@@ -176,7 +176,7 @@ def lock_settings(capture: Capture, lock: Lock, name: str) -> dict[str, Any]:
 
 
 def wait_for_frame(capture: Any, timeout_s: float) -> bool:
-    """Whether a camera of OpenCV has a frame, or an error, to be grabbed within a time; polls the node itself."""
+    """True once a camera of OpenCV has a frame or an error, within the given time; polls the device node itself."""
     if not capture.isOpened():
         return True  # grabbing says what is wrong; OpenCV itself would crash
     _, ready = cv2.VideoCapture.waitAny([capture], timeoutNs=round(timeout_s * NS_PER_S))

@@ -1,1 +1,1 @@
-"""What a picture of the gel says about the contact: depth, contact mask, deformation, shear, force."""
+"""Fields from pictures of the gel: depth, contact mask, deformation, shear, force."""

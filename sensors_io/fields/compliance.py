@@ -23,7 +23,7 @@ _PADDING = 12.0  # layer thicknesses between periodic images: near ν = ½ press
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NodeGrid:
-    """Where displacements are given and tractions sought.
+    """Grid on which displacements are given and tractions are computed.
 
     Args:
       shape: rows and columns.

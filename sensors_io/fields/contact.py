@@ -1,4 +1,4 @@
-"""Where the gel is touched, and whether it is touched at all."""
+"""Detection of contact, and the region of the gel in contact."""
 
 import dataclasses
 
@@ -162,7 +162,7 @@ def _steepness(picture: np.ndarray, background: np.ndarray, mm_per_px: float, sm
 
 
 def _meets_border(mask: np.ndarray, corner: tuple[int, int], shape: tuple[int, ...]) -> bool:
-    """Whether a mask that lies at `corner` (x, y) of a picture touches the picture's outermost pixels."""
+    """True if a mask placed at `corner` (x, y) of a picture reaches the outermost pixels of the window."""
     (x, y), (height, width) = corner, mask.shape
     sides = [mask[0].any() and y == 0, mask[-1].any() and y + height == shape[0]]
     return bool(any(sides) or (mask[:, 0].any() and x == 0) or (mask[:, -1].any() and x + width == shape[1]))

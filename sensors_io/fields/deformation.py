@@ -121,7 +121,7 @@ def _grey(picture: np.ndarray) -> np.ndarray:
 
 
 def _points(grey: np.ndarray, evidence: Evidence) -> tuple[np.ndarray, int]:
-    """What is tracked, (x, y) [P, 2], and the half side of its windows."""
+    """Points to track, (x, y) [P, 2], and the half side of their windows."""
     if evidence.pattern is Pattern.BARE:
         raise NoPatternError(f"the gel at rest shows neither dots nor a dense pattern: {evidence.reason}")
     if evidence.markers is None:

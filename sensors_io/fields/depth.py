@@ -17,7 +17,7 @@ CELL_PX = 8
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ZeroConfig:
-    """How the depth of untouched gel is told.
+    """Settings for the zero of depth, from untouched gel.
 
     Args:
       steep: slope beyond which a cell belongs to a contact or its rim.

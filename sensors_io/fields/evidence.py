@@ -1,4 +1,4 @@
-"""Whether a gel at rest carries what lateral motion is read from: printed dots, a dense pattern, or neither.
+"""Pattern of a gel at rest that allows lateral motion to be measured: printed dots, a dense texture, or neither.
 
 On a bare gel every tracker returns a plausible field, which is wrong by the motion itself: shading moves with the
 contact, not with the gel.  So a field is refused where the picture at rest cannot carry it.
@@ -37,7 +37,7 @@ _FINE_PX, _COARSE_PX = 1.0, 6.0  # band of the pattern: between noise and shadin
 
 
 class Pattern(enum.Enum):
-    """What lies in a gel."""
+    """Kinds of pattern in a gel."""
 
     BARE = "bare"
     MARKERS = "markers"
@@ -46,7 +46,7 @@ class Pattern(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evidence:
-    """What a gel at rest shows: its pattern, its dots where there are any, its texture in grey levels per pixel.
+    """Pattern found in a gel at rest, its dots if there are any, and its texture in grey levels per pixel.
 
     `reason` says why a bare gel is taken for bare, empty otherwise.
     """
@@ -107,7 +107,7 @@ def texture_of(grey: np.ndarray) -> float:
 
 
 def _missing(markers: Markers | None) -> str:
-    """What keeps candidates from being printed dots; empty where nothing does."""
+    """Reason why candidates are no printed dots; empty if they may be."""
     if markers is None:
         return "no dots"
     room = markers.pitch_px / markers.radius_px

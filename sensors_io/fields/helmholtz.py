@@ -22,7 +22,7 @@ class Hodge:
 
     @property
     def shear(self) -> np.ndarray:
-        """What the decomposition takes for shear: all that has no divergence."""
+        """Shear part of the decomposition: the component without divergence."""
         return self.rotation + self.harmonic
 
 

@@ -38,7 +38,7 @@ _JITTER = 1e-6  # added to the penalty's diagonal, which rounding would make ind
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class InverseConfig:
-    """What is known beforehand.
+    """Prior assumptions of the inversion.
 
     Args:
       lateral_noise_mm, depth_noise_mm: of the displacements; only their ratio counts, α takes their size.
@@ -61,7 +61,7 @@ class InverseConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Load:
-    """What acts on the gel in one frame, and what each part of it does.
+    """Load on the gel in one frame, and the displacement due to each part of it.
 
     Args:
       traction_mpa: on the gel along x, y, z [h, w, 3]; pressing is z < 0.

@@ -72,7 +72,7 @@ def find_markers(grey: np.ndarray) -> Markers | None:
 
 
 def inside(points_px: np.ndarray, shape: tuple[int, ...], margin_px: float) -> np.ndarray:
-    """Which points [P, 2] lie at least `margin_px` inside a picture [H, W], bool [P]."""
+    """Mask of the points [P, 2] that lie at least `margin_px` inside a picture [H, W], bool [P]."""
     height, width = shape[:2]
     x, y = points_px[:, 0], points_px[:, 1]
     return (x >= margin_px) & (y >= margin_px) & (x <= width - 1 - margin_px) & (y <= height - 1 - margin_px)
@@ -102,7 +102,7 @@ def _maxima(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _typical(strength: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Which candidates, strongest first, are about as strong and as large as the strongest ones."""
+    """Mask of the candidates, strongest first, whose strength and size are similar to those of the strongest."""
     if len(strength) == 0:
         return np.zeros(0, bool)
     strong = slice(0, _STRONG)

@@ -1,4 +1,4 @@
-"""Which points of a gel move together: a graph of near neighbours and the strain along its edges.
+"""Consistency of tracked points: a graph of near neighbours and the strain along its edges.
 
 A printed lattice looks the same one pitch further on.  A tracker that takes one dot for the next makes no error that
 the picture could tell, but it tears the gel: along the border of the mistaken points the strain is near one.
@@ -31,7 +31,7 @@ class Neighbours:
         self._count = len(points_px)
 
     def torn(self, displacement: np.ndarray, found: np.ndarray, strain: float) -> bool:
-        """Whether any edge between found points [P] is strained past a limit by displacements [P, 2]."""
+        """True if displacements [P, 2] strain any edge between found points [P] past a limit."""
         return bool(np.any(~self._whole(displacement, strain) & found[self._first] & found[self._second]))
 
     def pieces(self, displacement: np.ndarray, found: np.ndarray, strain: float) -> list[np.ndarray]:
@@ -51,6 +51,6 @@ class Neighbours:
         return beside & ~inner
 
     def _whole(self, displacement: np.ndarray, strain: float) -> np.ndarray:
-        """Which edges keep the limit."""
+        """Mask of the edges within the limit."""
         apart = displacement[self._first] - displacement[self._second]
         return np.hypot(apart[:, 0], apart[:, 1]) <= strain * self._length

@@ -27,7 +27,7 @@ _NOISE_LEFT = 1 / (4 * np.pi * _BLUR_PX**2)  # of the variance of white noise, a
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Found:
-    """Where P windows lie in a picture.
+    """Positions of P windows in a picture.
 
     `points_px` [P, 2]; `likeness` ρ [P]: correlation of window and reference after the fit, in −1..1; `spread_px` [P]:
     standard deviation of the point that the noise in its window makes, infinite where ρ ≤ 0.

@@ -14,7 +14,7 @@ Source: Wahba, Spline Models for Observational Data, 1990, ch. 2 and 4 (leaving 
 import numpy as np
 
 _NODES_PER_PITCH = 4
-"""How finely the spline itself is evaluated; a cubic between is off by less than a thousandth of the motion."""
+"""Spacing at which the spline itself is evaluated; cubic interpolation between is off by < 0.001 of the motion."""
 
 
 class ThinPlate:
@@ -82,7 +82,7 @@ class ThinPlate:
         return filled.astype(np.float32)
 
     def inconsistent(self, displacement: np.ndarray, found: np.ndarray, tolerance: float) -> np.ndarray:
-        """Which found points contradict the others: the worst is taken out until none is off by the tolerance.
+        """Mask of found points that contradict the others: the worst is removed until none is off by the tolerance.
 
         Args:
           displacement: [P, 2].

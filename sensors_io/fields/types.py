@@ -1,4 +1,4 @@
-"""What field extraction needs and what it gives: `Calibration` and `Fields`.
+"""Input and output of field extraction: `Calibration` and `Fields`.
 
 Frames of reference, units and the meaning of every field are those of `sensors_io.schema`.
 """
@@ -73,7 +73,7 @@ class CalibrationError(UserError, ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Calibration:
-    """How one sensor's pictures become slopes: made once from presses of a ball, saved as one file.
+    """Map from one sensor's pictures to slopes: made once from presses of a ball, saved as one file.
 
     Args:
       sensor: canonical name.

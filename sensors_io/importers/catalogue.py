@@ -52,7 +52,7 @@ class Listed:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Catalogue:
-    """What a source holds.
+    """Contents of a source.
 
     Args:
       source, licence: as in the records' meta.
@@ -78,7 +78,7 @@ class Catalogue:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportReport:
-    """What an import did; it is stored in the notes of the records' meta.
+    """Result of an import; it is stored in the notes of the records' meta.
 
     Args:
       contacts: contacts imported.
@@ -159,7 +159,7 @@ class _Run:
         self.writer.write_contact(taken.sequences)
 
     def report(self) -> ImportReport:
-        """What was imported and what was left out."""
+        """Report of recordings that were imported and left out."""
         done, cards = self.writer.objects_done, self.catalogue.cards
         empty = [Skip(name=name, reason="object without a readable contact") for name in cards if name not in done]
         kept = [card for name, card in cards.items() if name in done]

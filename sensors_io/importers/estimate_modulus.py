@@ -29,7 +29,7 @@ _NAME = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.\-]*)_(\d+)")
 
 
 def list_estimate_modulus(source: pathlib.Path, config: ImportConfig) -> Catalogue:
-    """What a directory and those below it hold; a video of another name is skipped.
+    """Catalogue of a directory and those below it; a video of another name is skipped.
 
     Raises:
       ImportSourceError: no .avi there.

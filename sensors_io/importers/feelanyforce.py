@@ -41,7 +41,7 @@ LEAST_PUSH_N = 1.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeelAnyForceConfig(ImportConfig):
-    """What is kept, and which sign of the readings' Fz means pressing."""
+    """Selection of samples, and the sign of the readings' Fz that means pressing."""
 
     pressing: Literal["infer", "positive", "negative"] = "infer"
 
@@ -58,7 +58,7 @@ class _Row:
 
 
 def list_feelanyforce(source: pathlib.Path, config: FeelAnyForceConfig) -> Catalogue:
-    """What the tables in a directory name.
+    """Catalogue of the tables in a directory.
 
     A row whose picture has no time for a name is skipped, and so is one without a reading whose picture is absent.
 

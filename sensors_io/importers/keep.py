@@ -1,4 +1,4 @@
-"""What is kept of a recording: how many rows, which frames; and which objects are held out."""
+"""Selection of an import: number of rows, frames, and the objects of the test split."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ class Skip:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Keep:
-    """What is kept of each recording.
+    """Selection within each recording.
 
     The defaults store 120 rows, just above the 112 of a clip, and 32 frames, four times those of a clip: every clip
     decodes all frames of its entry.  Keep everything with height = max_frames = 0.
@@ -67,7 +67,7 @@ class Keep:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Shares:
-    """Which objects of a source without splits of its own are held out, see `split_by_name`.
+    """Split by object of a source without splits of its own, see `split_by_name`.
 
     Args:
       val_share, test_share: shares of the objects that become the splits "val" and "test".
@@ -87,7 +87,7 @@ class Shares:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportConfig(Keep, Shares):
-    """What is kept of a source without splits of its own, and which of its objects are held out."""
+    """Selection and split of a source without splits of its own."""
 
     def __post_init__(self) -> None:
         Keep.__post_init__(self)

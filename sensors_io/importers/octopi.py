@@ -38,7 +38,7 @@ RATED = ("hardness", "roughness")
 
 
 def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
-    """What a folder of samples holds.
+    """Catalogue of a folder of samples.
 
     A sample whose data.json does not name its object, and an object whose samples contradict each other, are skipped.
 

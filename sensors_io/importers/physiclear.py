@@ -36,7 +36,7 @@ MATERIAL: Mapping[str, str] = {m: m for m in MATERIALS} | {"rubber": "other", "s
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysiclearConfig(Keep):
-    """What is kept of each video, and which objects are held out.
+    """Selection within each video, and the objects of the test split.
 
     The defaults keep the mean over 2 × 2 pixels and 32 frames evenly spread over the about 5 s of a video.
 
@@ -82,7 +82,7 @@ def import_physiclear(
 
 
 def list_physiclear(source: pathlib.Path, config: PhysiclearConfig) -> Catalogue:
-    """What a directory with labels.json and videos/ holds.
+    """Catalogue of a directory with labels.json and videos/.
 
     A video that is not named <object>_<trial> or present but not listed is skipped; labels that are null are `UNKNOWN`.
 

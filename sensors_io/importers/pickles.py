@@ -46,7 +46,7 @@ _ALLOWED: Mapping[tuple[str, str], Callable[..., Any]] = {
 """All that a pickle may ask for."""
 
 _BROKEN = (pickle.UnpicklingError, EOFError, ValueError, TypeError, IndexError, KeyError, AttributeError)
-"""What cut or foreign bytes raise in the course of unpickling."""
+"""Errors that truncated or foreign bytes raise during unpickling."""
 
 
 class _DataUnpickler(pickle.Unpickler):

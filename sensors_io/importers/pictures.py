@@ -13,7 +13,7 @@ from sensors_io.importers.keep import Keep, Skip, UnreadableError
 from sensors_io.schema import ContactKey, Flag, Sequence
 
 _END = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND\xaeB`\x82"}
-"""How JPEG and PNG begin and end; OpenCV decodes the rest of a cut file as grey without a word."""
+"""First and last bytes of JPEG and PNG; OpenCV decodes the rest of a truncated file as grey without an error."""
 
 _TAIL = 64  # bytes that some cameras append behind the end
 
@@ -40,11 +40,11 @@ class Pictures:
 
     @property
     def left_out(self) -> tuple[Skip, ...]:
-        """What was lost, for the report."""
+        """Counts of lost pictures, for the report."""
         return tuple(skip for _, skip in self.lost)
 
     def after_loss(self) -> np.ndarray:
-        """Which frames come right after one that was lost, bool [N]."""
+        """Mask of frames that directly follow a lost one, bool [N]."""
         lost = np.array([position for position, _ in self.lost], np.int64)
         before = np.concatenate([[-1], self.index[:-1]])
         return np.any((lost > before[:, None]) & (lost < self.index[:, None]), axis=1)

@@ -44,7 +44,7 @@ class RecordingError(UnreadableError):
 
 
 def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
-    """What a directory of recordings holds, whole; what was touched is not stored, each recording counts as an object.
+    """Catalogue of a directory of whole recordings; the object is not stored, so each recording counts as one object.
 
     Raises:
       ImportSourceError: no .npz there.

@@ -39,7 +39,7 @@ RATE_HZ = 30.0
 
 
 def list_tacquad(source: pathlib.Path, config: ImportConfig) -> Catalogue:
-    """What the tables in a directory name; a row that is not an item and six frame numbers is skipped.
+    """Catalogue of the tables in a directory; a row that is not an item and six frame numbers is skipped.
 
     Raises:
       ImportSourceError: no table with its folder there.

@@ -46,7 +46,7 @@ _LINE = re.compile(r"(\d{8}_\d{6})/(\d{10})\.jpg")
 
 
 def list_touch_and_go(source: pathlib.Path, config: ImportConfig) -> Catalogue:
-    """What the lists and the frames in a directory hold.
+    """Catalogue of the lists and frames in a directory.
 
     A line of another form, a class without a name, and a frame with two classes are skipped.
 

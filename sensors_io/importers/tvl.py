@@ -42,7 +42,7 @@ class _Row:
 
 
 def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
-    """What the tables in a directory name; a row that leaves its directory or names no trajectory is skipped.
+    """Catalogue of the tables in a directory; a row that leaves its directory or names no trajectory is skipped.
 
     Raises:
       ImportSourceError: no table there, or one without the columns.
@@ -118,7 +118,7 @@ def _read(key: ContactKey, rows: list[_Row], config: ImportConfig) -> Taken:
 
 
 def _swapped(row: _Row) -> bool:
-    """Whether the picture called vision is the DIGIT's."""
+    """True if the picture called vision is the DIGIT's."""
     return not _of_digit(row.tactile) and _of_digit(row.vision)
 
 

@@ -34,7 +34,7 @@ class Video:
     total: int
 
     def camera(self, path: pathlib.Path) -> dict[str, Any]:
-        """What a record says of the file that it comes from."""
+        """Camera entry of a record: the file that it comes from."""
         return {"file": path.name, "rate_hz": self.rate_hz, "size_px": self.size_px, "frames": self.total}
 
 

@@ -24,13 +24,13 @@ _NAME = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.\-]*)_(\d+)")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VTVConfig(ImportConfig):
-    """What is kept, and which sensor took the videos of the directory, such as gelsight_mini, digit or tac3d."""
+    """Selection, and the sensor that took the videos of the directory, such as gelsight_mini, digit or tac3d."""
 
     sensor: str
 
 
 def list_vtv150k(source: pathlib.Path, config: VTVConfig) -> Catalogue:
-    """What a flat directory of videos of one sensor holds; a video of another name is skipped.
+    """Catalogue of a flat directory of videos of one sensor; a video of another name is skipped.
 
     Raises:
       ImportSourceError: no .mp4 there.

@@ -28,7 +28,7 @@ TIMES = ("digit_data.npy", "synced_data.npy")
 
 
 def list_ycb_slide(source: pathlib.Path, config: ImportConfig) -> Catalogue:
-    """What a directory of objects holds; a slide without frames is skipped, one without times gets nominal ones.
+    """Catalogue of a directory of objects; a slide without frames is skipped, one without times gets nominal ones.
 
     Raises:
       ImportSourceError: no slide there.

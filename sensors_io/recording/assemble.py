@@ -22,7 +22,7 @@ _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "targ
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Assembled:
-    """What a journal held.
+    """Contents of a journal.
 
     Args:
       sequences: one of each sensor that gave a frame, in the order of the session.
@@ -75,7 +75,7 @@ def assemble(path: pathlib.Path) -> Assembled | None:
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:
-    """Where the picture of the gel at rest lies, beside the records."""
+    """Path of the picture of the gel at rest, next to the records."""
     return pathlib.Path("backgrounds", f"{key.object_id}-{key.site}-{key.motion}-{key.trial}-{sensor}.png")
 
 
@@ -91,7 +91,7 @@ def _backgrounds(start: Mapping[str, Any], entries: Seq[Entry]) -> dict[str, np.
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Shared:
-    """What all streams of a contact have in common."""
+    """Values that all streams of a contact share."""
 
     start: Mapping[str, Any]
     end: Mapping[str, Any] | None
@@ -130,7 +130,7 @@ class _Shared:
         )
 
     def _recording(self, stream: Mapping[str, Any], key: ContactKey, residual_n: float | None) -> dict[str, Any]:
-        """How it was recorded, as JSON."""
+        """Settings of the recording, as JSON."""
         sensor = stream["identity"]["sensor"]
         together = [s["identity"]["sensor"] for s in self.start["streams"]]
         return {
@@ -148,7 +148,7 @@ class _Shared:
 
 
 def _own_arrays(frames: Seq[Entry]) -> dict[str, np.ndarray]:
-    """What the sensor itself tells beside pictures, stacked."""
+    """Arrays that the sensor itself gives besides pictures, stacked."""
     names = [n for n in frames[0].arrays if n in FRAME_ARRAYS and n not in _MADE_HERE]
     return {n: np.stack([e.arrays[n] for e in frames]).astype(FRAME_ARRAYS[n].dtype) for n in names}
 

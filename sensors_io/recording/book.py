@@ -20,7 +20,7 @@ _PER_SHARD = 19  # contacts: those of one site by protocol
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectView:
-    """What an RGB-D camera saw of the object before the first contact.
+    """View of the object by an RGB-D camera before the first contact.
 
     Args:
       picture: uint8 [Hv, Wv, 3] RGB.
@@ -35,7 +35,7 @@ class ObjectView:
 
 @dataclasses.dataclass(kw_only=True)
 class Report:
-    """What a session did.
+    """Result of a session.
 
     Attributes:
       contacts: written.

@@ -1,4 +1,4 @@
-"""What the hand is to do next, told from the measured force alone.
+"""Instructions for the operator's hand, from the measured force alone.
 
 Two stages.  A press: from first touch to 20 N.  Then six motions at 2, 5 and 10 N each: load, settle, move, unload; a
 tap loads and unloads three times; a hold waits at its force.  The coach sees one force after the other and answers with
@@ -61,7 +61,7 @@ class CoachConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Advice:
-    """What the coach makes of the last force.
+    """Instruction that follows from the last force.
 
     Args:
       prompt: to the hand.

@@ -32,7 +32,7 @@ _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SessionConfig:
-    """What is recorded.
+    """Settings of a session.
 
     Args:
       object_id: of the object, as in its card.
@@ -62,7 +62,7 @@ class SessionConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Status:
-    """What a session shows while it goes on.
+    """State of a running session, for display.
 
     Args:
       stage: contact under way.

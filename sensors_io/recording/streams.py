@@ -17,7 +17,7 @@ _DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a milliseco
 
 
 class Feed(Protocol):
-    """What a session reads from; `Reader` is one."""
+    """Source of a session's samples; `Reader` is one."""
 
     @property
     def identity(self) -> Identity: ...
@@ -28,7 +28,7 @@ class Feed(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StreamStatus:
-    """What a session shows of one sensor.
+    """State of one sensor in a session, for display.
 
     Args:
       sensor: its name.
@@ -119,7 +119,7 @@ class Stream:
         return self._background.picture() if self._background.frames else None
 
     def begin(self) -> dict[str, Any]:
-        """What a journal begins with: identity, lateness, accounts, and how far the background has drifted."""
+        """First entry of a journal: identity, delay, counts, and the drift of the background."""
         self.frames = 0
         identity = dataclasses.asdict(self.feed.identity)
         drift = self._background.drift()
@@ -135,7 +135,7 @@ class Stream:
         self._before.clear()
 
     def status(self) -> StreamStatus:
-        """What is shown of it."""
+        """State for display."""
         return StreamStatus(
             sensor=self.sensor,
             frames=self.frames,

@@ -61,7 +61,7 @@ Texture = Callable[[int, np.random.Generator], np.ndarray]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Look:
-    """How a material looks: ranges of hue, saturation and value (0..1), gloss, texture and its share in the value.
+    """Appearance of a material: ranges of hue, saturation and value (0..1), gloss, texture and its share in the value.
 
     `clear` is the share of the background that shines through.
     """

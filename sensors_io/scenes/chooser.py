@@ -1,4 +1,4 @@
-"""Which grid, padding and tolerance a contact needs to stay below an error, chosen from a first, coarse solution.
+"""Choice of the grid, padding and tolerance that keep a contact below an error, from a first, coarse solution.
 
 Every scene is solved on 24² (`LOOK`), which takes a tenth of a millisecond.  What that solution and the gap on finer
 grids tell (`chooser_survey`) goes into a law of the error of every setting (`chooser_law`).  Where the coarse solution
@@ -36,7 +36,7 @@ Gap = Callable[[int], Array] | Array
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stage:
-    """Where contacts take place: the gel, its square window, and the object as a layer of 1 MPa, `None` if rigid."""
+    """Surroundings of contacts: the gel, its square window, and the object as a layer of 1 MPa, `None` if rigid."""
 
     gel: Layer
     body: Layer | None
@@ -48,7 +48,7 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Choice:
-    """How to solve a contact, and what may be expected of it.
+    """Settings for solving a contact, and the predicted error and cost.
 
     `promised_error` is the law's bound of the error.  Where `met` is false the setting is the one of least error, and
     not enough.

@@ -38,7 +38,7 @@ _MIDDLE_GRID = 48  # where x is 0, so that the law's coefficients are independen
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Setting:
-    """How a contact may be solved: sides of the grid and of the padded grid, tolerance of the solver."""
+    """Settings of a solve: sides of the grid and of the padded grid, tolerance of the solver."""
 
     grid: int
     padded: int
@@ -75,7 +75,7 @@ MENU = make_menu(GRIDS)
 
 @struct.dataclass
 class Survey:
-    """What the law knows of a scene: features φ, `FEATURES` by name, and what ê_wrap is made of.
+    """Input of the law for a scene: features φ, `FEATURES` by name, and the terms of ê_wrap.
 
     `radius_mm` is a, `slope_share` ln s.
     """

@@ -1,4 +1,4 @@
-"""What a contact solved on a coarse grid tells about its error there and on finer grids.
+"""Features of a contact solved on a coarse grid that predict its error there and on finer grids.
 
 Inside a contact the surfaces lie on each other, so whatever of the gap the grid does not resolve there is missing from
 the displacement: that part of the error is read off finer gaps, without solving anything.  What the contact's edge and

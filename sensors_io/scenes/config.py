@@ -1,4 +1,4 @@
-"""What to generate, the hash of it, and the streams of randomness."""
+"""Configuration of generated scenes, its hash, and the streams of randomness."""
 
 import dataclasses
 import hashlib
@@ -22,7 +22,7 @@ _LATER = ("past_limit", "coupled", "part_share", "graded_share", "error")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """What to generate: presses alone, or the whole protocol.
+    """Configuration of generated scenes: presses alone, or the whole protocol.
 
     Without `sequences` every object is pressed at `sites` sites: `frames` geometric levels between `min_force_n` and
     `max_force_n`, frames past the strain limit flagged.  With `sequences`, a multiple of the number of sensors, every
@@ -129,7 +129,7 @@ class SceneConfig:
 
     @property
     def replaces(self) -> bool:
-        """Whether frames past the strain limit are left out and replaced: only the protocol does so."""
+        """True if frames past the strain limit are left out and replaced: only the protocol does so."""
         return self.sequences is not None and self.past_limit == "replace"
 
     @property

@@ -31,7 +31,7 @@ _COARSE_SLACK = 4.0  # a coarse solution differs from the fine one by more than 
 
 
 class Tier(enum.IntEnum):
-    """How a contact was solved, cheapest first."""
+    """Methods of solving a contact, cheapest first."""
 
     WINKLER = 1
     SPG = 2

@@ -23,7 +23,7 @@ from sensors_io.scenes.traction import (
 
 @struct.dataclass
 class History:
-    """What one frame leaves to the next: its traction, MPa, and the relative displacement c that is carried, mm."""
+    """State that one frame passes to the next: its traction, MPa, and the carried relative displacement c, mm."""
 
     traction_mpa: Complex[Array, "N N"]
     carried_mm: Complex[Array, "N N"]

@@ -1,4 +1,4 @@
-"""What is drawn of one sequence before anything is solved: site, unit, hand, path, the errors of the force sensor.
+"""Random draws of one sequence before anything is solved: site, unit, hand, path, errors of the force sensor.
 
 Everything follows from (config, contact, sensor, trial) by streams of its own, so that whoever wants to solve, render
 or summarise a sequence in another way than `sequence` begins with the very same touch.
@@ -32,7 +32,7 @@ _CONTACT_MM = 3.0  # radius of an ordinary contact, by which the object's share 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Site:
-    """What all sensors share in a contact: the object as it is there, skin, place (mm from its centre), direction."""
+    """Values that all sensors share in a contact: the local object, skin, place (mm from its centre), direction."""
 
     solid: objects.Solid
     skin: surface.Skin
@@ -121,7 +121,7 @@ def draw(config: SceneConfig, index: int, what: schedule.Slot, order: int, trial
 
 
 def _hand(config: SceneConfig, what: schedule.Slot) -> motions.Plan:
-    """What the hand is asked for: geometric levels of force where only presses are made, else the motion's plan."""
+    """Target forces of the hand: geometric levels where only presses are made, else the motion's plan."""
     if config.sequences is not None:
         return motions.plan(what.motion, what.force_n, schedule.pace(config.frame_count))
     count = config.frame_count

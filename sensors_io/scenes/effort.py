@@ -29,7 +29,7 @@ _FINEST = 4 * LOOK.grid  # where the gap is evaluated for a look
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Effort:
-    """How a sequence is to be solved; `met` says that this promises every frame looked at the error asked for."""
+    """Solver settings of a sequence; `met` promises every frame that was examined the error asked for."""
 
     grid: int
     tolerance: float

@@ -1,4 +1,4 @@
-"""How a sensor fails in one frame: clipped pixels, markers that cannot be read, contact at the border of the window.
+"""Sensor failures in one frame: clipped pixels, unreadable markers, contact at the border of the window.
 
 All functions take one frame and run inside or outside compiled code; `flags` makes the bits of `schema.Flag`.
 """
@@ -22,7 +22,7 @@ STEEPEST = 1.0
 
 
 def saturated(picture: UInt8[Array, "H W 3"]) -> Bool[Array, ""]:
-    """Whether too many pixels have a channel at either end of its range."""
+    """True if too many pixels have a channel at either end of its range."""
     clipped = jnp.any((picture == 0) | (picture == 255), -1)
     return jnp.mean(clipped) > SATURATED_SHARE
 
@@ -30,7 +30,7 @@ def saturated(picture: UInt8[Array, "H W 3"]) -> Bool[Array, ""]:
 def lost_markers(
     x_mm: Float[Array, "N N"], y_mm: Float[Array, "N N"], depth_mm: Float[Array, "N N"], spacing_mm: float
 ) -> Bool[Array, "N N"]:
-    """Where the marker plane cannot be read: squeezed, stretched or folded out of recognition, or turned away.
+    """Mask of nodes whose markers cannot be read: squeezed, stretched or folded too far, or turned away.
 
     The camera looks along the normal of the undeformed gel, so that the area it sees is that at rest times
     det(1 + ∇u), u the lateral displacement.
@@ -46,12 +46,12 @@ def lost_markers(
 
 
 def marker_loss(valid: Bool[Array, "h w"]) -> Bool[Array, ""]:
-    """Whether too many nodes of the field are lost."""
+    """True if too many nodes of the field are lost."""
     return jnp.mean(~valid) > LOST_SHARE
 
 
 def border_contact(pressure_mpa: Float[Array, "N N"]) -> Bool[Array, ""]:
-    """Whether contact reaches the outermost pixels of the window."""
+    """True if contact reaches the outermost pixels of the window."""
     touching = pressure_mpa > 0
     return jnp.any(touching[0] | touching[-1]) | jnp.any(touching[:, 0] | touching[:, -1])
 

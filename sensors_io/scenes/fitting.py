@@ -181,7 +181,7 @@ def fit_jointly(
 def change(
     optics: PhotometricOptics, profiles: Profiles, touch: np.ndarray, axis_mm: np.ndarray, window_mm: float
 ) -> np.ndarray:
-    """What a touch adds to the flat field, [N, N, 3]."""
+    """Change of the picture due to touch, added to the flat field, [N, N, 3]."""
     slope = photometric.fields(optics, len(axis_mm), window_mm)[1]
     features = _features(profiles, touch, axis_mm[None, :], axis_mm[:, None])
     return np.einsum("fyx,fcyx->yxc", features[:5], slope) + features[5][..., None] * np.array(optics.depth[0])

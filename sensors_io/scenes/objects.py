@@ -45,7 +45,7 @@ PATTERNS = ("bumps", "ridges", "plateaus")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Variation:
-    """How an object changes over its surface: its values on the far side of a line, and the line.
+    """Variation of an object over its surface: its values on the far side of a line, and the line.
 
         share of the far side at r = ½ + ½ tanh((r · (cos φ, sin φ) − offset) / width),
 

@@ -1,4 +1,4 @@
-"""What the camera behind the gel sees: lamps over a gel, patterns on it, the camera's response.
+"""Image formation behind the gel: lamps over a gel, patterns on it, the camera's response.
 
 A renderer turns the deformed gel, sampled on the image grid, and the light of the unit into RGB [H, W, 3] in 0..1.
 Patterns are warped backwards: the picture at r shows the pattern at r − v, v = u − (u·∇)u, the second-order inverse of
@@ -102,7 +102,7 @@ SPECKLE_BAND = 0.3
 """Width of the speckle's band of spatial frequencies, as a standard deviation, over the frequency of its grain."""
 
 DOT_SLOPE_GAIN, SPECKLE_SLOPE_GAIN = 1.1, 0.5
-"""How much a slope brightens the gel towards a lamp; flatter light shows less relief: by eye."""
+"""Brightening of the gel by a slope towards a lamp; flatter light shows less relief: set by eye."""
 
 BRIGHTEST = 3.0
 """Bound of a lamp's light on a slope, over that on the flat gel, that keeps a steep edge from outshining all else."""
@@ -182,7 +182,7 @@ def _unit_coordinates(gel: DeformedGel) -> tuple[Array, Array]:
 
 
 def _pattern_coordinates(gel: DeformedGel, light: Light) -> tuple[Array, Array]:
-    """Where on the undeformed gel, in mm from its centre, lies what the picture shows at each pixel."""
+    """Coordinates on the undeformed gel, in mm from its centre, that each pixel shows."""
     x, y = (c * (gel.window_mm / 2) for c in _unit_coordinates(gel))
     magnified = gel.marker_depth_mm / CAMERA_DISTANCE_MM
     u, v = gel.marker_x_mm + magnified * x, gel.marker_y_mm + magnified * y

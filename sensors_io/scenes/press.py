@@ -17,7 +17,7 @@ from sensors_io.scenes.sensors import BODY, SensorModel
 
 @struct.dataclass
 class Path:
-    """What the hand does in each of F frames, in the gel's frame; the arrays are those of `motions.Plan`.
+    """Path of the hand over F frames, in the gel's frame; the arrays are those of `motions.Plan`.
 
     `force_n` is the elastic force, at which the contact is solved; 0 where nothing touches.
     """
@@ -30,7 +30,7 @@ class Path:
 
 @struct.dataclass
 class Press:
-    """What is touched: skin, pose, effective modulus and friction of the object, path, drift of exposure over it."""
+    """Touched object: skin, pose, effective modulus and friction, path, drift of exposure over it."""
 
     skin: surface.Skin
     pose: surface.Pose
@@ -42,7 +42,7 @@ class Press:
 
 @struct.dataclass
 class Recording:
-    """What comes out, F frames: pictures, fields on the 20 × 20 grid, load, and the solver's account of every frame.
+    """Result of F frames: pictures, fields on the 20 × 20 grid, load, and the solver's report on every frame.
 
     Force and moment act on the gel, about the window's centre.  `strain` is the greatest indentation over the gel's
     thickness; `failures` are the bits of `failures.flags`.

@@ -1,4 +1,4 @@
-"""What an object feels like: physical properties, the levels they fall into, and how the material shifts their odds.
+"""Physical properties of objects, the levels they fall into, and how the material shifts their odds.
 
 A property is a monotone function of a normal latent x = m(material) + σ ε, so the ranges of all materials overlap and
 the material only shifts the odds.  Levels come from the physical value alone, by the thresholds below.  No hardness,
@@ -99,10 +99,10 @@ GRIP = Property(
 """Smooth glass, plastic and rubber stick to silicone; what is rough or dusty touches it at few places."""
 
 PROPERTIES = {"hardness": HARDNESS, "roughness": ROUGHNESS, "protrusion": PROTRUSION}
-"""What a look or a press tells; appearance follows and contradicts these."""
+"""Properties that a look or a press reveals; appearance agrees with or contradicts these."""
 
 DYNAMIC = {"elasticity": ELASTICITY, "friction": GRIP}
-"""What takes unloading or sliding to tell."""
+"""Properties that only unloading or sliding reveals."""
 
 
 def level_odds(prop: Property) -> np.ndarray:

@@ -85,7 +85,7 @@ def _plan(config: SceneConfig) -> schedule.Schedule:
 
 
 def slot(config: SceneConfig, index: int) -> schedule.Slot:
-    """How contact `index` is made."""
+    """Plan of contact `index`."""
     return schedule.press_slot(config, index) if config.sequences is None else plan(config).slots[index]
 
 

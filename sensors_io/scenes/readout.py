@@ -1,4 +1,4 @@
-"""What a sensor reports of its deformed gel: fields on a coarse grid and a picture, with gains, noise and losses."""
+"""Readout of a deformed gel by a sensor: fields on a coarse grid and a picture, with gains, noise and losses."""
 
 import dataclasses
 

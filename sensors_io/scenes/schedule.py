@@ -1,4 +1,4 @@
-"""Which object is touched how and how hard, contact by contact: presses alone, or the protocol of press and motions.
+"""Schedule of objects, motions and forces, contact by contact: presses alone, or the protocol of press and motions.
 
 The protocol.  Every object is pressed once, all other contacts are the six exploratory motions, dealt in turn at 2, 5
 and 10 N; all sensors see every contact; contacts come in a random order, so that every prefix is a fair sample.

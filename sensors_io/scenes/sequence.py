@@ -57,7 +57,7 @@ def key_of(what: schedule.Slot, trial: int) -> ContactKey:
 
 
 def effort_of(config: SceneConfig, drawn: Draw) -> Effort:
-    """How a sequence is solved: as chosen for the error asked for, else as the config says."""
+    """Solver settings of a sequence: as chosen for the error asked for, else those of the config."""
     if config.error is None:
         return Effort(grid=config.contact_grid, tolerance=config.solver_tolerance, met=True)
     return effort.choose(config.error, drawn.press, drawn.unit.modulus_factor, drawn.sensor)
@@ -74,7 +74,7 @@ def _record(config: SceneConfig, drawn: Draw, chosen: Effort) -> Any:
 
 
 def _flags(made: Any, chosen: Effort) -> np.ndarray:
-    """What is wrong with each frame, [F] uint32."""
+    """Flags of each frame, [F] uint32."""
     flags: np.ndarray = made.failures.copy()
     flags[made.strain > STRAIN_LIMIT] |= np.uint32(Flag.STRAIN_LIMIT)
     flags[~made.converged] |= np.uint32(Flag.NOT_CONVERGED)

@@ -1,4 +1,4 @@
-"""How much force a contact bears before its deepest indentation passes the strain limit: a cheap look at every object.
+"""Force at which the deepest indentation of a contact passes the strain limit: a cheap estimate for every object.
 
 The look solves five forces on a coarse grid for every sensor.  Strain grows nearly as a power of force, so the limit
 lies on the log–log line between two of them.  Every object is looked at twice: as it is, and as if it were rigid.  The

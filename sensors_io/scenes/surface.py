@@ -10,7 +10,7 @@ from sensors_io.scenes.objects import Solid, Variation
 
 @struct.dataclass
 class Seam:
-    """How relief and roughness change over the skin: factors of their far side, and the line of `objects.Variation`.
+    """Change of relief and roughness over the skin: factors of their far side, and the line of `objects.Variation`.
 
     The line lies `offset_mm` from the site, along `direction_rad`.
     """
@@ -45,7 +45,7 @@ class Skin:
 
 @struct.dataclass
 class Pose:
-    """Where the sensor stands over the site: offset, turn about the normal, tilt as a slope along x and y."""
+    """Position of the sensor over the site: offset, turn about the normal, tilt as a slope along x and y."""
 
     offset_mm: Float[Array, "2"]
     turn_rad: Float[Array, ""]

@@ -62,7 +62,7 @@ class _State:
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    """What stays fixed in a solve; `total` is the prescribed Σ τ, `None` where the displacement is prescribed."""
+    """Constants of a solve; `total` is the prescribed Σ τ, `None` where the displacement is prescribed."""
 
     limit: Array
     target: Array

@@ -1,4 +1,4 @@
-"""What a solved contact may be used for: which assumptions of small-strain theory, grid and solver it keeps."""
+"""Validity of a solved contact: which assumptions of small-strain theory, grid and solver hold."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -21,7 +21,7 @@ class Validity:
 
     @property
     def all(self) -> Bool[Array, "..."]:
-        """Whether the frame may be used."""
+        """True if the frame may be used."""
         return self.converged & self.small_strain & self.resolved
 
 

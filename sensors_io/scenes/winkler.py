@@ -16,7 +16,7 @@ _TINY = 1e-30
 
 @struct.dataclass
 class Look:
-    """What a bed of springs tells about a scene before anything is solved.
+    """Estimates of a bed of springs for a scene before anything is solved.
 
     `contact` are the pixels that touch, `radius_mm` is √(area / π), `slope` the rms slope of the undeformed gap inside,
     `at_border` says that they reach the edge of the grid.

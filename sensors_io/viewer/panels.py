@@ -24,7 +24,7 @@ _INK, _HALO = (255, 255, 255), (20, 23, 26)
 
 
 def panels(sample: Sample) -> dict[str, Panel]:
-    """What is to be seen in a sample, by name."""
+    """Panels of a sample, by name."""
     arrays, frame = sample.arrays, sample.frame
     shown: dict[str, Panel] = {}
     if frame is not None and frame.ndim == 3:
@@ -49,7 +49,7 @@ SCALES = {
     "shear": f"arrows {_ARROW_GAIN:g} times as long, colour 0 to {_SHIFT_TOP_MM:g} mm",
     "distance": "from the camera, dark is near",
 }
-"""What the colours and lengths of a panel mean, by its name."""
+"""Meaning of the colours and lengths of a panel, by its name."""
 
 
 def outlined(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a bench shows: the newest sample of every sensor with its fields, the force, rates, losses, flags."""
+"""Display of a bench: the newest sample of every sensor with its fields, the force, rates, losses, flags."""
 
 import collections
 import contextlib
@@ -28,7 +28,7 @@ _FRAME_S = 1 / 30  # between two published states: screens show no more
 
 
 class Watched(Protocol):
-    """What is shown of a device; `Reader` is one."""
+    """Source of a device's display; `Reader` is one."""
 
     @property
     def identity(self) -> Identity: ...
@@ -84,7 +84,7 @@ class Channel:
         return (n1 - n0) / (t1 - t0) if t1 > t0 else 0.0
 
     def table(self) -> dict[str, str]:
-        """What is listed of it."""
+        """Rows of its table."""
         counts = self.device.counts
         listed = {
             "rate": f"{self.rate_hz:.1f} Hz",
@@ -219,7 +219,7 @@ class Presenter:
         return tables
 
     def _alarm(self, newtons: tuple[float, float, float] | None) -> str:
-        """What is wrong, worst first."""
+        """Problems, worst first."""
         if newtons is not None and float(np.linalg.norm(newtons)) >= _OVERLOAD_N:
             return f"overload: {float(np.linalg.norm(newtons)):.0f} N, release"
         silent = [c.name for c in self._channels if c.device.counts.disconnects > c.device.counts.reconnects]

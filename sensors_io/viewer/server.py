@@ -27,7 +27,7 @@ _WAIT_S = 1.0  # how long a stream that has nothing new waits before it looks wh
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Numbers:
-    """What stands beside the pictures.
+    """Numbers shown next to the pictures.
 
     Args:
       title: of the page.
@@ -97,7 +97,7 @@ class LiveView:
 
     @property
     def address(self) -> str:
-        """Where browsers find it."""
+        """Address for browsers."""
         host, port = self._wanted if self._server is None else self._server.server_address[:2]
         return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
 
@@ -110,12 +110,12 @@ class LiveView:
 
     @property
     def shown(self) -> Shown:
-        """What was published last."""
+        """The last published state."""
         with self._changed:
             return self._shown
 
     def wait(self, seen: int) -> Shown | None:
-        """What was published after version `seen`; `None` when the view has ended."""
+        """The state published after version `seen`; `None` when the view has ended."""
         with self._changed:
             while self._version == seen and not self._ended:
                 self._changed.wait(_WAIT_S)
