@@ -15,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from touchr1_jax.rl.evaluate import make_answer
+from touchr1_jax.rl.objective import GRPOBatch
 
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig, clip_batches
@@ -30,10 +32,8 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.advantages import group_advantage
-from touchr1_jax.rl.evaluate import make_answer
 from touchr1_jax.rl.grpo import sample_group
 from touchr1_jax.rl.losses import token_log_probs
-from touchr1_jax.rl.objective import GRPOBatch
 from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.rl.scoring import make_score
 from touchr1_jax.text.language import TOUCH_LANGUAGE as LANGUAGE
