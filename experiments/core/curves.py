@@ -1,6 +1,7 @@
 """Training curves of a run, and accuracy against the rate of middle answers, as SVG."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -72,13 +73,12 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
       scalars: scalar → (arm, seed) → curve, of one phase.
       colour: that of each arm; a curve of no arm is grey.
     """
-    last = len(scalars) - min(3, len(scalars))
-    return draw(
-        [
-            Panel(_seeds_and_means(series, colour), title=name, x_label="step" if i >= last else "")
-            for i, (name, series) in enumerate(scalars.items())
-        ]
-    )
+    columns = min(3, len(scalars))
+    panels = [
+        Panel(_seeds_and_means(series, colour), title=name, x_label="step" if i >= len(scalars) - columns else "")
+        for i, (name, series) in enumerate(scalars.items())
+    ]
+    return draw(panels, size=(3.35 * columns, 0.35 + 2.15 * math.ceil(len(scalars) / columns)))
 
 
 def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str]) -> list[Series]:
