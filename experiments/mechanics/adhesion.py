@@ -1,26 +1,26 @@
-"""Whether the generator's flag for adhesion is raised where adhesion counts: spheres on real gels against half-spaces.
+"""The generator's flag for adhesion, compared with adhesive presses of spheres on the layered gels.
 
-The generator takes the flag's threshold from JKR's sphere on a half-space.  Here presses without adhesion are solved on
-the layered gels and turned into presses with adhesion at equal contact areas (Ciavarella 2018), which knows no
-half-space; where the contact is then wider by the tolerance, the flag should begin or have begun.
+The generator takes the threshold of the flag from JKR's sphere on a half-space.  Here presses without adhesion are
+solved on the layered gels and converted to presses with adhesion at equal contact areas (Ciavarella 2018), which
+assumes no half-space; the flag must be set wherever adhesion widens the contact by more than the tolerance.
 """
 
-import dataclasses
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import Column, Table
+from experiments.core.results import Table, named_table
 from sensors_io import layer
 from sensors_io.scenes import adhesion, contact, hertz, press
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.sensors import MODELS, SensorModel
 
 RADII_MM = (5.0, 15.0, 40.0)
-"""From the most curved to the flattest bodies of the generator, both curvatures alike."""
+"""Radii of spheres, from the most curved to the flattest bodies of the generator."""
 
 _FORCES = (5e-3, 3.0)  # of a press over that at which the flag stops: from below the pull-off of a half-space on
 _RAMP = 28  # forces of a press, geometric
@@ -29,68 +29,53 @@ _DEGREE = 4  # of the polynomials in log δ that smooth a ramp
 _TOLERANCE, _ITERATIONS = 1e-4, 400
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AdhesionThreshold:
-    """A rigid sphere on one gel: force up to which frames are flagged, and up to which adhesion counts, N."""
+def thresholds(grid: int, context: Context) -> list[dict[str, Any]]:
+    """For every gel and radius: force up to which frames are flagged, and up to which adhesion matters, N; their ratio.
 
-    sensor: str
-    radius_mm: float
-    flagged_n: float
-    counts_n: float
-
-    @property
-    def missed(self) -> float:
-        """Force at which adhesion stops to count over that at which the flag stops: above 1 frames are missed."""
-        return self.counts_n / self.flagged_n
-
-
-def thresholds(grid: int, context: Context) -> list[AdhesionThreshold]:
-    """Every gel and radius, with the generator's work of adhesion and tolerance."""
+    Frames are missed where the ratio exceeds 1.
+    """
     spheres = itertools.product(MODELS, RADII_MM)
     return [_threshold(sensor, radius, grid) for sensor, radius in context.each("adhesion", spheres)]
 
 
-def threshold_table(found: list[AdhesionThreshold]) -> Table:
-    """All of them."""
+def threshold_table(rows: list[dict[str, Any]]) -> Table:
+    """All thresholds."""
     config = SceneConfig()
-    return Table(
-        title="Adhesion: where it is flagged, and where it counts",
-        columns=(
-            Column(name="sensor and sphere"),
-            Column(name="flagged below", unit="N", format=".3f", meaning="by JKR's sphere on a half-space"),
-            Column(name="counts below", unit="N", format=".3f", meaning="on the gel's finite thickness"),
-            Column(name="counts over flagged", format=".2f"),
-        ),
-        rows=tuple((f"{t.sensor}, R = {t.radius_mm:g} mm", t.flagged_n, t.counts_n, t.missed) for t in found),
+    return named_table(
+        "Adhesion: where it is flagged, and where it counts",
+        rows,
+        formats={"flagged below": ".3f", "counts below": ".3f", "counts over flagged": ".2f"},
+        units={"flagged below": "N", "counts below": "N"},
+        meanings={"flagged below": "by JKR's sphere on a half-space", "counts below": "on the gel's finite thickness"},
         note=f"Work of adhesion {config.adhesion_j_per_m2:g} J/m²; it counts where it widens the contact by more than "
         f"{config.adhesion_tolerance:.0%}.",
     )
 
 
-def _threshold(sensor: SensorModel, radius_mm: float, grid: int) -> AdhesionThreshold:
+def _threshold(sensor: SensorModel, radius_mm: float, grid: int) -> dict[str, Any]:
     config = SceneConfig()
     work = 1e-3 * config.adhesion_j_per_m2  # N/mm
-    sphere = adhesion.Adhesion(
-        radius_mm=radius_mm, plane_modulus_mpa=adhesion.plane_modulus_mpa(sensor.gel), work_n_per_mm=work
-    )
+    modulus = adhesion.plane_modulus_mpa(sensor.gel)
+    sphere = adhesion.Adhesion(radius_mm=radius_mm, plane_modulus_mpa=modulus, work_n_per_mm=work)
     flagged = sphere.least_force_n(config.adhesion_tolerance)
     force, approach, area = _smooth(*_press(sensor, radius_mm, flagged * np.geomspace(*_FORCES, _RAMP), grid))
     stuck_force, _ = adhesion.adhesive_ramp(force, approach, area, work)
     stable = slice(int(np.argmin(stuck_force)), None)
     wider = np.sqrt(area[stable] / np.interp(stuck_force[stable], force, area)) - 1
-    counts = (wider > config.adhesion_tolerance) & (stuck_force[stable] >= force[0])
-    return AdhesionThreshold(
-        sensor=sensor.name,
-        radius_mm=radius_mm,
-        flagged_n=flagged,
-        counts_n=float(np.max(stuck_force[stable], where=counts, initial=0.0)),
-    )
+    matters = (wider > config.adhesion_tolerance) & (stuck_force[stable] >= force[0])
+    most = float(np.max(stuck_force[stable], where=matters, initial=0.0))
+    return {
+        "sensor and sphere": f"{sensor.name}, R = {radius_mm:g} mm",
+        "flagged below": flagged,
+        "counts below": most,
+        "counts over flagged": most / flagged,
+    }
 
 
 def _press(
     sensor: SensorModel, radius_mm: float, force_n: np.ndarray, grid: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Force, approach, contact area of a press without adhesion, [K] each, on a grid that its widest contact fills."""
+    """Force, approach and contact area [K] of a press without adhesion, on a grid that its widest contact fills."""
     modulus = adhesion.plane_modulus_mpa(sensor.gel)
     widest = hertz.Hertz(radius_mm=radius_mm, plane_modulus_mpa=modulus, force_n=float(force_n[-1])).contact_radius_mm
     side = _SIDE * widest

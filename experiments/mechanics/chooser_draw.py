@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from experiments.mechanics.contact_scenes import FORCES_N, SHORTEST_WAVE_MM
+from experiments.mechanics.contact_scenes import SHORTEST_WAVE_MM, draw_press
 from sensors_io.scenes import nested, objects, surface
 from sensors_io.scenes.chooser import LOOK_GRIDS
 from sensors_io.scenes.objects import Solid
@@ -87,14 +87,9 @@ def draw(
     gaps, forces, moduli = [], [], []
     for name in family:
         solid = FAMILIES[name](rng, objects.sample(rng, 0.0, SHORTEST_WAVE_MM))
-        skin = surface.make_skin(solid, rng.uniform(-2, 2, 2), 1.0)
-        pose = surface.Pose(
-            offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
-            turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
-            tilt=jnp.asarray(rng.normal(0, 0.01, 2), jnp.float32),
-        )
+        skin, pose, force = draw_press(rng, solid)
         gaps.append(jax.device_get(_gaps(skin, pose, x, sides)))
-        forces.append(np.exp(rng.uniform(*np.log(FORCES_N))))
+        forces.append(force)
         moduli.append(solid.modulus_mpa)
     return SceneBatch(
         sensor=sensor,

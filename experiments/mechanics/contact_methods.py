@@ -1,4 +1,4 @@
-"""Contact methods to measure against, re-expressed from the literature: none of them is used to make data.
+"""Methods for normal contact: the package's solver, and solvers from the literature that it is compared with.
 
 Every method maps one scene (gap [N, N] mm, force N, gel and total compliance [M, M//2 + 1] mm/MPa, pixel size mm) to
 the gel's displacement [N, N] mm and the number of padded convolutions that it took.
@@ -15,21 +15,22 @@ from sensors_io.scenes import contact, spg, winkler
 
 _TINY = 1e-30
 _BLURS_MM = (0.8, 0.4, 0.2)
-_PUBLISHED_STEP = 1e4
+_STEP_RANGE = 1e4
+_MOST_ITERATIONS = 200
 
-Solver = Callable[[Array, Array, Array, Array, float], tuple[Array, Array]]
+ContactSolver = Callable[[Array, Array, Array, Array, float], tuple[Array, Array]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactMethod:
-    """A solver and what it is called; `kind` groups the chart."""
+    """A solver and its name; `kind` is its group in the chart."""
 
     name: str
     kind: str
-    solve: Solver
+    solve: ContactSolver
 
 
-def spg_nested(tolerance: float) -> Solver:
+def spg_nested(tolerance: float) -> ContactSolver:
     """The package's own solver."""
 
     def solve(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> tuple[Array, Array]:
@@ -46,12 +47,12 @@ def winkler_only(gap: Array, force: Array, gel: Array, total: Array, spacing: fl
 
 
 def winkler_and_response(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> tuple[Array, Array]:
-    """The springs' pressure on the true gel."""
-    return plain_convolve(_winkler(gap, force, total, spacing), gel), jnp.int32(1)
+    """The pressure of the springs, applied to the true gel."""
+    return _convolve(_winkler(gap, force, total, spacing), gel), jnp.int32(1)
 
 
 def blur(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> tuple[Array, Array]:
-    """The interpenetration of the springs, blurred by ever narrower Gaussians that leave the contact as it was.
+    """The interpenetration of the springs, blurred by ever narrower Gaussians that leave the contact unchanged.
 
     Source: Si & Yuan 2022 (Taxim); their kernel sizes in pixels are lengths here.
     """
@@ -62,14 +63,13 @@ def blur(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> 
     return _gaussian(sheet, _BLURS_MM[-1] / spacing), jnp.int32(0)
 
 
-def spg_plain(tolerance: float, published: bool, cap: int = 200) -> Solver:
+def spg_plain(tolerance: float, published: bool) -> ContactSolver:
     """Projected Barzilai–Borwein steps from a bed of springs, on the finest grid alone, without preconditioner.
 
     Args:
       tolerance: to stop at.
       published: stop on (Σ p|g| / Σ p + 0.1 penetration) / δ, else on the residual of the package's solver, which is
         stricter.
-      cap: most iterations.
 
     Source: Birgin, Martínez & Raydan 2000, without line search.
     """
@@ -92,13 +92,15 @@ def spg_plain(tolerance: float, published: bool, cap: int = 200) -> Solver:
             return moved, new_g, step, best, jnp.minimum(residual, lowest), made + 1
 
         state: tuple[Array, ...] = (start, g, first, start, residual, jnp.int32(0))
-        *_, best, _, made = jax.lax.while_loop(lambda s: (s[4] >= tolerance) & (s[5] < cap), advance, state)
-        return plain_convolve(best, gel), made + 2
+        *_, best, _, made = jax.lax.while_loop(
+            lambda s: (s[4] >= tolerance) & (s[5] < _MOST_ITERATIONS), advance, state
+        )
+        return _convolve(best, gel), made + 2
 
     return solve
 
 
-def polonsky_keer(iterations: int) -> Solver:
+def polonsky_keer(iterations: int) -> ContactSolver:
     """Constrained conjugate gradients, a fixed number of iterations of two convolutions each.
 
     Source: Polonsky & Keer 1999.
@@ -112,10 +114,10 @@ def polonsky_keer(iterations: int) -> Solver:
             touching = p > 0
             count = jnp.maximum(jnp.sum(touching), 1)
             centred = lambda w: w - jnp.sum(jnp.where(touching, w, 0)) / count
-            g = centred(plain_convolve(p, total) + gap)
+            g = centred(_convolve(p, total) + gap)
             new_norm = jnp.sum(jnp.where(touching, g**2, 0))
             direction = jnp.where(touching, g + conjugate * new_norm / jnp.maximum(norm, _TINY) * direction, 0)
-            response = centred(plain_convolve(direction, total))
+            response = centred(_convolve(direction, total))
             curvature = jnp.sum(jnp.where(touching, response * direction, 0))
             step = jnp.sum(jnp.where(touching, g * direction, 0)) / jnp.maximum(curvature, _TINY)
             p = jnp.where(touching, jnp.maximum(p - step * direction, 0), 0)
@@ -125,12 +127,27 @@ def polonsky_keer(iterations: int) -> Solver:
 
         p = jnp.full(gap.shape, load / gap.size, gap.dtype)
         p, *_ = jax.lax.fori_loop(0, iterations, advance, (p, 0 * p, jnp.float32(1), jnp.float32(0)))
-        return plain_convolve(p, gel), jnp.int32(2 * iterations + 1)
+        return _convolve(p, gel), jnp.int32(2 * iterations + 1)
 
     return solve
 
 
-def plain_convolve(field: Array, spectrum: Array) -> Array:
+def contact_methods() -> tuple[ContactMethod, ...]:
+    """The methods of the comparison, cheapest first within each kind."""
+    tolerances = ("1e-2", "1e-3", "1e-4", "1e-5")
+    method = lambda name, kind, solve: ContactMethod(name=name, kind=kind, solve=solve)
+    return (
+        method("Winkler", "no iteration", winkler_only),
+        method("blur", "no iteration", blur),
+        method("Winkler + response", "no iteration", winkler_and_response),
+        *(method(f"nested {t}", "nested SPG", spg_nested(float(t))) for t in tolerances),
+        *(method(f"plain {t}", "plain SPG", spg_plain(float(t), False)) for t in tolerances),
+        method("plain 1e-3 as published", "published stop", spg_plain(1e-3, True)),
+        method("PK-25", "Polonsky–Keer", polonsky_keer(25)),
+    )
+
+
+def _convolve(field: Array, spectrum: Array) -> Array:
     """Zero-padded convolution by two full transforms."""
     n, m = field.shape[-1], spectrum.shape[-2]
     return jnp.fft.irfft2(jnp.fft.rfft2(field, s=(m, m)) * spectrum, s=(m, m))[:n, :n]
@@ -142,7 +159,7 @@ def _winkler(gap: Array, force: Array, total: Array, spacing: float) -> Array:
 
 def _misfit(p: Array, gap: Array, total: Array, load: Array, published: bool) -> tuple[Array, Array]:
     """Residual and gradient."""
-    u = plain_convolve(p, total)
+    u = _convolve(p, total)
     w, touching = u + gap, p > 0
     approach = jnp.sum(jnp.where(touching, w, 0)) / jnp.maximum(jnp.sum(touching), 1)
     g = w - approach
@@ -154,10 +171,10 @@ def _misfit(p: Array, gap: Array, total: Array, load: Array, published: bool) ->
 
 
 def _barzilai_borwein(s: Array, y: Array, iteration: Array, first: Array) -> Array:
-    """The two lengths in turn."""
+    """The long and the short step length in turn."""
     sy = jnp.sum(s * y)
     long, short = jnp.sum(s * s) / jnp.maximum(sy, _TINY), sy / jnp.maximum(jnp.sum(y * y), _TINY)
-    step = jnp.clip(jnp.where(iteration % 2 == 0, long, short), first / _PUBLISHED_STEP, first * _PUBLISHED_STEP)
+    step = jnp.clip(jnp.where(iteration % 2 == 0, long, short), first / _STEP_RANGE, first * _STEP_RANGE)
     return jnp.where(sy > 0, step, first)
 
 

@@ -1,8 +1,8 @@
-"""Random scenes for measuring contact solvers: gaps, forces, moduli, the spectra of one sensor, float64 solutions."""
+"""Scenes for contact solvers, with exact solutions: random presses, rough spheres, known failure cases."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,33 +17,22 @@ FORCES_N = (0.2, 20.0)
 SHORTEST_WAVE_MM = 0.8
 REFERENCE_TOLERANCE = 1e-8
 
-
-class ContactScene(NamedTuple):
-    """Gap [N, N] mm, force N, modulus MPa of the object."""
-
-    gap_mm: np.ndarray
-    force_n: np.ndarray
-    modulus_mpa: np.ndarray
+SIDE_MM = 16.0
+GEL = layer.Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+"""Window and gel of the rough spheres and of the failure cases."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ContactScenes:
+class ContactScenes(NamedTuple):
     """S scenes on one grid: gaps [S, N, N] mm, forces [S] N, moduli [S] MPa of the objects; float32."""
 
     gap_mm: np.ndarray
     force_n: np.ndarray
     modulus_mpa: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.force_n)
-
-    def __iter__(self) -> Iterator[ContactScene]:
-        return map(ContactScene, self.gap_mm, self.force_n, self.modulus_mpa)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GelKernels:
-    """Float64 spectra of a sensor's gel and of an object of 1 MPa [M, M//2 + 1], mm/MPa, and the pixel size."""
+    """Float64 spectra of a gel and of an object of 1 MPa [M, M//2 + 1], mm/MPa; pixel size; thickness of the gel."""
 
     gel: np.ndarray
     body: np.ndarray
@@ -51,44 +40,59 @@ class GelKernels:
     thickness_mm: float
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FailureCase:
+    """A rigid body on a gel; `must_flag`: small-strain theory does not hold here, so the solver must flag the frame."""
+
+    name: str
+    gap_mm: np.ndarray
+    force_n: float
+    gel: layer.Layer = GEL
+    must_flag: bool = False
+
+    def kernels(self) -> GelKernels:
+        """Kernels of this gel on a grid padded to one and a half times its side."""
+        grid = self.gap_mm.shape[0]
+        spacing = SIDE_MM / grid
+        gel = layer.normal_compliance(np.hypot(*layer.wave_numbers(grid * 3 // 2, spacing)), self.gel)
+        return GelKernels(gel=gel, body=np.zeros_like(gel), spacing_mm=spacing, thickness_mm=self.gel.thickness_mm)
+
+
 def gel_kernels(sensor: SensorModel, grid: int) -> GelKernels:
-    """The kernels of a sensor on its padded grid."""
+    """Kernels of a sensor on its padded grid."""
     spacing = sensor.window_mm / grid
     q = np.hypot(*layer.wave_numbers(press.padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm), spacing))
-    return GelKernels(
-        gel=layer.normal_compliance(q, sensor.gel),
-        body=layer.normal_compliance(q, BODY),
-        spacing_mm=spacing,
-        thickness_mm=sensor.gel.thickness_mm,
+    gel, body = (layer.normal_compliance(q, material) for material in (sensor.gel, BODY))
+    return GelKernels(gel=gel, body=body, spacing_mm=spacing, thickness_mm=sensor.gel.thickness_mm)
+
+
+def draw_press(rng: np.random.Generator, solid: objects.Solid) -> tuple[surface.Skin, surface.Pose, float]:
+    """Skin of the object, a pose near its apex and a log-uniform force, N."""
+    skin = surface.make_skin(solid, rng.uniform(-2, 2, 2), 1.0)
+    pose = surface.Pose(
+        offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
+        turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
+        tilt=jnp.asarray(rng.normal(0, 0.01, 2), jnp.float32),
     )
+    return skin, pose, np.exp(rng.uniform(*np.log(FORCES_N)))
 
 
-def sample(sensor: SensorModel, count: int, grid: int, seed: int) -> ContactScenes:
-    """Draw scenes: a procedural object each, a pose near the apex, a log-uniform force.
-
-    The draws do not depend on the grid, so the same seed gives the same scenes on every grid.
-    """
+def sample_scenes(sensor: SensorModel, count: int, grid: int, seed: int) -> ContactScenes:
+    """Draw presses of procedural objects; the same seed gives the same scenes on every grid."""
     rng = np.random.default_rng(seed)
     x = jnp.asarray((np.arange(grid) + 0.5) * sensor.window_mm / grid - sensor.window_mm / 2, jnp.float32)
     gaps, forces, moduli = [], [], []
     for _ in range(count):
         solid = objects.sample(rng, 0.0, SHORTEST_WAVE_MM)
-        skin = surface.make_skin(solid, rng.uniform(-2, 2, 2), 1.0)
-        pose = surface.Pose(
-            offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
-            turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
-            tilt=jnp.asarray(rng.normal(0, 0.01, 2), jnp.float32),
-        )
+        skin, pose, force = draw_press(rng, solid)
         gaps.append(np.asarray(_gap(skin, pose, x)))
-        forces.append(np.exp(rng.uniform(*np.log(FORCES_N))))
+        forces.append(force)
         moduli.append(solid.modulus_mpa)
-    return ContactScenes(
-        gap_mm=np.stack(gaps), force_n=np.array(forces, np.float32), modulus_mpa=np.array(moduli, np.float32)
-    )
+    return ContactScenes(np.stack(gaps), np.array(forces, np.float32), np.array(moduli, np.float32))
 
 
-def exact(scenes: Iterable[ContactScene], kernels: GelKernels) -> np.ndarray:
-    """Float64 displacement of the gel on the same grid, [S, N, N] mm."""
+def exact(scenes: Iterable[tuple[np.ndarray, ...]], kernels: GelKernels) -> np.ndarray:
+    """Float64 displacement [S, N, N] mm of the gel on the same grid, for the gap, force and modulus of each scene."""
     found = []
     for gap, force, modulus in scenes:
         compliance = kernels.gel + kernels.body / float(modulus)
@@ -99,13 +103,31 @@ def exact(scenes: Iterable[ContactScene], kernels: GelKernels) -> np.ndarray:
     return np.stack(found)
 
 
+def batch_solver(solve: Callable[..., Any], scenes: ContactScenes, kernels: GelKernels) -> Callable[[], Any]:
+    """A compiled call that solves all scenes one after the other and stacks the results.
+
+    Args:
+      solve: maps gap [N, N] mm, force N, compliance of the gel and of the object [M, M//2 + 1] mm/MPa to arrays.
+      scenes: what to solve.
+      kernels: of the gel and of an object of 1 MPa.
+    """
+    gel, body = jnp.asarray(kernels.gel, jnp.float32), jnp.asarray(kernels.body, jnp.float32)
+    inputs = jax.tree.map(jnp.asarray, scenes)
+
+    def solve_one(scene: ContactScenes) -> Any:
+        return solve(scene.gap_mm, scene.force_n, gel, body / scene.modulus_mpa)
+
+    compiled = jax.jit(lambda scenes: jax.lax.map(solve_one, scenes))
+    return lambda: compiled(inputs)
+
+
 def displacement_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Relative L₂ error of each scene's displacement, [S]."""
     return _relative(np.asarray(found, np.float64), np.asarray(true, np.float64))
 
 
 def slope_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Relative L₂ error of each scene's surface slope, [S]: what a photometric sensor sees."""
+    """Relative L₂ error of each scene's surface slope, which a photometric sensor sees, [S]."""
     slopes = lambda field: np.stack([np.gradient(np.asarray(field, np.float64), axis=axis) for axis in (1, 2)], -1)
     return _relative(slopes(found), slopes(true))
 
@@ -116,3 +138,69 @@ def _relative(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 _gap = jax.jit(surface.gap)
+
+
+# Shapes on the 16 mm window ------------------------------------------------------------------------------------------
+
+
+def rough_sphere(rng: np.random.Generator, grid: int) -> np.ndarray:
+    """Gap of a sphere with self-affine roughness, [N, N] mm."""
+    x = (np.arange(grid) + 0.5) * SIDE_MM / grid - SIDE_MM / 2
+    k, a, phase = (v.astype(np.float64) for v in objects.rough_waves(rng, rng.uniform(0.01, 0.06), 5 * SIDE_MM / grid))
+    angle = k[:, 0, None, None] * x[None] + k[:, 1, None, None] * x[:, None] + phase[:, None, None]
+    return (x[None] ** 2 + x[:, None] ** 2) / rng.uniform(20, 60) + np.sum(a[:, None, None] * np.cos(angle), 0)
+
+
+def failure_suite(grid: int) -> tuple[FailureCase, ...]:
+    """Scenes at which contact solvers are known to fail: overflow, cycling, empty contacts, broken assumptions.
+
+    Kernel overflow is that of sinh(qh) in float32, at qh > 88: the finest wave of a thick gel.
+
+    Args:
+      grid: side of the grid, a multiple of 4.
+    """
+    x = (np.arange(grid) + 0.5) * SIDE_MM / grid - SIDE_MM / 2
+    r2 = x[None] ** 2 + x[:, None] ** 2
+    noise = np.random.default_rng(0).standard_normal((grid, grid))
+    gel = lambda **changes: dataclasses.replace(GEL, **changes)
+    dimple = r2 / (2 * 1e3 * (2 * SIDE_MM / grid) ** 3)  # a dozen pixels at 1 mN, so flat that the gel hardly dents
+    case = lambda name, gap_mm, force_n, **rest: FailureCase(name=name, gap_mm=gap_mm, force_n=force_n, **rest)
+    return (
+        case("kernel overflow: h = 40 mm", r2 / 16, 5.0, gel=gel(thickness_mm=40.0)),
+        case("a few pixels at 1 mN", r2 / 16, 1e-3, must_flag=True),
+        case("a dozen pixels at 1 mN", dimple, 1e-3),
+        case("needle beside a shoulder", _needle(grid), 2.0),
+        case("rough flat, 75 % contact", _waves(x, 0.03), 15.0),
+        case("full pad", np.zeros((grid, grid)), 5.0),
+        case("white noise", 0.1 * noise, 5.0),
+        case("ν = 0.4999", r2 / 16, 5.0, gel=gel(poisson=0.4999)),
+        case("ν = 0.5", r2 / 16, 5.0, gel=gel(poisson=0.5)),
+        case("h = 0.3 mm", r2 / 16, 5.0, gel=gel(thickness_mm=0.3), must_flag=True),
+        case("tilt", r2 / 60 + 0.2 * x[None], 5.0),
+        case("E = 0.01 MPa", r2 / 16, 1.0, gel=gel(modulus_mpa=0.01), must_flag=True),
+        case("sphere at 20 N, strain > 0.3", r2 / 8, 20.0, must_flag=True),
+        case("pin R 0.5 mm at 5 N", _pin(r2, 0.5), 5.0, must_flag=True),
+    )
+
+
+def _needle(grid: int) -> np.ndarray:
+    """A needle of 2 × 2 pixels next to a flat shoulder 0.6 mm higher up, which just touches."""
+    gap, half = np.full((grid, grid), 5.0), grid // 2
+    gap[:, : half - 4] = 0.6
+    gap[half - 1 : half + 1, half + 4 : half + 6] = 0.0
+    return gap
+
+
+def _waves(x: np.ndarray, rms_mm: float) -> np.ndarray:
+    """A flat with sixty waves between 4 and 0.9 mm."""
+    rng = np.random.default_rng(3)
+    q, angle, phase = rng.uniform(1.6, 7.0, 60), rng.uniform(0, 2 * np.pi, 60), rng.uniform(0, 2 * np.pi, 60)
+    along = np.cos(angle)[:, None, None] * x[None, None] + np.sin(angle)[:, None, None] * x[None, :, None]
+    height = np.cos(q[:, None, None] * along + phase[:, None, None]).sum(0)
+    return height / height.std() * rms_mm
+
+
+def _pin(r2: np.ndarray, radius: float) -> np.ndarray:
+    """A hemisphere on a steep cone."""
+    cap = radius - np.sqrt(np.maximum(radius**2 - r2, 0))
+    return np.where(r2 < radius**2, cap, radius + 3 * (np.sqrt(r2) - radius))
