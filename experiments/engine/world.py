@@ -1,9 +1,9 @@
-"""A small world of touch whose truth is known, and a policy for it that is small enough to train by the thousand.
+"""A small world of touch whose truth is known, and a policy for it small enough to be trained a thousand times.
 
-An object has a hardness and an elasticity of three levels.  Two sensors feel it for two time steps: sensor s has the
-evidence z_s = y + σ ε_s of each.  Hardness shows in every step alike; elasticity only in the order, as a ramp that
-rises (0), stays (1) or falls (2).  A view shows the right level with probability `sight`, else any.  Answers are those
-of the real language, read by the real parser.
+An object has a hardness and an elasticity, each of three levels.  Two sensors touch it for two time steps: sensor s has
+the evidence z_s = y + σ ε_s of each.  Hardness appears in every step alike; elasticity only in the order of the steps,
+as a ramp that rises (0), stays (1) or falls (2).  A view shows the right level with probability `sight`, else a random
+one.  Answers use the library's language and parser.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ LAYOUT = build_layout(TOKENIZER, LANGUAGE, tactile_tokens=2, view_tokens=1, ques
 PARSER: Parser = compile_parser(LANGUAGE, TOKENIZER)
 S, STEPS, A, K = len(LANGUAGE.sensors), 2, len(LANGUAGE.attributes), 3
 LENGTH = 15
-"""Tokens of an answer that names two levels in its conclusion, end included, and one more."""
+"""Tokens of an answer with two levels in its conclusion and its end, and one more."""
 
 DECODER = DecoderConfig(
     vocab_size=TOKENIZER.vocab_size,
@@ -62,29 +62,28 @@ FNS = PolicyFns(
 
 _BASIS = np.linalg.qr(np.random.default_rng(0).normal(size=(DECODER.hidden_size,) * 2))[0].astype(np.float32)
 LEVEL, RAMP, SENSOR, SIGHT, HOLE = np.split(_BASIS[: 2 * K + S + 2], [K, K + 1, K + 1 + S, 2 * K + 1 + S])
-"""Directions of the levels of hardness, of the ramp, of the sensors, of what is seen, and of a broken stream."""
+"""Directions [n, D] of the levels of hardness, the ramp, the sensors, the levels in view, and a broken stream."""
 
 BUMP = 0.5
 """Width of a level's response to evidence, in levels."""
 GRAIN = 0.1
-"""Standard deviation of what a channel adds at random."""
-
+"""Standard deviation of the noise of a channel."""
 
 Scalar = Any
 """A number or a traced scalar."""
 
 
 class World(NamedTuple):
-    """What there is to feel, and what supervised training makes of it; numbers or traced scalars.
+    """Properties of objects, sensors and supervised answers; numbers or traced scalars.
 
     Attributes:
       noise: σ of a sensor's evidence, in levels.
       sight: probability that the view shows the right level.
-      asked: attribute that is asked for, 0 hardness or 1 elasticity.
+      asked: attribute of the question, 0 hardness or 1 elasticity.
       tick: time id of the second step; that of the first is 0.
-      kept: how much of the second sensor's touch reaches the policy; the rest of it is one constant token.
+      kept: share of the second sensor's touch that reaches the policy; the rest is one constant token.
       anchored: share of supervised answers that conclude what the view shows.
-      sloppy: share of supervised answers that name two levels in their conclusion.
+      sloppy: share of supervised answers with two levels in their conclusion.
       sharp: factor on the logits of the supervised policy.
     """
 
@@ -99,7 +98,7 @@ class World(NamedTuple):
 
 
 class WorldBatch(NamedTuple):
-    """P questions with the truth behind them: evidence of the asked attribute in levels, and the level in view."""
+    """P questions, the true level, the sensors' evidence of it in levels, and the level in view."""
 
     batch: GRPOBatch
     level: Int[Array, "P"]
@@ -108,7 +107,7 @@ class WorldBatch(NamedTuple):
 
 
 def draw(world: World, key: Array, p: int) -> WorldBatch:
-    """P objects, felt, seen and asked about."""
+    """P random objects, touched, seen and asked about."""
     keys = jax.random.split(key, 5)
     level = jax.random.randint(keys[0], (p, A), 0, K)
     evidence = level[:, None] + world.noise * jax.random.normal(keys[1], (p, S, A))
@@ -134,7 +133,7 @@ def draw(world: World, key: Array, p: int) -> WorldBatch:
 
 
 def touch_tokens(world: World, evidence: Float[Array, "P S A"], key: Array) -> Float[Array, "P S N D"]:
-    """What the sensors send for their evidence: one token a step."""
+    """The sensors' tokens for their evidence, one a step."""
     p = evidence.shape[0]
     response = jnp.exp(-0.5 * ((evidence[..., :1] - jnp.arange(K)) / BUMP) ** 2)
     ramp = (1 - evidence[..., 1])[..., None, None] * jnp.array([[-1.0], [1.0]]) * jnp.asarray(RAMP)
@@ -144,7 +143,7 @@ def touch_tokens(world: World, evidence: Float[Array, "P S A"], key: Array) -> F
 
 
 def broken(world: World, touch: Float[Array, "*n S N D"]) -> Float[Array, "*n S N D"]:
-    """The touch as the policy gets it: of the last stream only the share `kept`."""
+    """Touch as the policy receives it: of the last stream only the share `kept`."""
     kept = jnp.where(jnp.arange(S) == S - 1, world.kept, 1.0)[:, None, None]
     return kept * touch + (1 - kept) * 2 * jnp.asarray(HOLE[0])
 
@@ -182,9 +181,9 @@ WORDS = np.array([[_ids(words[0])[0] for words in a.levels] for a in LANGUAGE.at
 
 
 def verified_answers(world: World, scene: WorldBatch, key: Array) -> tuple[Int[Array, "P T"], Array]:
-    """What supervised training imitates, and which tokens count, both [P, T].
+    """Answers for supervised training, and the tokens that count, both [P, T].
 
-    Each slot says its own evidence; the conclusion is the label, or what the view shows, or, sloppily, two levels.
+    Each slot names its own evidence; the conclusion is the label, or the level in view, or, if sloppy, two levels.
     """
     p = scene.level.shape[0]
     anchor_key, slop_key = jax.random.split(key)
@@ -194,14 +193,14 @@ def verified_answers(world: World, scene: WorldBatch, key: Array) -> tuple[Int[A
     anchored = jax.random.uniform(anchor_key, (p,)) < world.anchored
     level = jnp.where(anchored, scene.seen, scene.level)
     sloppy = jax.random.uniform(slop_key, (p,)) < world.sloppy
-    said, also = words[level], words[(level + 1) % K]
+    first, second = words[level], words[(level + 1) % K]
     fixed = lambda text: [jnp.full(p, i) for i in _ids(text)]
     perceive = [x for s, slot in zip(LANGUAGE.sensors, slots, strict=True) for x in (*fixed(s.phrases[0]), slot)]
     compare = nearest(jnp.mean(scene.evidence, 1))
     head = [*fixed("<perceive>"), *perceive, *fixed("</perceive> <compare>"), compare, *fixed("</compare> <conclude>")]
     end, pad = jnp.full(p, FNS.end_ids[0]), jnp.full(p, FNS.pad_id)
     (close,) = fixed("</conclude>")
-    tidy, loose = jnp.stack([*head, said, close, end, pad], -1), jnp.stack([*head, said, also, close, end], -1)
+    tidy, loose = jnp.stack([*head, first, close, end, pad], -1), jnp.stack([*head, first, second, close, end], -1)
     tokens = jnp.where(sloppy[:, None], loose, tidy).astype(jnp.int32)
     tokens = jnp.pad(tokens, ((0, 0), (0, LENGTH - tokens.shape[1])), constant_values=FNS.pad_id)
     return tokens, tokens != FNS.pad_id

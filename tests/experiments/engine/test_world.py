@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.engine.training import lenient_credit
 from experiments.engine.world import CONCLUDE, LENGTH, PARSER, WORDS, K, World, draw, noise_bank, verified_answers
+from experiments.engine.world_training import lenient_credit
 
 P = 64
 TIDY = World(sloppy=0.0, noise=0.2)
