@@ -25,7 +25,7 @@ RECORDED = Path("experiments/recorded")
 
 BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
 
-SIGHT = "tables > Right answers where sight helps and where it lies > deceptive questions"
+SIGHT = "tables > Accuracy where the picture helps and where it deceives > deceptive questions"
 
 ROWS = (
     (

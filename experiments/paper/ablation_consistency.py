@@ -3,13 +3,13 @@
     make experiment EXP=ablation_consistency [ARGS="--scale smoke"]
 
 Arms of GRPO from one SFT checkpoint per seed and the same questions, with the published ordinal and format rewards:
-without the consistency term, with the published one, and with the one that counts only where the answer is right.
+without the consistency term, with the published one, and with one that counts only where the answer is right.
 
 Cost: about 25 minutes on two cores with five seeds; `--scale smoke` under two.
 
-Expected: the published term can be met by writing one level into every slot (`echo_share` rises, and with it the
-agreement of slots), and it drives the middle level out, since sensors disagree most about middle objects; the gated
-term should raise consistency of conclusions (`csc`) without either.
+Expected: one level in every slot satisfies the published term (`echo_share` rises, and with it the agreement of
+slots), and the term drives the middle level out, since sensors disagree most about middle objects; the gated term
+should raise the consistency of conclusions (`csc`) without either.
 """
 
 from experiments.study.ablation import Ablation, ablation_experiment

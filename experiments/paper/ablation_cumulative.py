@@ -1,11 +1,11 @@
-"""Does each rung of the paper's ladder lift what it lifts there: ordinal credit OMAE, consistency CSC, SFT most of all?
+"""Does each step of the paper's ladder help what it helps there: ordinal credit OMAE, consistency CSC, SFT most?
 
     make experiment EXP=ablation_cumulative [ARGS="--scale smoke|gpu|paper"]
 
-The rungs of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)): the commonest levels, SFT, GRPO with
+The arms of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)): the commonest levels, SFT, GRPO with
 0/1 credit, ordinal credit, the consistency reward, the format reward, tactile grounding; and above them the credit for
-the use of touch that only the abstract has.  All rungs of GRPO start from the SFT checkpoint of their seed and see the
-same questions in the same order.  Each step is held against the paper's: its sign, intervals over seeds and objects,
+the use of touch that only the abstract has.  All arms of GRPO start from the SFT checkpoint of their seed and see the
+same questions in the same order.  Each step is compared with the paper's: its sign, intervals over seeds and objects,
 p-values corrected over the table, and where the sign does not come out the known failures that the run shows.
 
 Cost: some 25 minutes of one core with five seeds after `main_table`, whose policies it shares, 60 without; `--scale
@@ -15,132 +15,133 @@ Expected: SFT is by far the largest step.  Ordinal credit lowers OMAE by .02 to 
 reward makes slots agree and raises CSC little or not at all; format adds nothing after SFT.
 """
 
-import itertools
+import collections
+import dataclasses
 
 from experiments.core.context import Context
 from experiments.core.results import Requirement, Results
 from experiments.paper import presets
-from experiments.paper.aggregate import aggregate_table
-from experiments.paper.deltas import FOUR, MEASURES, Delta, Step
+from experiments.paper.bench_scores import pooled_table
+from experiments.paper.component_effects import (
+    FOUR,
+    LADDER_METRICS,
+    ComponentComparison,
+    ComponentEffect,
+    ComponentStep,
+    compare_components,
+    find_effect,
+)
+from experiments.paper.component_report import attribute_table, effects_picture, effects_table, ladder_table
+from experiments.paper.components import BASE, COMPONENTS, published_steps, reinforced
 from experiments.paper.eval_variants import untrained
-from experiments.paper.experiment import bench_experiment
-from experiments.paper.ladder_arms import LADDER, arms
-from experiments.paper.ladder_tables import DIFFERS, attribute_table, delta_table, rung_table
-from experiments.paper.outcome import CURVES, Outcome, delta_picture, find, outcome, phrase, shown
-from experiments.study import paper_numbers as paper
-from experiments.study.ablation import compared_pairs
-from experiments.study.examples import rollout_examples
-from experiments.study.levels import level_report
+from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.paper_numbers import differences_table
-from experiments.study.scores import PUBLISHED, study_settings
-from experiments.study.study import SFT, StudyConfig, Way, run_study
+from experiments.study.study import SFT, StudyConfig, Way
 
 UNTRAINED = "untrained"
 
+BELOW = dict(zip([c.added.name for c in COMPONENTS], [BASE, *(c.added.name for c in COMPONENTS)], strict=False))
+"""Arm of the ladder → the arm below it."""
+
 STEPS = tuple(
-    Step(
-        arm=rung.name,
-        against=below.name,
-        adds=rung.adds,
-        published=None
-        if rung.published is None or below.published is None
-        else tuple(a - b for a, b in zip(paper.LADDER[rung.published], paper.LADDER[below.published], strict=True)),
-    )
-    for below, rung in itertools.pairwise(LADDER)
+    ComponentStep(arm=c.added.name, against=BELOW[c.added.name], component=c.name, published=published_steps()[c.name])
+    for c in COMPONENTS
 )
-"""Each rung against the one below it."""
+
+WEIGHTS, ALGORITHMS = reinforced(c.added for c in COMPONENTS)
+
+ABLATION = Ablation(
+    arms=WEIGHTS,
+    algorithms=ALGORITHMS,
+    pairs=tuple((arm, BELOW[arm]) for arm in WEIGHTS),
+    variants={UNTRAINED: Way(of=SFT, ask=untrained)},
+    curves=presets.GRPO_CURVES,
+    example="grounding",
+)
+
+TITLE = "Change by each component of the ladder"
+
+NOTE = (
+    "Each arm minus the one below it. With five seeds p is .0625 or more before correction: over seeds judge by the "
+    "interval, over objects by p. OMAE should fall, CSC and Avg rise."
+)
 
 
 def run(config: StudyConfig, context: Context) -> Results:
-    """Train the rungs, compare each with the one below it, say why signs do not come out."""
-    weights, algorithms = arms()
-    ways = {UNTRAINED: Way(of=SFT, ask=untrained)}
-    study = run_study(config, weights, context, algorithms, ways)
+    """Train the arms, compare each with the one below it, diagnose the signs that do not come out."""
+    study, scored, results = run_ablation(ABLATION, config, context)
     with context.timed("compare"):
-        result = outcome(study, STEPS, context)
-    pictures, reliability = level_report(study)
-    return Results(
-        arms=result.scored.arms,
-        baselines={**result.scored.baselines, UNTRAINED: shown(result.estimates[UNTRAINED])},
-        settings=study_settings(config),
-        comparisons=tuple(compared_pairs([(s.arm, s.against) for s in STEPS[1:]], result.estimates, config.seeds)),
-        verdict=verdict(result),
-        requirements=requirements(result.found),
+        found = compare_components(study, scored, STEPS, context)
+    return dataclasses.replace(
+        results,
+        baselines={**results.baselines, UNTRAINED: found.reported(UNTRAINED)},
+        verdict=verdict(found),
+        requirements=requirements(found.effects),
         tables=(
-            rung_table(result.estimates),
-            delta_table(result.found, result.why, "What each rung changes", NOTE),
-            attribute_table(result.estimates),
-            *aggregate_table(result.scored.arms, SFT),
-            *reliability,
-            differences_table(DIFFERS),
+            ladder_table(found.estimates),
+            effects_table(found, TITLE, NOTE),
+            attribute_table(found.estimates),
+            *pooled_table(results.arms, SFT),
+            *results.tables,
+            differences_table(presets.DIFFERENCES),
         ),
-        pictures=(*delta_picture(result.found, "What each rung changes"), *pictures),
-        data=study.data.summary(),
-        curves=CURVES,
-        examples=rollout_examples(study, "grounding", PUBLISHED),
+        pictures=(*effects_picture(found.effects, TITLE), *results.pictures),
     )
 
 
-NOTE = (
-    "Each rung less the one below it. Five seeds leave p at .0625 or more before correction: over seeds the interval "
-    "judges, over objects p does. OMAE should fall, CSC and Avg rise."
-)
-
-
-def requirements(found: tuple[Delta, ...]) -> tuple[Requirement, ...]:
+def requirements(effects: tuple[ComponentEffect, ...]) -> tuple[Requirement, ...]:
     """The three signs that the paper rests on; none where a single seed leaves no interval."""
-    if not found:
+    if not effects:
         return ()
-    ordinal, consistency = find(found, "ordinal", "omae"), find(found, "consistency", "csc")
     bounds = []
+    ordinal, consistency = find_effect(effects, "ordinal", "omae"), find_effect(effects, "consistency", "csc")
     if ordinal is not None:
-        name = "ordinal credit: change of OMAE"
-        bounds.append(
-            Requirement(name=name, measured=ordinal.seeds.mean, bound=0.0, better="lower", note=phrase(ordinal))
-        )
+        name, change = "ordinal credit: change of OMAE", ordinal.seeds.mean
+        bounds.append(Requirement(name=name, measured=change, bound=0.0, better="lower", note=str(ordinal)))
     if consistency is not None:
-        name, gain = "consistency: change of CSC", consistency.seeds.mean
-        bounds.append(Requirement(name=name, measured=gain, bound=0.0, better="higher", note=phrase(consistency)))
-    return (*bounds, _largest(found))
+        name, change = "consistency: change of CSC", consistency.seeds.mean
+        bounds.append(Requirement(name=name, measured=change, bound=0.0, better="higher", note=str(consistency)))
+    return (*bounds, _sft_is_largest(effects))
 
 
-def _largest(found: tuple[Delta, ...]) -> Requirement:
-    """In how many measures SFT changes more than any rung above it."""
+def _sft_is_largest(effects: tuple[ComponentEffect, ...]) -> Requirement:
+    """In how many metrics SFT changes more than any step above it."""
     count = 0
-    for measure in MEASURES:
-        sizes = {d.step.arm: abs(d.seeds.mean) for d in found if d.measure == measure}
+    for metric in LADDER_METRICS:
+        sizes = {e.step.arm: abs(e.seeds.mean) for e in effects if e.metric == metric}
         count += sizes.get(SFT, 0.0) >= max(sizes.values())
     return Requirement(
         name="measures in which SFT is the largest step",
         measured=count,
-        bound=len(MEASURES),
+        bound=len(LADDER_METRICS),
         better="higher",
         note="from the commonest levels, which stand for the paper's untrained base",
     )
 
 
-def verdict(result: Outcome) -> tuple[str, ...]:
+def verdict(found: ComponentComparison) -> tuple[str, ...]:
     """A sentence for SFT and for each step that the paper rests on, whichever way the figures fall."""
-    if not result.found:
+    if not found.effects:
         return ("One seed: no step can be told from chance; train two seeds at least.",)
-    said = []
-    for arm, metric, words in (
+    sentences = []
+    for arm, metric, subject in (
         (SFT, FOUR, "SFT over the commonest levels"),
         ("ordinal", "omae", "Ordinal over 0/1 credit"),
         ("consistency", "csc", "The consistency reward"),
         ("format", FOUR, "The format reward"),
         ("grounding", FOUR, "Tactile grounding"),
     ):
-        delta = find(result.found, arm, metric)
-        if delta is not None:
-            reasons = result.why.get(delta, ())
-            said.append(f"{words}: {phrase(delta)}" + (f". {'; '.join(reasons)}." if reasons else "."))
-    count = {sign: sum(d.sign == sign for d in result.found) for sign in ("reproduced", "opposite", "undecided")}
-    said.append(
-        f"Of {sum(count.values())} signs of the paper {count['reproduced']} come out beyond chance, "
-        f"{count['opposite']} come out the other way, {count['undecided']} cannot be told."
+        effect = find_effect(found.effects, arm, metric)
+        if effect is not None:
+            reasons = found.failures.get(effect, ())
+            sentences.append(f"{subject}: {effect}" + (f". {'; '.join(reasons)}." if reasons else "."))
+    count = collections.Counter(e.sign for e in found.effects)
+    known = len(found.effects) - count["not in the paper"]
+    sentences.append(
+        f"Of {known} signs of the paper {count['reproduced']} come out beyond chance, {count['opposite']} come out the "
+        f"other way, {count['undecided']} cannot be decided."
     )
-    return tuple(said)
+    return tuple(sentences)
 
 
-EXPERIMENT = bench_experiment("ablation_cumulative", presets.BENCH, presets.SCALES, run)
+EXPERIMENT = presets.paper_experiment("ablation_cumulative", presets.BENCH, presets.SCALES, run)

@@ -3,8 +3,8 @@
     make experiment EXP=ablation_grounding [ARGS="--scale smoke"]
 
 Arms of GRPO from one SFT checkpoint per seed, the published reward, the same questions: no grounding, the published
-term at γ = .01, four times that with gradient through both branches, and the bounded form (masked branch held fixed,
-1 nat a token at most) at the same .04.
+term at γ = .01, four times that with gradient through both branches, and the bounded form (no gradient through the
+masked branch, 1 nat a token at most) at the same .04.
 
 Cost: about 35 minutes on two cores with five seeds; `--scale smoke` under two.
 
@@ -12,6 +12,7 @@ Expected: PAPO (arXiv 2507.06448), where the term comes from, reports that .04 c
 growing `grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
 """
 
+from experiments.paper.components import UNGROUNDED
 from experiments.study.ablation import Ablation, ablation_experiment
 from experiments.study.scores import PUBLISHED
 from touchr1_jax.rl.config import Paper
@@ -22,7 +23,7 @@ STRONG = 0.04
 ABLATION = Ablation(
     arms=dict.fromkeys(("none", "paper", "strong", "strong_bounded"), PUBLISHED),
     algorithms={
-        "none": Paper(gamma=0.0),
+        "none": UNGROUNDED,
         "paper": Paper(),
         "strong": Paper(gamma=STRONG),
         "strong_bounded": Paper(gamma=STRONG, grounding_stop_masked=True, grounding_cap_nat=1.0),

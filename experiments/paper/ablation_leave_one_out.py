@@ -6,7 +6,7 @@ The full objective has every component that Touch-R1 names (arXiv 2605.27154): S
 format rewards, tactile grounding, and the credit for the use of touch of its abstract.  Each is left out in turn:
 without SFT, GRPO starts from fresh parameters; without the accuracy reward only consistency and format are paid;
 without ordinal credit 0/1 credit takes its place.  All else is the same: seeds, questions, their order.  The paper has
-a cumulative ladder alone, so the step of its ladder stands beside ours.
+a cumulative ladder alone, so each effect is shown with the step of that ladder.
 
 Cost: some 30 minutes of one core with five seeds after `ablation_cumulative`, whose policies it shares, 70 without;
 `--scale smoke` under two.
@@ -15,85 +15,90 @@ Expected: without SFT every group earns nothing and nothing is learned (F7).  Wi
 and are wrong (F2).  The other components matter less than seeds differ.
 """
 
+import dataclasses
 import functools
 
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.paper import presets
-from experiments.paper.aggregate import aggregate_table
-from experiments.paper.deltas import FOUR, Step
+from experiments.paper.bench_scores import pooled_table
+from experiments.paper.component_effects import FOUR, ComponentComparison, ComponentStep, compare_components
+from experiments.paper.component_report import effects_picture, effects_table
+from experiments.paper.components import (
+    COMPONENTS,
+    FULL,
+    NO_SFT,
+    WITH_TACTILE_USE,
+    ComponentArm,
+    published_steps,
+    reinforced,
+)
 from experiments.paper.eval_variants import without_sft
-from experiments.paper.experiment import bench_experiment
-from experiments.paper.ladder_arms import FULL, NO_SFT, OMISSIONS, WHOLE, omitted
-from experiments.paper.ladder_tables import DIFFERS, delta_table
-from experiments.paper.outcome import CURVES, Outcome, delta_picture, outcome, phrase, shown
-from experiments.study import paper_numbers as paper
-from experiments.study.ablation import compared_pairs
-from experiments.study.examples import rollout_examples
-from experiments.study.levels import level_report
+from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.paper_numbers import differences_table
-from experiments.study.scores import PUBLISHED, study_settings
-from experiments.study.study import SFT, StudyConfig, Way, run_study
+from experiments.study.scores import PUBLISHED
+from experiments.study.study import SFT, StudyConfig, Way
 
 STEPS = tuple(
-    Step(
+    ComponentStep(
         arm=FULL,
-        against=o.name,
-        adds=o.component,
-        published=None
-        if o.step is None
-        else tuple(a - b for a, b in zip(*(paper.LADDER[row] for row in o.step), strict=True)),
-        watched=o.name,
+        against=c.omitted.name,
+        component=c.name,
+        published=published_steps()[c.name],
+        diagnosed=c.omitted.name,
     )
-    for o in OMISSIONS
+    for c in COMPONENTS
 )
-"""The full objective against what is left without each component."""
+
+FROM_SFT = [c.omitted for c in COMPONENTS if c.omitted.name != NO_SFT]
+
+WEIGHTS, ALGORITHMS = reinforced([ComponentArm(name=FULL, weights=PUBLISHED, algorithm=WITH_TACTILE_USE), *FROM_SFT])
+
+ABLATION = Ablation(
+    arms=WEIGHTS,
+    algorithms=ALGORITHMS,
+    pairs=tuple((FULL, arm.name) for arm in FROM_SFT),
+    variants={NO_SFT: Way(of=SFT, ask=functools.partial(without_sft, PUBLISHED, WITH_TACTILE_USE))},
+    curves=presets.GRPO_CURVES,
+    example=FULL,
+)
+
+TITLE = "Effect of each component on the full objective"
 
 NOTE = (
-    "The full objective less what is left without the component. The paper's figure is the step of its cumulative "
-    "ladder at which the component comes in, with fewer others around it. What shows is in the run without it."
+    "The full objective minus what is left without the component. The paper's figure is the step of its cumulative "
+    "ladder at which the component comes in, with fewer others around it. The failures are those of the run without it."
 )
 
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train the full objective and every omission, compare."""
-    weights, algorithms = omitted()
-    ways = {NO_SFT: Way(of=SFT, ask=functools.partial(without_sft, PUBLISHED, WHOLE))}
-    study = run_study(config, weights, context, algorithms, ways)
+    study, scored, results = run_ablation(ABLATION, config, context)
     with context.timed("compare"):
-        result = outcome(study, STEPS, context)
-    pictures, reliability = level_report(study)
-    kept = [s for s in STEPS if s.against != NO_SFT]
-    return Results(
-        arms={**result.scored.arms, NO_SFT: shown(result.estimates[NO_SFT])},
-        baselines=result.scored.baselines,
-        settings=study_settings(config),
-        comparisons=tuple(compared_pairs([(s.arm, s.against) for s in kept], result.estimates, config.seeds)),
-        verdict=verdict(result),
+        found = compare_components(study, scored, STEPS, context)
+    return dataclasses.replace(
+        results,
+        arms={**results.arms, NO_SFT: found.reported(NO_SFT)},
+        verdict=verdict(found),
         tables=(
-            delta_table(result.found, result.why, "What each component is worth", NOTE),
-            *aggregate_table(result.scored.arms, FULL),
-            *reliability,
-            differences_table(DIFFERS),
+            effects_table(found, TITLE, NOTE),
+            *pooled_table(results.arms, FULL),
+            *results.tables,
+            differences_table(presets.DIFFERENCES),
         ),
-        pictures=(*delta_picture(result.found, "What each component is worth"), *pictures),
-        data=study.data.summary(),
-        curves=CURVES,
-        examples=rollout_examples(study, FULL, PUBLISHED),
+        pictures=(*effects_picture(found.effects, TITLE), *results.pictures),
     )
 
 
-def verdict(result: Outcome) -> tuple[str, ...]:
-    """What is missed beyond chance, in accuracy; and what is not."""
-    if not result.found:
-        return ("One seed: nothing can be told from chance; train two seeds at least.",)
-    by_component = {d.step.adds: d for d in result.found if d.measure.metric == FOUR}
-    missed = [d for d in by_component.values() if d.seeds.low > 0]
-    better = [d for d in by_component.values() if d.seeds.high < 0]
-    rest = [name for name, d in by_component.items() if d not in missed and d not in better]
-    said = [f"{d.step.adds} is missed: {phrase(d)}." for d in missed]
-    said += [f"Without {d.step.adds} answers are better: {phrase(d)}." for d in better]
-    return (*said, *([f"No difference in accuracy beyond seeds: {', '.join(rest)}."] if rest else []))
+def verdict(found: ComponentComparison) -> tuple[str, ...]:
+    """The components that are missed beyond chance, in accuracy, and those that are not."""
+    if not found.effects:
+        return ("One seed: no effect can be told from chance; train two seeds at least.",)
+    effects = [e for e in found.effects if e.metric.metric == FOUR]
+    missed = [f"{e.step.component} is missed: {e}." for e in effects if e.seeds.low > 0]
+    better = [f"Without {e.step.component} answers are better: {e}." for e in effects if e.seeds.high < 0]
+    rest = ", ".join(e.step.component for e in effects if e.seeds.low <= 0 <= e.seeds.high)
+    return (*missed, *better, *([f"No difference in accuracy beyond seeds: {rest}."] if rest else []))
 
 
-EXPERIMENT = bench_experiment("ablation_leave_one_out", presets.BENCH, presets.SCALES, run)
+EXPERIMENT = presets.paper_experiment("ablation_leave_one_out", presets.BENCH, presets.SCALES, run)

@@ -1,5 +1,5 @@
-"""Further ways to ask the policies of a study: under the controls of touch, before any training, without SFT, and
-through a linear probe on what the encoder makes of touch."""
+"""Evaluations of a study's policies besides the standard one: with touch removed or replaced, before any training,
+after GRPO without SFT, and by a linear probe on the encoder."""
 
 import dataclasses
 import functools
@@ -9,8 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.baselines import Known, probed
-from experiments.paper.features import Seen, other_objects
+from experiments.paper.feature_baselines import (
+    ContactFeatures,
+    LabelledFeatures,
+    linear_probe,
+    other_objects,
+    together_and_alone,
+)
 from experiments.study import stages
 from experiments.study.answers import Evaluated, evaluate_policy
 from experiments.study.assembly import Weights
@@ -24,10 +29,10 @@ from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
 
 
-def under_controls(policy: str) -> dict[str, Way]:
-    """A policy asked without its touch, and with something else in its place: "POLICY under CONTROL" → way."""
+def control_variants(policy: str) -> dict[str, Way]:
+    """For each of `CONTROLS` the policy evaluated without its touch, or with something else in its place."""
     return {
-        control_name(policy, control): Way(of=policy, ask=functools.partial(_controlled, control))
+        control_name(policy, control): Way(of=policy, ask=functools.partial(_under_control, control))
         for control in CONTROLS
     }
 
@@ -58,31 +63,31 @@ def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> 
     return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)
 
 
-def by_encoder(strange: bool, trained: Trained) -> Evaluated:
-    """Levels by a probe on the encoded touch, its mean over the tokens of each stream.
+def encoder_probe(swapped: bool, trained: Trained) -> Evaluated:
+    """Levels by a linear probe on the encoded touch, its mean over the tokens of each stream.
 
     Args:
-      strange: every contact, training ones too, has the touch of another object.
+      swapped: give every contact, training ones too, the touch of another object.
       trained: whose encoder it is.
     """
     data = trained.data
     rows = np.concatenate([data.parts["sft"], data.parts["grpo"]])
-    known = pooled(encode_contacts(trained.assembly, trained.params, data, rows, trained.context))
-    asked = pooled(trained.test)
-    if strange:
-        known = known.strangers(data.object_ids[rows], trained.seed)
-        asked = asked.strangers(data.object_ids[data.parts["test"]], trained.seed)
-    known_as = Known(seen=known, label=data.label[rows])
-    levels = probed(known_as, asked, trained.assembly.levels, trained.config.probe)
+    known = mean_tokens(encode_contacts(trained.assembly, trained.params, data, rows, trained.context))
+    asked = mean_tokens(trained.test)
+    if swapped:
+        known = known.rows(other_objects(data.object_ids[rows], trained.seed))
+        asked = asked.rows(other_objects(data.object_ids[data.parts["test"]], trained.seed))
+    probe = functools.partial(linear_probe, levels=trained.assembly.levels, config=trained.config.probe)
+    levels = together_and_alone(probe, LabelledFeatures(features=known, label=data.label[rows]), asked)
     return level_answers(trained.assembly, trained.said, levels.together, levels.alone)
 
 
-def pooled(features: Features) -> Seen:
+def mean_tokens(features: Features) -> ContactFeatures:
     """Mean over the tokens of each stream."""
     there = (np.asarray(features.touch_time) >= 0) & np.asarray(features.stream_mask)[..., None]
     total = (np.asarray(features.touch) * there[..., None]).sum(-2)
     x = total / np.maximum(there.sum(-1), 1)[..., None]
-    return Seen(x=x.astype(np.float32), present=there.any(-1))
+    return ContactFeatures(x=x.astype(np.float32), present=there.any(-1))
 
 
 def swap_objects(features: Features, objects: np.ndarray, seed: int) -> Features:
@@ -102,7 +107,7 @@ def swap_objects(features: Features, objects: np.ndarray, seed: int) -> Features
     )
 
 
-def _controlled(control: str, trained: Trained) -> Evaluated:
+def _under_control(control: str, trained: Trained) -> Evaluated:
     test, key = jax.tree.map(jnp.asarray, trained.test), jax.random.key(trained.seed)
     objects = trained.data.object_ids[trained.data.parts["test"]]
     change: Mapping[str, Callable[[], Features]] = {

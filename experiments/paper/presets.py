@@ -1,4 +1,4 @@
-"""The scales of the bench's studies, in one place: two cores, `smoke`, one accelerator, the paper's sizes.
+"""What the experiments of the paper share: scales (two cores, `smoke`, one accelerator, the paper's sizes) and curves.
 
     SCALES = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}, refused on a machine that lacks what `NEEDS` says
 
@@ -12,10 +12,14 @@ are ours, the paper gives none.  Neither scale has been run: no machine of that 
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 from experiments.bench.draw import Quota
+from experiments.core.context import Context
 from experiments.core.machine import Accelerators
+from experiments.core.results import Results
+from experiments.core.runner import Experiment
 from experiments.study import paper_numbers as paper
 from experiments.study.assembly import ModelConfig
 from experiments.study.stages import SFTConfig
@@ -30,7 +34,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 
 BENCH = StudyConfig(sft=SFTConfig(steps=1350), blind=SFTConfig(steps=1350, micro_contacts=16))
 """The default: three times the SFT of `ablation_ordinal`, which still gained on validation objects when it stopped;
-what several studies share may cost more than a main job."""
+policies that several studies share may cost more than a main job."""
 
 SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
 """Questions of the bench at `smoke`; every other scale asks all 4,800."""
@@ -43,7 +47,7 @@ NEEDS: Mapping[str, Accelerators] = {
 
 
 def _sft(steps: int, contacts: int, lr_scale: float) -> SFTConfig:
-    """SFT by whole batches: micro-batches are for a processor's cache."""
+    """SFT by whole batches: micro-batches serve a processor's cache."""
     optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale)
     return SFTConfig(steps=steps, batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
 
@@ -132,3 +136,49 @@ PAPER = StudyConfig(
 )
 
 SCALES: Mapping[str, StudyConfig] = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}
+
+GRPO_CURVES = (
+    "reward",
+    "accuracy",
+    "middle_rate",
+    "echo_share",
+    "entropy",
+    "grounding",
+    "degenerate_share",
+    "parse_rate",
+    "kl",
+)
+CURVES: Mapping[str, tuple[str, ...]] = {"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": GRPO_CURVES}
+"""Of each phase the scalars that are drawn."""
+
+DIFFERENCES: tuple[tuple[str, str, str], ...] = (
+    ("policy", "Qwen2.5-VL, 7 billion pretrained parameters", "0.6 million parameters, from scratch"),
+    ("base", "the pretrained model, asked without training", "the commonest level of each attribute"),
+    ("data", "14,700 recorded sequences by four sensors", "2,400 generated objects, a press by four sensors"),
+    ("questions", "4,800, authored and audited", "all four attributes of every unseen object"),
+    ("learning rate", "1e-6 in GRPO, 1e-5 in SFT", "the same times 200 falling to 10, and times 100"),
+    ("grounding γ, clip", "not given", ".01, .2"),
+    ("tactile use", "in the abstract alone", "an arm of its own, above the paper's last row"),
+    ("Avg of the ladder", "equals the mean of its four accuracies", "that mean"),
+    ("seeds, intervals", "none", "paired seeds; seeds and objects, corrected over the table"),
+)
+"""Topic, in the paper, here: why the figures are not expected to agree beyond their signs."""
+
+C = TypeVar("C")
+
+
+def paper_experiment(
+    name: str, config: C, scales: Mapping[str, C], run: Callable[[C, Context], Results], *, spreads: bool = True
+) -> Experiment[C]:
+    """`Experiment` with `CURVES`, the machine that each scale needs, and a quick `smoke`; arguments of `Experiment`."""
+    needs = {scale: NEEDS[scale] for scale in scales if scale in NEEDS}
+    return Experiment(
+        name=name,
+        config=config,
+        scales=scales,
+        run=run,
+        curves=CURVES,
+        needs=needs,
+        quick=("smoke",),
+        spreads=spreads,
+    )

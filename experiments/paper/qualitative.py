@@ -1,34 +1,34 @@
-"""What do answers look like where touch decides, where sight lies, and where they fail?
+"""What do answers look like where touch decides, where the picture deceives, and where they fail?
 
     make experiment EXP=qualitative [ARGS="--scale smoke|gpu|paper"]
 
 A browser of rollouts over the bench: frames, forces, fields at the strongest press, the trace with its parsed slots,
-the reward term by term, and beside it what the same policy says without its touch, with noise, with another object's
-touch, with the frames in another order, and what SFT and a policy without touch say.  Cases and items are chosen by
-rule, the first that fit in the order of the data; a table says how common each case is, which examples cannot.
+the reward term by term, and next to it the answers of the same policy without its touch, with noise, with another
+object's touch, with the frames in another order, and those of SFT and of a policy without touch.  Cases and items are
+chosen by rule, not by hand: the rules see answers and labels alone, and the first that fit in the order of the data are
+shown, one of each object.  A table says how common each case is, which examples cannot.
 
-Cost: a minute of one core after `main_table`, whose policy it asks, seven without; `--scale smoke` under one.
+Cost: a minute of one core after `main_table`, whose policy it evaluates, seven without; `--scale smoke` under one.
 
-Expected: answers that are right become wrong with another object's touch; where a picture leads a policy without touch
-astray, touch overrules it in about half of the questions (`conflict`), about the material least often.
+Expected: right answers become wrong with another object's touch; where a picture misleads a policy without touch,
+touch overrules it in about half of the questions (`conflict`), about the material least often.
 """
 
 import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from experiments.bench.draw import Quota
+from experiments.bench.wording import answer_words, question
 from experiments.core.context import Context
-from experiments.core.results import Results, RolloutExample
+from experiments.core.results import Cell, Results, RolloutExample, Table, named_table
 from experiments.paper import presets
-from experiments.paper.cases import Case, Said, Shown, case_table, cases, first_of, items_shown
-from experiments.paper.conflict_metrics import Asked, asked_of
-from experiments.paper.eval_variants import control_name, under_controls
-from experiments.paper.experiment import bench_experiment
-from experiments.paper.ladder_arms import FULL
-from experiments.paper.ladder_tables import DIFFERS
-from experiments.paper.outcome import CURVES
-from experiments.paper.questions import answered, questions, touch_rows
+from experiments.paper.bench_scores import bench_answers, bench_questions, touch_rows
+from experiments.paper.components import FULL
+from experiments.paper.conflict_metrics import TouchQuestions, concluded, touch_questions
+from experiments.paper.eval_variants import control_name, control_variants
 from experiments.study.answers import Evaluated
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
@@ -36,21 +36,32 @@ from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.grounding import CONTROLS
+from touchr1_jax.bench.items import KINDS, Ask, Touch
+from touchr1_jax.bench.metrics import BOTTOM
 from touchr1_jax.rl.config import Paper
 
-STRANGE = "swapped"
-"""The control that shows another object's touch."""
+SWAPPED = "swapped"
+"""The control with another object's touch."""
 
-INSTEAD = {
+REPLACEMENTS = {
     "drop": "nothing",
     "noise": "noise of each sensor",
-    STRANGE: "another object's touch",
+    SWAPPED: "another object's touch",
     "shuffle": "its frames in another order",
 }
-"""Controls, as the browser calls what stands in the place of the touch."""
+"""Controls, as the browser names what stands in place of the touch."""
 
-ALSO = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
-"""Other policies, in the same table."""
+OTHER_POLICIES = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
+"""In the same table."""
+
+SHOWN_KINDS = ("compose", "compare", "order")
+"""Kinds of the bench's items whose answer consists of several answers."""
+
+DIFFERENCES = (
+    ("examples", "two kinds, chosen", "every case of the table, the first by the order of the data"),
+    ("traces", "free text", "the slots of a fixed form"),
+    ("counterfactual answers", "none", "five, next to every trace"),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,76 +73,190 @@ class QualitativeConfig:
     shown: int = 2
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Conclusions:
+    """Levels that policies of one seed concluded for the same N questions, −1 for ⊥: each int [N].
+
+    `swapped` is the full model with another object's touch, `perceived` [N, S] the level that it perceives by each
+    sensor, −1 where a sensor is absent.
+    """
+
+    full: Int[np.ndarray, "N"]
+    sft: Int[np.ndarray, "N"]
+    blind: Int[np.ndarray, "N"]
+    swapped: Int[np.ndarray, "N"]
+    perceived: Int[np.ndarray, "N S"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AnswerCase:
+    """A kind of answer.
+
+    Attributes:
+      title: what happens.
+      rows: bool [N], the answers of this kind.
+      among: bool [N], the questions that could have been of this kind.
+      paper: what the paper's figure of examples shows of it; empty where it shows none.
+    """
+
+    title: str
+    rows: Bool[np.ndarray, "N"]
+    among: Bool[np.ndarray, "N"]
+    paper: str = ""
+
+    @property
+    def share(self) -> float:
+        """Percent; 0 where there is nothing to be a share of."""
+        return 100.0 * float(self.rows.sum()) / max(int(self.among.sum()), 1)
+
+
 def run(config: QualitativeConfig, context: Context) -> Results:
-    """Train one seed, ask in every way, choose, show."""
-    study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, under_controls(FULL))
+    """Train one seed, evaluate every variant, choose, show."""
+    study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, control_variants(FULL))
     scored = score_study(study)
-    asked = asked_questions(study)
-    found = cases(asked, said(study))
-    asks = questions(study.data, config.quota, context)
-    items = items_shown(
-        asks,
-        answered(study.data, asks, study.answers[FULL][:1])[0],
-        touch_rows(study.data),
-        study.answers[FULL][0],
+    first = {name: seeds[0] for name, seeds in {**study.answers, **study.further}.items()}
+    full, questions = first[FULL], touch_questions(study, first[SFT])
+    slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
+    cases = answer_cases(
+        questions,
+        Conclusions(
+            full=concluded(full),
+            sft=concluded(first[SFT]),
+            blind=concluded(first[BLIND]),
+            swapped=concluded(first[control_name(FULL, SWAPPED)]),
+            perceived=np.where(full.streams, slots, BOTTOM),
+        ),
     )
+    asks = bench_questions(study.data, config.quota, context)
+    chosen = [(case.title, first_of(case.rows, questions.objects, config.shown)) for case in cases]
+    chosen += item_examples(asks, bench_answers(study.data, asks, [full])[0], touch_rows(study.data), full)
     return Results(
         arms=scored.arms,
         baselines=scored.baselines,
         settings=study_settings(config.study),
-        verdict=verdict(found),
-        tables=(case_table(found), differences_table((*DIFFERS[:3], *HERE))),
+        verdict=verdict(cases),
+        tables=(case_table(cases), differences_table((*presets.DIFFERENCES[:3], *DIFFERENCES))),
         data=study.data.summary() | {"items of the bench": len(asks)},
-        curves=CURVES,
-        examples=browser(study, asked, found, items, config.shown),
+        curves=presets.CURVES,
+        examples=tuple(browser(study, chosen)),
     )
 
 
-HERE = (
-    ("examples", "two kinds, chosen", "every case of the table, the first by the order of the data"),
-    ("traces", "free text", "the slots of a fixed form"),
-    ("counterfactual answers", "none", "five, beside every trace"),
-)
-"""What differs besides."""
-
-
-def asked_questions(study: Study) -> Asked:
-    """The questions about the test contacts."""
-    test = study.data.parts["test"]
-    return asked_of(study.answers[SFT][0], study.data.object_ids[test], study.data.visual_lies[test], ATTRIBUTES)
-
-
-def said(study: Study) -> Said:
-    """What the policies of the first seed concluded."""
-    first = {name: seeds[0] for name, seeds in {**study.answers, **study.further}.items()}
-    return Said.of(first[FULL], first[SFT], first[BLIND], first[control_name(FULL, STRANGE)])
-
-
-def browser(
-    study: Study, asked: Asked, found: tuple[Case, ...], items: list[Shown], count: int
-) -> tuple[RolloutExample, ...]:
-    """The cards of every case, then those of the items."""
-    instead: dict[str, Evaluated] = {INSTEAD[c]: study.further[control_name(FULL, c)][0] for c in CONTROLS}
-    instead |= {title: study.answers[policy][0] for policy, title in ALSO.items()}
-    chosen = [(case.title, first_of(case.rows, asked.objects, count)) for case in found]
-    chosen += [(item.heading, list(item.rows)) for item in items]
-    return tuple(card for group, rows in chosen for card in rollouts_of(study, FULL, PUBLISHED, rows, instead, group))
-
-
-def verdict(found: tuple[Case, ...]) -> tuple[str, ...]:
-    """How common the cases of the paper's figure are, and how common it is that sight is believed."""
-    hardness, material, level, believed = found[:4]
-    lies = int(np.sum([case.among.sum() for case in (material, level)]))
-    overruled = int(np.sum([case.rows.sum() for case in (material, level)]))
+def answer_cases(questions: TouchQuestions, answers: Conclusions) -> tuple[AnswerCase, ...]:
+    """The kinds of answers that are shown."""
+    right, read = answers.full == questions.label, answers.full != BOTTOM
+    material = questions.of("material")
+    misled = questions.looks_like_another & (answers.blind != questions.label) & (answers.blind != BOTTOM)
+    known = answers.perceived != BOTTOM
+    least = np.where(known, answers.perceived, np.iinfo(answers.perceived.dtype).max).min(1)
+    split = questions.ordinal & (known.sum(1) > 1) & (least < answers.perceived.max(1))
+    two_off = read & (np.abs(answers.full - questions.label) > 1)
+    case = lambda title, rows, among, paper="": AnswerCase(title=title, rows=rows & among, among=among, paper=paper)
     return (
-        f"Hardness is right in a way that hangs on touch in {hardness.share:.0f} % of its questions.",
-        f"Where the picture misleads a policy without touch ({lies} questions), touch overrules it in {overruled}; "
-        f"in {int(believed.rows.sum())} the picture is believed. About the material, the case that the paper shows, "
+        case("Hardness is right, and wrong with another object's touch", right & (answers.swapped != questions.label),
+             questions.of("hardness"), "hardness, estimated from touch"),
+        case("The picture deceives about the material, touch overrules it", right, misled & material,
+             "a conflict about the material, resolved"),
+        case("The picture deceives about a level, touch overrules it", right, misled & ~material),
+        case("The picture deceives and is followed", answers.full == answers.blind, misled),
+        case("Sensors disagree, the conclusion is right", right, split),
+        case("Sensors disagree, the conclusion is wrong", ~right, split),
+        case("Two levels off", two_off, questions.ordinal),
+        case("GRPO corrects what SFT had wrong", right, answers.sft != questions.label),
+        case("GRPO spoils what SFT had right", ~right, answers.sft == questions.label),
+        case("Cannot be read", ~read, np.ones_like(read)),
+    )  # fmt: skip
+
+
+def first_of(rows: Bool[np.ndarray, "N"], objects: np.ndarray, count: int) -> list[int]:
+    """Indices of the first answers, one of each object.
+
+    Args:
+      rows: which answers fit.
+      objects: [N], the object of each answer.
+      count: how many at most.
+    """
+    numbers = np.flatnonzero(rows)
+    _, first = np.unique(objects[numbers], return_index=True)
+    return [int(n) for n in numbers[np.sort(first)[:count]]]
+
+
+def item_examples(
+    asks: Sequence[Ask], answers: Mapping[str, tuple[int, ...]], places: Mapping[Touch, int], full: Evaluated
+) -> Iterator[tuple[str, list[int]]]:
+    """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`.
+
+    Args:
+      asks: the bench's items.
+      answers: id → the full model's answer.
+      places: touch → contact, as `full.contact` counts.
+      full: answers about single touches.
+    """
+    index = {(int(c), int(a)): n for n, (c, a) in enumerate(zip(full.contact, full.attribute, strict=True))}
+    for kind in SHOWN_KINDS:
+        for wanted in (True, False):
+            ask = next((x for x in asks if x.kind == kind and (answers[x.id] == x.answer) == wanted), None)
+            if ask is not None:
+                pairs = [(places[t], ATTRIBUTES.index(a)) for t in ask.touches for a in ask.attributes]
+                yield _heading(ask, answers[ask.id]), [index[pair] for pair in pairs]
+
+
+def _heading(ask: Ask, answer: tuple[int, ...]) -> str:
+    words = "an answer that cannot be read"
+    if BOTTOM not in answer:
+        words = answer_words(dataclasses.replace(ask, answer=answer))
+    outcome = "right" if answer == ask.answer else f"wrong, it is {answer_words(ask)}"
+    return f"Tier {KINDS[ask.kind].tier}, {ask.kind}: {question(ask)} – {words} ({outcome})"
+
+
+def case_table(cases: Sequence[AnswerCase]) -> Table:
+    """How common each kind of answer is."""
+    rows: list[dict[str, Cell]] = [
+        {
+            "case": case.title,
+            "answers": int(case.rows.sum()),
+            "of": int(case.among.sum()),
+            "share": case.share,
+            "paper's examples": case.paper or "–",
+        }
+        for case in cases
+    ]
+    return named_table(
+        "How common each case is",
+        rows,
+        formats={"answers": "d", "of": "d", "share": ".1f"},
+        units={"share": "%"},
+        meanings={
+            "of": "questions that could have been of this case",
+            "paper's examples": "what its figure of examples is said to show",
+        },
+        note="Greedy answers of the full model's first seed to all questions about the test objects. The paper shows "
+        "chosen examples and says of none how common it is.",
+    )
+
+
+def browser(study: Study, chosen: Sequence[tuple[str, Sequence[int]]]) -> Iterator[RolloutExample]:
+    """The cards of each group of answers: its heading, and indices in the full model's answers."""
+    instead: dict[str, Evaluated] = {REPLACEMENTS[c]: study.further[control_name(FULL, c)][0] for c in CONTROLS}
+    instead |= {title: study.answers[policy][0] for policy, title in OTHER_POLICIES.items()}
+    for group, rows in chosen:
+        yield from rollouts_of(study, FULL, PUBLISHED, rows, instead, group)
+
+
+def verdict(cases: Sequence[AnswerCase]) -> tuple[str, ...]:
+    """How common the cases of the paper's figure are, and how often the picture is followed."""
+    hardness, material, level, followed = cases[:4]
+    misled, overruled = (int(getattr(material, f).sum() + getattr(level, f).sum()) for f in ("among", "rows"))
+    return (
+        f"In {hardness.share:.0f} % of its questions the answer for hardness is right and depends on touch: it is "
+        "wrong with another object's touch.",
+        f"Where the picture misleads a policy without touch ({misled} questions), touch overrules it in {overruled}; "
+        f"in {int(followed.rows.sum())} the picture is followed. About the material, the case that the paper shows, "
         f"touch overrules it in {int(material.rows.sum())} of {int(material.among.sum())}.",
     )
 
 
-EXPERIMENT = bench_experiment(
+EXPERIMENT = presets.paper_experiment(
     "qualitative",
     QualitativeConfig(),
     {name: QualitativeConfig(study=dataclasses.replace(study, seeds=1)) for name, study in presets.SCALES.items()}

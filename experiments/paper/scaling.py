@@ -5,17 +5,17 @@
 The same study three times: a tactile encoder, picture tower and decoder of .43, 1 and 2.1 times the default's
 parameters, as 3 and 14 billion are of 7 in the paper's figure.  Every size is trained by SFT and by GRPO with the
 published rewards and grounding, on the same scenes, questions and seeds, and answers the bench's questions about the
-test objects; beside it a policy of its size without touch.  Learning rates and steps are the default size's.
+test objects; so does a policy of its size without touch.  Learning rates and steps are the default size's.
 
 Cost: some 45 minutes of one core with three seeds and their data, GRPO shortened to a third; the default size's SFT is
 shared with other experiments; `--scale smoke` under one minute.
 
 Expected: on 2,400 objects some five points from the smallest to the default, and nothing beyond: the encoder's probe
-stands above every policy here (`main_table`), so that data and decoding, not size, hold answers back.
+is better than every policy here (`main_table`), so data and decoding, not size, limit the answers.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,26 +23,34 @@ import numpy as np
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
 from experiments.core.results import Estimate, Picture, Results, RolloutExample
+from experiments.core.text import bounds
 from experiments.core.timing import interleaved
 from experiments.paper import presets
-from experiments.paper.experiment import bench_experiment
-from experiments.paper.growth import (
-    CLAIMED,
-    Growth,
-    Rows,
-    beside_sizes,
-    growth_chart,
-    growth_table,
-    growths,
-    size_table,
+from experiments.paper.bench_scores import (
+    bench_answers,
+    bench_questions,
+    bench_row,
+    comparison_table,
+    question_table,
 )
-from experiments.paper.ladder_arms import FULL
-from experiments.paper.ladder_tables import DIFFERS
-from experiments.paper.outcome import CURVES
-from experiments.paper.paper_comparison import tier_table
-from experiments.paper.questions import answered, questions
-from experiments.paper.rows import bench_row
-from experiments.paper.sizes import CALLS, LARGE, SMALL, Calls, Cost, calls_of, grpo_step_s, study_apart
+from experiments.paper.components import FULL
+from experiments.paper.model_sizes import (
+    CLAIMED,
+    LARGE,
+    SMALL,
+    SizeCost,
+    SizeRows,
+    SizeTrend,
+    TimedPrograms,
+    grpo_step_s,
+    size_chart,
+    size_table,
+    size_trends,
+    study_of_size,
+    timed_programs,
+    trend_table,
+)
+from experiments.study import paper_numbers as paper
 from experiments.study.assembly import ModelConfig
 from experiments.study.examples import rollout_examples
 from experiments.study.paper_numbers import differences_table
@@ -55,15 +63,20 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 
 POLICIES = {FULL: "full model", SFT: "SFT", BLIND: "without touch"}
-"""Who is drawn, and how the report calls it."""
+"""Policies that are drawn, and their names in the report."""
 
 DRAWN = ("acc", "omae")
-LOOKED_AT = (*DRAWN, "mat_acc", "sfd", *CLAIMED)
+TRENDS = (*DRAWN, "mat_acc", "sfd", *CLAIMED)
+
+DIFFERENCES = (
+    ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million"),
+    ("steps", "the same for all, not given", "the same for all, GRPO a third of the other experiments'"),
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScalingConfig:
-    """The study, the sizes that take the place of its model, the bench's questions, and how often steps are timed."""
+    """The study, the sizes that replace its model, the bench's questions, and how often steps are timed."""
 
     study: StudyConfig = StudyConfig(seeds=3, grpo_steps=300)
     small: ModelConfig = SMALL
@@ -73,20 +86,20 @@ class ScalingConfig:
 
     @property
     def sizes(self) -> dict[str, ModelConfig]:
-        """Every size by its name; the one between is the study's own."""
+        """Every size by its name; the middle one is the study's own."""
         return {"small": self.small, "default": self.study.model, "large": self.large}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Sized:
-    """What is kept of the study of one size: rows by policy, what is to be timed, seconds of a step of GRPO.
+class SizeResult:
+    """The study of one size: rows by policy, rows of the baselines, programs to be timed, seconds of a step of GRPO.
 
     `asks` and `data`, the bench's questions and the sizes of the data, are the same for all.
     """
 
     rows: Mapping[str, Mapping[str, Estimate]]
-    others: Mapping[str, Mapping[str, Estimate]]
-    calls: Calls
+    baselines: Mapping[str, Mapping[str, Estimate]]
+    programs: TimedPrograms
     grpo_s: float
     asks: tuple[Ask, ...]
     data: Mapping[str, Any]
@@ -95,53 +108,60 @@ class Sized:
 
 def run(config: ScalingConfig, context: Context) -> Results:
     """Train every size, ask, time, fit lines."""
-    sized = {name: one_size(config, name, context) for name in context.each("sizes", config.sizes)}
-    costs = timed(sized, config.rounds, context)
-    rows: Rows = {title: {name: s.rows[policy] for name, s in sized.items()} for policy, title in POLICIES.items()}
-    found = growths(rows, costs, LOOKED_AT) if config.study.seeds > 1 else ()
-    full = rows[POLICIES[FULL]]
+    found = {name: one_size(config, name, context) for name in context.each("sizes", config.sizes)}
+    costs = measured_costs(found, config.rounds, context)
+    rows: SizeRows = {title: {name: s.rows[policy] for name, s in found.items()} for policy, title in POLICIES.items()}
+    trends = size_trends(rows, costs, TRENDS) if config.study.seeds > 1 else ()
+    full, default = rows[POLICIES[FULL]], found["default"]
     return Results(
         arms=full,
         baselines={
-            **{f"{name}, {POLICIES[policy]}": s.rows[policy] for policy in (SFT, BLIND) for name, s in sized.items()},
-            **sized["default"].others,
+            **{f"{name}, {POLICIES[policy]}": s.rows[policy] for policy in (SFT, BLIND) for name, s in found.items()},
+            **default.baselines,
         },
         settings=study_settings(config.study),
-        verdict=verdict(full, costs, found),
-        pictures=(_picture(rows, costs, config.study),),
-        tables=(
-            size_table({name: shape(model) for name, model in config.sizes.items()}, costs, config.study),
-            *((growth_table(found),) if found else ()),
-            beside_sizes(full),
-            tier_table(sized["default"].asks),
-            differences_table((*DIFFERS[:4], *HERE)),
+        verdict=verdict(full, costs, trends),
+        pictures=(
+            Picture(
+                name="scaling",
+                title="Accuracy and ordinal error against size",
+                caption="Means over seeds with 95 % intervals over objects; small dots are single seeds. Accuracy over "
+                "hardness, roughness and protrusion. Seconds of both stages of a seed, by the time of a step.",
+                content=size_chart(rows, costs, config.study, DRAWN),
+            ),
         ),
-        data={**sized["default"].data, "questions": len(sized["default"].asks)},
-        curves=CURVES,
-        examples=sized["large"].examples,
+        tables=(
+            size_table(config.sizes, costs, config.study),
+            *((trend_table(trends),) if trends else ()),
+            comparison_table(
+                "Comparison with the paper's sizes",
+                full,
+                {f"Touch-R1-{n}B": paper.MAIN["Touch-R1-7B"] if n == 7 else None for n in paper.BACKBONES},
+                "The paper draws 3 and 14 billion as bars without numbers, and leaves OMAE out; there is no Qwen2.5-VL "
+                "of 14 billion.",
+            ),
+            question_table(default.asks),
+            differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
+        ),
+        data={**default.data, "questions": len(default.asks)},
+        curves=presets.CURVES,
+        examples=found["large"].examples,
     )
 
 
-HERE = (
-    ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million"),
-    ("steps", "the same for all, not given", "the same for all, GRPO a third of the other experiments'"),
-)
-"""What differs besides."""
-
-
-def one_size(config: ScalingConfig, name: str, context: Context) -> Sized:
-    """Train and ask one size; the study itself, which keeps its clips in memory, is not kept."""
-    study, timing = study_apart(dataclasses.replace(config.study, model=config.sizes[name]), name, context)
-    asks, scored = questions(study.data, config.quota, context), score_study(study)
+def one_size(config: ScalingConfig, name: str, context: Context) -> SizeResult:
+    """Train and ask one size; the study itself, which keeps its clips in memory, is dropped."""
+    study, timing = study_of_size(dataclasses.replace(config.study, model=config.sizes[name]), name, context)
+    asks, scored = bench_questions(study.data, config.quota, context), score_study(study)
 
     def row(policy: str) -> dict[str, Estimate]:
-        alone = {m: scored.estimates[policy][m] for m in ("acc", "parse_rate", "middle_rate", "reward")}
-        return alone | bench_row(asks, answered(study.data, asks, study.answers[policy]))
+        single = {m: scored.estimates[policy][m] for m in ("acc", "parse_rate", "middle_rate", "reward")}
+        return single | bench_row(asks, bench_answers(study.data, asks, study.answers[policy]))
 
-    return Sized(
+    return SizeResult(
         rows={policy: row(policy) for policy in POLICIES},
-        others={title: line for title, line in scored.baselines.items() if title not in POLICIES},
-        calls=calls_of(study),
+        baselines={title: line for title, line in scored.baselines.items() if title not in POLICIES},
+        programs=timed_programs(study),
         grpo_s=grpo_step_s(config.study, timing),
         asks=asks,
         data=study.data.summary(),
@@ -149,69 +169,54 @@ def one_size(config: ScalingConfig, name: str, context: Context) -> Sized:
     )
 
 
-def timed(sized: Mapping[str, Sized], rounds: int, context: Context) -> dict[str, Cost]:
-    """Parameters and seconds of every size, each call in turns with those of the others."""
-    calls: dict[str, Callable[[], Any]] = {
-        f"{name}/{call}": s.calls.by_name[call] for name, s in sized.items() for call in CALLS
-    }
+def measured_costs(found: Mapping[str, SizeResult], rounds: int, context: Context) -> dict[str, SizeCost]:
+    """Parameters and seconds of every size, each program in turns with those of the others."""
+    calls = {f"{name}/{call}": getattr(s.programs, call) for name, s in found.items() for call in ("train", "answer")}
     with context.timed("timing"):
         measured = interleaved(calls, context.rounds("timing sizes", rounds))
-        seconds = {name: float(np.median(s)) for name, s in measured.items()}
+    seconds = {name: float(np.median(s)) for name, s in measured.items()}
     return {
-        name: Cost(
-            parameters=s.calls.parameters,
+        name: SizeCost(
+            parameters=s.programs.parameters,
             sft_s=seconds[f"{name}/train"],
             grpo_s=s.grpo_s,
-            question_s=seconds[f"{name}/answer"] / s.calls.questions,
+            question_s=seconds[f"{name}/answer"] / s.programs.questions,
         )
-        for name, s in sized.items()
+        for name, s in found.items()
     }
-
-
-def shape(model: ModelConfig) -> str:
-    """Layers × width of the three towers."""
-    towers = ((x.num_layers, x.width) for x in (model.tactile, model.vision))
-    return ", ".join(f"{n}×{w}" for n, w in (*towers, (model.decoder.num_layers, model.decoder.hidden_size)))
-
-
-def _picture(rows: Rows, costs: Mapping[str, Cost], config: StudyConfig) -> Picture:
-    return Picture(
-        name="scaling",
-        title="Accuracy and ordinal error against size",
-        caption="Means over seeds with 95 % intervals over objects; small dots are single seeds. Accuracy over "
-        "hardness, roughness and protrusion. Seconds of both stages of a seed, by the time of a step.",
-        content=growth_chart(rows, costs, config, DRAWN),
-    )
 
 
 def verdict(
-    full: Mapping[str, Mapping[str, Estimate]], costs: Mapping[str, Cost], found: tuple[Growth, ...]
+    full: Mapping[str, Mapping[str, Estimate]], costs: Mapping[str, SizeCost], trends: tuple[SizeTrend, ...]
 ) -> tuple[str, ...]:
-    """The sizes in one sentence, what a doubling changes, and which of the paper's claims come out."""
-    told = ", ".join(
+    """The sizes in one sentence, the change for a doubling, and which of the paper's claims come out."""
+    sizes = ", ".join(
         f"{row['acc'].mean:.1f} % with {costs[name].parameters / 1e6:.2f} million parameters"
         for name, row in full.items()
     )
     times = costs["large"].sft_s / costs["small"].sft_s
-    said = [f"The full model answers {told}; a step of SFT of the largest takes {times:.1f} times the smallest's."]
-    by = {(g.policy, g.metric): g for g in found}
+    sentences = [
+        f"The full model answers {sizes} right; a step of SFT of the largest takes {times:.1f} times the smallest's."
+    ]
+    by = {t.metric: t for t in trends if t.policy == POLICIES[FULL]}
     for metric in DRAWN:
-        growth = by.get((POLICIES[FULL], metric))
-        if growth is not None:
-            slope = growth.slope
-            said.append(
+        if metric in by:
+            slope = by[metric].slope
+            sentences.append(
                 f"A doubling of the parameters changes its {REPORTED[metric].title} by {slope.mean:+.2g} "
-                f"[{slope.low:.2g}, {slope.high:.2g}] ({growth.sign})."
+                f"{bounds(slope.low, slope.high, '.2g')} ({by[metric].larger_is})."
             )
-    claimed = [by[key] for m in CLAIMED if (key := (POLICIES[FULL], m)) in by]
+    claimed = [by[metric] for metric in CLAIMED if metric in by]
     if claimed:
-        count = sum(g.sign == "better" for g in claimed)
-        said.append(f"Of the {len(claimed)} metrics that grow clearly in the paper, {count} here beyond chance.")
-    return tuple(said)
+        count = sum(trend.larger_is == "better" for trend in claimed)
+        sentences.append(
+            f"Of the {len(claimed)} metrics that grow clearly in the paper, {count} do here beyond chance."
+        )
+    return tuple(sentences)
 
 
 def _narrow(width: int) -> ModelConfig:
-    """Towers of one layer that look at quarter pictures: three of them compile in half a minute."""
+    """Towers of one layer on quarter pictures: three of them compile in half a minute."""
     return ModelConfig(
         tactile=TactileViTConfig(sensors=0, width=width, num_layers=1, num_heads=2),
         vision=VisionConfig(width=16, num_layers=1),
@@ -220,7 +225,7 @@ def _narrow(width: int) -> ModelConfig:
     )
 
 
-EXPERIMENT = bench_experiment(
+EXPERIMENT = presets.paper_experiment(
     "scaling",
     ScalingConfig(),
     {

@@ -44,10 +44,10 @@ from experiments.core.context import Context
 from experiments.core.progress import in_megabytes
 from experiments.core.results import Comparison, Estimate, Requirement, Results
 from experiments.core.runner import Experiment
-from experiments.paper.conflict_metrics import Use, asked_of, touch_use
-from experiments.paper.conflict_tables import use_table
-from experiments.paper.eval_variants import control_name, under_controls
-from experiments.paper.outcome import CURVES
+from experiments.core.text import interval
+from experiments.paper.conflict_metrics import TouchGain, study_touch_gain, touch_gain_table
+from experiments.paper.eval_variants import control_name, control_variants
+from experiments.paper.presets import CURVES
 from experiments.paper.released_gain import kept_shares, kept_table, least_kept
 from experiments.paper.released_memory import counted, memory_table, shape_of
 from experiments.paper.released_policy import (
@@ -71,7 +71,7 @@ from experiments.study.stages import SFTConfig
 from experiments.study.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import ATTRIBUTES, SENSORS
+from sensors_io.schema import SENSORS
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.lm import DecoderConfig
@@ -164,7 +164,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
     ways = {
         ZERO: Way(of=SFT, ask=zero_shot),
         WRITTEN: Way(of=ARM, ask=functools.partial(written, source)),
-        **under_controls(ARM),
+        **control_variants(ARM),
     }
     check_ways(ways, arms)
     assembly, start = begin(config, source, context)
@@ -175,15 +175,15 @@ def run(config: TouchR1Config, context: Context) -> Results:
     zero = [score(study, said) for said in study.further[ZERO]]
     baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
     pictures, tables = level_report(study)
-    use, kept = touch_worth(study), kept_shares(ARM, config.seeds, context)
+    gain, kept = study_touch_gain(study, ARM), kept_shares(ARM, config.seeds, context)
     return Results(
         arms=scored.arms,
         baselines=baselines,
         settings=settings(config, source),
         comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
-        verdict=verdict(config, {**scored.arms, **baselines}, use),
+        verdict=verdict(config, {**scored.arms, **baselines}, gain),
         requirements=(differing(study), least_kept(kept)),
-        tables=(use_table({(ARM, "all"): use}), kept_table(kept), memory_table(memory), *tables),
+        tables=(touch_gain_table({f"{ARM}, all": gain}), kept_table(kept), memory_table(memory), *tables),
         pictures=pictures,
         data=study.data.summary(),
         curves=CURVES,
@@ -267,18 +267,6 @@ def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.nda
     return found
 
 
-def touch_worth(study: Study) -> Use | None:
-    """What the policy's answers lose under each control; `None` with fewer than two objects."""
-    test = study.data.parts["test"]
-    said = study.answers[ARM][0]
-    asked = asked_of(said, study.data.object_ids[test], study.data.visual_lies[test], ATTRIBUTES)
-    mask = asked.label >= 0
-    if len(np.unique(asked.objects[mask & asked.ordinal])) < 2:
-        return None
-    controls = {c: study.further[control_name(ARM, c)] for c in CONTROLS}
-    return touch_use(asked, study.answers[ARM], controls, study.assembly.ordered[asked.attribute], mask)
-
-
 def differing(study: Study) -> Requirement:
     """Answers that the written folder gives and the trained policy does not."""
     pairs = zip(study.answers[ARM], study.further[WRITTEN], strict=True)
@@ -287,7 +275,9 @@ def differing(study: Study) -> Requirement:
     return Requirement(name=name, measured=count, bound=0, better="lower", note=note)
 
 
-def verdict(config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], use: Use | None) -> tuple[str, ...]:
+def verdict(
+    config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], gain: TouchGain | None
+) -> tuple[str, ...]:
     """How often each stage is right, and what touch is worth."""
     acc = lambda name: rows[name]["acc"].mean
     said = [
@@ -295,12 +285,8 @@ def verdict(config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], u
         f"without touch, {acc(SFT):.1f} % after SFT, {acc(ARM):.1f} % after GRPO; trained without touch "
         f"{acc(BLIND):.1f} %, a constant {acc('constant'):.1f} %."
     ]
-    if use is not None:
-        gain = use.least.gain
-        said.append(
-            f"Touch is worth {gain.mean:.1f} points [{gain.low:.1f}, {gain.high:.1f}] at least, over "
-            f"{use.least.control}."
-        )
+    if gain is not None:
+        said.append(f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}.")
     if config.weights is None:
         said.insert(0, TAUGHT if config.teaching.steps else DRAWN)
     return tuple(said)

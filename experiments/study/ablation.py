@@ -1,36 +1,49 @@
-"""What the ablations share: arms of GRPO from one SFT checkpoint, scored beside the baselines, compared in pairs."""
+"""Ablations: arms of GRPO from one SFT checkpoint per seed, scored with the baselines, compared in pairs."""
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
+
+import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results
 from experiments.core.runner import Experiment
+from experiments.core.text import bounds
+from experiments.study.answers import Evaluated, reward_of
 from experiments.study.assembly import Weights
-from experiments.study.estimates import compare_over_seeds
+from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import score_study, study_settings
-from experiments.study.study import SFT, SMOKE, StudyConfig, run_study
+from experiments.study.scores import Scored, score_study, study_settings
+from experiments.study.study import BLIND, SFT, SMOKE, Study, StudyConfig, Way, run_study
+from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
 
+OWN_REWARD = "reward_trained"
+"""An arm's reward under its own weights, on what GRPO asks about."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Arms and what is asked of them; the second of each pair is the one compared against.
+    """Arms of GRPO and the comparisons between them.
 
-    `algorithms` names the arms that train by another algorithm than the configured one.
+    Attributes:
+      arms: reward weights of each arm.
+      pairs: arms to compare, each with the one it is compared against.
+      algorithms: of the arms that train by another algorithm than the configured one.
+      variants: further evaluations of SFT or of arms, by the names of their answers.
+      curves: scalars of GRPO that are drawn.
+      example: the arm whose rollouts are shown; empty for the last.
     """
 
     arms: Mapping[str, Weights]
     pairs: tuple[tuple[str, str], ...]
     algorithms: Mapping[str, AnyAlgorithm] = dataclasses.field(default_factory=dict)
+    variants: Mapping[str, Way] = dataclasses.field(default_factory=dict)
     curves: tuple[str, ...] = ("reward", "accuracy", "entropy", "kl", "grounding", "parse_rate", "length")
     example: str = ""
-    """The arm whose rollouts are shown; empty for the last."""
 
     @property
     def drawn(self) -> dict[str, tuple[str, ...]]:
@@ -44,31 +57,39 @@ def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig
         name=name,
         config=StudyConfig(),
         scales={"smoke": SMOKE},
-        run=functools.partial(run_ablation, ablation),
+        run=lambda config, context: run_ablation(ablation, config, context)[-1],
         curves=ablation.drawn,
         quick=("smoke",),
         spreads=True,
     )
 
 
-def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> Results:
-    """Train the arms, score them beside the baselines, compare them in pairs over seeds."""
-    study = run_study(config, ablation.arms, context, ablation.algorithms)
+def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> tuple[Study, Scored, Results]:
+    """Train the arms, score them with the baselines, compare them over seeds and SFT with the baselines over objects.
+
+    Returns:
+      The study, its scores, and results that an experiment may extend by further tables.
+    """
+    study = run_study(config, ablation.arms, context, ablation.algorithms, ablation.variants)
     scored = score_study(study)
-    comparisons = compared(ablation, scored.estimates, config.seeds)
+    comparisons = (*over_seeds(ablation, study, scored), *over_objects(study, scored))
     shown = ablation.example or list(ablation.arms)[-1]
     pictures, tables = level_report(study)
-    return Results(
-        arms=scored.arms,
-        baselines=scored.baselines,
-        settings=settings(ablation, config),
-        comparisons=tuple(comparisons),
-        verdict=verdict(ablation, comparisons, scored.estimates),
-        tables=tables,
-        pictures=pictures,
-        data=study.data.summary(),
-        curves=ablation.drawn,
-        examples=rollout_examples(study, shown, ablation.arms[shown]),
+    return (
+        study,
+        scored,
+        Results(
+            arms=scored.arms,
+            baselines=scored.baselines,
+            settings=settings(ablation, config),
+            comparisons=comparisons,
+            verdict=verdict(ablation, comparisons, scored.estimates),
+            tables=tables,
+            pictures=pictures,
+            data=study.data.summary(),
+            curves=ablation.drawn,
+            examples=rollout_examples(study, shown, ablation.arms[shown]),
+        ),
     )
 
 
@@ -79,39 +100,72 @@ def settings(ablation: Ablation, config: StudyConfig) -> dict[str, str | float]:
     return {**study_settings(config), **presets}
 
 
-def compared(ablation: Ablation, rows: Mapping[str, Mapping[str, Estimate]], seeds: int) -> list[Comparison]:
-    """The pairs, and every arm against SFT, paired by seed; needs two seeds at least."""
-    return compared_pairs([*ablation.pairs, *((arm, SFT) for arm in ablation.arms)], rows, seeds)
-
-
-def compared_pairs(
-    pairs: Sequence[tuple[str, str]], rows: Mapping[str, Mapping[str, Estimate]], seeds: int
-) -> list[Comparison]:
-    """Each pair in every metric of `COMPARED` that its first arm has, paired by seed; needs two seeds at least."""
-    if seeds < 2:
+def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Comparison]:
+    """The pairs, and every arm against SFT, paired by seed; every arm's own reward against SFT's under its weights."""
+    if study.config.seeds < 2:
         return []
-    return [
+    rows = scored.estimates
+    found = [
         compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric])
-        for a, b in pairs
+        for a, b in dict.fromkeys([*ablation.pairs, *((arm, SFT) for arm in ablation.arms)])
         for metric in COMPARED
         if metric in rows[a]
+    ]
+    for arm, weights in ablation.arms.items():
+        after, before = (own_reward(study, study.answers[name], weights) for name in (arm, SFT))
+        found.append(compare_over_seeds(OWN_REWARD, arm, SFT, after, before))
+    return found
+
+
+def own_reward(study: Study, seeds: Sequence[Evaluated], weights: Weights) -> Estimate:
+    """Mean reward under an arm's own weights of greedy answers to what GRPO asks, of every seed; without interval."""
+    asked = [i for i, name in enumerate(ATTRIBUTES) if name in study.config.grpo_attributes]
+    each = []
+    for answers in seeds:
+        reward = reward_of(study.assembly, answers, weights, study.prior)
+        each.append(float(reward[np.isin(answers.attribute, asked)].mean()))
+    mean = float(np.mean(each))
+    return Estimate(mean=mean, ci95=(mean, mean), per_seed=tuple(each))
+
+
+def over_objects(study: Study, scored: Scored) -> list[Comparison]:
+    """SFT against the baselines, paired by object: the gain from touch before any reinforcement."""
+    rows, seeds = scored.rows, study.config.seeds
+    repeated = {name: rows[name] if len(rows[name]) > 1 else rows[name] * seeds for name in rows}
+    return [
+        compare_over_objects(
+            metric, SFT, name, [s[metric] for s in rows[SFT]], [s[metric] for s in repeated[name]], scored.objects
+        )
+        for name in scored.baselines
+        for metric in ("acc", "omae")
     ]
 
 
 def verdict(
     ablation: Ablation, comparisons: Sequence[Comparison], rows: Mapping[str, Mapping[str, Estimate]]
 ) -> tuple[str, ...]:
-    """One sentence for SFT and one for each pair, whichever way the figures fall."""
+    """One sentence for SFT, one for each pair, and one for each arm against SFT, whichever way the figures fall."""
     by = {(c.metric, c.arm, c.against): c for c in comparisons}
-    said = [f"SFT answers {rows[SFT]['acc'].mean:.1f} % of ordinal questions about unseen objects right."]
+    touch = [by["acc", SFT, name] for name in ("constant", BLIND)]
+    sentences = [
+        f"SFT answers {rows[SFT]['acc'].mean:.1f} % of ordinal questions about unseen objects right: "
+        + ", ".join(f"{c.difference:+.1f} points {_interval(c)} against {c.against}" for c in touch)
+        + "."
+    ]
     for a, b in ablation.pairs:
         found = [by[m, a, b] for m in COMPARED if (m, a, b) in by]
         if found:
-            said.append(f"{a} against {b}: " + ", ".join(map(_phrase, found)) + ".")
-    return tuple(said)
+            changes = ", ".join(f"{c.metric} {c.difference:+.3g} {_interval(c)}" for c in found)
+            sentences.append(f"{a} against {b}: {changes}.")
+    for arm in ablation.arms:
+        if (OWN_REWARD, arm, SFT) in by:
+            reward, accuracy = by[OWN_REWARD, arm, SFT], by["acc", arm, SFT]
+            sentences.append(
+                f"GRPO of {arm} changes its own reward on unseen objects by {reward.difference:+.4f} "
+                f"{_interval(reward)} and accuracy by {accuracy.difference:+.1f} points {_interval(accuracy)}."
+            )
+    return tuple(sentences)
 
 
-def _phrase(c: Comparison) -> str:
-    low, high = c.ci95
-    beyond = "" if low > 0 or high < 0 else ", which may be chance"
-    return f"{c.metric} {c.difference:+.3g} [{low:.3g}, {high:.3g}]{beyond}"
+def _interval(c: Comparison) -> str:
+    return bounds(c.low, c.high) + ("" if c.low > 0 or c.high < 0 else " (may be chance)")

@@ -9,8 +9,9 @@ import signal
 import sys
 
 from experiments.core.commands import find
-from experiments.core.runner import main
+from experiments.core.runner import run_experiment
 from experiments.paper.presets import SMALL_QUOTA
+from experiments.study.ablation import ablation_experiment
 from experiments.study.feeds import AnswerFeed
 from tests.experiments import tiny
 
@@ -35,10 +36,11 @@ if __name__ == "__main__":
         name, *arguments = arguments[1:]
     module = importlib.import_module(find("experiments")[name].module)
     config = dataclasses.replace(tiny.STUDY, seeds=1, grpo_steps=3)
+    experiment = module.EXPERIMENT
     if name == "ablation_ordinal":
-        module.ARMS = {"ordinal": module.ARMS["ordinal"]}
+        arms = {"ordinal": module.ABLATION.arms["ordinal"]}
+        experiment = ablation_experiment(name, dataclasses.replace(module.ABLATION, arms=arms, pairs=()))
     if name == "main_table":
         quota = dataclasses.replace(SMALL_QUOTA, identify=8, scale=0, compose=3, compare=2, order=0, conflict=0)
         config = module.MainConfig(study=config, quota=quota)
-    module.EXPERIMENT = dataclasses.replace(module.EXPERIMENT, config=config)
-    sys.exit(main([name, *arguments]))
+    sys.exit(run_experiment(dataclasses.replace(experiment, config=config), arguments, module.__doc__))

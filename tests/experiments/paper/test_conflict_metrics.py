@@ -1,4 +1,4 @@
-"""Deceptive questions, leads and gains from touch, by hand values."""
+"""Deceptive questions, contrasts of accuracy and gains from touch, by hand values."""
 
 import dataclasses
 
@@ -6,86 +6,84 @@ import numpy as np
 import pytest
 
 from experiments.paper.conflict_metrics import (
-    Asked,
-    asked_of,
+    TouchQuestions,
+    concluded,
     contrast,
     deceptive,
-    revised,
-    spoken,
-    suggested,
-    touch_use,
+    picture_prior,
+    revision_share,
+    touch_gain,
 )
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments.study.test_study import TEST, answers_about
 from touchr1_jax.bench.grounding import CONTROLS
 
-ASKED = Asked(
+QUESTIONS = TouchQuestions(
     attribute=np.array([0, 0, 0, 0, 1, 1]),
     label=np.array([0, 1, 2, 0, 1, 2]),
     objects=np.array(["a", "b", "c", "d", "a", "b"]),
-    lies=np.array([True, True, True, False, True, True]),
-    names=ATTRIBUTES,
+    looks_like_another=np.array([True, True, True, False, True, True]),
 )
 PRIOR = np.array([2, 1, 0, 1, -1, 0])
 
 
-def test_deceptive_is_what_looks_like_another_and_suggests_another_level():
-    assert deceptive(ASKED, PRIOR).tolist() == [True, False, True, False, False, True]
+def test_deceptive_objects_look_like_others_and_suggest_another_level():
+    assert deceptive(QUESTIONS, PRIOR).tolist() == [True, False, True, False, False, True]
 
 
-def test_what_pictures_suggest_is_the_vote_of_the_other_seeds():
+def test_the_prior_from_pictures_is_the_vote_of_the_other_seeds():
     blind = [np.array([0, 2, -1]), np.array([1, 2, -1]), np.array([1, 0, -1])]
-    assert [s.tolist() for s in suggested(blind)] == [[1, 0, -1], [0, 0, -1], [0, 2, -1]]
+    assert [s.tolist() for s in picture_prior(blind)] == [[1, 0, -1], [0, 0, -1], [0, 2, -1]]
     with pytest.raises(ValueError, match="holds 1 seeds"):
-        suggested(blind[:1])
+        picture_prior(blind[:1])
 
 
 def test_a_contrast_counts_each_seeds_own_questions():
-    ours, theirs = [ASKED.label, ASKED.label], [PRIOR, PRIOR]
-    misled = deceptive(ASKED, PRIOR)
-    found = contrast(ASKED, ours, theirs, [misled, misled])
+    ours, theirs = [QUESTIONS.label, QUESTIONS.label], [PRIOR, PRIOR]
+    misled = deceptive(QUESTIONS, PRIOR)
+    found = contrast(QUESTIONS, ours, theirs, [misled, misled])
     assert (found.questions, found.ours, found.theirs) == (3, 100, 0)
     assert (found.seeds.mean, found.objects.mean) == (100, 100)
     other = np.array([True, True, False, False, False, False])
-    found = contrast(ASKED, ours, theirs, [misled, other])
+    found = contrast(QUESTIONS, ours, theirs, [misled, other])
     assert found.seeds.mean == pytest.approx((100 + 50) / 2)
-    with pytest.raises(ValueError, match=r"where\[1\] holds no question"):
-        contrast(ASKED, ours, theirs, [misled, misled & False])
+    with pytest.raises(ValueError, match=r"masks\[1\] holds no question"):
+        contrast(QUESTIONS, ours, theirs, [misled, misled & False])
 
 
-def test_who_is_right_revised_and_who_repeats_sight_did_not():
-    assert revised(ASKED, [ASKED.label], [PRIOR]) == 100
-    assert revised(ASKED, [PRIOR], [PRIOR]) == 0
+def test_right_answers_revise_the_prior_and_its_copies_do_not():
+    assert revision_share(QUESTIONS, [QUESTIONS.label], [PRIOR]) == 100
+    assert revision_share(QUESTIONS, [PRIOR], [PRIOR]) == 0
 
 
 @pytest.fixture(scope="module")
-def said():
+def answers():
     return answers_about(TEST)
 
 
-def with_levels(said, level):
-    conclude = np.full_like(said.parsed.conclude, -1)
-    conclude[np.arange(len(level)), said.attribute] = level
-    return dataclasses.replace(said, parsed=dataclasses.replace(said.parsed, conclude=conclude))
+def with_levels(answers, level):
+    conclude = np.full_like(answers.parsed.conclude, -1)
+    conclude[np.arange(len(level)), answers.attribute] = level
+    return dataclasses.replace(answers, parsed=dataclasses.replace(answers.parsed, conclude=conclude))
 
 
-def test_touch_is_worth_what_its_absence_costs(said):
-    ids, lies = np.array(list("vwxyz")), np.array([True, False, True, False, False])
-    asked = asked_of(said, ids, lies, ATTRIBUTES)
-    right = with_levels(said, asked.label)
-    wrong = with_levels(said, (asked.label + 1) % 3)
-    assert np.array_equal(spoken(right), asked.label)
-    controls = {"drop": [wrong] * 2, "shuffle": [right] * 2, "noise": [wrong, right], "swapped": [wrong] * 2}
-    everywhere, unordered = np.ones(len(asked.label), bool), np.zeros(len(asked.label), bool)
-    found = touch_use(asked, [right, right], controls, unordered, everywhere)
-    assert {name: gain.mean for name, gain in found.gains.items()} == {
-        "drop": 100,
-        "shuffle": 0,
-        "noise": 50,
-        "swapped": 100,
-    }
-    assert (found.least.control, found.least.gain.mean) == ("noise", 50)
-    assert (
-        touch_use(asked, [right], {c: controls[c][:1] for c in CONTROLS}, ~unordered, everywhere).least.gain.mean == 0
+def test_the_gain_from_touch_is_what_its_absence_costs(answers):
+    n = np.arange(len(answers.contact))
+    questions = TouchQuestions(
+        attribute=answers.attribute,
+        label=answers.label[n, answers.attribute],
+        objects=np.array(list("vwxyz"))[answers.contact],
+        looks_like_another=np.zeros(len(n), bool),
     )
-    assert list(asked.ordinal) == [name != "material" for name in np.array(ATTRIBUTES)[asked.attribute]]
+    right = with_levels(answers, questions.label)
+    wrong = with_levels(answers, (questions.label + 1) % 3)
+    assert np.array_equal(concluded(right), questions.label)
+    controls = {"drop": [wrong] * 2, "shuffle": [right] * 2, "noise": [wrong, right], "swapped": [wrong] * 2}
+    every, unordered = np.ones(len(n), bool), np.zeros(len(n), bool)
+    found = touch_gain(questions, [right, right], controls, unordered, every)
+    assert [found.over[name].mean for name in ("drop", "shuffle", "noise", "swapped")] == [100, 0, 50, 100]
+    assert (found.least.control, found.least.gain.mean) == ("noise", 50)
+    single = {c: controls[c][:1] for c in CONTROLS}
+    assert touch_gain(questions, [right], single, ~unordered, every).least.gain.mean == 0
+    assert touch_gain(questions, [right], single, unordered, questions.objects == "v") is None
+    assert questions.ordinal.tolist() == [ATTRIBUTES[a] != "material" for a in questions.attribute]

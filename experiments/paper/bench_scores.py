@@ -1,0 +1,270 @@
+"""The bench's questions, answered from answers about single touches, scored, and compared with the paper's table.
+
+A policy has one touch in its prompt.  A property of a touch is asked as it stands; several properties one by one; one
+sensor by that sensor alone.  Touches are compared by the answers about each: by the level, between equal levels by the
+mean of the levels from single sensors; if these are equal too, the touch that is shown first counts as the lesser.  So
+a constant answer has exactly the chance accuracy of a question that comes in all orders.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from experiments.bench.contacts import measure_split
+from experiments.bench.draw import Quota, draw
+from experiments.core.context import Context
+from experiments.core.results import Cell, Estimate, Table, named_table
+from experiments.core.text import bounds, number
+from experiments.study.answers import Evaluated
+from experiments.study.dataset import Dataset
+from experiments.study.estimates import estimate
+from experiments.study.paper_numbers import Row as PaperRow
+from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.averages import AVERAGED, WORST_OMAE, touch_average
+from touchr1_jax.bench.comparison import ORDERS
+from touchr1_jax.bench.items import KINDS, Ask, Touch
+from touchr1_jax.bench.metrics import BOTTOM, Scores
+from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
+from touchr1_jax.bench.statistics import (
+    draw_clusters,
+    drawn_means,
+    improvement_interval,
+    stratified_bootstrap_iqm,
+)
+
+ORDINAL_LEVELS = 3
+"""K of ordinal levels: means of levels over K stay below one level."""
+
+RESAMPLES = 2_000
+"""Of the average's interval: its ends are then good to a tenth of its width."""
+
+AVERAGE_MEANING = "mean of the nine columns, OMAE as 100(1 − OMAE/2), ρ as 100ρ"
+
+Estimates = Mapping[str, Estimate]
+"""Metric → estimate, of one row of a table."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleTouchAnswers:
+    """Levels answered about n contacts, from all streams and from each alone; −1 where no answer can be read."""
+
+    level: Int[np.ndarray, "n A"]
+    alone: Int[np.ndarray, "n S A"]
+
+    @staticmethod
+    def of(answers: Evaluated, contacts: int) -> "SingleTouchAnswers":
+        """From the answers to every question about `contacts` contacts, which `answers.contact` counts.
+
+        A policy without touch gives the same answer whichever sensor is shown.
+        """
+        attributes, streams = answers.label.shape[1], answers.streams.shape[1]
+        level = np.full((contacts, attributes), BOTTOM)
+        alone = np.full((contacts, streams, attributes), BOTTOM)
+        n = np.arange(len(answers.contact))
+        concluded = np.asarray(answers.parsed.conclude)[n, answers.attribute]
+        level[answers.contact, answers.attribute] = concluded
+        repeated = np.repeat(concluded[:, None], streams, 1)
+        single = repeated if answers.alone is None else answers.alone[n, :, answers.attribute]
+        alone[answers.contact, :, answers.attribute] = single
+        return SingleTouchAnswers(level=level, alone=alone)
+
+    def strength(self, contact: int, attribute: int) -> float | None:
+        """How much of a property a contact has; `None` where its level is ⊥."""
+        level, alone = self.level[contact, attribute], self.alone[contact, :, attribute]
+        if level == BOTTOM:
+            return None
+        read = alone[alone != BOTTOM]
+        return float(level) + (float(read.mean()) / ORDINAL_LEVELS if len(read) else 0.0)
+
+
+def bench_questions(data: Dataset, quota: Quota, context: Context) -> tuple[Ask, ...]:
+    """The bench's questions about the test contacts."""
+    with context.progress("measuring contacts", len(data.store.contacts_of_split("test"))) as advance:
+        contacts = measure_split(data.store, "test", advance).contacts
+    return draw(contacts, data.clip.sensors, quota, seed=0)
+
+
+def bench_answers(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
+    """ItemAnswers to the bench's questions that follow from the answers about single touches, for every seed."""
+    rows, contacts = touch_rows(data), len(data.parts["test"])
+    each = (SingleTouchAnswers.of(answers, contacts) for answers in seeds)
+    return [answer_all(asks, single, rows, data.clip.sensors) for single in each]
+
+
+def touch_rows(data: Dataset) -> dict[Touch, int]:
+    """The place of each test contact among the test contacts."""
+    keys = [data.store.contacts[int(i)] for i in data.parts["test"]]
+    return {Touch(object=k.object_id, site=k.site, motion=k.motion, trial=k.trial): n for n, k in enumerate(keys)}
+
+
+def answer_all(
+    asks: Iterable[Ask], single: SingleTouchAnswers, rows: Mapping[Touch, int], sensors: Sequence[str]
+) -> dict[str, tuple[int, ...]]:
+    """The levels that answer each question, keyed by its id, −1 for ⊥.
+
+    Args:
+      asks: questions about contacts in `rows`.
+      single: answers about each of them.
+      rows: place of each contact in `single`.
+      sensors: names of the streams, in their order.
+    """
+    return {ask.id: _answer(ask, single, [rows[t] for t in ask.touches], sensors) for ask in asks}
+
+
+def _answer(ask: Ask, single: SingleTouchAnswers, rows: list[int], sensors: Sequence[str]) -> tuple[int, ...]:
+    asked = [ATTRIBUTES.index(name) for name in ask.attributes]
+    if ask.kind == "one_sensor":
+        return (int(single.alone[rows[0], sensors.index(ask.sensors[0]), asked[0]]),)
+    if ask.kind not in ("compare", "order"):
+        return tuple(int(single.level[rows[0], a]) for a in asked)
+    strengths = [single.strength(row, asked[0]) for row in rows]
+    known = [s for s in strengths if s is not None]
+    if len(known) < len(strengths):
+        return (BOTTOM,)
+    rising = tuple(int(i) for i in np.argsort(known, kind="stable"))
+    return (rising[-1],) if ask.kind == "compare" else (ORDERS.index(rising),)
+
+
+def bench_row(
+    asks: Sequence[Ask], answers: Sequence[ItemAnswers], by_picture: Sequence[ItemAnswers] | None = None
+) -> dict[str, Estimate]:
+    """Every metric of the bench that the questions define, and their average where all of its metrics are there.
+
+    A metric about a single object has no interval and is left out, and so is one that some seed lacks.
+
+    Args:
+      asks: the questions.
+      answers: those of every seed.
+      by_picture: answers from pictures alone, for every seed.
+    """
+    priors: Sequence[ItemAnswers | None] = [None] * len(answers) if by_picture is None else by_picture
+    tables = [score(asks, given, prior) for given, prior in zip(answers, priors, strict=True)]
+    objects = np.array([ask.cluster for ask in asks])
+    several = lambda scores: len(np.unique(objects[scores.items])) > 1
+    shared = [name for name in tables[0] if all(name in table and several(table[name]) for table in tables)]
+    row = {name: estimate([table[name] for table in tables], objects) for name in shared}
+    return row | ({"avg": average(tables, objects)} if set(AVERAGED) <= set(shared) else {})
+
+
+def average(tables: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> Estimate:
+    """`touch_average` of every seed, and its interval: one resample of the objects serves all metrics and seeds.
+
+    Args:
+      tables: metric → scores of every seed, `AVERAGED` among them.
+      objects: [N], the object of each question.
+    """
+    cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
+
+    def drawn(table: Mapping[str, Scores]) -> np.ndarray:
+        means = {n: drawn_means(s.values, cluster[s.items], s.strata, weights) for n in AVERAGED for s in (table[n],)}
+        whole = np.all([np.isfinite(m) for m in means.values()], axis=0)
+        return np.array([touch_average({n: m[i] for n, m in means.items()}) for i in np.flatnonzero(whole)])
+
+    each = tuple(touch_average({name: table[name].mean() for name in AVERAGED}) for table in tables)
+    low, high = np.quantile(np.mean([drawn(table) for table in tables], axis=0), (0.025, 0.975))
+    return Estimate(mean=float(np.mean(each)), ci95=(float(low), float(high)), per_seed=each)
+
+
+def comparison_table(
+    title: str, ours: Mapping[str, Estimates], theirs: Mapping[str, tuple[PaperRow, float] | None], note: str
+) -> Table:
+    """Our rows, then the paper's, in the columns of its main table; the last columns are averages.
+
+    Args:
+      title: heading.
+      ours: row → metric.
+      theirs: row → the paper's figures and its printed average; `None` where it prints none.
+      note: a sentence above the table.
+    """
+    titles = [REPORTED[m].title for m in AVERAGED]
+    rows: list[dict[str, Cell]] = []
+    for name, row in ours.items():
+        cells = [row[m].mean if m in row else None for m in (*AVERAGED, "avg")]
+        rows.append({"row": name, **dict(zip((*titles, "Avg"), cells, strict=True)), "Avg as printed": None})
+    for name, printed in theirs.items():
+        if printed is None:
+            rows.append({"row": f"{name} (paper)"})
+            continue
+        values, average = printed
+        of_paper = {"Avg": touch_average(dict(zip(AVERAGED, values, strict=True))), "Avg as printed": average}
+        rows.append({"row": f"{name} (paper)", **dict(zip(titles, values, strict=True)), **of_paper})
+    return named_table(
+        title,
+        rows,
+        formats={REPORTED[m].title: REPORTED[m].format for m in AVERAGED} | {"Avg": ".1f", "Avg as printed": ".1f"},
+        units={REPORTED[m].title: REPORTED[m].unit for m in AVERAGED},
+        meanings={"Avg": AVERAGE_MEANING, "Avg as printed": "the paper's own, whose formula is not given"},
+        note=note,
+    )
+
+
+def question_table(asks: Sequence[Ask]) -> Table:
+    """How many questions of each kind, about how many objects."""
+    counts = collections.Counter(ask.kind for ask in asks)
+    rows: list[dict[str, Cell]] = [
+        {
+            "kind": kind,
+            "tier": about.tier,
+            "questions": counts[kind],
+            "objects": len({touch.object for ask in asks if ask.kind == kind for touch in ask.touches}),
+            "asks for": about.meaning,
+        }
+        for kind, about in KINDS.items()
+        if counts[kind]
+    ]
+    return named_table("Questions", rows, formats=dict.fromkeys(("tier", "questions", "objects"), "d"))
+
+
+def pooled_table(rows: Mapping[str, Estimates], against: str) -> tuple[Table, ...]:
+    """Every row of two seeds or more, pooled over its columns: interquartile mean and probability of improvement.
+
+    Args:
+      rows: row → metric; rows of one seed, baselines, are left out.
+      against: the row that the others are compared with.
+
+    Returns:
+      The table; none where `against` has a single seed.
+    """
+    trained = {name: row for name, row in rows.items() if all(len(e.per_seed) > 1 for e in row.values())}
+    if against not in trained:
+        return ()
+    columns = [m for m in AVERAGED if all(m in row for row in trained.values())]
+    scores = {name: np.stack([_share(m, row[m].per_seed) for m in columns], axis=1) for name, row in trained.items()}
+    lines: list[dict[str, Cell]] = []
+    better = f"P(better than {against})"
+    for name, values in scores.items():
+        iqm, gain = stratified_bootstrap_iqm(values), improvement_interval(values, scores[against])
+        compared = name != against
+        lines.append(
+            {
+                "row": name,
+                "IQM": number(iqm.mean, ".1f"),
+                "95 % of the IQM": bounds(iqm.low, iqm.high, ".1f"),
+                better: number(gain.mean, ".2f") if compared else "–",
+                "95 % of P": bounds(gain.low, gain.high, ".2f") if compared else "–",
+            }
+        )
+    titles = ", ".join(REPORTED[m].title for m in columns)
+    table = named_table(
+        "Pooled over seeds and columns",
+        lines,
+        units={"IQM": "%"},
+        meanings={
+            "IQM": "interquartile mean over seeds and columns",
+            "95 % of the IQM": "the seeds of each column resampled on their own",
+            better: "probability of improvement, ties count half",
+            "95 % of P": "the seeds of both sides resampled on their own",
+        },
+        note=f"Columns: {titles}; OMAE as 100(1 − OMAE/2), ρ as 100ρ. After Agarwal et al., Deep RL at the Edge of the "
+        "Statistical Precipice (2021). These intervals resample seeds alone; the other tables' resample objects.",
+    )
+    return (table,)
+
+
+def _share(metric: str, per_seed: Sequence[float]) -> np.ndarray:
+    """The values of a column as shares in percent: 100 is right, higher is better."""
+    values = np.asarray(per_seed)
+    return {"omae": 100 * (1 - values / WORST_OMAE), "soi_rho": 100 * values}.get(metric, values)

@@ -1,0 +1,240 @@
+"""The change that each component makes: differences of arms with intervals and corrected p-values, and the paper's."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+
+from experiments.core.context import Context, read_metrics
+from experiments.core.results import Estimate
+from experiments.core.text import bounds, number
+from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
+from experiments.study.baselines import baselines
+from experiments.study.estimates import estimate
+from experiments.study.scores import Scored, score
+from experiments.study.study import Study
+from touchr1_jax.bench.metrics import Scores, mean_accuracy
+from touchr1_jax.bench.statistics import (
+    Interval,
+    clustered_bootstrap,
+    clustered_sign_flip_test,
+    holm,
+    sign_flip_test,
+    student_interval,
+)
+
+RESAMPLES = 2_000
+"""Of each interval over objects: its ends are then good to a tenth of its width."""
+
+FOUR = "four_acc"
+"""Mean accuracy over hardness, roughness, protrusion and material: what the paper's ladder prints as Avg."""
+
+SignVerdict = Literal["reproduced", "opposite", "undecided", "not in the paper"]
+
+SeedScores = Sequence[Mapping[str, Scores]]
+"""Metric → scores, of every seed."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LadderMetric:
+    """A column of the paper's ladder: our metric, the column's title and position, its format."""
+
+    metric: str
+    title: str
+    column: int
+    format: str
+
+
+LADDER_METRICS: tuple[LadderMetric, ...] = (
+    LadderMetric(metric="omae", title="OMAE", column=0, format="+.3f"),
+    LadderMetric(metric="csc", title="CSC", column=1, format="+.1f"),
+    LadderMetric(metric=FOUR, title="Avg", column=2, format="+.1f"),
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComponentStep:
+    """One arm against another.
+
+    Attributes:
+      arm, against: `arm` has the component, `against` does not.
+      component: its name.
+      published: the paper's change in the columns of `LADDER_METRICS`; `None` where it has no such row.
+      diagnosed: the arm whose run is searched for failures whatever comes out; `None` for `arm`, and only where the
+        paper's sign does not come out.
+    """
+
+    arm: str
+    against: str
+    component: str
+    published: tuple[float, ...] | None
+    diagnosed: str | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComponentEffect:
+    """A step in one metric: the difference with intervals over training seeds and over objects, and their p-values.
+
+    The p-values are of sign-flip tests, corrected over all steps and metrics of a table by Holm's method.
+    """
+
+    step: ComponentStep
+    metric: LadderMetric
+    seeds: Interval
+    objects: Interval
+    p_seeds: float
+    p_objects: float
+
+    @property
+    def published(self) -> float | None:
+        """The paper's difference."""
+        return None if self.step.published is None else self.step.published[self.metric.column]
+
+    @property
+    def sign(self) -> SignVerdict:
+        """Agreement with the paper's sign: beyond chance over seeds, against it, or neither."""
+        if self.published is None or self.published == 0:
+            return "not in the paper"
+        if not self.seeds.excludes_zero:
+            return "undecided"
+        return "reproduced" if np.sign(self.seeds.mean) == np.sign(self.published) else "opposite"
+
+    def __str__(self) -> str:
+        spec = self.metric.format
+        published = "" if self.published is None else f"; paper {number(self.published, spec)}"
+        return (
+            f"{self.metric.title} {number(self.seeds.mean, spec)} {bounds(self.seeds.low, self.seeds.high, spec)}, "
+            f"p = {self.p_seeds:.2f} over seeds and {self.p_objects:.3f} over objects{published} ({self.sign})"
+        )
+
+
+def component_effects(
+    steps: Sequence[ComponentStep], rows: Mapping[str, SeedScores], objects: np.ndarray
+) -> tuple[ComponentEffect, ...]:
+    """Every step in every metric of the ladder that both of its arms have.
+
+    Args:
+      steps: what to compare.
+      rows: arm → seeds; an arm of one seed, a baseline, is compared with every seed of the other.
+      objects: [N], the object of each question.
+
+    Raises:
+      ValueError: two arms of different numbers of seeds, or fewer than two seeds.
+    """
+    found = [
+        _effect(step, metric, *_paired(step, metric.metric, rows), objects)
+        for step in steps
+        for metric in LADDER_METRICS
+        if all(metric.metric in rows[name][0] for name in (step.arm, step.against))
+    ]
+    over_seeds, over_objects = (holm(np.array([getattr(e, p) for e in found])) for p in ("p_seeds", "p_objects"))
+    return tuple(
+        dataclasses.replace(effect, p_seeds=float(a), p_objects=float(b))
+        for effect, a, b in zip(found, over_seeds, over_objects, strict=True)
+    )
+
+
+def pooled(seeds: Sequence[Scores]) -> Scores:
+    """The mean over seeds of each value; all seeds were scored on the same questions."""
+    return dataclasses.replace(seeds[0], values=np.mean([s.values for s in seeds], axis=0))
+
+
+def find_effect(effects: Sequence[ComponentEffect], arm: str, metric: str) -> ComponentEffect | None:
+    """The effect of a step's arm on a metric."""
+    return next((e for e in effects if e.step.arm == arm and e.metric.metric == metric), None)
+
+
+def _paired(step: ComponentStep, metric: str, rows: Mapping[str, SeedScores]) -> tuple[list[Scores], list[Scores]]:
+    a, b = ([seed[metric] for seed in rows[name]] for name in (step.arm, step.against))
+    count = max(len(a), len(b))
+    if count < 2 or {len(a), len(b)} - {1, count}:
+        raise ValueError(
+            f"{step.arm} and {step.against} have {len(a)} and {len(b)} seeds: must have the same number, two at least, "
+            "or one of a baseline; train the missing ones"
+        )
+    a, b = (side * count if len(side) == 1 else side for side in (a, b))
+    return a, b
+
+
+def _effect(
+    step: ComponentStep, metric: LadderMetric, a: list[Scores], b: list[Scores], objects: np.ndarray
+) -> ComponentEffect:
+    per_seed = np.array([x.mean() - y.mean() for x, y in zip(a, b, strict=True)])
+    difference = pooled(a).values - pooled(b).values
+    where = {"clusters": objects[a[0].items], "strata": a[0].strata}
+    return ComponentEffect(
+        step=step,
+        metric=metric,
+        seeds=student_interval(per_seed),
+        objects=clustered_bootstrap(difference, **where, resamples=RESAMPLES),
+        p_seeds=sign_flip_test(per_seed),
+        p_objects=clustered_sign_flip_test(difference, **where),
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComponentComparison:
+    """The rows of a ladder and what its steps change.
+
+    Attributes:
+      estimates: row → metric of all policies, variants and baselines, `FOUR` among them.
+      effects: differences of the steps; none with a single seed.
+      failures: known failures that show in the runs behind an effect.
+    """
+
+    estimates: Mapping[str, Mapping[str, Estimate]]
+    effects: tuple[ComponentEffect, ...]
+    failures: Mapping[ComponentEffect, tuple[str, ...]]
+
+    def reported(self, row: str) -> dict[str, Estimate]:
+        """The metrics of a row that `Results` knows; `FOUR` stands in the ladder's own tables."""
+        return {metric: value for metric, value in self.estimates[row].items() if metric != FOUR}
+
+
+def compare_components(
+    study: Study, scored: Scored, steps: Sequence[ComponentStep], context: Context
+) -> ComponentComparison:
+    """Score all answers with `FOUR`, compare the steps, and diagnose the runs whose signs do not come out."""
+    answers = {**study.answers, **{name: [one] for name, one in baselines(study).items()}, **study.further}
+    plain = {**scored.rows, **{name: [score(study, one) for one in seeds] for name, seeds in study.further.items()}}
+    rows = {
+        name: [
+            {**scores, FOUR: mean_accuracy(np.asarray(one.parsed.conclude), one.label)}
+            for scores, one in zip(seeds, answers[name], strict=True)
+        ]
+        for name, seeds in plain.items()
+    }
+    estimates = {
+        name: {
+            metric: scored.estimates.get(name, {}).get(metric) or estimate([s[metric] for s in seeds], scored.objects)
+            for metric in seeds[0]
+        }
+        for name, seeds in rows.items()
+    }
+    effects = component_effects(steps, rows, scored.objects) if study.config.seeds > 1 else ()
+    means = {name: {metric: e.mean for metric, e in row.items()} for name, row in estimates.items()}
+    lines = read_metrics(context.directory)
+    failures = {}
+    for effect in effects:
+        step = effect.step
+        if step.diagnosed is None and effect.sign not in ("opposite", "undecided"):
+            continue
+        arm, other = (step.against, step.arm) if step.diagnosed == step.against else (step.arm, step.against)
+        found = diagnose(
+            ArmMeasurements(
+                history=training_history(lines, arm),
+                after=means[arm],
+                before=means[other],
+                consistency="consistency" in study.arms.get(arm, {}),
+            )
+        )
+        failures[effect] = found or (() if effect.sign == "reproduced" else (_no_failure(effect),))
+    return ComponentComparison(estimates=estimates, effects=effects, failures=failures)
+
+
+def _no_failure(effect: ComponentEffect) -> str:
+    """Where no known failure shows: the least effect that these seeds could have detected."""
+    half = (effect.seeds.high - effect.seeds.low) / 2
+    published = "" if effect.published is None else f", the paper prints {number(effect.published, '+.2g')}"
+    return f"no known failure shows; these seeds detect changes beyond {half:.2g}{published}"

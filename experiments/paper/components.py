@@ -1,0 +1,124 @@
+"""The components of Touch-R1's objective: for each the arm that adds it to the ladder and the arm that leaves it out.
+
+Every arm of GRPO starts from the SFT checkpoint of its seed and sees the same questions in the same order.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+
+from experiments.study import paper_numbers as paper
+from experiments.study.assembly import Weights
+from experiments.study.scores import PUBLISHED
+from experiments.study.study import SFT
+from touchr1_jax.rl.config import AnyAlgorithm, Paper, TactileUse
+
+BASE, FULL, NO_SFT = "constant", "full", "no_sft"
+"""The base is the commonest level of each attribute: the paper's, a pretrained model asked without training, answers
+near chance too, while nothing can be read in the answers of a policy that is untrained here."""
+
+BASE_ROW = "Qwen2.5-VL-7B"
+"""Of the paper's ladder."""
+
+
+def published_without(*terms: str) -> Weights:
+    """The published reward weights without some terms."""
+    return {name: weight for name, weight in PUBLISHED.items() if name not in terms}
+
+
+ZERO_ONE: Weights = {"exact": PUBLISHED["accuracy"], **published_without("accuracy")}
+"""The published reward with 0/1 credit in place of ordinal credit."""
+
+UNGROUNDED = Paper(gamma=0.0)
+"""GRPO without the grounding term."""
+
+WITH_TACTILE_USE = Paper(tactile_use=TactileUse.RECOMMENDED)
+"""The published objective with credit for the use of touch, which the paper's abstract names and no equation holds."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComponentArm:
+    """An arm of GRPO: its name, its reward weights and its algorithm; `weights` is `None` where GRPO does not run."""
+
+    name: str
+    weights: Weights | None = None
+    algorithm: AnyAlgorithm = UNGROUNDED
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Component:
+    """One component of the objective.
+
+    Attributes:
+      name: what is added or left out.
+      row: of the paper's ladder, the first that has the component; `None` where no row has it.
+      added: the ladder up to this component.
+      omitted: the full objective without it.
+    """
+
+    name: str
+    row: str | None
+    added: ComponentArm
+    omitted: ComponentArm
+
+
+def _omitted(name: str, weights: Weights = PUBLISHED, algorithm: AnyAlgorithm = WITH_TACTILE_USE) -> ComponentArm:
+    return ComponentArm(name=name, weights=weights, algorithm=algorithm)
+
+
+COMPONENTS: tuple[Component, ...] = (
+    Component(name="SFT", row="+ Cold-start SFT", added=ComponentArm(name=SFT), omitted=_omitted(NO_SFT)),
+    Component(
+        name="accuracy reward",
+        row="+ GRPO (0/1)",
+        added=ComponentArm(name="zero_one", weights={"exact": ZERO_ONE["exact"]}),
+        omitted=_omitted("no_accuracy", published_without("accuracy")),
+    ),
+    Component(
+        name="ordinal credit",
+        row="+ Ordinal Reward",
+        added=ComponentArm(name="ordinal", weights=published_without("consistency", "format")),
+        omitted=_omitted("no_ordinal", ZERO_ONE),
+    ),
+    Component(
+        name="consistency",
+        row="+ Consistency Reward",
+        added=ComponentArm(name="consistency", weights=published_without("format")),
+        omitted=_omitted("no_consistency", published_without("consistency")),
+    ),
+    Component(
+        name="format",
+        row="+ Format Reward",
+        added=ComponentArm(name="format", weights=PUBLISHED),
+        omitted=_omitted("no_format", published_without("format")),
+    ),
+    Component(
+        name="grounding G_tg",
+        row="Touch-R1",
+        added=ComponentArm(name="grounding", weights=PUBLISHED, algorithm=Paper()),
+        omitted=_omitted("no_grounding", algorithm=dataclasses.replace(WITH_TACTILE_USE, gamma=0.0)),
+    ),
+    Component(
+        name="tactile use R_tu",
+        row=None,
+        added=ComponentArm(name="tactile_use", weights=PUBLISHED, algorithm=WITH_TACTILE_USE),
+        omitted=_omitted("no_tactile_use", algorithm=Paper()),
+    ),
+)
+"""In the order of the paper's ladder; the last is named in its abstract alone."""
+
+
+def published_steps() -> dict[str, tuple[float, ...] | None]:
+    """Component → change of OMAE, CSC and Avg from the row below it in the paper's ladder; `None` without a row."""
+    steps: dict[str, tuple[float, ...] | None] = {}
+    below = paper.LADDER[BASE_ROW]
+    for component in COMPONENTS:
+        row = None if component.row is None else paper.LADDER[component.row]
+        steps[component.name] = None if row is None else tuple(a - b for a, b in zip(row, below, strict=True))
+        below = below if row is None else row
+    return steps
+
+
+def reinforced(arms: Iterable[ComponentArm]) -> tuple[dict[str, Weights], Mapping[str, AnyAlgorithm]]:
+    """Reward weights and algorithms of the arms that GRPO trains, by name."""
+    trained = [(arm, arm.weights) for arm in arms if arm.weights is not None]
+    return {arm.name: weights for arm, weights in trained}, {arm.name: arm.algorithm for arm, _ in trained}

@@ -1,0 +1,289 @@
+"""Policies of several sizes: shapes, parameters, times of a step and of an answer, and the trend of their metrics."""
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.core.charts import Panel, Series, draw
+from experiments.core.context import Context, read_metrics
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.loops import STEPPING
+from experiments.core.results import Cell, Estimate, Table, named_table
+from experiments.core.text import bounds, number
+from experiments.paper.components import FULL
+from experiments.study.answers import answer_program
+from experiments.study.assembly import ModelConfig
+from experiments.study.feeds import AnswerFeed, labelled, question_batch, touch_batch
+from experiments.study.scores import PUBLISHED
+from experiments.study.stages import ENCODE_BATCH, encode_program, sft_program
+from experiments.study.study import Study, StudyConfig, run_study
+from touchr1_jax.bench.scoring import REPORTED
+from touchr1_jax.bench.statistics import Interval, student_interval
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rl.config import Paper
+from touchr1_jax.training.sft import SFTState
+
+SMALL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=60),
+    vision=VisionConfig(width=36),
+    decoder=DecoderConfig(vocab_size=0, hidden_size=60, num_heads=2, intermediate_size=120),
+)
+LARGE = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, width=144),
+    vision=VisionConfig(width=96),
+    decoder=DecoderConfig(vocab_size=0, hidden_size=144, num_heads=5, intermediate_size=288),
+)
+"""About .43 and 2.1 times the parameters of the default, as 3 and 14 billion are of 7; pictures, frames, tokens and the
+answer's length are the default's."""
+
+CLAIMED = ("l2_em", "soi_rho", "csc", "avg")
+"""Metrics that the paper names as growing clearly with the size; it claims growth of most other metrics as well."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SizeCost:
+    """Parameters of a size, and seconds of a step of SFT, of a step of GRPO, and of a question.
+
+    `grpo_s` is that of the run itself, waiting for data included; the others are measured in turns with other sizes.
+    """
+
+    parameters: int
+    sft_s: float
+    grpo_s: float
+    question_s: float
+
+    def training_s(self, config: StudyConfig) -> float:
+        """Seconds of both stages of one seed."""
+        return config.sft.steps * self.sft_s + config.grpo_steps * self.grpo_s
+
+
+def study_of_size(config: StudyConfig, name: str, context: Context) -> tuple[Study, Mapping[str, float]]:
+    """SFT and the full model of every seed in a folder of the run; the run's log holds the curves as arms `name`.
+
+    Args:
+      config: of the study.
+      name: of the folder.
+      context: the run.
+
+    Returns:
+      The study, and the wall seconds of its stages.
+    """
+    directory = context.directory / name
+    directory.mkdir(exist_ok=True)
+    inner = Context(
+        directory, context.cache_dir, context.console, (), context.stopping, context.processes, context.devices
+    )
+    with contextlib.closing(inner), context.timed(f"study/{name}"):
+        study = run_study(config, {FULL: PUBLISHED}, inner, {FULL: Paper()})
+        for line in read_metrics(directory):
+            phase, seed = line["stage"].split("/")[0], line["stage"].split("/")[-1]
+            scalars = {key: value for key, value in line.items() if key not in ("stage", "step")}
+            context.log(f"{phase}/{name}/{seed}", line["step"], **scalars)
+        return study, inner.timing()
+
+
+def grpo_step_s(config: StudyConfig, timing: Mapping[str, float]) -> float:
+    """Mean seconds of a step of GRPO; the first step of a seed, which compiles, is not timed."""
+    total = math.fsum(s for stage, s in timing.items() if stage.startswith(f"{STEPPING}/grpo/"))
+    return total / (config.seeds * max(config.grpo_steps - 1, 1))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TimedPrograms:
+    """Programs of one size that have run once: a step of SFT, and a block of questions from pictures to answers.
+
+    An untrained policy answers them, which never ends early: `answer` takes the longest time that it can.
+    """
+
+    train: Callable[[], Any]
+    answer: Callable[[], Any]
+    questions: int
+    parameters: int
+
+
+def timed_programs(study: Study) -> TimedPrograms:
+    """A step of SFT and a block of questions about some test contacts, ready to be timed."""
+    data, assembly = study.data, study.assembly
+    rows = data.parts["test"][:ENCODE_BATCH]
+    clips = data.batches(rows, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
+    touch = touch_batch(next(iter(clips)))
+    params = assembly.init(0, touch)
+    label = data.label[rows]
+    contact, attribute = labelled(label)
+    encode, ask = encode_program(assembly.fns, False), answer_program(assembly)
+
+    def answer() -> Any:
+        features = jax.device_get(encode(params, touch))
+        present = features.stream_mask[contact]
+        batch = question_batch(assembly, features, label, contact, attribute, present)
+        return ask({"decoder": params["decoder"]}, batch)
+
+    config = study.config.sft
+    evidence = np.zeros((len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels)))
+    batch = next(AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, questions=config.questions, seed=0))
+    optimizer, step = sft_program(assembly.fns, config, False)
+    donated = jax.tree.map(jnp.array, params)  # a copy: the step gives its buffers away
+    states = [SFTState(params=donated, opt_state=optimizer.init(donated), step=jnp.zeros((), jnp.int32))]
+
+    def train() -> Any:
+        state, metrics = step(states.pop(), batch)
+        states.append(state)
+        return metrics
+
+    for call in (train, answer):
+        jax.block_until_ready(call())
+    parameters = sum(math.prod(x.shape) for x in jax.tree.leaves(params))
+    return TimedPrograms(train=train, answer=answer, questions=len(contact), parameters=parameters)
+
+
+SizeRows = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
+"""Policy → size → metric."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SizeTrend:
+    """Change of a metric for each doubling of the parameters, with its interval over seeds."""
+
+    policy: str
+    metric: str
+    slope: Interval
+
+    @property
+    def larger_is(self) -> Literal["better", "worse", "undecided"]:
+        """The direction beyond chance over seeds."""
+        if not self.slope.excludes_zero:
+            return "undecided"
+        rises = self.slope.mean > 0
+        return "better" if rises == (REPORTED[self.metric].better == "higher") else "worse"
+
+
+def size_trends(rows: SizeRows, costs: Mapping[str, SizeCost], metrics: Sequence[str]) -> tuple[SizeTrend, ...]:
+    """Slopes of every policy and metric: for every seed a line m = a + b·log₂ N through its sizes, b over seeds.
+
+    Args:
+      rows: policy → size → metric; every policy and size has the same seeds, two at least.
+      costs: size → parameters N.
+      metrics: those to look at; one that some size lacks is left out.
+    """
+    doublings = np.log2([costs[name].parameters for name in costs])
+    found = []
+    for policy, sizes in rows.items():
+        for metric in metrics:
+            if all(metric in sizes[name] for name in costs):
+                values = np.array([sizes[name][metric].per_seed for name in costs])
+                slope = student_interval(_slopes(doublings, values))
+                found.append(SizeTrend(policy=policy, metric=metric, slope=slope))
+    return tuple(found)
+
+
+def _slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Least squares, Σ (x − x̄)(y − y₀) / Σ (x − x̄)²: exactly 0 where y [n, seeds] does not change with x [n]."""
+    away = x - x.mean()
+    return np.asarray(away @ (y - y[:1]) / (away @ away))
+
+
+def trend_table(trends: Sequence[SizeTrend]) -> Table:
+    """Every slope, and the paper's claim about the metric."""
+    rows: list[dict[str, Cell]] = []
+    for trend in trends:
+        metric, spec = REPORTED[trend.metric], f"+{REPORTED[trend.metric].format}"
+        rows.append(
+            {
+                "policy and metric": f"{trend.policy}: {metric.title}",
+                "change": number(trend.slope.mean, spec),
+                "95 % over seeds": bounds(trend.slope.low, trend.slope.high, spec),
+                "larger is": trend.larger_is,
+                "paper": "grows clearly" if trend.metric in CLAIMED else "grows, if it is among most",
+            }
+        )
+    return named_table(
+        "Change for each doubling of the parameters",
+        rows,
+        meanings={
+            "95 % over seeds": "Student's t over the slopes of single seeds",
+            "larger is": "better or worse where the interval excludes 0",
+            "paper": "its text: consistent growth on most higher-better metrics, these named",
+        },
+        note="Slopes of straight lines through three sizes; the learning rates are those of the default size.",
+    )
+
+
+def size_table(models: Mapping[str, ModelConfig], costs: Mapping[str, SizeCost], config: StudyConfig) -> Table:
+    """Shape, parameters and times of each size.
+
+    Args:
+      models: size → its model.
+      costs: size → its cost.
+      config: of the studies.
+    """
+    rows: list[dict[str, Cell]] = [
+        {
+            "size": name,
+            "parameters": cost.parameters,
+            "shape": _shape(models[name]),
+            "SFT step": 1e3 * cost.sft_s,
+            "GRPO step": 1e3 * cost.grpo_s,
+            "question": 1e3 * cost.question_s,
+            "training": cost.training_s(config),
+        }
+        for name, cost in costs.items()
+    ]
+    return named_table(
+        "Sizes",
+        rows,
+        formats={"SFT step": ".0f", "GRPO step": ".0f", "question": ".1f", "training": ".0f"},
+        units={"SFT step": "ms", "GRPO step": "ms", "question": "ms", "training": "s"},
+        meanings={
+            "shape": "layers × width of the tactile encoder, the picture tower, the decoder",
+            "SFT step": "measured in turns with the other sizes",
+            "GRPO step": "as it ran",
+            "question": "pictures to answer, to its full length",
+            "training": "both stages of a seed, by the steps' times",
+        },
+    )
+
+
+def _shape(model: ModelConfig) -> str:
+    """Layers × width of the three towers."""
+    towers = ((x.num_layers, x.width) for x in (model.tactile, model.vision))
+    return ", ".join(f"{n}×{w}" for n, w in (*towers, (model.decoder.num_layers, model.decoder.hidden_size)))
+
+
+def size_chart(rows: SizeRows, costs: Mapping[str, SizeCost], config: StudyConfig, metrics: Sequence[str]) -> bytes:
+    """One row of panels for each metric, against parameters and against seconds of training.
+
+    Args:
+      rows: policy → size → metric.
+      costs: size → its cost.
+      config: of the studies.
+      metrics: those to draw.
+    """
+    positions = {
+        "parameters (million)": [cost.parameters / 1e6 for cost in costs.values()],
+        "training of a seed (s)": [cost.training_s(config) for cost in costs.values()],
+    }
+    panels = []
+    for metric in metrics:
+        unit = f" ({REPORTED[metric].unit})" if REPORTED[metric].unit else ""
+        for label, x in positions.items():
+            series: list[Series] = []
+            for (policy, sizes), colour in zip(rows.items(), (*PALETTE[:2], SHARED), strict=False):
+                found = [sizes[name][metric] for name in costs]
+                mean, low, high = ([getattr(e, end) for e in found] for end in ("mean", "low", "high"))
+                series.append(Series(policy, x=x, y=mean, low=low, high=high, colour=colour, marker="o"))
+                dots = [(at, value) for at, e in zip(x, found, strict=True) for value in e.per_seed]
+                at, values = zip(*dots, strict=True)
+                series.append(Series(x=at, y=values, line="", marker="o", size=9, alpha=0.35, colour=colour))
+            ticks = {value: format(value, ".2g") if value < 10 else format(value, ".0f") for value in x}
+            x_label = label if metric == metrics[-1] else ""
+            y_label = f"{REPORTED[metric].title}{unit}" if label == next(iter(positions)) else ""
+            panels.append(Panel(series, x_scale="log", x_ticks=ticks, x_label=x_label, y_label=y_label))
+    return draw(panels, columns=len(positions), size=(8.2, 2.5 * len(metrics) + 0.5))

@@ -1,0 +1,158 @@
+"""Effects of components by hand values, agreement with the paper's signs, and the failures that a run shows."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.paper.component_effects import (
+    FOUR,
+    LADDER_METRICS,
+    ComponentStep,
+    component_effects,
+    find_effect,
+    pooled,
+)
+from experiments.paper.components import COMPONENTS, PUBLISHED, published_steps
+from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.rewards import make_rewards, uniform_prior
+
+STEP = ComponentStep(arm="b", against="a", component="it", published=(-0.1, 5.0, 2.0))
+OBJECTS = np.repeat(np.arange(20), 2)
+
+
+def scores(values) -> Scores:
+    values = np.broadcast_to(np.asarray(values, float), 40)
+    return Scores(values=values, items=np.arange(40), strata=np.zeros(40, int))
+
+
+def rows(a, b):
+    """Two arms in all metrics of the ladder, one value a seed."""
+    row = lambda seeds: [{m.metric: scores(x) for m in LADDER_METRICS} for x in seeds]
+    return {"a": row(a), "b": row(b)}
+
+
+def effects(a, b, step=STEP):
+    return component_effects([step], rows(a, b), OBJECTS)
+
+
+def test_an_effect_is_the_mean_difference_of_paired_seeds():
+    omae, csc, four = found = effects([1.0, 2.0, 3.0], [0.9, 2.1, 3.3])
+    assert omae.seeds.mean == pytest.approx(0.1)
+    assert omae.seeds.high - omae.seeds.mean == pytest.approx(4.302653 * 0.2 / np.sqrt(3), rel=1e-5)
+    assert [e.published for e in found] == [-0.1, 5.0, 2.0]
+    assert [e.metric.metric for e in found] == ["omae", "csc", FOUR]
+    assert find_effect(found, "b", "csc") is csc
+    assert find_effect(found, "c", "csc") is None
+    assert four is not csc
+
+
+@pytest.mark.parametrize(
+    ("after", "signs"),
+    [
+        ([1.1, 2.1, 3.11], ["opposite", "reproduced", "reproduced"]),
+        ([0.9, 1.9, 2.91], ["reproduced", "opposite", "opposite"]),
+        ([0.9, 2.1, 3.3], ["undecided"] * 3),
+    ],
+)
+def test_signs_need_an_interval_without_zero(after, signs):
+    before = [1.0, 2.0, 3.0]
+    assert [e.sign for e in effects(before, after)] == signs
+    bare = dataclasses.replace(STEP, published=None)
+    assert [e.sign for e in effects(before, after, bare)] == ["not in the paper"] * 3
+
+
+def test_p_values_are_corrected_over_the_table():
+    found = effects([1.0, 2.0, 3.0], [1.1, 2.1, 3.2])
+    assert [e.p_seeds for e in found] == [0.75] * 3  # .25 is the least of three seeds; three metrics
+    assert all(e.p_objects < 0.01 for e in found)
+
+
+def test_a_baseline_of_one_seed_is_compared_with_every_seed():
+    assert effects([1.0], [2.0, 3.0])[0].seeds.mean == pytest.approx(1.5)
+    with pytest.raises(ValueError, match="b and a have 2 and 3 seeds"):
+        effects([1.0, 1.0, 1.0], [2.0, 3.0])
+
+
+def test_metrics_that_an_arm_lacks_are_left_out():
+    table = rows([1.0, 2.0], [2.0, 3.0])
+    table["a"] = [{m: s for m, s in seed.items() if m != "csc"} for seed in table["a"]]
+    assert [e.metric.metric for e in component_effects([STEP], table, OBJECTS)] == ["omae", FOUR]
+
+
+def test_pooling_means_over_seeds_question_by_question():
+    a, b = scores(np.arange(40)), scores(np.arange(40) + 2.0)
+    assert np.array_equal(pooled([a, b]).values, np.arange(40) + 1.0)
+
+
+def test_arms_add_or_omit_one_component_and_use_known_rewards():
+    """The ladder ends in the full objective, from which each omission takes one component."""
+    known = make_rewards(uniform_prior([3, 3, 3, 9]))
+    arms = [arm for c in COMPONENTS for arm in (c.added, c.omitted)]
+    assert len({arm.name for arm in arms}) == len(arms)
+    assert {term for arm in arms for term in arm.weights or ()} <= set(known)
+    assert PUBLISHED == {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
+    full = COMPONENTS[-1].added
+    for below, component in zip((None, *COMPONENTS), COMPONENTS, strict=False):
+        one, omitted = component.added, component.omitted
+        if below and below.added.weights:
+            assert (one.weights == below.added.weights) != (one.algorithm == below.added.algorithm)
+        if omitted.name != "no_sft":
+            assert (omitted.weights == full.weights) != (omitted.algorithm == full.algorithm)
+
+
+def test_steps_of_the_paper_are_differences_of_its_rows():
+    steps = published_steps()
+    assert steps["SFT"] == pytest.approx((-0.37, 21.2, 19.8))
+    assert steps["grounding G_tg"] == pytest.approx((-0.02, 0.9, 0.9))
+    assert steps["tactile use R_tu"] is None
+
+
+def lines(arm: str, seed: int, alarm: bool = False, **metrics):
+    """Thirty steps of training: each metric has its first value for ten steps, then its second."""
+    for step in range(30):
+        row = {name: a if step < 10 else b for name, (a, b) in metrics.items()}
+        yield {"stage": f"grpo/{arm}/{seed}", "step": step, **row} | ({"alarm_F9": 0.1} if alarm and step == 20 else {})
+
+
+def test_a_history_is_the_beginning_and_the_end():
+    rows = [
+        *lines("b", 0, entropy=(0.8, 0.2)),
+        *lines("b", 1, True, entropy=(0.6, 0.2)),
+        *lines("c", 0, entropy=(0, 1)),
+    ]
+    history = training_history(rows, "b")
+    assert history.start == pytest.approx({"entropy": 0.7})
+    assert history.end == pytest.approx({"entropy": 0.2})
+    assert history.alarms == {"F9": 0.5}
+    assert training_history(rows, "sft") is None
+
+
+QUIET = {"middle_rate": 30.0, "csc": 40.0, "csc_slot": 60.0, "parse_rate": 100.0}
+
+
+@pytest.mark.parametrize(
+    ("after", "consistency", "code"),
+    [
+        ({"middle_rate": 45.0}, False, "F1"),
+        ({"middle_rate": 5.0}, True, "F2"),
+        ({"middle_rate": 5.0}, False, "F9"),
+        ({"csc_slot": 90.0, "csc": 41.0}, False, "F2"),
+        ({"parse_rate": 80.0}, False, "F13"),
+    ],
+)
+def test_failures_show_on_test_questions(after, consistency, code):
+    arm = ArmMeasurements(history=None, after={**QUIET, **after}, before=QUIET, consistency=consistency)
+    (found,) = diagnose(arm)
+    assert found.startswith(f"{code}: ")
+
+
+def test_failures_show_in_training():
+    rows = [*lines("b", 0, entropy=(0.8, 0.1), degenerate_share=(0.1, 0.9))]
+    found = diagnose(ArmMeasurements(history=training_history(rows, "b"), after=QUIET, before=QUIET))
+    assert [text.split(":")[0] for text in found] == ["F7", "F9"]
+    assert "90 %" in found[0]
+    assert diagnose(ArmMeasurements(history=None, after=QUIET, before=QUIET)) == ()
+    alarmed = training_history([*lines("b", 0, True, entropy=(0.8, 0.7))], "b")
+    assert diagnose(ArmMeasurements(history=alarmed, after=QUIET, before=QUIET))[0].startswith("F9: ")

@@ -1,0 +1,166 @@
+"""Baselines on fixed features, on contacts whose answers are known by hand; the features of recorded contacts."""
+
+import dataclasses
+import functools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments.paper.eval_variants import mean_tokens, swap_objects
+from experiments.paper.feature_baselines import (
+    CELLS,
+    ContactFeatures,
+    LabelledFeatures,
+    field_features,
+    linear_probe,
+    nearest,
+    other_objects,
+    picture_features,
+    together_and_alone,
+)
+from tests.experiments import tiny
+from touchr1_jax.training.evidence import ProbeConfig
+
+LEVELS = (3,)
+
+
+def features(x, present=None) -> ContactFeatures:
+    x = np.asarray(x, np.float32)
+    return ContactFeatures(x=x, present=np.ones(x.shape[:2], bool) if present is None else np.asarray(present))
+
+
+def predict(known, asked, levels, **options):
+    return together_and_alone(functools.partial(nearest, levels=levels, **options), known, asked)
+
+
+def two_streams(noise: float, seed: int = 0, n: int = 60) -> LabelledFeatures:
+    """Stream 0 carries the level, stream 1 something else; both carry a constant too."""
+    rng = np.random.default_rng(seed)
+    label = np.arange(n)[:, None] % 3
+    signal = np.stack([label[:, 0], np.arange(n) // 3 % 2], 1).astype(float)
+    x = np.stack([signal, np.full((n, 2), 7.0)], 2)
+    return LabelledFeatures(features=features(x + noise * rng.normal(size=x.shape)), label=label)
+
+
+def test_the_nearest_contact_decides():
+    known = LabelledFeatures(features=features([[[0.0]], [[1.0]], [[10.0]]]), label=np.array([[0], [1], [2]]))
+    found = predict(known, features([[[0.2]], [[1.1]], [[7.0]]]), (3,), neighbours=1)
+    assert found.together[:, 0].tolist() == [0, 1, 2]
+    assert found.alone.shape == (3, 1, 1)
+
+
+def test_neighbours_vote_by_one_over_their_distance():
+    known = LabelledFeatures(features=features([[[0.0]], [[3.0]], [[3.0]]]), label=np.array([[0], [1], [1]]))
+    at = lambda x: predict(known, features([[[x]]]), (2,), neighbours=3).together[0, 0]
+    assert at(0.9) == 0  # 1/.9 against 2/2.1
+    assert at(1.1) == 1  # 1/1.1 against 2/1.9
+
+
+def test_a_feature_counts_by_its_spread_and_one_without_spread_does_not():
+    x = [[[0.0, 0.0, 5.0]], [[1.0, 1000.0, 5.0]]]
+    known = LabelledFeatures(features=features(x), label=np.array([[0], [1]]))
+    assert predict(known, features([[[0.1, 600.0, 9.0]]]), (2,), neighbours=1).together[0, 0] == 0
+
+
+def test_streams_that_are_not_shared_do_not_count():
+    known = LabelledFeatures(
+        features=features([[[0.0], [9.0]], [[1.0], [0.0]]], [[True, False], [True, True]]), label=np.array([[0], [1]])
+    )
+    asked = features([[[0.1], [0.0]], [[0.0], [0.0]]], [[True, True], [False, False]])
+    found = predict(known, asked, (2,), neighbours=1)
+    assert found.together[:, 0].tolist() == [0, -1]  # by the first stream alone; ⊥ where nothing was recorded
+    assert found.alone[:, :, 0].tolist() == [[0, 1], [-1, -1]]
+
+
+def test_unannotated_contacts_do_not_vote():
+    known = LabelledFeatures(features=features([[[0.0]], [[1.0]]]), label=np.array([[-1], [2]]))
+    assert predict(known, features([[[0.0]]]), (3,)).together[0, 0] == 2
+    with pytest.raises(ValueError, match=r"label\[:, 0\] is −1 throughout"):
+        predict(LabelledFeatures(features=known.features, label=np.full((2, 1), -1)), features([[[0.0]]]), (3,))
+
+
+def test_a_probe_reads_a_stream_and_gives_bottom_where_it_is_absent():
+    known, asked = two_streams(noise=0.05), two_streams(noise=0.05, seed=1)
+    single = dataclasses.replace(known, features=known.features.only(0))
+    present = np.arange(60)[:, None] > 0
+    probe = functools.partial(linear_probe, levels=LEVELS, config=ProbeConfig(iterations=20))
+    found = together_and_alone(probe, single, features(asked.features.only(0).x, present))
+    assert np.array_equal(found.together[1:], asked.label[1:])
+    assert np.array_equal(found.alone[:, 0], found.together)
+    assert found.together[0, 0] == -1
+
+
+def test_the_order_of_training_contacts_changes_nothing():
+    known, asked = two_streams(noise=0.3), two_streams(noise=0.3, seed=1).features
+    order = np.random.default_rng(0).permutation(60)
+    turned = LabelledFeatures(features=known.features.rows(order), label=known.label[order])
+    assert np.array_equal(predict(known, asked, LEVELS).together, predict(turned, asked, LEVELS).together)
+
+
+def test_other_objects_are_others_and_all_are_drawn():
+    objects = np.array(["a", "b", "a", "c", "b", "a"])
+    drawn = np.stack([other_objects(objects, seed) for seed in range(200)])
+    assert (objects[drawn] != objects).all()
+    for i in range(6):
+        assert set(drawn[:, i]) == set(np.flatnonzero(objects != objects[i]))
+    with pytest.raises(ValueError, match="only"):
+        other_objects(np.array(["a", "a"]), 0)
+
+
+def test_the_touch_of_other_objects_predicts_nothing():
+    known, asked = two_streams(noise=0.0, n=300), two_streams(noise=0.0, n=300, seed=1)
+    objects = np.arange(300).astype(str)
+    swapped = LabelledFeatures(features=known.features.rows(other_objects(objects, 0)), label=known.label)
+    right = lambda k, a: (predict(k, a, LEVELS).together == asked.label).mean()
+    assert right(known, asked.features) == 1
+    assert right(swapped, asked.features.rows(other_objects(objects, 1))) < 0.45  # chance is a third
+
+
+def test_fields_of_the_strongest_press_are_averaged_over_cells(data):
+    rows = data.parts["test"][:2]
+    found = field_features(data.store, rows, data.clip.sensors)
+    assert found.x.shape == (2, 4, 2 * CELLS**2)
+    assert found.present.all()
+    recorded = data.store.contact(int(rows[0]))["tac3d"]
+    t = int(np.argmin(recorded.force_n[:, 2]))
+    depth = found.x[0, data.clip.sensors.index("tac3d"), : CELLS**2]
+    assert depth.max() <= recorded.depth_mm[t].max() + 1e-6
+    assert depth.mean() == pytest.approx(recorded.depth_mm[t].mean(), rel=0.05)
+
+
+def test_a_stream_without_fields_is_absent():
+    bare = SimpleNamespace(depth_mm=None, deformation_mm=None)
+    store = SimpleNamespace(contact=lambda row, fields: {"tac3d": bare})
+    assert not field_features(store, np.arange(2), ("tac3d", "xense")).present.any()
+
+
+def test_pictures_give_colour_and_texture():
+    view = np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)
+    found = picture_features([view, np.full((16, 16, 3), 100, np.uint8), None])
+    assert found.present.tolist() == [[True], [True], [False]]
+    colour, texture = np.split(found.x[:, 0], [3 * CELLS**2], axis=1)
+    assert colour[0].reshape(CELLS, CELLS, 3).mean((0, 1)) == pytest.approx(view.mean((0, 1)) / 255, abs=1e-3)
+    assert np.ptp(texture[1]) == 0
+    assert texture[0].min() > texture[1].max()
+
+
+def test_absent_tokens_do_not_count():
+    encoded = tiny.features(3)
+    time = encoded.touch_time.copy()
+    time[0, 0, 1:] = -1
+    present = encoded.stream_mask & (np.arange(3) != 2)[:, None]
+    found = mean_tokens(dataclasses.replace(encoded, touch_time=time, stream_mask=present))
+    assert np.allclose(found.x[0, 0], encoded.touch[0, 0, 0], atol=1e-6)
+    assert np.allclose(found.x[1, 2], encoded.touch[1, 2].mean(0), atol=1e-6)
+    assert found.present.tolist() == [[True] * 4, [True] * 4, [False] * 4]
+
+
+def test_swapped_touch_is_whole_and_of_another_object():
+    encoded = tiny.features(4)
+    objects = np.array(["a", "a", "b", "c"])
+    swapped = swap_objects(encoded, objects, 0)
+    for i in range(4):
+        (source,) = (j for j in range(4) if np.array_equal(swapped.touch[i], encoded.touch[j]))
+        assert objects[source] != objects[i]
+    assert np.array_equal(swapped.view, encoded.view)

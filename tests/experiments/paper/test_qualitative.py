@@ -1,0 +1,55 @@
+"""The cases of answers and the bench's items that are shown, by hand."""
+
+import numpy as np
+
+from experiments.paper.conflict_metrics import TouchQuestions
+from experiments.paper.qualitative import Conclusions, answer_cases, first_of, item_examples
+from experiments.study.answers import Evaluated
+from touchr1_jax.bench.items import Ask, Touch
+
+QUESTIONS = TouchQuestions(
+    attribute=np.array([0, 0, 1, 3, 3]),
+    label=np.array([0, 2, 2, 5, 7]),
+    objects=np.array(["a", "b", "b", "c", "d"]),
+    looks_like_another=np.array([False, True, True, True, False]),
+)
+CONCLUSIONS = Conclusions(
+    full=np.array([0, 0, 2, 5, -1]),
+    sft=np.array([1, 2, 2, 5, 7]),
+    blind=np.array([0, 0, 1, 4, 4]),
+    swapped=np.array([2, 0, 2, 5, 7]),
+    perceived=np.array([[0, 1], [0, 0], [2, 1], [5, 4], [-1, -1]]),
+)
+
+
+def test_every_answer_is_of_its_cases():
+    cases = answer_cases(QUESTIONS, CONCLUSIONS)
+    assert [np.flatnonzero(c.rows).tolist() for c in cases] == [[0], [3], [2], [1], [0, 2], [], [1], [0], [1, 4], [4]]
+    assert [c.share for c in cases[:4]] == [50, 100, 50, 100 / 3]
+
+
+def test_a_case_without_questions_has_no_share():
+    honest = TouchQuestions(**{**vars(QUESTIONS), "looks_like_another": np.zeros(5, bool)})
+    assert answer_cases(honest, CONCLUSIONS)[1].share == 0
+
+
+def test_the_first_answer_of_each_object_is_shown():
+    rows = np.array([False, True, True, True, True])
+    assert first_of(rows, QUESTIONS.objects, 2) == [1, 3]
+    assert first_of(np.zeros(5, bool), QUESTIONS.objects, 2) == []
+
+
+def test_an_item_is_shown_by_the_answers_that_it_consists_of():
+    touches = tuple(Touch(object=name, site=0, motion="press", trial=0) for name in ("a", "b"))
+    pair = Ask(
+        id="compare-0000", kind="compare", attributes=("hardness",), touches=touches, sensors=("xense",), answer=(1,)
+    )
+    contact, attribute = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    full = Evaluated(
+        contact=contact, attribute=attribute, streams=None, tokens=None, parsed=None, label=None, alone=None
+    )
+    places = {touches[0]: 0, touches[1]: 1}
+    for answer, words in (((0,), "first"), ((-1,), "cannot be read")):
+        ((heading, rows),) = item_examples([pair], {"compare-0000": answer}, places, full)
+        assert rows == [0, 2]
+        assert words in heading
