@@ -88,7 +88,7 @@ def bench_questions(data: Dataset, quota: Quota, context: Context) -> tuple[Ask,
 
 
 def bench_answers(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
-    """ItemAnswers to the bench's questions that follow from the answers about single touches, for every seed."""
+    """Answers to the bench's questions that follow from the answers about single touches, for every seed."""
     rows, contacts = touch_rows(data), len(data.parts["test"])
     each = (SingleTouchAnswers.of(answers, contacts) for answers in seeds)
     return [answer_all(asks, single, rows, data.clip.sensors) for single in each]
