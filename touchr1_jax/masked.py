@@ -1,7 +1,7 @@
-"""Statistics over the selected elements of an array; the one place where they are divided, so no stray epsilons.
+"""Statistics over the selected elements of an array; all masked divisions are here, so that no epsilon is needed.
 
-In all of them `mask` (boolean) broadcasts against `x` and `axis` is as in NumPy.  What is not selected has no
-influence, not even when it is NaN or infinite.  Gradients are finite: 0 where nothing is selected or nothing varies.
+`mask` (boolean) broadcasts against `x`, and `axis` is as in NumPy.  Elements that are not selected have no influence,
+even if they are NaN or infinite.  Gradients are finite: 0 where nothing is selected or nothing varies.
 """
 
 import jax.numpy as jnp

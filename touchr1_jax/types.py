@@ -15,7 +15,7 @@ Params = Any  # a pytree of float arrays, as flax.linen returns it
 
 @struct.dataclass
 class TouchBatch:
-    """P contacts, each seen by all sensors; the JAX side of `sensors_io.schema.CLIP_ARRAYS`."""
+    """P contacts, each recorded by all sensors; the JAX side of `sensors_io.schema.CLIP_ARRAYS`."""
 
     frames: UInt8[Array, "P S F H W 3"]
     force_n: Float[Array, "P S F 3"]
@@ -29,9 +29,9 @@ class TouchBatch:
 
 @struct.dataclass
 class Target:
-    """What one rollout is scored against; −1 marks an unknown label.
+    """The right answer that a rollout is scored against; −1 marks an unknown label.
 
-    `asked` selects the attributes of the question, `streams` the sensors that were there to be reported on.
+    `asked` selects the attributes of the question, `streams` the sensors that were present.
     """
 
     asked: Bool[Array, "A"]
@@ -43,9 +43,9 @@ class Target:
 
 @struct.dataclass
 class Parsed:
-    """One completion as the rewards see it; a level of −1 is ⊥, unparsable.
+    """The levels that a completion states; −1 is ⊥, unparsable.
 
-    `perceive[s, a]` is what the answer says sensor s feels, `compare[a]` the cross-sensor summary, `conclude[a]` the
+    `perceive[s, a]` is the level reported for sensor s, `compare[a]` the cross-sensor summary, `conclude[a]` the
     answer.  `formatted` means each of the six tags exactly once, in order, no empty body, only white space after the
     last.  `truncated` means that no end token came.  `length` counts the tokens before the end token.
     """

@@ -1,10 +1,10 @@
-"""Limits of configured numbers: what lies outside is refused by name, and so is what is no number."""
+"""Range checks for fields of a configuration; NaN is rejected."""
 
 from typing import Any
 
 
 def at_least(config: Any, bound: float, *fields: str) -> None:
-    """Refuse a config with a field that is below a bound.
+    """Check that fields are ≥ a bound.
 
     Raises:
       ValueError: naming the field, its value and the bound.
@@ -16,7 +16,7 @@ def at_least(config: Any, bound: float, *fields: str) -> None:
 
 
 def above(config: Any, bound: float, *fields: str) -> None:
-    """Refuse a config with a field that is a bound or below it.
+    """Check that fields are > a bound.
 
     Raises:
       ValueError: naming the field, its value and the bound.
@@ -28,7 +28,7 @@ def above(config: Any, bound: float, *fields: str) -> None:
 
 
 def within(config: Any, low: float, high: float, *fields: str) -> None:
-    """Refuse a config with a field outside [low, high].
+    """Check that fields lie in [low, high].
 
     Raises:
       ValueError: naming the field, its value and the bounds.

@@ -35,7 +35,7 @@ from experiments.engine.world import (
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards
-from touchr1_jax.rl.alarms import Watch
+from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.counterfactual import noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
@@ -138,9 +138,9 @@ class VariantRun:
 
     def alarms(self, seed: int) -> "dict[str, FirstAlarm]":
         """Code of each alarm that a seed's training raised → when it first did."""
-        watch, fired = Watch(), dict[str, FirstAlarm]()
+        monitor, fired = AlarmMonitor(), dict[str, FirstAlarm]()
         for t in range(len(self.metrics["reward"][seed])):
-            for alarm in watch.see({name: float(value[seed, t]) for name, value in self.metrics.items()}):
+            for alarm in monitor.update({name: float(value[seed, t]) for name, value in self.metrics.items()}):
                 fired.setdefault(alarm.code, FirstAlarm(t, alarm.value))
         return fired
 

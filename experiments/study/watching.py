@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from experiments.core.context import Context, read_metrics
-from touchr1_jax.rl.alarms import Watch
+from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.training.loop import SKIPPED
 
 _FIELDS = ("stage", "step")
@@ -22,12 +22,12 @@ def watched_log(context: Context, stage: str, start: int) -> Callable[[int, dict
       stage: name of the stage.
       start: first step that is computed.
     """
-    watch, told = Watch(), set[str]()
+    monitor, told = AlarmMonitor(), set[str]()
 
     def see(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
         if SKIPPED in metrics:  # its update was left out, and what was not finite is missing
             return {}
-        alarms = watch.see(metrics)
+        alarms = monitor.update(metrics)
         for alarm in alarms:
             if aloud and alarm.code not in told:
                 context.print(f"{stage}, step {t}: {alarm}")

@@ -1,1 +1,1 @@
-"""One program on many devices: the mesh, who holds what on it, and what a step needs of each device."""
+"""Training on many devices: the mesh, the sharding rules, and the memory and time of a step on each device."""

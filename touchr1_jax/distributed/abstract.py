@@ -1,4 +1,4 @@
-"""A GRPO step of a Qwen2.5-VL policy in shapes alone, to be compiled without weights or data."""
+"""A GRPO step of a Qwen2.5-VL policy in shapes alone, compiled without weights or data."""
 
 import dataclasses
 import functools
@@ -41,7 +41,7 @@ class PromptShape:
 
 
 class AbstractStep(NamedTuple):
-    """Arguments of a step, as `jax.ShapeDtypeStruct`, and its fns."""
+    """Arguments of a step, as `jax.ShapeDtypeStruct`, and the policy functions."""
 
     fns: PolicyFns
     state: GRPOState
@@ -65,7 +65,7 @@ def abstract_grpo(
 
     Args:
       config: towers; the decoder alone is trained.
-      prompt: what stands in a prompt.
+      prompt: tokens of a prompt.
       shape: sizes of the step; its decoder is the config's.
       optimizer: whose state is counted.
       lora: adapters to train on a decoder that is frozen in bfloat16; `None` trains the decoder.

@@ -1,8 +1,8 @@
-"""What a step needs of each device, known before there is a device or a weight: counted by hand, and compiled.
+"""Memory of a step on each device, predicted without devices or weights: counted by hand, and compiled.
 
-The count follows from shapes and rules alone.  The compiler's own figures come from lowering and compiling the step for
-the mesh on as many simulated devices (`--xla_force_host_platform_device_count`); a CPU keeps bfloat16 products in
-float32, so that its temporary memory is an upper figure.
+The count follows from shapes and sharding rules alone.  The compiler's own figures come from lowering and compiling
+the step for the mesh on as many simulated devices (`--xla_force_host_platform_device_count`); a CPU keeps bfloat16
+products in float32, so that its temporary memory is an upper bound.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ HALF, FLOAT = 2, 4
 
 
 class Compiled(NamedTuple):
-    """What the compiler reserves on each device, bytes; `aliased` is the part of the results that takes over arguments.
+    """Bytes that the compiler reserves on each device; `aliased` is the part of the results in buffers of arguments.
 
     Source: `jax.stages.Compiled.memory_analysis`, of one device's program.
     """
@@ -44,19 +44,19 @@ class Compiled(NamedTuple):
 
 
 def compiled_bytes(step: jax.stages.Wrapped, *arguments: Any) -> Compiled:
-    """Compile a jitted step for the shapes of its arguments, and ask the compiler.
+    """Compile a jitted step for the shapes of its arguments, and return the compiler's figures.
 
     Raises:
-      RuntimeError: a backend that does not tell.
+      RuntimeError: a backend without memory analysis.
     """
     return reserved_bytes(step.lower(*arguments).compile())
 
 
 def reserved_bytes(compiled: jax.stages.Compiled) -> Compiled:
-    """What the compiler of a program says.
+    """The compiler's figures for a program.
 
     Raises:
-      RuntimeError: a backend that does not tell.
+      RuntimeError: a backend without memory analysis.
     """
     found: Any = compiled.memory_analysis()
     if found is None:
@@ -84,7 +84,7 @@ def held_bytes(mesh: MeshConfig, tree: Any) -> int:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GRPOShape:
-    """All that the memory of a GRPO step depends on.
+    """The sizes that the memory of a GRPO step depends on.
 
     Raises:
       ValueError: prompts or micro-batches that data · fsdp does not divide, or key heads that tensor does not.
@@ -128,15 +128,16 @@ def grpo_bytes(
 ) -> dict[str, int]:
     """Bytes of a GRPO step on each device, line by line; shapes in place of arrays will do.
 
-    Sampling gathers all weights before its first token.  Other passes gather a layer's where they use them and drop
-    them: two layers are there at a time, the next one on its way, and the heads of all policies that are compared.  Of
+    Sampling gathers all weights before its first token.  Other passes gather the weights of a layer where
+    they use them and drop them: two layers at a time, with the next one on its way, and the heads of all policies that
+    are compared.  Of
     two gradients one is the sum over micro-batches.  With `remat` the backward pass keeps products with weights alone;
     without it about twice that.
 
     Args:
       shape: sizes of the step.
       state, batch, frozen: its arguments.
-      base: frozen parameters under low-rank adapters, which are then what the state holds.
+      base: frozen parameters under low-rank adapters, which the state then holds.
     """
     held = lambda tree: held_bytes(shape.mesh, tree)
     layer = layer_weights(shape.decoder) // shape.mesh.tensor
@@ -163,11 +164,11 @@ def grpo_bytes(
 
 
 ARGUMENTS = ("frozen base", "parameters", "optimizer", "reference", "noise bank", "batch")
-"""Lines of `grpo_bytes` that are arguments of the step, and must be what the compiler says."""
+"""Lines of `grpo_bytes` that are arguments of the step; the compiler's figure must be the same."""
 
 SAMPLING = ("weights while sampling", "caches while sampling", "logits while sampling")
 LEARNING = ("gradients", "saved for the gradient", "attention while learning", "logits while learning")
-"""Lines that are there one after the other."""
+"""Lines that are needed one after the other."""
 
 
 def counted_peak(lines: Mapping[str, int]) -> int:
@@ -195,8 +196,8 @@ def cache_bytes(shape: GRPOShape) -> int:
 
 
 def saved_bytes(shape: GRPOShape) -> int:
-    """What the backward pass keeps of each token and layer: its input, and all matrix products but the last, which the
-    next layer's input holds; twice, where the perturbed branch has a gradient too."""
+    """Activations that the backward pass keeps of each token and layer: its input and all matrix products but the last,
+    which is part of the next layer's input; twice, where the perturbed branch has a gradient too."""
     c, algorithm = shape.decoder, shape.grpo.algorithm
     split = (c.num_heads + 2 * c.num_kv_heads) * c.head_dim + 2 * c.intermediate_size
     products = split // shape.mesh.tensor + 2 * c.hidden_size
@@ -214,14 +215,14 @@ def attention_bytes(shape: GRPOShape) -> int:
 
 
 def logit_bytes(shape: GRPOShape) -> int:
-    """Logits of a block of tokens, their log-softmax and its gradient, of each policy that is asked."""
+    """Logits of a block of tokens, their log-softmax and its gradient, of each policy."""
     v = shape.decoder.vocab_size
     tokens = min(shape.grpo.group * shape.grpo.length, max(1, shape.grpo.max_logits // v))
     return 3 * _policies(shape) * shape.micro_rows * tokens * v // shape.mesh.tensor * FLOAT
 
 
 def _sampler_bytes(shape: GRPOShape, params: Params) -> int:
-    """The parameters whole along fsdp, where that axis is there: sampling gathers them once."""
+    """The parameters gathered along fsdp, if that axis has several devices: sampling gathers them once."""
     return held_bytes(dataclasses.replace(shape.mesh, fsdp=1), params) if shape.mesh.fsdp > 1 else 0
 
 

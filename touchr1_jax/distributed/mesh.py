@@ -8,14 +8,14 @@ import jax
 from jax.sharding import AbstractMesh, AxisType, Mesh
 
 DATA, FSDP, TENSOR = "data", "fsdp", "tensor"
-"""Names of the mesh's axes, slowest first: neighbours on the last exchange most."""
+"""Names of the mesh's axes, slowest first: neighbours on the last axis exchange most."""
 
 AXES = (DATA, FSDP, TENSOR)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MeshConfig:
-    """How data · fsdp · tensor devices share the work; the defaults are one device.
+    """A mesh of data · fsdp · tensor devices; the defaults are one device.
 
     Prompts are split over data and fsdp.  Parameters and optimizer state are whole along data, so that it suits slow
     links between machines; they are split along fsdp and gathered where they are used (ZeRO-3, arXiv 1910.02054), to
@@ -60,5 +60,5 @@ class MeshConfig:
         return jax.make_mesh(self.shape, AXES, (AxisType.Auto,) * len(AXES), devices=found)
 
     def abstract(self) -> AbstractMesh:
-        """The mesh without devices, for whoever only asks what would lie where."""
+        """The mesh without devices, for questions about placement alone."""
         return AbstractMesh(self.shape, AXES, (AxisType.Auto,) * len(AXES))

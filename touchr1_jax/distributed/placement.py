@@ -1,4 +1,4 @@
-"""Put states and batches on a mesh, and compile a step for where they lie.
+"""Put states and batches on a mesh, and compile a step for their shardings.
 
 The steps of all stages, (state, batch, …) → (state, metrics), stay as they are: GSPMD (arXiv 2105.04663) splits the one
 program that they trace to by the shardings of its arguments and results.
@@ -19,7 +19,7 @@ from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gath
 from touchr1_jax.models.layers import RMSNorm
 
 LAYERS = (nn.Dense, nn.Embed, RMSNorm)
-"""Layers whose results are held in place; what lies between follows from them."""
+"""Layers whose results are constrained to a sharding; others follow from them."""
 
 OUTPUTS = ("__call__", "attend")
 """Their methods; by `attend` a table of embeddings computes logits."""
@@ -30,7 +30,7 @@ Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
 def place_state(mesh: Mesh, state: Any) -> Any:
     """A state on the mesh, on buffers of its own; every process must hold the same.
 
-    What does not fit into one device is made in place instead, by `jax.jit(make, out_shardings=state_shardings(…))`.
+    Make a state that does not fit into one device in place, by `jax.jit(make, out_shardings=state_shardings(…))`.
     """
     return jax.tree.map(_placed, state, state_shardings(mesh, state))
 
@@ -70,7 +70,7 @@ def place_batch(mesh: Mesh, rows: Any, batch_size: int) -> Any:
 
 
 def local_rows(mesh: Mesh, batch_size: int) -> np.ndarray:
-    """Rows of a batch that the devices of this process hold, ascending: all that it need read.
+    """Rows of a batch that the devices of this process hold, ascending: all that it must read.
 
     A pipeline that draws the rows of the whole batch and then reads these gives the same batches whatever the number of
     processes, so that a run goes on with another number of them.
@@ -96,7 +96,7 @@ def shard_step(
     Args:
       step: a stage's step, jitted or not.
       mesh: where it runs.
-      state, batch, shared: arguments, or their shapes and dtypes; `shared` is what a run never changes.
+      state, batch, shared: arguments, or their shapes and dtypes; a run never changes `shared`.
       compiler_options: of `jax.jit`; those that the step was made with do not carry over.
 
     Raises:
@@ -124,7 +124,7 @@ def gather_params(mesh: Mesh, params: Any) -> Any:
 
 
 def split_activations(mesh: Mesh) -> AbstractContextManager[None]:
-    """Within this context what every layer computes lies as `rules.activation_axes` says."""
+    """Context in which the result of every layer has the sharding of `rules.activation_axes`."""
 
     def constrain(call: Callable[..., Any], args: Any, kwargs: Any, context: nn.module.InterceptorContext) -> Any:
         y = call(*args, **kwargs)

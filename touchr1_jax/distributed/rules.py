@@ -1,6 +1,6 @@
-"""Who holds what: the sharding of every parameter, of optimizer state, caches and batches on a mesh.
+"""Sharding of every parameter, of optimizer state, caches and batches on a mesh.
 
-A parameter is placed by the last two names of its path, layer and leaf, for a layer's name says what it does.  Moments
+A parameter is placed by the last two names of its path, layer and leaf, since a layer's name tells its role.  Moments
 of an optimizer, averaged and reference parameters are nested as the parameters are and end in the same two names, so
 that one table serves all of them.
 
@@ -25,7 +25,7 @@ ROWS = (DATA, FSDP)
 """Axes along which the prompts, contacts or streams of a batch are split, always their first dimension."""
 
 LARGE_BYTES = 2**20
-"""Size from which on an array must be split as its rule says; a thousand smaller ones are a gigabyte."""
+"""Size from which on an array must be split by its rule; a thousand smaller ones are a gigabyte."""
 
 OPENING: Kernel = (FSDP, TENSOR)
 """A layer that reads the residual stream: each device of the tensor axis computes some of its outputs, …"""
@@ -68,16 +68,15 @@ SPLIT_OUTPUTS = frozenset(layer for layer, (_, outputs) in KERNELS.items() if ou
 """Layers whose outputs are split along the tensor axis; keys and values that a cache holds are, and logits."""
 
 
-def state_shardings(mesh: AnyMesh, state: Any, *, large_bytes: int = LARGE_BYTES) -> Any:
+def state_shardings(mesh: AnyMesh, state: Any) -> Any:
     """Sharding of every leaf of parameters or of a state that holds them, in the same tree; scalars are whole.
 
     Args:
       mesh: where it will lie.
       state: arrays, or their shapes and dtypes.
-      large_bytes: size from which on an array must be split as its rule says.
 
     Raises:
-      ValueError: a leaf that no rule names, or a large one that its rule cannot split; the error names its path.
+      ValueError: a leaf without a rule, or one of `LARGE_BYTES` that its rule cannot split; the error names its path.
     """
 
     def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
@@ -85,7 +84,7 @@ def state_shardings(mesh: AnyMesh, state: Any, *, large_bytes: int = LARGE_BYTES
             return NamedSharding(mesh, PartitionSpec())
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         axes = rule(name, len(leaf.shape))
-        return NamedSharding(mesh, _fitted(mesh, name, leaf, axes, large_bytes))
+        return NamedSharding(mesh, _fitted(mesh, name, leaf, axes))
 
     return jax.tree_util.tree_map_with_path(place, state)
 
@@ -170,10 +169,10 @@ def _rule(layer: str, leaf: str) -> tuple[Axis, ...] | None:
     return of_layer.get(leaf)
 
 
-def _fitted(mesh: AnyMesh, name: str, leaf: Any, axes: tuple[Axis, ...], large_bytes: int) -> PartitionSpec:
+def _fitted(mesh: AnyMesh, name: str, leaf: Any, axes: tuple[Axis, ...]) -> PartitionSpec:
     """The axes that divide their dimensions."""
     fits = [axis is None or size % mesh.shape[axis] == 0 for axis, size in zip(axes, leaf.shape, strict=True)]
-    if not all(fits) and math.prod(leaf.shape) * leaf.dtype.itemsize >= large_bytes:
+    if not all(fits) and math.prod(leaf.shape) * leaf.dtype.itemsize >= LARGE_BYTES:
         at = fits.index(False)
         raise ValueError(
             f"parameter {name} has shape {leaf.shape}: dimension {at} must be a multiple of mesh {axes[at]} = "

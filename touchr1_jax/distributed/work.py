@@ -1,6 +1,6 @@
-"""What a GRPO step asks of each device, by phase: floating-point operations, memory read, bytes exchanged.
+"""Work of a GRPO step on each device, by phase: floating-point operations, memory read, bytes exchanged.
 
-Counted from shapes.  With what a machine can do, `seconds` makes a prediction of it.
+Counted from shapes; `seconds` predicts the time on a machine from it.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ FORWARD, BACKWARD = 2, 4
 
 
 class Work(NamedTuple):
-    """What one phase asks of each device."""
+    """Work of one phase on each device."""
 
     flops: float
     read_bytes: float
@@ -27,7 +27,7 @@ class Work(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Machine:
-    """What a device can do, and what share of it programs reach; the defaults are an H200's in machines of eight.
+    """Peak rates of a device, and the shares of them that programs reach; by default an H200 in machines of eight.
 
     989 TFLOP/s in dense bfloat16, 141 GB at 4.8 TB/s, 900 GB/s of NVLink in both directions together (data sheet), and
     one 400 Gb/s adapter a device between machines.  The shares are assumptions: matrix products of large models reach
@@ -51,7 +51,7 @@ class Machine:
 def grpo_work(shape: GRPOShape) -> dict[str, Work]:
     """Work of a step on each device; the optimizer's is too little to count.
 
-    What prompts gather, sampling finds there.
+    Sampling uses the weights that were gathered for the prompts.
     """
     return {
         "prompts": _prompts(shape),

@@ -27,7 +27,7 @@ from touchr1_jax.models.qwen.config import QwenConfig, read_config
 from touchr1_jax.models.qwen.pictures import PixelBudget, read_budget
 from touchr1_jax.models.qwen.safetensors import Tell
 from touchr1_jax.models.qwen.weights import load_params
-from touchr1_jax.text.chat import SEEN, SEEN_END, check_template
+from touchr1_jax.text.chat import VISION, VISION_END, check_template
 from touchr1_jax.text.tokenizer import Tokenizer, from_file
 from touchr1_jax.types import Params
 
@@ -88,8 +88,8 @@ def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:
       ValueError: they differ.
     """
     ids = {
-        "vision_start_token_id": (config.vision_start_id, tokenizer.encode(SEEN)),
-        "vision_end_token_id": (config.vision_end_id, tokenizer.encode(SEEN_END)),
+        "vision_start_token_id": (config.vision_start_id, tokenizer.encode(VISION)),
+        "vision_end_token_id": (config.vision_end_id, tokenizer.encode(VISION_END)),
         "image_token_id": (config.image_id, [tokenizer.view_id]),
         "video_token_id": (config.video_id, [tokenizer.tactile_id]),
     }

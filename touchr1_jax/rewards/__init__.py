@@ -17,7 +17,7 @@ def make_rewards(prior: np.ndarray) -> dict[str, Reward]:
     """All rewards by name, for `total_reward` to choose from.
 
     Args:
-      prior: float [A, K], how often each level is the label in training (see `accuracy_debiased`).
+      prior: float [A, K], frequency of each level as label in training (see `accuracy_debiased`).
     """
     return {
         "accuracy": Reward(accuracy),

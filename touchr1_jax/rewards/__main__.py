@@ -1,4 +1,4 @@
-"""`python -m touchr1_jax.rewards`: what the rewards make of one answer.
+"""`python -m touchr1_jax.rewards`: list the rewards, or explain the score of one answer.
 
 python -m touchr1_jax.rewards list
 python -m touchr1_jax.rewards explain --text "<perceive> xense soft </perceive> <compare> soft </compare> …"
@@ -29,13 +29,13 @@ PUBLISHED: Mapping[str, float] = {"accuracy": 0.6, "consistency": 0.3, "format":
 """Weights of Touch-R1 (arXiv 2605.27154)."""
 
 UNREAD = "⊥"
-"""Stands for a slot that names no level, or several."""
+"""Value of a slot that names no level, or several."""
 
 NOT_DEFINED = "does not apply"
-"""Stands for a value that the question does not define; its weight goes to the other terms."""
+"""Value of a reward that is not defined for the question; its weight goes to the other terms."""
 
 MOST_TRUTHS = 100
-"""More combinations of labels than this are no table to read."""
+"""Largest number of label combinations in a table."""
 
 WIDTH = 110
 """Columns of the output where it is no terminal."""
@@ -46,8 +46,8 @@ class ExplainError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class List:
-    """Name every reward and what its file says of it."""
+class ListRewards:
+    """List every reward with the first line of its file."""
 
     def run(self) -> int:
         """Print one line per reward and return the exit status."""
@@ -59,7 +59,7 @@ class List:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Explain:
+class ExplainAnswer:
     """Show the slots of an answer, the value of every reward, its share of the total, and the total.
 
     Without `--label` the answer is scored against every label that it could be about.
@@ -68,11 +68,11 @@ class Explain:
     text: str
     """The answer."""
     label: dict[str, str] = dataclasses.field(default_factory=dict)
-    """What is true, as in `hardness soft`."""
+    """Right levels, as in `hardness soft`."""
     asked: tuple[str, ...] = ()
     """Attributes asked for; by default the labelled ones, else those that the answer concludes about."""
     sensors: tuple[str, ...] = ()
-    """Sensors that touched; by default those that the answer reports on."""
+    """Sensors that are present; by default those that the answer reports on."""
     weights: dict[str, float] = dataclasses.field(default_factory=dict)
     """Weight of each reward, as in `accuracy 0.6 format 0.1`; by default the published ones."""
     length: int | None = None
@@ -159,7 +159,7 @@ def all_rewards(language: Language) -> dict[str, Reward]:
 
 
 def slots_table(language: Language, reading: Reading) -> Table:
-    """What the answer says, slot by slot; attributes that it never names are left out."""
+    """Levels of every slot; attributes that the answer never names are left out."""
     slots = dict(zip((f"perceive {s.name}" for s in language.sensors), reading.perceive, strict=True))
     slots |= {"compare": reading.compare, "conclude": reading.conclude}
     named = [a for a in range(len(language.attributes)) if any(levels[a] >= 0 for levels in slots.values())]
@@ -171,7 +171,7 @@ def slots_table(language: Language, reading: Reading) -> Table:
 
 
 def level_words(language: Language) -> str:
-    """One word for every level of every attribute."""
+    """A word for every level of every attribute."""
     return "; ".join(f"{a.name} {', '.join(words[0] for words in a.levels)}" for a in language.attributes)
 
 
@@ -206,7 +206,7 @@ def terms_table(
 
 
 def format_fault(language: Language, text: str, reading: Reading) -> str:
-    """Whether an answer is formatted, and why not."""
+    """\"yes\", or the reason why an answer is not formatted."""
     if reading.formatted:
         return "yes"
     wrong = [f"{tag} occurs {text.count(tag)} times" for tag in tags_of(language) if text.count(tag) != 1]
@@ -242,7 +242,9 @@ def _console(stderr: bool = False) -> Console:
     return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=WIDTH)
 
 
-Command = Annotated[List, tyro.conf.subcommand("list")] | Annotated[Explain, tyro.conf.subcommand("explain")]
+Command = (
+    Annotated[ListRewards, tyro.conf.subcommand("list")] | Annotated[ExplainAnswer, tyro.conf.subcommand("explain")]
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ from touchr1_jax.rewards.base import Reward
 from touchr1_jax.types import Parsed, Target
 
 PRIOR_TOLERANCE = 1e-3
-"""How far the probabilities of an attribute may be from summing to 1."""
+"""Largest error of the sum of an attribute's probabilities."""
 
 
 def accuracy_debiased(prior: np.ndarray) -> Reward:
@@ -22,7 +22,7 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
     every constant earns mean_k r̄(k).  Unparsable answers keep their credit.  A departure from the paper.
 
     Args:
-      prior: float [A, K], how often each level of an attribute is the label in training; 0 past an attribute's levels.
+      prior: float [A, K], frequency of each level of an attribute as label in training; 0 past an attribute's levels.
 
     Raises:
       ValueError: a prior that is not [A, K], negative, or whose rows do not sum to 1.
@@ -54,7 +54,7 @@ def uniform_prior(levels: Sequence[int]) -> np.ndarray:
 
 
 def _constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:
-    """r̄(k), what the constant answer k earns on average, and which levels k an attribute has, both [A, K]."""
+    """Mean credit r̄(k) of the constant answer k, and the mask of levels that an attribute has, both [A, K]."""
     level = jnp.arange(prior.shape[1])
     levels, ordinal = target.levels[:, None, None], target.ordinal[:, None, None]
     table = credit(level[:, None], level, levels, ordinal)  # [A, K answered, K true]

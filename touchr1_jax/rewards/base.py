@@ -1,4 +1,4 @@
-"""What a reward is, and how rewards add up."""
+"""The type of a reward, and the weighted sum of rewards."""
 
 import math
 import traceback
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from touchr1_jax.types import Parsed, Target
 
 UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError)
-"""What JAX raises where Python or NumPy wants to know a number that the compiled program will compute."""
+"""Errors of JAX where Python or NumPy needs a number that the compiled program will compute."""
 
 
 class RewardError(ValueError):
@@ -30,8 +30,8 @@ class Reward(NamedTuple):
 
     Attributes:
       value: (parsed, target) → float scalar, finite even where the reward does not apply.
-      applies: target → boolean scalar, whether the reward is defined for this question.  It sees the target alone: an
-        answer must not be able to escape a term.
+      applies: target → boolean scalar, true if the reward is defined for this question.  It depends on the target
+        alone: an answer must not be able to escape a term.
     """
 
     value: Callable[[Parsed, Target], Float[Array, ""]]
@@ -48,11 +48,11 @@ def total_reward(
     Args:
       rewards: the choices, by name.
       weights: weight ≥ 0 of each reward that counts.
-      parsed: what the rollout said.
-      target: what it is scored against.
+      parsed: the parsed rollout.
+      target: the right answer.
 
     Returns:
-      R, and what each weighted reward adds to it: the parts sum to R.
+      R, and the part of each weighted reward; the parts sum to R.
 
     Raises:
       RewardError: an unknown name, a weight that is negative or not finite, or none above 0; a reward that is no
@@ -70,7 +70,7 @@ def total_reward(
 
 
 def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -> None:
-    """Hold the names and sizes of weights against the rewards that there are.
+    """Check the names and sizes of weights.
 
     Raises:
       RewardError: an unknown name, an entry that is no `Reward`, a weight that is negative or not finite, or none above
@@ -90,13 +90,13 @@ def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -
 
 
 def _scalar(name: str, part: str, kind: type, function: Callable[..., Any], *of: Parsed | Target) -> Any:
-    """What a part of a reward gives, if it is a scalar of that kind."""
+    """Value of a part of a reward, checked to be a scalar of that kind."""
     try:
         value = function(*of)
     except UNTRACEABLE as error:
         line = traceback.extract_tb(error.__traceback__)[1]  # below this function stands the reward's
         raise RewardError(
-            f"reward {name!r}: {part} cannot be traced, {line.filename}:{line.lineno} wants to know a number that is "
+            f"reward {name!r}: {part} cannot be traced, {line.filename}:{line.lineno} needs a number that is "
             "computed later; choose with jnp.where instead of `if`, compute with jnp instead of numpy or float(), or "
             "score on the host with rl.scoring.make_host_score"
         ) from error

@@ -1,4 +1,4 @@
-"""Agreement between what each sensor is said to feel and the cross-sensor summary."""
+"""Agreement between the levels reported per sensor and the cross-sensor summary."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -10,8 +10,8 @@ from touchr1_jax.types import Parsed, Target
 def agreement(parsed: Parsed, target: Target) -> Float[Array, "A"]:
     """1 − mean_s w(p_s, p_c) of each attribute, w(u, v) = min(|u − v| / (K − 1), 1).
 
-    p_s is sensor s's level in `perceive`, p_c the level in `compare`; the mean is over the sensors that were there.  0
-    where any of these is unparsable.
+    p_s is sensor s's level in `perceive`, p_c the level in `compare`; the mean is over the sensors that were present.
+    0 where any of these is unparsable.
     """
     summary = parsed.compare
     distance = jnp.abs(parsed.perceive - summary) / jnp.maximum(target.levels - 1, 1)
@@ -23,7 +23,7 @@ def agreement(parsed: Parsed, target: Target) -> Float[Array, "A"]:
 def consistency(parsed: Parsed, target: Target) -> Float[Array, ""]:
     """R_cs: mean `agreement` over the asked ordinal attributes (Touch-R1, arXiv 2605.27154, for any number of sensors).
 
-    It rewards saying the same thing everywhere, true or not: a constant answer earns 1.
+    It rewards the same level in every slot, true or not: a constant answer earns 1.
     """
     return masked.mean(agreement(parsed, target), target.asked & target.ordinal)
 

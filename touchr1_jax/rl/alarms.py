@@ -1,8 +1,8 @@
-"""Alarms: what goes wrong in reinforcement from touch, each seen in the metrics of a run by one small function.
+"""Alarms: known failures of reinforcement from touch, each detected in the metrics of a run by one small function.
 
-A function gets the means over the last `WINDOW` steps and over the first `START`, which are those of the policy that
-training starts from, and returns the number that fired, or `None`.
-The codes F1 … F13 number known failures; F11, the collapse of latent prediction, belongs to another stage.
+A function gets the mean metrics of the last `WINDOW` steps and of the first `START`, those of the policy that training
+starts from, and returns the number that is compared with a bound, or `None`.
+The codes F1 … F13 number the failures; F11, the collapse of latent prediction, belongs to another stage.
 """
 
 import collections
@@ -10,17 +10,17 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 
 WINDOW = 20
-"""Steps that a mean is over: with 8 prompts of 8 rollouts a share has then a standard error below .02."""
+"""Steps of a mean: with 8 prompts of 8 rollouts the standard error of a share is then below .02."""
 
 START = 5
-"""Steps that the beginning is the mean of: few enough that the policy is still the one that training starts from, and
-enough that its accuracy has a standard error of .05, where that of one step of 8 prompts is .1."""
+"""Steps of the initial mean: few enough that the policy is still the one that training starts from, and enough that its
+accuracy has a standard error of .05, where that of one step of 8 prompts is .1."""
 
 RARE = 0.02
-"""Shares of groups below this are three in a window of 160: too few to judge by."""
+"""Smaller shares of groups are ignored: they are at most three groups in a window of 160."""
 
 WORSE = 0.1
-"""A change of accuracy beyond chance: two standard errors of the beginning's."""
+"""A change of accuracy beyond chance: two standard errors of the initial mean."""
 
 NO_LEAD = 0.04
 """Leads of touch below this are chance: two standard errors of the difference of two means in a window, from 1,280
@@ -31,7 +31,7 @@ Metrics = Mapping[str, float]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Alarm:
-    """A failure that was seen: its code, what it means, the number that fired and the bound that it passed."""
+    """A detected failure: its code and meaning, the number that fired and the bound that it passed."""
 
     code: str
     meaning: str
@@ -43,8 +43,8 @@ class Alarm:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Rule:
-    """One alarm: `check` returns what lies beyond `bound`; `reason` says why the bound is there."""
+class AlarmRule:
+    """A rule that raises an alarm where `check` passes `bound`; `reason` justifies the bound."""
 
     code: str
     meaning: str
@@ -52,7 +52,7 @@ class Rule:
     reason: str
     check: Callable[[Metrics, Metrics], float | None]
     below: bool = False
-    """Whether it fires below the bound instead of above."""
+    """Fire below the bound instead of above."""
 
     def alarm(self, now: Metrics, start: Metrics) -> Alarm | None:
         """The alarm, if it fires; metrics that a run does not log raise none."""
@@ -70,10 +70,10 @@ def middle_excess(now: Metrics, start: Metrics) -> float | None:
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:
-    """F2: how much oftener all slots agree than the answer is right.
+    """F2: share of answers whose slots all agree, less the share of right answers.
 
-    Of honest slots it is at most 0: two that are right with probability a each for itself, and else err either way,
-    agree in a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
+    For honest slots it is at most 0: two independent slots, each right with probability a and otherwise wrong in
+    either direction, agree with probability a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
     """
     del start
     return now["echo_share"] - now["accuracy"]
@@ -86,7 +86,7 @@ def grounding_size(now: Metrics, start: Metrics) -> float | None:
 
 
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
-    """F4: how much more noise costs than another object's touch; needs the controls of R_tu."""
+    """F4: accuracy lost under noise, less that lost under another object's touch; needs the controls of R_tu."""
     del start
     controls = _controls(now)
     return controls["order"] - controls["noise"] if {"order", "noise"} <= set(controls) else None
@@ -132,13 +132,13 @@ def heavy_tail(now: Metrics, start: Metrics) -> float | None:
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
-    """F9: entropy over that of the beginning, while answers are no better than then and not all right."""
+    """F9: entropy relative to the initial one, while answers have not improved and are not all right."""
     stuck = now["accuracy"] < min(start["accuracy"] + WORSE, 0.95)
     return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
 
 
 def entropy_growth(now: Metrics, start: Metrics) -> float | None:
-    """F9: entropy above that of the beginning, nat."""
+    """F9: entropy above the initial one, nat."""
     return now["entropy"] - start["entropy"]
 
 
@@ -161,64 +161,64 @@ def gamed_answers(now: Metrics, start: Metrics) -> float | None:
     return now["gamed_share"]
 
 
-RULES: tuple[Rule, ...] = (
-    Rule(
+RULES: tuple[AlarmRule, ...] = (
+    AlarmRule(
         code="F1",
         meaning="answers drift to the middle level",
         bound=0.25,
         reason="a policy 60 % right whose errors are all one level inwards says 'middle' .27 too often at most",
         check=middle_excess,
     ),
-    Rule(
+    AlarmRule(
         code="F2",
         meaning="slots echo each other instead of reporting",
         bound=0.1,
         reason="two standard errors of a window above what honest slots reach, 0; a constant echo reaches .67",
         check=echo_excess,
     ),
-    Rule(
+    AlarmRule(
         code="F3",
         meaning="grounding grows without bound",
         bound=1.0,
         reason="1 nat a token over a whole answer: every word is e times likelier with touch than with noise",
         check=grounding_size,
     ),
-    Rule(
+    AlarmRule(
         code="F4",
         meaning="noise is detected, but another object's touch passes",
         bound=0.25,
         reason="a policy that reads touch loses as much by another object's touch, up to chance agreement of ⅓",
         check=swap_blindness,
     ),
-    Rule(
+    AlarmRule(
         code="F5",
         meaning="the tactile bonus cancels within groups",
         bound=0.5,
         reason="a bonus that acts moves the advantages of most groups whose rollouts earn different ones",
         check=cancelled_bonus,
     ),
-    Rule(
+    AlarmRule(
         code="F6",
         meaning="tactile credit without a tactile lead",
         bound=0.17,
         reason="the false-credit rate that R_tu is designed for, .12, and two standard errors of a window's 160 groups",
         check=unearned_credit,
     ),
-    Rule(
+    AlarmRule(
         code="F7",
         meaning="most groups teach nothing",
         bound=0.5,
         reason="half of the rollouts that could teach something are then spent for nothing",
         check=idle_groups,
     ),
-    Rule(
+    AlarmRule(
         code="F8",
         meaning="single tokens dominate the update by their reference KL",
         bound=1.0,
         reason="one token then costs more than a standard deviation of the reward is worth",
         check=heavy_tail,
     ),
-    Rule(
+    AlarmRule(
         code="F9",
         meaning="entropy collapses before the answers are right",
         bound=0.05,
@@ -226,14 +226,14 @@ RULES: tuple[Rule, ...] = (
         check=entropy_collapse,
         below=True,
     ),
-    Rule(
+    AlarmRule(
         code="F9",
         meaning="entropy blows up",
         bound=0.2,
         reason="on every token of an answer of 15: three nats, so twenty times as many answers in play as at first",
         check=entropy_growth,
     ),
-    Rule(
+    AlarmRule(
         code="F10",
         meaning="a stream has no influence on the answer",
         bound=1e-7,
@@ -241,14 +241,14 @@ RULES: tuple[Rule, ...] = (
         check=forgotten_stream,
         below=True,
     ),
-    Rule(
+    AlarmRule(
         code="F12",
         meaning="time ids stand still, so that a shuffle tests nothing",
         bound=0.01,
         reason="recorded frames have different indices; only a cast or a unit error makes them equal",
         check=frozen_time,
     ),
-    Rule(
+    AlarmRule(
         code="F13",
         meaning="answers name levels where they cannot be read",
         bound=0.2,
@@ -258,15 +258,15 @@ RULES: tuple[Rule, ...] = (
 )
 
 
-class Watch:
-    """Feeds the metrics of a run to all rules; it holds the last `WINDOW` steps and the mean of the first `START`."""
+class AlarmMonitor:
+    """Checks the metrics of a run by all rules; it keeps the last `WINDOW` steps and the first `START`."""
 
     def __init__(self) -> None:
         self._first: list[Metrics] = []
         self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
 
-    def see(self, metrics: Metrics) -> list[Alarm]:
-        """The alarms after one more step, from the end of the first window on."""
+    def update(self, metrics: Metrics) -> list[Alarm]:
+        """The alarms after one more step; none before the first window is full."""
         self._last.append(metrics)
         if len(self._first) < START:
             self._first.append(metrics)

@@ -27,7 +27,7 @@ class Surrogate(enum.Enum):
 
 
 class Average(enum.Enum):
-    """How the tokens of a group become one number (see `losses.group_mean`)."""
+    """Mean over the tokens of a group (see `losses.group_mean`)."""
 
     ROLLOUT = "rollout"
     TOKEN = "token"
@@ -35,7 +35,7 @@ class Average(enum.Enum):
 
 
 class TactileUse(enum.Enum):
-    """The reward for answers that controls without touch do not reach (see `tactile_use`)."""
+    """Form of R_tu, the reward for answers that controls without touch do not reach (see `tactile_use`)."""
 
     OFF = "off"
     LITERAL = "literal"
@@ -46,8 +46,8 @@ class TactileUse(enum.Enum):
 class Algorithm:
     """The objective of an update and how groups are chosen for it; the defaults are Touch-R1's (arXiv 2605.27154).
 
-    `gamma`, the clip range, population σ and `epsilon` are ours: the paper gives none.  Weights may be traced scalars,
-    so that one program serves a sweep over them; their sign is then the caller's to check.
+    The paper gives no value of `gamma`, the clip range and `epsilon`; these are ours, and so is the population σ.
+    Weights may be traced scalars, so that one program serves a sweep over them; their sign is then not checked.
     """
 
     surrogate: Surrogate = Surrogate.TOKEN
@@ -59,44 +59,45 @@ class Algorithm:
     """Largest weight of a token for π_learner/π_sampler (truncated importance sampling); `None` trusts the sampler."""
     average: Average = Average.ROLLOUT
     normalise: bool = True
-    """Whether advantages are divided by σ."""
+    """Divide advantages by σ."""
     batch_sigma: bool = False
-    """Whether that σ is one for all groups of a step instead of each group's own."""
+    """Use one σ for all groups of a step instead of each group's own."""
     epsilon: float = 1e-4
     """Added to σ, in the units of the reward."""
     drop_degenerate: bool = False
     """Leave groups of equal rewards out of the policy-gradient mean; KL and G_tg keep all."""
     candidates: int = 1
-    """Prompts that are sampled for each that is learned from; groups of equal rewards are passed over."""
+    """Prompts sampled for each prompt that is learned from; groups of equal rewards are passed over."""
     constrained: bool = False
-    """Sample only what can still become a formatted answer; the learner scores it as the free policy."""
+    """Sample only tokens from which a formatted answer can still follow; the learner scores them without constraint."""
     beta: float = 1e-3
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
     reference_every: int | None = None
-    """Every how many steps the policy becomes its own reference; `None` keeps the first one."""
+    """Steps after which the policy becomes its own reference; `None` keeps the first one."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus, per nat."""
     entropy_floor_nat: float | None = None
-    """Mean entropy above which a prompt gets no bonus; `None` pays without end."""
+    """Mean entropy above which a prompt gets no more bonus; `None` sets no limit."""
     gamma: float = 0.01
     """Weight of the tactile grounding G_tg."""
     grounding_stop_masked: bool = False
+    """No gradient through the perturbed branch of G_tg."""
     grounding_cap_nat: float | None = None
     """Largest grounding of a token, nat."""
     grounding_budget: float | None = None
-    """Most that a prompt's grounding may add to the objective, in standard deviations of the reward."""
+    """Largest contribution of a prompt's grounding to the objective, in standard deviations of the reward."""
     tactile_use: TactileUse = TactileUse.OFF
     tactile_weight: float = 0.3
     """Weight α of the tactile-use reward."""
     tactile_margin: float = 0.1
-    """Lead δ over the best control that earns it, in units of accuracy credit."""
+    """Lead δ over the best control that is needed for it, in units of accuracy credit."""
     controls: int = 4
     """Rollouts of each control."""
     updates: int = 1
     """Updates μ from the same rollouts."""
     trust_nat: float | None = None
-    """Most that an update may move the policy, KL to the one before in nat a token; longer ones are shortened."""
+    """Largest KL between the policies before and after an update, nat a token; longer updates are shortened."""
 
     def __post_init__(self) -> None:
         for field in ("candidates", "controls", "updates", "reference_every"):
@@ -124,15 +125,15 @@ class Paper(Algorithm):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stable(Algorithm):
-    """Departures that keep the objective bounded: masked branch held fixed, G_tg capped at 1 nat a token, exact KL,
-    groups that teach nothing left out of the policy-gradient mean, R_tu added after normalisation.
+    """Departures that keep the objective bounded: no gradient through the masked branch, G_tg capped at 1 nat a token,
+    exact KL, groups of equal rewards left out of the policy-gradient mean, R_tu added after normalisation.
 
-    Ours beyond these: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most a
-    twentieth of a standard deviation of the reward, so that no γ outbids the answer; entropy is paid for up to .1 nat a
-    token, about what supervised policies have, so that a group keeps differing; an update moves the policy by about
-    .003 nat a token at most; β is .1, a hundred times the published: where touch says little all answers earn alike
-    under a debiased reward, the policy drifts at random until it has one answer left, and only the reference pulls it
-    back.
+    Further departures: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most
+    a twentieth of a standard deviation of the reward, so that at no γ it outweighs the answer; an entropy bonus up to
+    .1 nat a token, about the entropy of supervised policies, so that the rollouts of a group stay different; an update
+    moves the policy by about .003 nat a token at most; β is .1, a hundred times the published value: where touch is
+    uninformative, all answers earn the same under a debiased reward, the policy drifts at random until one answer is
+    left, and only the reference pulls it back.
 
     At margin δ = .13 and 4 rollouts a control, no split of a common distribution over credits 0, .4 and 1 earns R_tu in
     more than 9 % of groups; at the literal δ = .1 a single right answer in eight would pass for touch (18 %).
@@ -202,10 +203,10 @@ AnyAlgorithm = Paper | Stable | Dapo | DrGrpo | Gspo | Cispo
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GRPOConfig:
-    """One step: sizes, learning rate, algorithm.
+    """Sizes, learning rate and algorithm of a step.
 
-    `lr_scale` multiplies the paper's learning rate for models trained from scratch, which stand still at 1e-6;
-    `final_share`, to which the rate falls linearly, is ours.
+    `lr_scale` multiplies the paper's learning rate, at which models trained from scratch do not move; the rate falls
+    linearly to `final_share` of itself (not in the paper).
     """
 
     prompts: int = 8
@@ -219,9 +220,9 @@ class GRPOConfig:
     max_grad_norm: float = 1.0
     algorithm: AnyAlgorithm = dataclasses.field(default_factory=Paper)
     buckets: tuple[int, ...] = ()
-    """Lengths below `length`, ascending: an update pays for the shortest that holds its rollouts; each is compiled."""
+    """Lengths below `length`, ascending: an update computes the shortest that holds its rollouts; each is compiled."""
     inverse_draws: bool = False
-    """Draw tokens by one uniform number a rollout instead of one Gumbel number a word: faster, other random bits."""
+    """Draw tokens by one uniform number per rollout, not one Gumbel number per word: faster, other random bits."""
     remat: bool = False
     """Keep only matrix products for the backward pass and compute the rest again: less memory, more time."""
     max_logits: int = MAX_LOGITS
@@ -247,7 +248,7 @@ class GRPOConfig:
 
     @property
     def drawn(self) -> int:
-        """Prompts that a batch must hold: those to learn from and those to choose among."""
+        """Prompts of a batch: `candidates` for each prompt that is learned from."""
         return self.prompts * self.algorithm.candidates
 
     @staticmethod
@@ -257,7 +258,7 @@ class GRPOConfig:
 
     @staticmethod
     def stable() -> "GRPOConfig":
-        """The objective that stays bounded."""
+        """The bounded objective."""
         return GRPOConfig(algorithm=Stable())
 
 

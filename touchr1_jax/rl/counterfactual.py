@@ -1,6 +1,6 @@
-"""What the policy would have felt otherwise: perturbed touch for the grounding term and for the tactile controls.
+"""Counterfactual touch: perturbations for the grounding term and for the controls of R_tu.
 
-Every perturbation takes the encoded features of P prompts and gives them back changed; all run inside the step.
+Every perturbation maps the encoded features of P prompts to changed ones, inside the compiled step.
 """
 
 import dataclasses
@@ -14,20 +14,20 @@ from touchr1_jax.models.policy import Features
 
 
 class Perturbed(NamedTuple):
-    """Changed features, and for which prompts anything could be changed."""
+    """Changed features, and the prompts in which anything could be changed."""
 
     features: Features
     applies: Bool[Array, "P"]
 
 
 def drop_touch(features: Features) -> Perturbed:
-    """No stream at all, neither its tokens nor its name."""
-    felt = jnp.any(features.stream_mask, -1)
-    return Perturbed(dataclasses.replace(features, stream_mask=jnp.zeros_like(features.stream_mask)), felt)
+    """Remove every stream, its tokens and its name."""
+    touched = jnp.any(features.stream_mask, -1)
+    return Perturbed(dataclasses.replace(features, stream_mask=jnp.zeros_like(features.stream_mask)), touched)
 
 
 def noise_touch(features: Features, noise: Float[Array, "K S N D"], key: Array) -> Perturbed:
-    """Every present stream becomes an encoded noise draw of its sensor; streams draw independently.
+    """Replace every present stream by an encoded noise draw of its sensor; streams draw independently.
 
     Args:
       noise: encoded draws of N(μ, σ²) at each sensor's statistics, a bank of K for each sensor.
@@ -39,13 +39,13 @@ def noise_touch(features: Features, noise: Float[Array, "K S N D"], key: Array) 
 
 
 def shuffle_touch(features: Features, key: Array) -> Perturbed:
-    """The time steps of every stream change places, never all to their own; the time ids stay.
+    """Permute the time steps of every stream, never by the identity; the time ids stay.
 
     A step is a run of tokens with one frame index.  A stream with fewer than two steps cannot be shuffled, and a prompt
     of such streams alone is one to which the control does not apply: with all time ids 0 it would test nothing.
-    Departure from R_tu's definition, which permutes frames: here encoded steps change places, because the encoder
-    stands still in GRPO and contacts are encoded once.  The two are the same for an encoder that reads each step by
-    itself; one whose steps see each other leaves traces of the order in them, so that this control is the milder one.
+    Departure from R_tu's definition, which permutes frames: here encoded steps change places, because the encoder is
+    frozen in GRPO and contacts are encoded once.  The two are the same for an encoder that reads each step alone; one
+    whose steps attend to each other leaves traces of the order in them, so that this control is the milder one.
     """
     keys = jax.random.split(key, features.stream_mask.shape)
     source, moved = jax.vmap(jax.vmap(_shuffled_tokens))(features.touch_time, keys)
@@ -54,10 +54,10 @@ def shuffle_touch(features: Features, key: Array) -> Perturbed:
 
 
 def swap_touch(features: Features, key: Array) -> Perturbed:
-    """The touch of another prompt of the batch, at a random distance 1 … P − 1 around it; never its own.
+    """Replace touch by that of another prompt of the batch, at a random distance 1 … P − 1; never its own.
 
-    It looks like touch in every respect, so that telling noise from touch does not meet it.  Only streams that both
-    prompts have are exchanged.
+    It has all statistics of touch, so that a policy which only detects noise does not pass this control.  Only streams
+    that both prompts have are exchanged.
     """
     p = features.stream_mask.shape[0]
     other = (jnp.arange(p) + jax.random.randint(key, (), 1, max(p, 2))) % p
@@ -70,10 +70,10 @@ def swap_touch(features: Features, key: Array) -> Perturbed:
 def mask_one_stream(
     features: Features, noise: Float[Array, "K S N D"], key: Array
 ) -> tuple[Float[Array, "P S N D"], Int[Array, "P"]]:
-    """T_mask: in each prompt one present stream, uniformly chosen, becomes an encoded noise draw of its sensor.
+    """T_mask: replace one present stream of each prompt, uniformly chosen, by an encoded noise draw of its sensor.
 
     Returns:
-      The touch, and which stream was replaced; a prompt without any is left as it is.
+      The touch and the index of the replaced stream; a prompt without streams stays as it is.
     """
     p = features.stream_mask.shape[0]
     stream_key, draw_key = jax.random.split(key)
@@ -85,9 +85,9 @@ def mask_one_stream(
 
 
 def _shuffled_tokens(time: Int[Array, "N"], key: Array) -> tuple[Int[Array, "N"], Bool[Array, ""]]:
-    """Which token moves to each place when the steps of one stream are shuffled, and whether any does.
+    """Source of each token when the steps of one stream are shuffled, and true if any moves.
 
-    Steps are as many tokens long as the first one; a stream whose steps differ in length keeps its order.
+    Steps must be of one length; a stream whose steps differ in length keeps its order.
     """
     n = time.shape[0]
     first = jnp.concatenate([jnp.ones(1, bool), time[1:] != time[:-1]]) & (time >= 0)
@@ -103,9 +103,9 @@ def _shuffled_tokens(time: Int[Array, "N"], key: Array) -> tuple[Int[Array, "N"]
 
 
 def _another_order(member: Bool[Array, "n"], key: Array) -> tuple[Int[Array, "n"], Bool[Array, ""]]:
-    """A random order of the members among their places that is not the identity; false where there are not two.
+    """A random permutation of the members that is not the identity; false where there are fewer than two.
 
-    An identity that is drawn becomes a rotation by one, so that orders are uniform but for rotations.
+    A drawn identity becomes a rotation by one, so that all other orders are equally likely.
     """
     n = member.shape[0]
     place, last = jnp.arange(n), jnp.sum(member) - 1

@@ -1,7 +1,7 @@
-"""How often the recommended R_tu pays by chance, and how often where touch helps: exact, by enumeration.
+"""Probability that the recommended R_tu is paid by chance, and where touch helps: exact, by enumeration.
 
-A group of G rollouts is spread over the credits 0, .4 and 1, and so are the J rollouts of each control; every spread
-has its multinomial probability, and the engine's own formula says whether it pays.
+The G rollouts of a group have credits 0, .4 or 1, and so have the J rollouts of each control; every combination of
+counts has its multinomial probability, and `tactile_use.recommended` decides if it is paid.
 """
 
 import functools
@@ -16,9 +16,9 @@ from jaxtyping import Array, Float, Int
 from touchr1_jax.rl.tactile_use import recommended
 
 CREDIT = np.array([0.0, 0.4, 1.0], np.float32)
-"""What an ordinal answer can earn."""
+"""Credits of an ordinal answer."""
 HELPED, HINDERED = np.array([0.05, 0.25, 0.70]), np.array([0.22, 0.45, 0.33])
-"""The case that power is asked for: credits with touch, and under a control."""
+"""The case for which power is reported: probabilities of `CREDIT` with touch, and under a control."""
 
 
 def credit_odds(
@@ -47,7 +47,10 @@ def credit_odds(
 
 
 def false_credit(*, group: int, rollouts: int, controls: int = 3, margin: float) -> float:
-    """Largest `credit_odds` with touch and controls alike, over p(1) = .1 … .9 and splits of the rest in tenths."""
+    """Largest `credit_odds` when touch and controls have one distribution.
+
+    The maximum is over p(1) = .1 … .9 and splits of the rest in tenths.
+    """
     shares = itertools.product(np.arange(1, 10) / 10, np.linspace(0, 1, 11))
     splits = [np.array([(1 - p) * (1 - q), (1 - p) * q, p]) for p, q in shares]
     odds = functools.partial(credit_odds, group=group, rollouts=rollouts, controls=controls, margin=margin)
@@ -56,7 +59,7 @@ def false_credit(*, group: int, rollouts: int, controls: int = 3, margin: float)
 
 @functools.cache
 def _pays(group: int, rollouts: int, margin: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spreads of a group, the order of a control's spreads by their means, and whether each pair pays."""
+    """Counts of a group, a control's counts in the order of their means, and true for each pair that is paid."""
     own = _spreads(group)
     earned = np.stack([np.repeat(CREDIT, count) for count in own])
     mean = (_spreads(rollouts) @ CREDIT / rollouts).astype(np.float32)
@@ -72,11 +75,11 @@ def _pays_each(earned: Float[Array, "n G"], bars: Float[Array, "m"], margin: Flo
 
 
 def _spreads(n: int) -> Int[np.ndarray, "m 3"]:
-    """All ways to spread n rollouts over the three credits."""
+    """All counts of the three credits among n rollouts."""
     return np.array([c for c in itertools.product(range(n + 1), repeat=3) if sum(c) == n])
 
 
 def _probability(count: Int[np.ndarray, "m 3"], p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m"]:
-    """Multinomial probability of each spread."""
+    """Multinomial probability of the counts."""
     ways = np.array([factorial(sum(c)) / np.prod([factorial(x) for x in c]) for c in count.tolist()])
     return ways * np.prod(p**count, -1)

@@ -1,4 +1,4 @@
-"""What a researcher watches at every step: reward and its spread, accuracy, parse rate, agreement, lengths, touch."""
+"""Metrics of every step: reward and its spread, accuracy, parse rate, agreement, lengths, touch."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -30,12 +30,12 @@ def rollout_metrics(
 
 
 def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
-    """How the answers are spread: accuracy of each level, the commonest answer, and slots that all say the same.
+    """Distribution of the answers: accuracy of each level, the most frequent answer, slots that repeat each other.
 
-    `right_level_k` is the share right of ordinal questions whose label is k, `labels_level_k` how many there were;
-    `mode_share` the share of the commonest level among ordinal answers, `label_mode_share` among their labels;
-    `echo_share` how often every slot of a formatted answer holds one and the same level; `gamed_share` how often an
-    answer that names levels is not formatted or names several in its conclusion.
+    `right_level_k` is the share right of ordinal questions whose label is k, `labels_level_k` their number;
+    `mode_share` the share of the most frequent level among ordinal answers, `label_mode_share` among their labels;
+    `echo_share` the share of formatted answers whose slots all name one level; `gamed_share` the share of answers that
+    name levels and are not formatted or name several in their conclusion.
     """
     asked = jnp.broadcast_to((target.asked & target.ordinal)[:, None], parsed.conclude.shape)
     label = jnp.broadcast_to(target.label[:, None], asked.shape)
@@ -59,19 +59,19 @@ def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
 
 
 def group_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"], right: Bool[Array, "P G"]):
-    """Size of the advantages, and how much of their spread separates right answers that earned the same."""
-    lively = ~zero_variance(reward)
+    """Size of the advantages, and shares of groups whose answers are all right or all wrong."""
+    informative = ~zero_variance(reward)
     return {
         "advantage_abs": jnp.mean(jnp.abs(advantage)),
         "advantage_peak": jnp.max(jnp.abs(advantage)),
         "all_right_share": jnp.mean(jnp.all(right, -1)),
         "none_right_share": jnp.mean(~jnp.any(right, -1)),
-        "lively_groups": jnp.sum(lively).astype(jnp.float32),
+        "lively_groups": jnp.sum(informative).astype(jnp.float32),
     }
 
 
 def touch_metrics(features: Features) -> dict[str, Array]:
-    """`static_time_share`: streams that are there and have several steps, all with one time id."""
+    """`static_time_share`: share of streams with several steps whose time ids are all equal."""
     time, there = features.touch_time, features.touch_time >= 0
     several = features.stream_mask & (jnp.sum(there, -1) > 1)
     low = masked.minimum(time, there, -1, empty=0.0)

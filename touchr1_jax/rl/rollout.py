@@ -57,10 +57,10 @@ DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[A
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SampleConfig:
-    """How completions are drawn: `group` of them per prompt, `length` tokens at most, greedily or at temperature 1.
+    """Settings of the sampler: `group` completions per prompt of at most `length` tokens, greedy or at temperature 1.
 
-    `inverse` draws by the inverse of the distribution function, with one random number a rollout instead of V;
-    `constraint` lets through only tokens from which a formatted answer can still be finished in time.
+    `inverse` draws by the inverse distribution function, with one random number per rollout instead of V;
+    `constraint` allows only tokens from which a formatted answer can still be finished in time.
     """
 
     group: int
@@ -175,8 +175,11 @@ def sample(
 
 @custom_vmap
 def _any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
-    """Whether a rollout goes on.  Under `vmap` the answer is one for all: a condition of each run's own would batch the
-    token index too, and with it every write to a cache."""
+    """True while any rollout continues.
+
+    Under `vmap` one condition serves all runs: a condition per run would batch the token index too, and with it every
+    write to a cache.
+    """
     return jnp.any(alive)
 
 

@@ -1,6 +1,6 @@
-"""From the tokens of one rollout to its reward: in-graph for traceable rewards, on the host for any other.
+"""Reward of one rollout from its tokens: in-graph for traceable rewards, on the host for any other.
 
-Both make the same thing, a `ScoreFn`, so that the step does not know which one it has.
+Both are a `ScoreFn`, so that the step needs no distinction.
 """
 
 import functools
@@ -19,7 +19,7 @@ ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, 
 """(tokens, target) → (total reward, its named terms, parsed completion), for one rollout."""
 
 HostReward = Callable[[np.ndarray, Parsed, Target], Mapping[str, float]]
-"""(tokens of one rollout, what it says, target), all NumPy → its named terms; the reward is their sum."""
+"""(tokens, parsed completion, target) of one rollout, all NumPy → its named terms; the reward is their sum."""
 
 
 def make_score(
@@ -83,7 +83,7 @@ def _host_terms(found: Mapping[str, float], terms: tuple[str, ...]) -> list[floa
 
 @functools.cache
 def check_finite(name: str, reward: Reward, sensors: int, attributes: int) -> None:
-    """Try a reward on the corners of what answers and targets can be; once for each reward and size.
+    """Evaluate a reward on extreme answers and targets; once for each reward and size.
 
     Raises:
       RewardError: NaN or infinity.
@@ -95,15 +95,15 @@ def check_finite(name: str, reward: Reward, sensors: int, attributes: int) -> No
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         a, t = bad[0]
-        say = lambda tree, i: jax.tree.map(lambda x: np.asarray(x)[i].tolist(), tree)
+        plain = lambda tree, i: jax.tree.map(lambda x: np.asarray(x)[i].tolist(), tree)
         raise RewardError(
-            f"reward {name!r} is {values[a, t]} for {say(answers, a)} against {say(targets, t)}: must be finite "
+            f"reward {name!r} is {values[a, t]} for {plain(answers, a)} against {plain(targets, t)}: must be finite "
             "everywhere; choose with jnp.where before you divide or take logarithms"
         )
 
 
 def _corner_answers(sensors: int, attributes: int) -> Parsed:
-    """Nothing said, and the lowest and the highest of three levels; formatted or not; empty or not."""
+    """All slots ⊥, the lowest or the highest of three levels; formatted or not; empty or not."""
     rows = [
         Parsed(
             perceive=jnp.full((sensors, attributes), level),
@@ -119,7 +119,7 @@ def _corner_answers(sensors: int, attributes: int) -> Parsed:
 
 
 def _corner_targets(sensors: int, attributes: int) -> Target:
-    """Nothing or everything asked, labels unknown, lowest or highest, ordinal or not, without sensors or with all."""
+    """No attribute asked or all, labels unknown, lowest or highest, ordinal or not, no sensor present or all."""
     rows = [
         Target(
             asked=jnp.full(attributes, asked),

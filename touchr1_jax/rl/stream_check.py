@@ -1,4 +1,4 @@
-"""A check before training that every stream reaches the policy: a divergence cannot pay for touch that nobody gets."""
+"""A check before training that every tactile stream influences the policy's answers."""
 
 import dataclasses
 
@@ -14,13 +14,13 @@ from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, sample_group
 from touchr1_jax.types import Params
 
 ROUNDING_NAT = 1e-7
-"""A stream that is never attended to moves the answers by exactly nothing, or by what float32 rounds."""
+"""Influence at which a stream counts as ignored: without attention it is 0 up to the rounding of float32."""
 
 
 def stream_influence(
     fns: PolicyFns, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
 ) -> tuple[Float[Array, "S"], Bool[Array, "S"]]:
-    """How much noise in each stream alone moves sampled answers, and which streams any prompt has.
+    """Change of sampled answers by noise in each stream alone, and the streams that any prompt has.
 
     KL(π(· | touch) ‖ π(· | stream s made noise)), mean over the tokens of one answer a prompt and over the prompts that
     have the stream, nat.
@@ -55,10 +55,10 @@ def stream_influence(
 
 
 def check_streams(influence: Float[np.ndarray, "S"], present: Bool[np.ndarray, "S"]) -> None:
-    """Refuse to train where a present stream has no influence at all.
+    """Check that every present stream has an influence.
 
     Raises:
-      ValueError: noise in a stream moves no answer by more than float32 rounds.
+      ValueError: noise in a stream changes the answers by no more than the rounding of float32.
     """
     for s, (size, there) in enumerate(zip(influence, present, strict=True)):
         if there and not size > ROUNDING_NAT:

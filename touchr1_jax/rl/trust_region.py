@@ -1,4 +1,4 @@
-"""Updates of a bounded size: what a step moves the policy by is measured, and a step that is too long is shortened."""
+"""Updates of bounded size: the KL of each update is measured, and an update that is too long is shortened."""
 
 import dataclasses
 
@@ -14,10 +14,10 @@ from touchr1_jax.rl.losses import estimated_kl
 from touchr1_jax.types import Params
 
 NEAR = 1.5
-"""A KL of up to this many δ is near enough: where KL is quadratic one shortening ends at 1."""
+"""Factor on δ up to which a KL is accepted; where KL is quadratic, one shortening ends at 1."""
 
 MOST = 4
-"""Measurements of one update at most; each is a forward pass over the rollouts."""
+"""Largest number of measurements of an update; each is a forward pass over the rollouts."""
 
 
 def within_trust(
@@ -26,8 +26,8 @@ def within_trust(
     """Shorten an update until it moves the policy by about δ nat a token at most, on the rollouts that it is from.
 
     θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
-    grows with the square of a small step, so that once is enough for a step that is little too long, and not for one
-    from far beyond, where KL has flattened.  An update that was short enough is measured once.  The KL is the k3
+    is quadratic in a small step, so that one shortening is enough for a step that is slightly too long, but not for a
+    much longer one, where KL grows more slowly.  An update that is short enough is measured once.  The KL is the k3
     estimate on the rollouts, which π₀ sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix
     C), here of any optimizer's, with this fixed point for its line search.
 
@@ -64,7 +64,7 @@ def within_trust(
 
 
 def log_probs(fns: PolicyFns, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:
-    """Log-probabilities of the sampled tokens under some parameters, nothing else."""
+    """Log-probabilities of the sampled tokens under some parameters."""
     algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
     plain = dataclasses.replace(config, algorithm=algorithm)
     of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob

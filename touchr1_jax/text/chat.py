@@ -1,4 +1,4 @@
-"""Conversations as Qwen2.5-VL was trained on them, written out as one text.
+"""Conversations in the text format that Qwen2.5-VL was trained on.
 
     <|im_start|>system
     You are a helpful assistant.<|im_end|>
@@ -6,9 +6,9 @@
     <|vision_start|><|image_pad|><|vision_end|>How hard is it?<|im_end|>
     <|im_start|>assistant
 
-What is seen is one pad between two marks here; `expand` gives it the room that its tokens take.  The published template
-is a Jinja program; its result is written directly, so that no template engine is needed, and `check_template` refuses a
-checkpoint that brings another one.
+A picture or video is one pad between two marks here; `expand` repeats the pad once per token.  The published template
+is a Jinja program; its result is written directly, so that no template engine is needed, and `check_template` rejects a
+checkpoint with another template.
 """
 
 import dataclasses
@@ -22,30 +22,30 @@ from typing import Literal
 Role = Literal["system", "user", "assistant"]
 
 TURN, TURN_END = "<|im_start|>", "<|im_end|>"
-SEEN, SEEN_END = "<|vision_start|>", "<|vision_end|>"
-MARKS = (TURN, TURN_END, SEEN, SEEN_END, "<|image_pad|>", "<|video_pad|>", "<|endoftext|>")
-"""Special tokens, which no text may spell."""
+VISION, VISION_END = "<|vision_start|>", "<|vision_end|>"
+MARKS = (TURN, TURN_END, VISION, VISION_END, "<|image_pad|>", "<|video_pad|>", "<|endoftext|>")
+"""Special tokens, which no text may contain."""
 
 SYSTEM = "You are a helpful assistant."
-"""What the system says where a conversation does not begin with it."""
+"""System message of a conversation that does not begin with one."""
 
 TEMPLATE_SHA256 = "a0bc6f6fc7a29a80017a433e8f03a1cc1236e838a944a2d034295a60c4f2fddb"
 """Digest of the published template without surrounding white space, the same for all released sizes."""
 
 
 class Media(enum.Enum):
-    """What a message shows."""
+    """Picture or video in a message."""
 
     PICTURE = "image"
     VIDEO = "video"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Message:
-    """One turn: texts, pictures and videos in order.
+class ChatMessage:
+    """A turn of a conversation: texts, pictures and videos in order.
 
     Raises:
-      ValueError: a text that spells a special token and would be read as one.
+      ValueError: a text that contains a special token.
     """
 
     role: Role
@@ -60,13 +60,13 @@ class Message:
                 )
 
 
-def render(messages: Sequence[Message], *, reply: bool = True, numbered: bool = False) -> str:
+def render(messages: Sequence[ChatMessage], *, reply: bool = True, numbered: bool = False) -> str:
     """The text of a conversation, by the published template of Qwen2.5-VL.
 
     Args:
-      messages: the turns; a system message may only stand first, and the default one is put there otherwise.
-      reply: whether the assistant's turn is opened.
-      numbered: whether pictures and videos are called "Picture 1: ", "Video 1: " and so on.
+      messages: the turns; a system message may only be the first one, and is `SYSTEM` by default.
+      reply: open the assistant's turn.
+      numbered: name pictures and videos "Picture 1: ", "Video 1: " and so on.
 
     Raises:
       ValueError: no message.
@@ -81,7 +81,7 @@ def render(messages: Sequence[Message], *, reply: bool = True, numbered: bool = 
             if isinstance(part, Media):
                 count[part] += 1
                 body += _number(part, count[part]) if numbered else ""
-                body += f"{SEEN}<|{part.value}_pad|>{SEEN_END}"
+                body += f"{VISION}<|{part.value}_pad|>{VISION_END}"
             else:
                 body += part
         text += turn(message.role, body)
@@ -89,7 +89,7 @@ def render(messages: Sequence[Message], *, reply: bool = True, numbered: bool = 
 
 
 def turn(role: Role, body: str) -> str:
-    """A whole turn."""
+    """A complete turn."""
     return f"{opening(role)}{body}{TURN_END}\n"
 
 
@@ -124,7 +124,7 @@ def check_template(directory: Path) -> Path:
 
     Raises:
       FileNotFoundError: the checkpoint has none.
-      ValueError: it is another one, so that `render` would not speak its language.
+      ValueError: it is another one, so that `render` would write other texts.
     """
     for name in ("chat_template.jinja", "chat_template.json", "tokenizer_config.json"):
         path = directory / name

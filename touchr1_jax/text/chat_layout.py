@@ -1,8 +1,8 @@
-"""The prompt of a policy on a pretrained Qwen2.5-VL, in the words of its chat template.
+"""The prompt of a policy on a pretrained Qwen2.5-VL, in its chat template.
 
     system turn, user turn: <view>, for each sensor its name and its touch, the question; the assistant's turn opened
 
-Touch stands where a video would, one pad per tactile token between the two marks of what is seen.  Questions are padded
+Touch takes the place of a video, one pad per tactile token between the two marks of vision.  Questions are padded
 on their left, as in `template`, so that all prompts have one length and end where the completion starts.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from touchr1_jax.text.chat import SEEN, SEEN_END, SYSTEM, TURN_END, opening, turn
+from touchr1_jax.text.chat import SYSTEM, TURN_END, VISION, VISION_END, opening, turn
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import QUESTIONS, PromptLayout, question_ids
 from touchr1_jax.text.tokenizer import Tokenizer
@@ -28,8 +28,8 @@ def build_chat_layout(
 ) -> PromptLayout:
     """Lay out one prompt per entry of `asked`; by default one per attribute of the language, in its order.
 
-    A stream's name and marks are its own (`stream_text` s), the marks of the view are the view's (S, the number of
-    streams): they vanish with it.
+    A stream's name and marks belong to the stream (`stream_text` s), the marks of the view to the view (S, the number
+    of streams): they are masked with it.
 
     Args:
       tokenizer: must know the special tokens of the chat template.
@@ -38,7 +38,7 @@ def build_chat_layout(
       view_tokens: n_view, embeddings of the RGB view; 0 for none.
       asked: names of the attributes that each prompt asks for.
       questions: question of each attribute.
-      system: what the system says.
+      system: the system message.
 
     Raises:
       ValueError: a tokenizer that splits a mark, or as `question_ids`.
@@ -64,7 +64,7 @@ def _head(
     tokenizer: Tokenizer, language: Language, tactile_tokens: int, view_tokens: int, system: str
 ) -> tuple[list[int], list[int], list[list[int]], list[int]]:
     """Ids before the question, the stream whose text each is, and the places of touch and view."""
-    begin, end = (_mark(tokenizer, mark) for mark in (SEEN, SEEN_END))
+    begin, end = (_mark(tokenizer, mark) for mark in (VISION, VISION_END))
     ids = tokenizer.encode(turn("system", system) + opening("user"))
     owner = [-1] * len(ids)
 

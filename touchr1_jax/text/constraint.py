@@ -30,7 +30,7 @@ class Constraint:
 
     token_class: np.ndarray  # int32 [V]
     is_end: np.ndarray  # bool [V]
-    successor: np.ndarray  # int32 [states, C], −1 where the answer would be spoilt
+    successor: np.ndarray  # int32 [states, C], −1 where no formatted answer can follow
     need: np.ndarray  # int32 [states]
     may_end: np.ndarray  # bool [states]
 
@@ -40,7 +40,7 @@ class Constraint:
         return int(self.need[0])
 
     def allowed(self, state: Int[Array, "*n"], left: Int[Array, ""]) -> Bool[Array, "*n V"]:
-        """Which tokens may come when `left` may still be written, this one included."""
+        """Mask of the tokens that may come next when `left` tokens remain, this one included."""
         after = jnp.asarray(self._need_after)[state] < left
         return jnp.where(self.is_end, jnp.asarray(self.may_end)[state][..., None], after[..., self.token_class])
 
@@ -77,7 +77,7 @@ def compile_constraint(language: Language, tokenizer: Tokenizer) -> Constraint:
 
 
 def _places_after(events: np.ndarray) -> np.ndarray:
-    """Place after each list of events from each place, int32 [lists, places]; −1 where it spoils the answer."""
+    """Place after each list of events from each place, int32 [lists, places]; −1 if no formatted answer can follow."""
     after = np.tile(np.arange(_PLACES, dtype=np.int32), (len(events), 1))
     for place_row, row in zip(after, events, strict=True):
         for event in row:

@@ -18,7 +18,7 @@ _PHRASE = re.compile(r"[a-z0-9_]+(?:[ \-][a-z0-9_]+)*")
 class Attribute:
     """A property that can be asked for: `levels[k]` are the phrases that name level k, the canonical one first.
 
-    `ordered` marks a property that shows in the order of the frames, so that a shuffle of them is a control for it.
+    `ordered` marks a property that depends on the order of the frames, so that a shuffle of them is a control for it.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Sensor:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Language:
-    """Everything that the template writes and the parser reads.
+    """Attributes, sensors and tags of the answers that the template writes and the parser reads.
 
     Raises:
       ValueError: a phrase that is not lower-case words joined by single spaces or hyphens, or that means two things.

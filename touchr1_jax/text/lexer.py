@@ -1,6 +1,6 @@
 """From token ids to events: an automaton over bytes, compiled on the host into tables over tokens.
 
-What counts, here and in the parser:
+Definitions, here and in the parser:
   White space is ASCII white space.  Word characters are ASCII letters, digits, "_" and every byte ≥ 0x80, so that a
   non-ASCII letter and the replacement character of broken UTF-8 behave alike in bytes and in text.
   A tag is its literal lower-case bytes, `<perceive>`, wherever they stand, even inside a word; it breaks words.
@@ -103,7 +103,7 @@ class _Rules:
         self.letters = set("".join([*self.tags, *self.phrases]))
 
     def symbol(self, byte: int) -> str:
-        """The character that stands for a byte, one for all bytes that no rule tells apart."""
+        """The character that stands for a byte; one for all bytes that no rule distinguishes."""
         char = chr(byte)
         if char in " \t\n\r\v\f":
             return " "
@@ -134,7 +134,7 @@ class _Rules:
         return phrase + (char.lower() if char == "-" or _WORD.fullmatch(char.lower()) else _BREAK)
 
     def _settle(self, text: str) -> tuple[list[int], str]:
-        """Emit and drop words from the left until the rest begins a phrase; its last word may go on."""
+        """Emit and drop words from the left until the rest begins a phrase; its last word may continue."""
         found = []
         while text not in self.phrase_beginnings:
             ends = [n for n in range(1, len(text)) if text[n] in " -." and text[:n] in self.phrases]

@@ -1,4 +1,4 @@
-"""A plain parser of decoded text on the host: the check on the compiled one, and a reader for reports.
+"""A plain parser of decoded text on the host, for reports and as a test oracle of the compiled parser.
 
 It shares no code with `lexer` and `parser`, only the definitions in their docstrings.
 """
@@ -14,7 +14,7 @@ _FOLD = {upper: upper + 32 for upper in range(ord("A"), ord("Z") + 1)}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a text says, as `types.Parsed` has it; −1 is ⊥."""
+    """The levels that a text states, as in `types.Parsed`; −1 is ⊥."""
 
     perceive: list[list[int]]  # [S][A]
     compare: list[int]  # [A]
@@ -56,13 +56,13 @@ def _phrases(language: Language, body: str) -> list[str]:
 
 
 def _perceive(language: Language, body: str) -> list[list[int]]:
-    said: list[list[str]] = [[] for _ in language.sensors]
+    named: list[list[str]] = [[] for _ in language.sensors]
     sensor = None
     for phrase in _phrases(language, body):
         sensor = next((s for s, known in enumerate(language.sensors) if phrase in known.phrases), sensor)
         if sensor is not None:
-            said[sensor].append(phrase)
-    return [_slot(language, phrases) for phrases in said]
+            named[sensor].append(phrase)
+    return [_slot(language, phrases) for phrases in named]
 
 
 def _slot(language: Language, phrases: list[str]) -> list[int]:

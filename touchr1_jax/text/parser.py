@@ -1,16 +1,16 @@
-"""The parser of answers: token ids in, what they say out, inside the jitted step and for any tokenizer.
+"""The parser of answers: from token ids to levels, inside the jitted step and for any tokenizer.
 
     parser = compile_parser(TOUCH_LANGUAGE, tokenizer)
     parsed = jax.vmap(parser)(tokens)  # tokens int32 [G, T]
 
-What an answer says (tags, phrases and white space are defined in `lexer`):
+Rules (tags, phrases and white space are defined in `lexer`):
   The text is that of the tokens before the first end token; without one the answer is truncated and read as it stands.
   The body of a segment lies between its open and its close tag.  It counts only where each of the two tags occurs
   exactly once in the whole text and the open one comes first; otherwise all slots of the segment are ⊥ (−1).
   A level named in `perceive` belongs to the sensor last named before it in that body, and to none if there is none.
-  `compare` and `conclude` have one slot; sensor names mean nothing there.
-  A slot that names no level of an attribute, or two different ones, is ⊥ for it; one named twice is fine, and negation
-  is not understood: "not hard" counts as hard.
+  `compare` and `conclude` have one slot; sensor names are ignored there.
+  A slot that names no level of an attribute, or two different ones, is ⊥ for it; one named twice counts,
+  and negation is ignored: "not hard" is hard.
   Formatted: each of the six tags exactly once, in order, no body without a non-white character, nothing but white space
   after the last tag.  Free text may stand before and between the segments.
 """
@@ -33,7 +33,7 @@ _UNROLL = 8
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Parser:
-    """Reads one completion; a pure function of its tokens that closes over constant tables."""
+    """A pure function from the tokens of one completion to `Parsed`, with constant tables."""
 
     lexer: Lexer
     end_ids: tuple[int, ...]
@@ -42,7 +42,7 @@ class Parser:
     levels_of: np.ndarray  # int32 [events, A], bit k where an event names level k of an attribute
 
     def __call__(self, tokens: Int[Array, "*T"]) -> Parsed:
-        """What one completion says; tokens from the first end token on do not matter.
+        """Parse one completion; tokens from the first end token on are ignored.
 
         Raises:
           ValueError: tokens with a batch dimension.
@@ -76,7 +76,7 @@ class Parser:
     def _read(
         self, events: Int[Array, "N"]
     ) -> tuple[Int[Array, "S A"], Int[Array, "A"], Int[Array, "A"], Bool[Array, ""]]:
-        """The slots that a sequence of events fills, and whether it is formatted."""
+        """The slots that a sequence of events fills, and true if it is formatted."""
         order = jnp.arange(events.size)
         hit = events == FIRST_TAG + jnp.arange(6)[:, None]
         once, at = jnp.sum(hit, axis=1) == 1, jnp.argmax(hit, axis=1)
@@ -92,7 +92,7 @@ class Parser:
         return level[: self.sensors], level[self.sensors], level[self.sensors + 1], formatted
 
     def _sensor_in_force(self, events: Int[Array, "N"], inside: Bool[Array, "N"]) -> Bool[Array, "S N"]:
-        """Whether sensor s is the one last named in the body up to each event."""
+        """True where sensor s is the one last named in the body up to each event."""
         sensor = jnp.asarray(self.sensor_of)[events]
         rank = jnp.arange(events.size) * self.sensors + sensor  # sorts by position, remembers the sensor
         last = jax.lax.cummax(jnp.where(inside & (sensor >= 0), rank, -1))
@@ -124,7 +124,7 @@ def compile_parser(language: Language, tokenizer: Tokenizer) -> Parser:
 
 
 def _meaning(language: Language) -> tuple[np.ndarray, np.ndarray]:
-    """What each event names: its sensor or −1, int32 [events], and its levels as bits, int32 [events, A]."""
+    """Sensor that each event names or −1, int32 [events], and its levels as bits, int32 [events, A]."""
     phrases = phrases_of(language)
     sensor_of = np.full(FIRST_PHRASE + len(phrases), -1, np.int32)
     levels_of = np.zeros((len(sensor_of), len(language.attributes)), np.int32)

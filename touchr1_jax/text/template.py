@@ -23,13 +23,13 @@ QUESTIONS: Mapping[str, str] = {
     "protrusion": "how protruding is it",
     "material": "which material is it",
 }
-"""What is asked for each attribute."""
+"""Question for each attribute."""
 
 AND = "and"
 """Joins the questions of a prompt that asks for several attributes."""
 
 NO_SENSOR = "nothing"
-"""What `perceive` holds when no sensor is there: a body must not be empty."""
+"""Body of `perceive` when no sensor is present: a body must not be empty."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +152,7 @@ def answer_text(
 
 
 def encode_answer(tokenizer: Tokenizer, text: str, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """An answer as training wants it: ids, end token, padding, int32 [T], and what counts, end included, bool [T].
+    """An answer for training: ids, end token and padding, int32 [T], and the mask of ids with the end, bool [T].
 
     Raises:
       ValueError: the answer and its end token are longer than T.

@@ -1,4 +1,4 @@
-"""Any vocabulary seen as bytes: what each id adds to the decoded text, and how text becomes ids."""
+"""Vocabularies as bytes: the bytes that each id adds to the decoded text, and the encoding of text."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -74,7 +74,7 @@ class Tokenizer:
 
 
 def word_level(language: Language, extra_words: Iterable[str] = ()) -> Tokenizer:
-    """One id per blank-separated word: tags, sensor names, level words, then `extra_words`.
+    """A tokenizer with one id per blank-separated word: tags, sensor names, level words, then `extra_words`.
 
     Each piece starts with a blank, so that pieces put together are spaced text; the first tag, which starts an answer,
     has none.  `encode` raises ValueError on a word that is not in the vocabulary.

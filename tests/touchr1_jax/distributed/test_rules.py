@@ -110,11 +110,11 @@ def test_a_large_parameter_that_an_axis_does_not_divide_is_named(seven):
         state_shardings(MeshConfig(tensor=8).abstract(), {"vision": {"blocks_0": seven["vision"]["blocks_0"]}})
 
 
-def test_a_small_one_stays_whole():
-    kernel = {"q_proj": {"kernel": jnp.zeros((6, 6))}}
-    assert state_shardings(MESH, kernel)["q_proj"]["kernel"].spec == P(None, "tensor")
-    with pytest.raises(ValueError, match=r"dimension 0 must be a multiple of mesh fsdp = 4; choose a divisor of 6"):
-        state_shardings(MESH, kernel, large_bytes=1)
+def test_a_small_parameter_that_an_axis_does_not_divide_stays_whole_and_a_large_one_is_named():
+    kernel = lambda *shape: {"q_proj": {"kernel": jax.ShapeDtypeStruct(shape, jnp.float32)}}
+    assert state_shardings(MESH, kernel(6, 6))["q_proj"]["kernel"].spec == P(None, "tensor")
+    with pytest.raises(ValueError, match=r"dimension 0 must be a multiple of mesh fsdp = 4; choose a divisor of 514"):
+        state_shardings(MESH, kernel(514, 512))  # 1 MiB and some
 
 
 def test_batches_are_split_by_their_rows():

@@ -14,7 +14,7 @@ from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget
 from touchr1_jax.models.qwen.prompts import Film, prepare
 from touchr1_jax.models.qwen.safetensors import read_header
-from touchr1_jax.text.chat import Media, Message
+from touchr1_jax.text.chat import ChatMessage, Media
 
 
 @pytest.fixture
@@ -106,7 +106,7 @@ def test_newer_picture_settings_are_read(directory):
 def test_conversation_runs_through_the_loaded_model(directory):
     """A picture and a video of three frames: their tokens stand between their marks, and both reach the logits."""
     found, rng = load_checkpoint(directory, jnp.float32), np.random.default_rng(0)
-    message = Message(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, "hard"))
+    message = ChatMessage(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, "hard"))
     picture = rng.integers(0, 256, (17, 25, 3), dtype=np.uint8)
     film = Film(rng.integers(0, 256, (3, 16, 16, 3), dtype=np.uint8), 4.0)
 

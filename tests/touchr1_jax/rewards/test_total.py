@@ -127,7 +127,7 @@ def test_a_bare_function_in_the_dictionary_is_named():
         (Reward(lambda p, t: None), r"reward 'mine': value is None, must be float\[\]; return one number"),
         (
             Reward(lambda p, t: 1.0 if p.length > 5 else 0.0),
-            r"reward 'mine': value cannot be traced, .*test_total\.py:\d+ wants .*jnp\.where .*make_host_score",
+            r"reward 'mine': value cannot be traced, .*test_total\.py:\d+ needs .*jnp\.where .*make_host_score",
         ),
         (
             Reward(lambda p, t: np.mean(np.asarray(p.conclude))),

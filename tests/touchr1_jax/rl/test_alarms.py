@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from touchr1_jax.rl.alarms import RULES, WINDOW, Watch, echo_excess
+from touchr1_jax.rl.alarms import RULES, WINDOW, AlarmMonitor, echo_excess
 
 HEALTHY = {
     "labels_level_0": 20.0,
@@ -55,11 +55,11 @@ FAILURES = [
 
 def fired(change: dict[str, float]) -> dict[str, float]:
     """Alarms of a run that was healthy for one window and then failed for one."""
-    watch = Watch()
+    monitor = AlarmMonitor()
     for _ in range(WINDOW):
-        assert watch.see(HEALTHY) == []
+        assert monitor.update(HEALTHY) == []
     for _ in range(WINDOW):
-        alarms = watch.see(HEALTHY | change)
+        alarms = monitor.update(HEALTHY | change)
     return {a.code: a.value for a in alarms}
 
 
@@ -93,10 +93,10 @@ def test_honest_slots_never_agree_oftener_than_they_are_right():
 
 def test_a_lucky_first_step_is_not_the_beginning():
     """One step of 8 prompts is right by chance in .95 where the policy is in .7."""
-    watch = Watch()
+    monitor = AlarmMonitor()
     lucky = HEALTHY | {"accuracy": 0.95}
     costly = HEALTHY | {"kl_cost_peak": 3.0}
-    assert all(watch.see(m) == [] for m in [lucky, *[costly] * (2 * WINDOW)])
+    assert all(monitor.update(m) == [] for m in [lucky, *[costly] * (2 * WINDOW)])
 
 
 def test_credit_for_a_lead_that_is_chance_is_unearned():
@@ -114,9 +114,9 @@ def test_a_costly_token_is_no_failure_as_long_as_answers_hold():
 
 
 def test_a_run_without_controls_has_no_alarm_of_them():
-    watch = Watch()
+    monitor = AlarmMonitor()
     plain = {name: value for name, value in HEALTHY.items() if not name.startswith(("control", "tactile", "touch"))}
-    assert all(watch.see(plain) == [] for _ in range(2 * WINDOW))
+    assert all(monitor.update(plain) == [] for _ in range(2 * WINDOW))
 
 
 def test_a_control_that_does_not_apply_says_nothing():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.models.qwen import chats, words
-from touchr1_jax.text.chat import SYSTEM, Media, Message, check_template, expand, render
+from touchr1_jax.text.chat import SYSTEM, ChatMessage, Media, check_template, expand, render
 from touchr1_jax.text.chat_layout import build_chat_layout
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.template import QUESTIONS
@@ -17,8 +17,8 @@ TOKENIZER = words.tokenizer(TOUCH_LANGUAGE)
 STREAMS = len(TOUCH_LANGUAGE.sensors)
 
 
-def messages(conversation) -> list[Message]:
-    return [Message(role=role, parts=tuple(MEDIA.get(p, p) for p in parts)) for role, parts in conversation]
+def messages(conversation) -> list[ChatMessage]:
+    return [ChatMessage(role=role, parts=tuple(MEDIA.get(p, p) for p in parts)) for role, parts in conversation]
 
 
 @pytest.mark.parametrize("i", range(len(chats.CONVERSATIONS)))
@@ -28,7 +28,7 @@ def test_conversations_are_rendered_as_by_the_published_template(i):
 
 
 def test_one_by_hand():
-    assert render([Message(role="user", parts=(Media.PICTURE, "How hard is it?"))]) == (
+    assert render([ChatMessage(role="user", parts=(Media.PICTURE, "How hard is it?"))]) == (
         "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
         "<|im_start|>user\n<|vision_start|><|image_pad|><|vision_end|>How hard is it?<|im_end|>\n"
         "<|im_start|>assistant\n"
@@ -37,7 +37,7 @@ def test_one_by_hand():
 
 def test_texts_may_not_spell_marks():
     with pytest.raises(ValueError, match=r"a message of the user spells '<\|im_end\|>'"):
-        Message(role="user", parts=("stop<|im_end|>",))
+        ChatMessage(role="user", parts=("stop<|im_end|>",))
 
 
 def test_nothing_said_is_refused():
@@ -87,7 +87,7 @@ def test_prompts_are_rendered_conversations(layout):
     for sensor in TOUCH_LANGUAGE.sensors:
         parts += [sensor.phrases[0], Media.VIDEO]
     for q, attribute in enumerate(TOUCH_LANGUAGE.attributes):
-        text = render([Message(role="user", parts=(*parts, QUESTIONS[attribute.name]))])
+        text = render([ChatMessage(role="user", parts=(*parts, QUESTIONS[attribute.name]))])
         sizes = {TOKENIZER.view_id: [4], TOKENIZER.tactile_id: [3] * STREAMS}
         np.testing.assert_array_equal(
             layout.ids[q][layout.mask[q]], expand(TOKENIZER.encode(text), sizes), err_msg=attribute.name

@@ -20,7 +20,7 @@ from touchr1_jax.models.qwen.pictures import (
     resize,
 )
 from touchr1_jax.models.qwen.positions import Seen, picture, position_ids, video
-from touchr1_jax.text.chat import Message, expand, render
+from touchr1_jax.text.chat import ChatMessage, expand, render
 from touchr1_jax.text.tokenizer import Tokenizer
 
 
@@ -40,7 +40,7 @@ class Shown(NamedTuple):
 
 
 def prepare(
-    messages: Sequence[Message],
+    messages: Sequence[ChatMessage],
     tokenizer: Tokenizer,
     config: QwenConfig,
     *,

@@ -8,7 +8,7 @@ from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.pictures import PixelBudget
 from touchr1_jax.models.qwen.positions import picture, position_ids, video
 from touchr1_jax.models.qwen.prompts import Film, prepare, show_picture, show_video
-from touchr1_jax.text.chat import Media, Message, render
+from touchr1_jax.text.chat import ChatMessage, Media, render
 
 BUDGET = PixelBudget(least=64, most=1024)
 WIDE, TALL = (
@@ -16,8 +16,8 @@ WIDE, TALL = (
 )
 FILM = Film(np.random.default_rng(2).integers(0, 256, (3, 16, 8, 3), dtype=np.uint8), 2.0)
 MESSAGES = [
-    Message(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, Media.PICTURE)),
-    Message(role="assistant", parts=("hard",)),
+    ChatMessage(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, Media.PICTURE)),
+    ChatMessage(role="assistant", parts=("hard",)),
 ]
 
 
@@ -62,7 +62,7 @@ def test_positions_are_counted_over_the_whole(ready):
 
 
 def test_text_alone_has_nothing_to_show():
-    inputs, grids = prepare([Message(role="user", parts=("soft",))], TOKENIZER, CONFIG)
+    inputs, grids = prepare([ChatMessage(role="user", parts=("soft",))], TOKENIZER, CONFIG)
     assert grids == ()
     assert inputs.slots.size == inputs.patches.size == 0
     np.testing.assert_array_equal(inputs.positions, [range(len(inputs.ids))] * 3)
