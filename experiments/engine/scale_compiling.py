@@ -1,11 +1,16 @@
-"""Compile a step for devices that are not there, in a process that believes in them.
+"""Shapes of the published training and its layouts over devices, compiled for devices that are not there.
 
-For `cpu` XLA simulates the devices; it computes products of bfloat16 in float32, so that its temporary memory is an
-upper figure.  For `h200` XLA's GPU compiler gets a description of the machine, which needs NVIDIA's compiler and JAX's
-plugin for CUDA but no GPU: what it reserves is what a step there takes.
+Touch-R1 (arXiv 2605.27154) trains Qwen2.5-VL 7B on 16 H200 with 8 frames of 448² pixels from four sensors and groups of
+eight.  A frame of 448² is 16 · 16 tokens of Qwen2.5-VL, which reads two frames at a time: 4 · 256 tokens a sensor, and
+256 for the view.  Lengths of question and answer are not published; here 128 and 512.
+
+For `cpu` XLA simulates the devices; it computes products of bfloat16 in float32, so its temporary memory is an upper
+bound.  For `h200` XLA's GPU compiler gets a description of the machine, which needs NVIDIA's compiler and JAX's plugin
+for CUDA but no GPU: it reserves what a step needs there.
 """
 
 import contextlib
+import dataclasses
 import importlib.util
 import os
 import time
@@ -13,16 +18,129 @@ from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import optax
 from jax.experimental import topologies
 
-from experiments.engine.paper_shapes import OPTIMIZER, Setup, Training, score_of
 from experiments.engine.processes import in_own_process
-from touchr1_jax.distributed.abstract import compile_grpo
-from touchr1_jax.distributed.memory import Compiled
+from touchr1_jax.distributed.abstract import AbstractStep, PromptShape, abstract_grpo, compile_grpo
+from touchr1_jax.distributed.memory import Compiled, GRPOShape, grpo_bytes
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.types import Parsed, Target
 
 Compiler = Literal["cpu", "h200"]
 
-OF_A_MACHINE = 8
+PAPER_PROMPT = PromptShape(streams=4, stream_tokens=1024, view_tokens=256, text_tokens=128)
+TINY_PROMPT = PromptShape(streams=2, stream_tokens=4, view_tokens=4, text_tokens=8)
+
+TINY = QwenConfig(
+    decoder=DecoderConfig(
+        vocab_size=256,
+        hidden_size=32,
+        num_layers=4,
+        num_heads=4,
+        num_kv_heads=2,
+        head_dim=8,
+        intermediate_size=64,
+        mrope_section=(1, 1, 2),
+        tie_embedding=False,
+    ),
+    vision=QwenVisionConfig(out_size=32, depth=1, hidden_size=32, num_heads=2, intermediate_size=64, full_layers=(0,)),
+    vision_start_id=250,
+    vision_end_id=251,
+    image_id=252,
+    video_id=253,
+)
+"""A model of the same kind that compiles in seconds."""
+
+OPTIMIZER = optax.adamw(1e-6)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Setup:
+    """A layout of the training: a mesh, and adapters on a frozen base if any."""
+
+    mesh: MeshConfig
+    lora: LoraConfig | None = None
+
+    @property
+    def name(self) -> str:
+        """Such as `fsdp 8 × tensor 2`."""
+        axes = {"data": self.mesh.data, "fsdp": self.mesh.fsdp, "tensor": self.mesh.tensor}
+        mesh = " × ".join(f"{axis} {size}" for axis, size in axes.items() if size > 1)
+        return f"{mesh or 'one device'}{'' if self.lora is None else f', LoRA {self.lora.rank}'}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Training:
+    """A model, its prompts, and the sizes of a step."""
+
+    model: QwenConfig
+    prompt: PromptShape
+    group: int
+    length: int
+    micro_rows: int
+    """Prompts of a micro-batch on each device."""
+    prompts: int
+
+    def shape(self, setup: Setup) -> GRPOShape:
+        """The sizes that the memory of a step depends on."""
+        rows = setup.mesh.data * setup.mesh.fsdp
+        grpo = GRPOConfig(
+            prompts=self.prompts,
+            micro_prompts=min(self.prompts, rows * self.micro_rows),
+            group=self.group,
+            length=self.length,
+            remat=True,
+            bfloat16=True,
+            algorithm=Paper(),
+        )
+        return GRPOShape(decoder=self.model.decoder, grpo=grpo, mesh=setup.mesh, prompt_tokens=self.prompt.tokens)
+
+    def step(self, setup: Setup) -> AbstractStep:
+        """The arguments of the step as shapes."""
+        return abstract_grpo(self.model, self.prompt, self.shape(setup), OPTIMIZER, lora=setup.lora)
+
+    def counted(self, setup: Setup) -> dict[str, int]:
+        """Bytes on each device, line by line."""
+        step = self.step(setup)
+        return grpo_bytes(self.shape(setup), step.state, step.batch, step.frozen, step.base)
+
+    def of_depth(self, layers: int) -> "Training":
+        """The same training with another number of layers."""
+        decoder = dataclasses.replace(self.model.decoder, num_layers=layers)
+        return dataclasses.replace(self, model=dataclasses.replace(self.model, decoder=decoder))
+
+
+def model_of(size: str) -> QwenConfig:
+    """The released model of a size, or the tiny one."""
+    return TINY if size == "tiny" else released(size)
+
+
+def score_of(streams: int):
+    """A reward of the right form for a step that is compiled and never run."""
+
+    def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
+        level = jnp.where(target.asked, tokens[0] % 3, -1)
+        right = jnp.mean(tokens % 3 == jnp.max(target.label))
+        parsed = Parsed(
+            perceive=jnp.tile(level, (streams, 1)),
+            compare=level,
+            conclude=level,
+            formatted=tokens[0] > 0,
+            truncated=tokens[-1] > 0,
+            length=jnp.sum(tokens > 0),
+        )
+        return right, {"right": right}, parsed
+
+    return score
+
+
+PER_MACHINE = 8
 """H200s of one machine."""
 
 H200 = """
@@ -51,20 +169,20 @@ dnn_version_info { major: 9 minor: 10 patch: 0 }
 runtime_version { major: 12 minor: 8 patch: 0 }
 device_description_str: "NVIDIA H200 141GB HBM3e"
 """
-"""What XLA must know of the device, in its own words (`stream_executor.GpuTargetConfigProto`)."""
+"""The device's description for XLA (`stream_executor.GpuTargetConfigProto`)."""
 
 TOOLKIT = "nvidia.cuda_nvcc"
 """Python package of NVIDIA's compiler."""
 
 
 class Compilation(NamedTuple):
-    """What the compiler reserves, and how long it took, seconds."""
+    """Bytes that the compiler reserves, and the seconds that it took."""
 
     compiled: Compiled
     seconds: float
 
 
-def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
+def compile_in_process(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
     """Compile in a fresh process.
 
     Raises:
@@ -79,7 +197,7 @@ def compiled_alone(training: Training, setup: Setup, compiler: Compiler) -> Comp
 
 
 def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
-    """The same in this process, whose environment must be right."""
+    """Compile in this process, whose environment must fit the compiler."""
     began = time.perf_counter()
     score = score_of(training.prompt.streams)
     devices = jax.devices() if compiler == "cpu" else h200s(setup.mesh.devices)
@@ -89,7 +207,7 @@ def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Compil
 
 def h200s(count: int) -> list[jax.Device]:
     """Devices of as many machines as it takes, to compile for."""
-    machines = -(-count // OF_A_MACHINE)
+    machines = -(-count // PER_MACHINE)
     topology = f"1x{machines}x{count // machines}"
     return list(topologies.get_topology_desc(platform="cuda", target_config=H200, topology=topology).devices)
 

@@ -3,14 +3,14 @@
     python -m experiments scale_paper [--scale smoke] [--compiler h200]
 
 Touch-R1 trained Qwen2.5-VL 7B on sixteen H200 with 8 frames of 448² from four sensors and groups of eight.  Here the
-same step, with the reference and the counterfactual policy, is lowered and compiled for sixteen devices without weights
-and without the devices, and what the compiler reserves is held against a count by hand.  Decoders of one and two layers
-are compiled at full width; layers are alike, so that a straight line gives all of them.  `--compiler cpu` asks the
-compiler of this machine, which keeps products of bfloat16 in float32; `--compiler h200` asks the GPU's, which needs
-JAX's CUDA plugin but no GPU.  Other meshes, and adapters on a frozen base, are counted; `--compiled N` compiles more.
+same step, with the reference and the counterfactual policy, is compiled for sixteen devices without weights and without
+the devices, and the memory that the compiler reserves is compared with a count by hand.  Decoders of one and two layers
+are compiled at full width; layers are equal, so a straight line gives all of them.  `--compiler cpu` is the compiler of
+this machine, which keeps products of bfloat16 in float32; `--compiler h200` is the GPU's, which needs JAX's CUDA plugin
+but no GPU.  Other meshes, and adapters on a frozen base, are counted; `--compiled N` compiles more of them.
 
-To train so: the same mesh on the command line of a study, `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process
-per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16` and micro-batches of one prompt a device.
+To train in this layout: the same mesh on the command line of a study, `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in
+one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16` and micro-batches of one prompt a device.
 
 Cost: 5 to 10 minutes on one core with one mesh compiled; `--scale smoke` half a minute.
 
@@ -19,26 +19,41 @@ sampling gathers the sharded weights once, not at every token.
 """
 
 import dataclasses
+from collections.abc import Mapping
 
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Picture, Requirement, Results
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.engine.paper_shapes import PAPER_PROMPT, TINY_PROMPT, Setup, Training, model_of
-from experiments.engine.scale_charts import memory_bars
-from experiments.engine.scale_compiling import Compiler, compiled_alone
-from experiments.engine.scale_tables import GB, Lines, Reserved, byte_table, memory_table, time_table
-from touchr1_jax.distributed.memory import ARGUMENTS, Compiled, at_depths, counted_peak, grpo_bytes
+from experiments.engine.scale_compiling import (
+    PAPER_PROMPT,
+    TINY_PROMPT,
+    Compiler,
+    Setup,
+    Training,
+    compile_in_process,
+    model_of,
+)
+from touchr1_jax.distributed.memory import ARGUMENTS, LEARNING, SAMPLING, Compiled, at_depths, counted_peak
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.work import Machine, seconds
+from touchr1_jax.distributed.work import Machine, model_flops, seconds
 from touchr1_jax.models.lora import LoraConfig
 
+GB = 1e9
+
+Lines = Mapping[Setup, Mapping[str, int]]
+"""Setup → line → counted bytes on each device."""
+
+Reserved = Mapping[Setup, Mapping[int, Compiled]]
+"""Setup → layers → bytes that the compiler reserves; the largest number of layers is extrapolated."""
+
 COUNTERS_BYTES = 12
-"""Of a step's arguments that no line counts: its key, 8 bytes, and its number, 4."""
+"""Bytes of the step's arguments that no line counts: its key, 8, and its number, 4."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScaleConfig:
-    """The training, the ways to lay it out, and how many of them are compiled.
+    """The training, its layouts over devices, and how many of these are compiled.
 
     Raises:
       ValueError: no mesh, more compiled than there are, depths that do not ascend.
@@ -92,7 +107,7 @@ class ScaleConfig:
 def run(config: ScaleConfig, context: Context) -> Results:
     """Count every setup, compile the first, predict."""
     training = config.training
-    lines = {setup: counted(training, setup) for setup in context.each("counting", config.setups)}
+    lines = {setup: training.counted(setup) for setup in context.each("counting", config.setups)}
     reserved = {
         setup: compiled(config, setup, context) for setup in context.each("compilers", config.setups[: config.compiled])
     }
@@ -102,14 +117,15 @@ def run(config: ScaleConfig, context: Context) -> Results:
         requirements=requirements(config, lines, reserved),
         tables=(
             byte_table(lines),
-            *((memory_table(lines, reserved, config.compiler, depth(config)),) if reserved else ()),
+            *((memory_table(config, lines, reserved),) if reserved else ()),
             time_table(training, full, config.machine),
         ),
         pictures=(
             Picture(
                 name="memory",
                 title="Memory of a step on each device",
-                caption="Bars are counted by hand; the larger of sampling and learning is drawn, for they take turns.",
+                caption="Bars are counted by hand; the larger of sampling and learning is drawn, since one follows the "
+                "other.",
                 content=memory_bars(lines, reserved, config.machine.memory_bytes),
             ),
         ),
@@ -126,19 +142,13 @@ def depth(config: ScaleConfig) -> int:
     return config.training.model.decoder.num_layers
 
 
-def counted(training: Training, setup: Setup) -> dict[str, int]:
-    """Bytes on each device, line by line."""
-    step = training.step(setup)
-    return grpo_bytes(training.shape(setup), step.state, step.batch, step.frozen, step.base)
-
-
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:
-    """What the compiler reserves at both depths, each of which is remembered, and on their line at the model's."""
+    """Bytes that the compiler reserves at both depths, saved as stages, and by extrapolation at the model's depth."""
     found: dict[int, Compiled] = {}
     for layers in context.each(setup.name, config.layers):
         stage = f"compile/{config.setups.index(setup)}/{layers}"
         if not context.done(stage):
-            outcome = compiled_alone(config.training.of_depth(layers), setup, config.compiler)
+            outcome = compile_in_process(config.training.of_depth(layers), setup, config.compiler)
             context.save_stage(stage, {"bytes": outcome.compiled, "seconds": outcome.seconds})
         saved = context.load_stage(stage)
         found[layers] = Compiled(*saved["bytes"])
@@ -149,42 +159,122 @@ def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, C
 
 
 def requirements(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[Requirement, ...]:
-    """The device's memory holds the count and what is reserved; the arguments are those counted."""
-    bound, found = config.machine.memory_bytes / GB, []
-    for setup, by in lines.items():
-        found.append(fits(f"{setup.name}: counted", counted_peak(by), bound))
+    """The count and the reserved memory fit the device; the compiled arguments equal the counted ones."""
+
+    def fits(name: str, size: float) -> Requirement:
+        bound = config.machine.memory_bytes / GB
+        return Requirement(name=name, measured=size / GB, bound=bound, better="lower", unit="GB")
+
+    found = [fits(f"{setup.name}: counted", counted_peak(by)) for setup, by in lines.items()]
     for setup, depths in reserved.items():
-        found.append(fits(f"{setup.name}: reserved for {config.compiler}", depths[depth(config)].peak, bound))
+        full = depths[depth(config)]
         own = sum(lines[setup][name] for name in ARGUMENTS) + COUNTERS_BYTES
-        off = abs(depths[depth(config)].arguments / own - 1)
-        found.append(
-            Requirement(name=f"{setup.name}: arguments off the count", measured=off, bound=1e-3, better="lower")
-        )
+        off, name = abs(full.arguments / own - 1), f"{setup.name}: arguments off the count"
+        found.append(fits(f"{setup.name}: reserved for {config.compiler}", full.peak))
+        found.append(Requirement(name=name, measured=off, bound=1e-3, better="lower"))
     return tuple(found)
 
 
-def fits(name: str, size: float, bound: float) -> Requirement:
-    """Bytes against gigabytes of a device."""
-    return Requirement(name=name, measured=size / GB, bound=bound, better="lower", unit="GB")
-
-
 def verdict(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[str, ...]:
-    """Whether it fits, and how long it would take."""
+    """Memory of a step, counted and compiled, and its predicted time."""
     first = config.setups[0]
-    said = [
+    times = seconds(config.training.shape(first), config.machine)
+    return (
         f"Counted by hand, a step of the {config.size} on {first.mesh.devices} devices ({first.name}) takes "
-        f"{counted_peak(lines[first]) / GB:.1f} of {config.machine.memory_bytes / GB:.0f} GB on each."
-    ]
-    for setup, by in reserved.items():
-        said.append(
+        f"{counted_peak(lines[first]) / GB:.1f} of {config.machine.memory_bytes / GB:.0f} GB on each.",
+        *(
             f"XLA reserves {by[depth(config)].peak / GB:.1f} GB for {setup.name} (compiler: {config.compiler}), the "
             "reference and the counterfactual passes included."
-        )
-    times = seconds(config.training.shape(first), config.machine)
-    said.append(
-        f"Predicted, not measured: {sum(times.values()):.1f} s a step, of which sampling {times['sampling']:.1f} s."
+            for setup, by in reserved.items()
+        ),
+        f"Predicted, not measured: {sum(times.values()):.1f} s a step, of which sampling {times['sampling']:.1f} s.",
     )
-    return tuple(said)
+
+
+def byte_table(lines: Lines) -> Table:
+    """The count, line by line."""
+    rows: list[dict[str, Cell]] = [
+        {"what": name, **{setup.name: by[name] / GB for setup, by in lines.items()}}
+        for name in next(iter(lines.values()))
+    ]
+    rows.append({"what": "largest at one time", **{s.name: counted_peak(by) / GB for s, by in lines.items()}})
+    return named_table(
+        "Counted by hand, GB on each device",
+        rows,
+        formats={setup.name: ".2f" for setup in lines},
+        note="LoRA: adapters of that rank on a frozen base.  Sampling and learning take turns: the larger counts.",
+    )
+
+
+def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table:
+    """The compiler's figures with the count."""
+    rows: list[dict[str, Cell]] = []
+    for setup, by in reserved.items():
+        for layers, c in by.items():
+            full = layers == depth(config)
+            rows.append(
+                {
+                    "setup": f"{setup.name}, {layers} layers{' (extrapolated)' if full else ''}",
+                    "arguments": c.arguments / GB,
+                    "temporary": c.temporary / GB,
+                    "peak": c.peak / GB,
+                    "counted": counted_peak(lines[setup]) / GB if full else None,
+                }
+            )
+    return named_table(
+        f"Reserved by XLA's compiler for {config.compiler}, GB on each device",
+        rows,
+        formats=dict.fromkeys(("arguments", "temporary", "peak", "counted"), ".2f"),
+        note="Equal layers need equal memory: a straight line through the compiled depths gives the model's.",
+    )
+
+
+def time_table(training: Training, setups: tuple[Setup, ...], machine: Machine) -> Table:
+    """Predicted seconds of a step by phase."""
+    rows: list[dict[str, Cell]] = []
+    for setup in setups:
+        shape = training.shape(setup)
+        phases = seconds(shape, machine)
+        step_s = sum(phases.values())
+        share = model_flops(shape) / step_s / machine.flops / setup.mesh.devices
+        rows.append({"setup": setup.name, **phases, "step": step_s, "share of peak": 100 * share})
+    return named_table(
+        "Predicted seconds of a step",
+        rows,
+        units={**dict.fromkeys(("prompts", "sampling", "learning", "step"), "s"), "share of peak": "%"},
+        meanings={"share of peak": "operations that no program can avoid, over the step"},
+        note=(
+            f"Each phase takes what is longest of computing at {machine.flops_share:.0%} of {machine.flops / 1e12:.0f} "
+            f"TFLOP/s, reading at {machine.read_share:.0%} of {machine.read_bytes / 1e12:.1f} TB/s and gathering at "
+            f"{machine.link_share:.0%} of {machine.near_bytes / GB:.0f} GB/s inside a machine, "
+            f"{machine.far_bytes / GB:.0f} between machines.  A prediction: no step was timed on such a machine."
+        ),
+    )
+
+
+def memory_bars(lines: Lines, reserved: Reserved, bound: float) -> bytes:
+    """Draw counted bytes in four parts, the compiler's figures as points, and the device's memory as a line."""
+    rows = [setup.name for setup in lines]
+    bars = [Series(name, x=sizes, bar=True) for name, sizes in parts(lines).items()]
+    if reserved:
+        peaks, y = [by[max(by)].peak / GB for by in reserved.values()], [rows.index(s.name) for s in reserved]
+        bars.append(Series("compiled, extrapolated", x=peaks, y=y, marker="D", colour="black"))
+    rules = [Rule(x=bound / GB, name="memory of the device")]
+    return draw([Panel(bars, rows=rows, stacked=True, x_label="GB on each device", rules=rules)])
+
+
+def parts(lines: Lines) -> dict[str, list[float]]:
+    """Counted gigabytes of each setup: arguments, weights in use, and the larger of sampling and learning."""
+    found: dict[str, list[float]] = {name: [] for name in ("arguments", "weights in use", "sampling", "learning")}
+    for by in lines.values():
+        phases = {"sampling": sum(by[n] for n in SAMPLING), "learning": sum(by[n] for n in LEARNING)}
+        larger = max(phases, key=lambda name: phases[name])
+        arguments = sum(by[n] for n in ARGUMENTS)
+        found["arguments"].append(arguments / GB)
+        found["weights in use"].append((sum(by.values()) - arguments - sum(phases.values())) / GB)
+        for name, size in phases.items():
+            found[name].append(size / GB if name == larger else 0.0)
+    return {name: sizes for name, sizes in found.items() if any(sizes)}
 
 
 DEFAULT = ScaleConfig()

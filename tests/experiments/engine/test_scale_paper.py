@@ -8,9 +8,8 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.engine import scale_compiling as compiling
 from experiments.engine import scale_paper
-from experiments.engine.paper_shapes import Setup
-from experiments.engine.scale_charts import parts
-from experiments.engine.scale_paper import DEFAULT, SMOKE, ScaleConfig, counted
+from experiments.engine.scale_compiling import Setup
+from experiments.engine.scale_paper import DEFAULT, SMOKE, ScaleConfig, parts
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.distributed.memory import counted_peak
 from touchr1_jax.distributed.mesh import MeshConfig
@@ -19,7 +18,7 @@ from touchr1_jax.models.lora import LoraConfig
 
 def test_the_paper_fits_by_count_and_adapters_need_less():
     first, adapters, *_ = DEFAULT.setups
-    whole, lean = (counted(DEFAULT.training, setup) for setup in (first, adapters))
+    whole, lean = (DEFAULT.training.counted(setup) for setup in (first, adapters))
     assert DEFAULT.training.prompt.tokens == 4 * 1024 + 256 + 128
     assert whole["parameters"] == pytest.approx(4 * 7.616e9 / 16, rel=1e-3)
     assert counted_peak(lean) + 2.5 * whole["parameters"] < counted_peak(whole) < DEFAULT.machine.memory_bytes / 2
@@ -44,7 +43,7 @@ def test_setups_have_names():
 
 
 def test_bars_hold_what_is_counted():
-    lines = {setup: counted(SMOKE.training, setup) for setup in SMOKE.setups}
+    lines = {setup: SMOKE.training.counted(setup) for setup in SMOKE.setups}
     totals = [sum(sizes) for sizes in zip(*parts(lines).values(), strict=True)]
     assert totals == pytest.approx([counted_peak(by) / 1e9 for by in lines.values()])
 
