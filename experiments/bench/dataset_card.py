@@ -78,21 +78,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             "thresholds, do not give the answer: these questions stay, or the bench would hold only what a threshold "
             "can answer.",
         ),
-        requirements=(
-            Requirement(
-                name="questions", measured=len(items), bound=config.quota.total, better="higher", note="of the quota"
-            ),
-            Requirement(name="made twice, the same bytes", measured=float(again == found), bound=1, better="higher"),
-            Requirement(
-                name="planted faults caught, the worst rule", measured=least, bound=100, better="higher", unit="%"
-            ),
-            *(
-                Requirement(
-                    name=c.name, measured=c.measured, bound=c.bound, better="lower", unit=c.unit, note=c.meaning
-                )
-                for c in checks
-            ),
-        ),
+        requirements=_requirements(config, len(items), again == found, least, checks),
         tables=(
             _question_table(items),
             _answer_table(items),
@@ -122,6 +108,22 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             "training_contacts": len(source.train.contacts),
             "recordings_without_contact": sum(source.bench.skipped.values()) + sum(source.train.skipped.values()),
         },
+    )
+
+
+def _requirements(
+    config: DatasetCardConfig, questions: int, same: bool, least: float, checks: Sequence[card.CardCheck]
+) -> tuple[Requirement, ...]:
+    return (
+        Requirement(
+            name="questions", measured=questions, bound=config.quota.total, better="higher", note="of the quota"
+        ),
+        Requirement(name="made twice, the same bytes", measured=float(same), bound=1, better="higher"),
+        Requirement(name="planted faults caught, the worst rule", measured=least, bound=100, better="higher", unit="%"),
+        *(
+            Requirement(name=c.name, measured=c.measured, bound=c.bound, better="lower", unit=c.unit, note=c.meaning)
+            for c in checks
+        ),
     )
 
 
