@@ -24,7 +24,7 @@ DOCUMENTS = [ROOT / "README.md", *(ROOT / ".github").glob("*.md"), *(ROOT / p / 
 DOCUMENTS.append(ROOT / "experiments" / "TUTORIAL.md")
 EXPERIMENTS = find("experiments")
 
-MODULE = re.compile(r"^(?:    )?(?:.*`)?python -m ((?:experiments|sensors_io|touchr1_jax)[\w.]*) ?([^`\n]*)", re.MULTILINE)
+MODULE = re.compile(r"^(?:    )?(?:.*`)?python -m ((?:experiments|sensors_io|touchr1_jax)[\w.]*) ?([^`\n]*)", re.M)
 MAKE = re.compile(r"make experiment EXP=(\w+)(?: \[?ARGS=\"([^\"]*)\")?")
 STANDS_FOR = {"D": "6.3", "S": "0.06", "N": "2", "I": "1", "MASS_KG": "0.1"}
 """Capital letters of the documents where the command line wants numbers."""

@@ -84,13 +84,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             _answer_table(items),
             _rule_table(found, caught),
             _threshold_table(source),
-            named_table(
-                "Objects of the bench",
-                [
-                    {"attribute": name, "objects by level": ", ".join(f"{k}: {n}" for k, n in counts.items())}
-                    for name, counts in card.coverage(source.bench)
-                ],
-            ),
+            _object_table(source),
             _sample_table(items),
         ),
         pictures=(
@@ -125,6 +119,14 @@ def _requirements(
             for c in checks
         ),
     )
+
+
+def _object_table(source: BenchSource) -> Table:
+    rows = [
+        {"attribute": name, "objects by level": ", ".join(f"{level}: {n}" for level, n in counts.items())}
+        for name, counts in card.coverage(source.bench)
+    ]
+    return named_table("Objects of the bench", rows)
 
 
 def _question_table(items: Sequence[Item]) -> Table:
