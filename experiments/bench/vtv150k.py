@@ -36,7 +36,7 @@ from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.mechanics.identify_motions import MotionData, feel, rows_of
+from experiments.mechanics.identify_motions import MotionData, contacts_of, motion_data
 from experiments.mechanics.identify_probes import transfer
 from experiments.study import paper_numbers as paper
 from experiments.study.paper_numbers import differences_table
@@ -90,7 +90,7 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
         rows = one_each(LiveScenes(config.scenes))
         advance()
     with context.timed("recordings"), context.progress("recordings", sum(map(len, rows.values()))) as advance:
-        made = together([feel(config.scenes, name, config.moments, advance, rows[name]) for name in MOTIONS])
+        made = together([motion_data(config.scenes, name, config.moments, advance, rows[name]) for name in MOTIONS])
     tasks = vtv.draw_tasks(made.label, config.questions, seed=0)
     with context.timed("probes"):
         predicted = predictions(made, config.probe, context)
@@ -130,7 +130,7 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
       DataError: no object has one of each.
     """
     first: dict[str, dict[str, int]] = {
-        name: {scenes.contacts[row].object_id: row for row in reversed(rows_of(scenes, name))} for name in MOTIONS
+        name: {scenes.contacts[row].object_id: row for row in reversed(contacts_of(scenes, name))} for name in MOTIONS
     }
     shared = sorted(set.intersection(*(set(rows) for rows in first.values())))
     if not shared:

@@ -3,18 +3,18 @@
     python -m experiments identifiability [--scale smoke]
 
 Generated objects are pressed once, 0.3 to 5 N in four frames, by all four sensors.  A linear probe on fixed features of
-a sensor's pictures, fields and force is asked for hardness, roughness and protrusion of objects that it never felt, at
-several multiples of the sensors' noise; beside it stand probes that know the true shape alone, or the measured force
-alone.  What such a probe tells is a lower bound of what can be told.  Then the probe is trained at other tiers of the
-contact ladder, on the same presses with the same noise, and asked about the exact ones.  A slide and a press that is
-released, from the protocol, are asked for friction and elasticity, which a press cannot tell.  Intervals are over
-objects.
+a sensor's pictures, fields and force predicts hardness, roughness and protrusion of unseen objects, at several
+multiples of the sensors' noise; it is compared with probes that know the true shape alone, or the measured force alone.
+The accuracy of such a probe is a lower bound of what touch can tell.  Then the probe is trained at other tiers of the
+contact ladder, on the same presses with the same noise, and tested on the exact ones.  Friction and elasticity, which a
+press cannot tell, are predicted from a slide and from a press that is released, both from the protocol.  Intervals are
+over objects.
 
 Cost: about seven minutes on two cores (`smoke` two minutes on one).
 
-Expected: touch tells hardness far above the lines of shape and force, which stay near guessing; roughness is told by
-the camera of the GelSight Mini alone; protrusion by all sensors, short of what its shape tells.  The generator's grid
-of 64² costs a probe less than a point, 24² several, a bed of springs ten.
+Expected: touch tells hardness far better than shape or force alone, which stay near guessing; roughness is told by the
+camera of the GelSight Mini alone; protrusion by all sensors, less well than by its shape.  The generator's grid of 64²
+costs a probe less than a point, 24² several, a bed of springs ten.
 """
 
 import dataclasses
@@ -26,11 +26,10 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Requirement, Results
 from experiments.core.runner import Experiment
-from experiments.mechanics import identify_motions, identify_tables
-from experiments.mechanics.identify_figures import ProbeFigures, StudyPredictions, figures
+from experiments.mechanics import identify_motions, identify_report
 from experiments.mechanics.identify_motions import MOTIONS, MotionData
-from experiments.mechanics.identify_presses import PressData, press
-from experiments.mechanics.identify_studies import (
+from experiments.mechanics.identify_presses import ContactTier, PressData, press
+from experiments.mechanics.identify_probes import (
     DYNAMIC,
     FORCE,
     FUSED,
@@ -41,8 +40,7 @@ from experiments.mechanics.identify_studies import (
     over_noise,
     without_touch,
 )
-from experiments.mechanics.identify_tables import CHANCE, MAY_LOSE
-from experiments.mechanics.identify_touch import ContactTier
+from experiments.mechanics.identify_report import CHANCE, MAY_LOSE, ProbeFigures, StudyPredictions, figures
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.validity import STRAIN_LIMIT
@@ -119,9 +117,9 @@ def run(config: IdentifiabilityConfig, context: Context) -> Results:
 
 
 def _move(config: IdentifiabilityConfig, motion: str, context: Context) -> MotionData:
-    count = len(identify_motions.rows_of(LiveScenes(config.motions), motion))
+    count = len(identify_motions.contacts_of(LiveScenes(config.motions), motion))
     with context.progress(motion, count) as advance:
-        return identify_motions.feel(config.motions, motion, config.moments, advance)
+        return identify_motions.motion_data(config.motions, motion, config.moments, advance)
 
 
 def _ask(
@@ -129,7 +127,7 @@ def _ask(
 ) -> StudyPredictions:
     """Every probe."""
     tiers, own = (*config.solved, config.springs), config.noise.index(1.0)
-    held = [np.asarray(pressed.felt[config.exact.name, order].features)[:, own] for order in range(len(SENSORS))]
+    held = [np.asarray(pressed.by_tier[config.exact.name, order].features)[:, own] for order in range(len(SENSORS))]
     dynamic: dict[str, tuple[Seq[np.ndarray], PressData | MotionData]] = {"press": (held, pressed)}
     dynamic |= {motion: (m.touch, m) for motion, m in moved.items()}
     per_sensor = len(STATIC) * (len(config.noise) + len(tiers)) + len(DYNAMIC) * len(dynamic)
@@ -153,17 +151,17 @@ def _ask(
 def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Results:
     """Everything that is reported."""
     made, scenes = figures(studied), config.presses
-    strain = studied.pressed.felt[studied.exact, 0].strain
+    strain = studied.pressed.by_tier[studied.exact, 0].strain
     return Results(
         verdict=verdict(config, studied, made),
         requirements=requirements(config, studied, made),
         tables=(
-            identify_tables.touch_table(studied, made),
-            identify_tables.blind_table(studied, made),
-            identify_tables.tier_table(studied, made),
-            identify_tables.motion_table(studied, made),
+            identify_report.touch_table(studied, made),
+            identify_report.blind_table(studied, made),
+            identify_report.tier_table(studied, made),
+            identify_report.motion_table(studied, made),
         ),
-        pictures=(identify_tables.noise_picture(studied, made), identify_tables.tier_picture(made)),
+        pictures=(identify_report.noise_picture(studied, made), identify_report.tier_picture(made)),
         settings={
             "presses": f"{len(studied.pressed.objects)} objects, {scenes.frame_count} frames of {scenes.min_force_n:g} "
             f"to {scenes.max_force_n:g} N, pictures of {scenes.image_px} px",
@@ -173,8 +171,8 @@ def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Result
         },
         data={
             "frames not converged": {
-                f"{tier}, {SENSORS[order]}": int(np.sum(~felt.converged))
-                for (tier, order), felt in studied.pressed.felt.items()
+                f"{tier}, {SENSORS[order]}": int(np.sum(~found.converged))
+                for (tier, order), found in studied.pressed.by_tier.items()
                 if tier != studied.springs
             }
         },

@@ -1,4 +1,4 @@
-"""What exploratory motions tell: features of a slide, and of a press that is held and released, by every sensor.
+"""Features of exploratory motions by every sensor: of a slide, and of a press that is held and released.
 
 The contacts are those of the protocol, straight from the generator.
 """
@@ -7,31 +7,27 @@ import dataclasses
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from experiments.mechanics.identify_geometry import statistics
-from experiments.mechanics.identify_threads import in_threads
-from experiments.mechanics.identify_touch import features_of, field_counts
+from experiments.mechanics.identify_features import features_of, field_counts, force_of, in_threads, statistics
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import slot
 from sensors_io.schema import SENSORS, Phase, Sequence
-from touchr1_jax.models.tactile_vit import force_features
 
 MOTIONS = ("slide_x", "hold")
-"""One that feels friction, one that feels what an object gives back."""
+"""A slide shows friction; a press that is released shows how much work the object returns."""
 
 _QUIET = (Phase.APPROACH, Phase.HOLD)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MotionData:
-    """n contacts of one motion: what each sensor felt [n, D], force [n, S, E], true shape [n, G], levels [n].
+    """n contacts of one motion: features of each sensor [n, D], force [n, S, E], true shape [n, G].
 
-    `levels` are of every property, `objects` [n] says what was touched.
+    `levels` [n] by property; `objects` [n].
     """
 
     touch: tuple[np.ndarray, ...]
@@ -41,7 +37,7 @@ class MotionData:
     objects: np.ndarray
 
 
-def feel(
+def motion_data(
     config: SceneConfig, motion: str, moments: int, advance: Callable[[], object], rows: list[int] | None = None
 ) -> MotionData:
     """Make and summarise contacts of one motion.
@@ -54,7 +50,7 @@ def feel(
       rows: which contacts; all of the motion by default.
     """
     scenes = LiveScenes(config)
-    rows = rows_of(scenes, motion) if rows is None else rows
+    rows = contacts_of(scenes, motion) if rows is None else rows
     felt = in_threads(lambda row: _contact(scenes, row, moments), rows, advance)
     slots = [slot(config, row) for row in rows]
     sites = [site_of(config, s.object_index, s.site, one.trial) for s, one in zip(slots, felt, strict=True)]
@@ -68,7 +64,7 @@ def feel(
     )
 
 
-def rows_of(scenes: LiveScenes, motion: str) -> list[int]:
+def contacts_of(scenes: LiveScenes, motion: str) -> list[int]:
     """Contacts of one motion."""
     return [i for i, key in enumerate(scenes.contacts) if key.motion == motion]
 
@@ -91,7 +87,7 @@ def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class _ContactFeatures:
-    """One contact."""
+    """Features of one contact by sensor, force, and number of the trial."""
 
     touch: tuple[np.ndarray, ...]
     force: np.ndarray
@@ -107,12 +103,6 @@ def _contact(scenes: LiveScenes, row: int, moments: int) -> _ContactFeatures:
         force=np.stack([force_of(_known(sequence.force_n)[chosen]) for sequence in made]),
         trial=made[0].key.trial,
     )
-
-
-def force_of(force_n: np.ndarray) -> np.ndarray:
-    """Features of measured forces [..., F, 3], flat."""
-    found = np.asarray(force_features(jnp.asarray(force_n)))
-    return found.reshape(*found.shape[:-2], -1)
 
 
 def _touch(sequence: Sequence, chosen: np.ndarray) -> np.ndarray:

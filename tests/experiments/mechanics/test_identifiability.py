@@ -10,16 +10,15 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.mechanics import (
     identifiability,
-    identify_draw,
-    identify_geometry,
+    identify_features,
     identify_motions,
     identify_presses,
     identify_probes,
 )
+from experiments.mechanics.identify_features import in_threads
 from experiments.mechanics.identify_motions import MotionData
-from experiments.mechanics.identify_studies import SOURCES, STATIC
-from experiments.mechanics.identify_threads import in_threads
-from experiments.mechanics.identify_touch import ContactTier, PressFeatures, feel, means, see
+from experiments.mechanics.identify_presses import ContactTier, PressFeatures, press_features, press_setup, read_press
+from experiments.mechanics.identify_probes import SOURCES, STATIC
 from sensors_io.scenes import schedule, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import make_kernels
@@ -87,16 +86,16 @@ def test_a_tiny_study_fills_every_table(tmp_path, monkeypatch):
             objects=np.arange(8),
         )
 
-    monkeypatch.setattr(identify_presses, "feel", felt)
-    monkeypatch.setattr(identify_motions, "feel", moved)
-    monkeypatch.setattr(identify_motions, "rows_of", lambda scenes, motion: [0])
+    monkeypatch.setattr(identify_presses, "press_features", felt)
+    monkeypatch.setattr(identify_motions, "motion_data", moved)
+    monkeypatch.setattr(identify_motions, "contacts_of", lambda scenes, motion: [0])
     check(run(tmp_path))
 
 
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
     order, tier = SENSORS.index("tac3d"), ContactTier(name="", grid=24)
-    draws = identify_draw.touches(SCENES, order)[:3]
-    two, one = (feel(SCENES, tier, order, draws, (0.0, 4.0), batch) for batch in (2, 1))
+    draws = identify_presses.drawn_presses(SCENES, order)[:3]
+    two, one = (press_features(SCENES, tier, order, draws, (0.0, 4.0), batch) for batch in (2, 1))
     assert two.features.shape[:2] == (3, 2)
     np.testing.assert_allclose(two.features, one.features, atol=2e-3)
     assert np.all(two.converged)
@@ -112,10 +111,10 @@ def test_a_whole_study_runs(tmp_path):
 @pytest.mark.parametrize("order", [SENSORS.index("gelsight_mini"), SENSORS.index("tac3d")])
 def test_a_press_is_the_generators_own(order):
     tier = ContactTier(name="", grid=SCENES.contact_grid, tolerance=SCENES.solver_tolerance)
-    by = means(SCENES, tier, order, (1.0,))
-    drawn = identify_draw.touches(SCENES, order)[2]
+    by = press_setup(SCENES, tier, order, (1.0,))
+    drawn = identify_presses.drawn_presses(SCENES, order)[2]
     kernels = make_kernels(MODELS[order], by.grid)
-    seen = jax.jit(lambda touch: see(touch, kernels, tier.tolerance, by))(drawn)
+    seen = jax.jit(lambda touch: read_press(touch, kernels, tier.tolerance, by))(drawn)
     made = make_sequence(SCENES, 2, schedule.press_slot(SCENES, 2), order, 0)
     np.testing.assert_array_equal(drawn.measured_n, made.force_n)
     np.testing.assert_allclose(seen.fields.depth_mm[:, 0], made.depth_mm, atol=1e-5)
@@ -128,12 +127,12 @@ def test_a_press_is_the_generators_own(order):
 
 
 def test_noise_is_scaled_and_nothing_else():
-    assert identify_draw.noisier(XENSE, 1.0) == XENSE
-    louder = identify_draw.noisier(XENSE, 3.0)
+    assert identify_presses.noisier(XENSE, 1.0) == XENSE
+    louder = identify_presses.noisier(XENSE, 3.0)
     assert louder.depth_noise_mm == pytest.approx(3 * XENSE.depth_noise_mm)
     assert louder.lateral_noise_mm == pytest.approx(3 * XENSE.lateral_noise_mm)
     assert louder.shot_noise == pytest.approx(tuple(3 * s for s in XENSE.shot_noise))
-    silent = identify_draw.noisier(TAC3D, 0.0)
+    silent = identify_presses.noisier(TAC3D, 0.0)
     assert silent.read_noise == (0, 0, 0)
     assert (silent.gel, silent.window_mm, silent.name) == (TAC3D.gel, TAC3D.window_mm, TAC3D.name)
 
@@ -156,16 +155,16 @@ def skin(radius_mm=(20.0, 40.0), wave_mm=1.5, amplitude_mm=0.0):
 
 
 def test_statistics_of_a_paraboloid():
-    (found,) = np.exp(identify_geometry.statistics([skin()]))
+    (found,) = np.exp(identify_features.statistics([skin()]))
     np.testing.assert_allclose(found[:2], [1 / 40, 1 / 20], rtol=1e-3)
     np.testing.assert_allclose(found[2:9], 0, atol=1e-4)
-    below = 2 * np.pi * np.sqrt(20 * 40) * np.array([0.1, 0.3]) / identify_geometry.WINDOW_MM**2  # π√(R₁R₂)·2h
+    below = 2 * np.pi * np.sqrt(20 * 40) * np.array([0.1, 0.3]) / identify_features.WINDOW_MM**2  # π√(R₁R₂)·2h
     np.testing.assert_allclose(found[11:13], below, rtol=0.05)
 
 
 @pytest.mark.parametrize(("wave_mm", "band"), [(1.5, 5), (1.0, 6)])
 def test_a_wave_lies_in_its_band(wave_mm, band):
-    (found,) = np.exp(identify_geometry.statistics([skin((1e4, 1e4), wave_mm, 0.02)]))
+    (found,) = np.exp(identify_features.statistics([skin((1e4, 1e4), wave_mm, 0.02)]))
     rms = found[2:9]
     assert rms[band] == pytest.approx(0.02 / np.sqrt(2) * 0.375, rel=0.05)  # Hann's mean square along each axis is 3/8
     assert np.delete(rms, band).max() < 0.1 * rms[band]
@@ -173,7 +172,7 @@ def test_a_wave_lies_in_its_band(wave_mm, band):
 
 def test_a_coarse_grid_leaves_out_short_waves():
     fine, coarse = (
-        np.exp(identify_geometry.statistics(identify_draw.skins(dataclasses.replace(SCENES, contact_grid=n))))[:, 8]
+        np.exp(identify_features.statistics(identify_presses.skins(dataclasses.replace(SCENES, contact_grid=n))))[:, 8]
         for n in (64, 24)
     )
     assert np.median(coarse / fine) < 0.5

@@ -1,17 +1,29 @@
-"""What the shape of an object alone tells: statistics of the true gap, to which no touch was added.
+"""Fixed features of touch and force, statistics of the true shape, and threads to compute them in.
 
-They set the line that touch has to pass.  The material ties the properties of an object together, so its shape tells
-something of its hardness; roughness and protrusion are shape, so here the line is a ceiling.
+The statistics of shape set the line that touch has to exceed.  The material ties the properties of an object together,
+so its shape tells something about its hardness; roughness and protrusion are shape, so here the line is a ceiling.
 """
 
+import concurrent.futures
 import itertools
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Seq
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, UInt8
 
 from sensors_io.scenes import surface
+from sensors_io.selection import FIELD_MM_PER_COUNT
+from touchr1_jax.models.tactile_vit import force_features
+from touchr1_jax.training.evidence import stream_features
+
+WORKERS = 2
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 WINDOW_MM, POINTS = 18.0, 108
 """Part of the skin that is looked at: as much as a sensor covers, six points per mm."""
@@ -23,6 +35,38 @@ HEIGHTS_MM = (0.01, 0.03, 0.1, 0.3, 1.0)
 """Heights above the deepest point at which the area below is taken."""
 
 _TINY = 1e-6  # mm; keeps logarithms of a perfectly smooth skin finite
+
+
+def in_threads(work: Callable[[Item], Result], items: Iterable[Item], advance: Callable[[], object]) -> list[Result]:
+    """Results of all items, in their order; `advance` is called in this thread after each."""
+    pool = concurrent.futures.ThreadPoolExecutor(WORKERS)
+    try:
+        results = []
+        for result in pool.map(work, items):
+            results.append(result)
+            advance()
+        return results
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def features_of(pictures: UInt8[Array, "*n F H W 3"] | None, fields: UInt8[Array, "*n F h w 3"]) -> Array:
+    """Fixed summary [*n, D] of what a sensor saw, without its force: of its pictures, if any, and of its fields."""
+    unknown = jnp.zeros((*fields.shape[:-3], 3))
+    parts = [fields] if pictures is None else [pictures, fields]
+    return jnp.concatenate([stream_features(part, unknown) for part in parts], -1)
+
+
+def field_counts(deformation_mm: Float[Array, "*n h w 2"], depth_mm: Float[Array, "*n h w"]) -> Array:
+    """Displacement and depth as a picture [*n, h, w, 3], 128 for none, on the scale of the clips that policies see."""
+    mm = jnp.concatenate([deformation_mm, depth_mm[..., None]], -1)
+    return jnp.clip(jnp.round(128 + mm / FIELD_MM_PER_COUNT), 0, 255).astype(jnp.uint8)
+
+
+def force_of(force_n: np.ndarray) -> np.ndarray:
+    """Features of measured forces [..., F, 3], flat."""
+    found = np.asarray(force_features(jnp.asarray(force_n)))
+    return found.reshape(*found.shape[:-2], -1)
 
 
 def statistics(skins: Seq[surface.Skin]) -> np.ndarray:

@@ -1,0 +1,303 @@
+"""Figures, tables and pictures of `identifiability`."""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from experiments.core.charts import Panel, Rule, Series, draw, estimates
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Column, Picture, Table, named_table
+from experiments.mechanics.identify_motions import MotionData
+from experiments.mechanics.identify_presses import PressData
+from experiments.mechanics.identify_probes import (
+    DYNAMIC,
+    FORCE,
+    FUSED,
+    LEVELS,
+    SHAPE,
+    SOURCES,
+    STATIC,
+    ProbePredictions,
+    TransferPredictions,
+    accuracy,
+    points,
+)
+from sensors_io.schema import SENSORS
+from touchr1_jax.bench.statistics import Interval
+
+MAY_LOSE = 2.0
+"""Points that a tier may lose."""
+
+CHANCE = 100 / LEVELS
+
+TICKS = (-5, -2, 0, 2, 5, 10, 20, 50)
+LINEAR_POINTS = 5.0
+"""The axis of lost points is linear up to here and logarithmic beyond: springs lose ten times what tiers lose."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StudyPredictions:
+    """Predictions of all probes, keyed as in `identify_probes`; `motion` and `still` by motion first, the press too.
+
+    `solved`, `springs` and `exact` name the tiers, `noise` the multiples of the sensors' noise.
+    """
+
+    noise: tuple[float, ...]
+    exact: str
+    solved: tuple[str, ...]
+    springs: str
+    touch: dict[tuple[str, str, int], ProbePredictions]
+    blind: dict[tuple[str, str], ProbePredictions]
+    tiers: dict[tuple[str, str, str], TransferPredictions]
+    motion: dict[str, dict[tuple[str, str], ProbePredictions]]
+    still: dict[str, dict[tuple[str, str], ProbePredictions]]
+    pressed: PressData
+    moved: dict[str, MotionData]
+
+    @property
+    def own(self) -> int:
+        """Level of the sensors' own noise."""
+        return self.noise.index(1.0)
+
+    def objects(self, motion: str) -> np.ndarray:
+        """Object of each contact of a motion, [n]."""
+        return self.pressed.objects if motion == "press" else self.moved[motion].objects
+
+    def losses(self, tier: str, name: str, sources: tuple[str, ...]) -> np.ndarray:
+        """Right answers about exact records less those by training at a tier instead, paired, [n, sources]."""
+        exact = [self.touch[name, source, self.own].right for source in sources]
+        cheap = [self.tiers[tier, name, source].exact.right for source in sources]
+        return np.stack(exact, 1) - np.stack(cheap, 1)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ProbeFigures:
+    """Accuracies in % and losses in points, with intervals over objects.
+
+    `told` by property, source and level of noise; `blind` by property and source; `lost` by tier and property, mean
+    over sensors; `lost_by` by tier, property and source, without interval; `moved` by property and motion, of all
+    sensors without force.
+    """
+
+    told: dict[tuple[str, str, int], Interval]
+    blind: dict[tuple[str, str], Interval]
+    lost: dict[tuple[str, str], Interval]
+    lost_by: dict[tuple[str, str, str], float]
+    moved: dict[tuple[str, str], Interval]
+
+
+def figures(studied: StudyPredictions) -> ProbeFigures:
+    """Every figure that tables, pictures and sentences share."""
+    objects = studied.pressed.objects
+    keys = [(tier, name) for tier in (*studied.solved, studied.springs) for name in STATIC]
+    return ProbeFigures(
+        told={key: accuracy(answers, objects) for key, answers in studied.touch.items()},
+        blind={key: accuracy(answers, objects) for key, answers in studied.blind.items()},
+        lost={key: points(studied.losses(*key, SENSORS), objects) for key in keys},
+        lost_by={(*key, s): 100 * float(studied.losses(*key, (s,)).mean()) for key in keys for s in SOURCES},
+        moved={
+            (name, motion): accuracy(found, studied.objects(motion))
+            for motion, answers in studied.motion.items()
+            for (name, source), found in answers.items()
+            if source == FUSED
+        },
+    )
+
+
+def touch_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+    """Accuracy of every property by every source over the noise."""
+    rows: list[dict[str, Cell]] = []
+    for name, source in itertools.product(STATIC, SOURCES):
+        told = [found.told[name, source, level] for level in range(len(studied.noise))]
+        rows.append(
+            {
+                "property, sensor": f"{name}, {source}",
+                **{f"noise ×{f:g}": one.mean for f, one in zip(studied.noise, told, strict=True)},
+                "×1 from": told[studied.own].low,
+                "×1 to": told[studied.own].high,
+                "two levels off": studied.touch[name, source, studied.own].far_off,
+            }
+        )
+    return _percent_table(
+        "What touch and force tell of unseen objects",
+        rows,
+        {
+            **{f"noise ×{f:g}": "right answers" for f in studied.noise},
+            "×1 from": "lower end of the 95 % interval over objects",
+            "×1 to": "upper end",
+            "two levels off": "at the sensors' own noise",
+        },
+        f"Probes are trained and tested at the same noise, on {studied.exact}; guessing gives {CHANCE:.0f} %. "
+        "The noise of fields and cameras is multiplied; that of units, mountings and the force sensor stays.",
+    )
+
+
+def blind_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+    """Accuracy without touch."""
+    rows: list[tuple[Cell, ...]] = []
+    for name in STATIC:
+        shape, force = found.blind[name, SHAPE], found.blind[name, FORCE]
+        commonest = 100 * float(np.bincount(studied.pressed.levels[name]).max()) / len(studied.pressed.objects)
+        rows.append((name, shape.mean, shape.low, shape.high, force.mean, force.low, force.high, commonest))
+    percent = lambda name, meaning: Column(name=name, unit="%", format=".1f", meaning=meaning)
+    interval = [percent(end, "end of the 95 % interval over objects") for end in ("from", "to")]
+    return Table(
+        title="What is told without touch",
+        columns=(
+            Column(name="property"),
+            percent(SHAPE, "statistics of the true gap, noiseless"),
+            *interval,
+            percent(FORCE, "the forces measured by all four sensors"),
+            *interval,
+            percent("commonest level", "its share of the objects"),
+        ),
+        rows=tuple(rows),
+        note="Roughness and protrusion are shape, so true shape is their ceiling. Materials tie hardness to shape.",
+    )
+
+
+def tier_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+    """Accuracy on exact records of probes trained at each tier."""
+    rows: list[dict[str, Cell]] = []
+    for (tier, name), lost in found.lost.items():
+        answers = [studied.tiers[tier, name, sensor] for sensor in SENSORS]
+        rows.append(
+            {
+                "tier: property": f"{tier}: {name}",
+                "own records": 100 * float(np.mean([a.own.right for a in answers])),
+                "exact records": 100 * float(np.mean([a.exact.right for a in answers])),
+                "lost": lost.mean,
+                "from": lost.low,
+                "to": lost.high,
+                **{source: found.lost_by[tier, name, source] for source in SOURCES},
+            }
+        )
+    return _percent_table(
+        "Trained at a tier, asked about exact records",
+        rows,
+        {
+            "own records": "right about unseen objects at the same tier",
+            "exact records": f"right about them at {studied.exact}",
+            "lost": "compared with training on exact records, mean over sensors",
+            "from": "lower end of the 95 % interval over objects",
+            "to": "upper end",
+            **dict.fromkeys(SOURCES, "lost by it"),
+        },
+        "The same presses with the same noise at every tier; a coarse grid leaves out short waves of the skin.",
+        in_points=("lost", "from", "to", *SOURCES),
+    )
+
+
+def motion_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+    """Friction and elasticity by motion, by touch without force and without touch."""
+    percent = lambda answers: 100 * float(answers.right.mean())
+    rows: list[dict[str, Cell]] = []
+    for (name, motion), fused in sorted(found.moved.items(), key=lambda item: DYNAMIC.index(item[0][0])):
+        rows.append(
+            {
+                "property by motion": f"{name} by {motion}",
+                **{sensor: percent(studied.motion[motion][name, sensor]) for sensor in SENSORS},
+                FUSED: fused.mean,
+                "from": fused.low,
+                "to": fused.high,
+                **{source: percent(studied.still[motion][name, source]) for source in (SHAPE, FORCE)},
+            }
+        )
+    return _percent_table(
+        "Elasticity and friction by motion",
+        rows,
+        {
+            **dict.fromkeys(SENSORS, "right answers of touch without force"),
+            FUSED: "their product",
+            "from": "lower end of the 95 % interval over objects",
+            "to": "upper end",
+            SHAPE: "statistics of the true gap",
+            FORCE: "forces along three axes: in a slide they are friction itself",
+        },
+        "A press neither slides nor unloads: what it tells about the two comes from the material.",
+    )
+
+
+def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
+    """Accuracy over noise."""
+    at = range(len(studied.noise))
+    shifts = dict(zip(SOURCES, np.linspace(-0.12, 0.12, len(SOURCES)), strict=True))
+    panels = [
+        Panel(
+            [
+                estimates(s, [found.told[name, s, level] for level in at], at=at, shift=float(shift))
+                for s, shift in shifts.items()
+            ],
+            title=name,
+            x_label="noise",
+            y_label="right on unseen objects, %" if name == STATIC[0] else "",
+            x_ticks={float(i): f"×{factor:g}" for i, factor in enumerate(studied.noise)},
+            x_limits=(-0.35, len(at) - 0.65),
+            rules=[
+                Rule(y=found.blind[name, SHAPE].mean, name=SHAPE, line="--", colour=SHARED),
+                Rule(y=found.blind[name, FORCE].mean, name=FORCE, line=":", colour=SHARED),
+                Rule(y=CHANCE, name="guessing", line="-", colour=SHARED, width=0.6),
+            ],
+        )
+        for name in STATIC
+    ]
+    return Picture(
+        name="identifiability",
+        title="What touch tells, over noise",
+        caption="Right answers about unseen objects, with 95 % intervals over objects. The lines take no touch; shape "
+        "is the ceiling for roughness and protrusion.",
+        content=draw(panels, share_y=True, size=(9.3, 3.5)),
+    )
+
+
+def tier_picture(found: ProbeFigures) -> Picture:
+    """Points lost by tier."""
+    tiers = list(dict.fromkeys(tier for tier, _ in found.lost))
+    panels = []
+    for name in STATIC:
+        lost = [found.lost[tier, name] for tier in tiers]
+        colour = [PALETTE[0] if one.mean <= MAY_LOSE else PALETTE[1] for one in lost]
+        each = [(found.lost_by[tier, name, s], row) for row, tier in enumerate(tiers) for s in SENSORS]
+        x, y = zip(*each, strict=True)
+        panels.append(
+            Panel(
+                [
+                    estimates("", lost, bar=True, colour=colour, alpha=0.45),
+                    Series(x=x, y=y, line="", marker="o", size=8, colour=SHARED, alpha=0.7),
+                ],
+                title=name,
+                x_label="points lost",
+                x_scale="symlog",
+                linear_to=LINEAR_POINTS,
+                x_ticks={float(tick): f"{tick:g}" for tick in TICKS},
+                rows=tiers,
+                rules=[Rule(x=0, line="-", colour=SHARED, width=0.8), Rule(x=MAY_LOSE, colour=SHARED)],
+            )
+        )
+    return Picture(
+        name="label_transfer",
+        title="What a cheaper contact costs",
+        caption="Points lost about exact records by training at a tier, mean over sensors with 95 % interval; dots are "
+        f"single sensors, the dotted line is what may be lost, {MAY_LOSE:g} points.",
+        content=draw(panels, share_x=True, share_y=True, size=(9.7, 0.9 + 0.36 * len(tiers))),
+    )
+
+
+def _percent_table(
+    title: str,
+    rows: Sequence[Mapping[str, Cell]],
+    meanings: Mapping[str, str],
+    note: str,
+    in_points: Sequence[str] = (),
+) -> Table:
+    figures = list(meanings)
+    return named_table(
+        title,
+        rows,
+        formats=dict.fromkeys(figures, ".1f"),
+        units=dict.fromkeys(figures, "%") | dict.fromkeys(in_points, "points"),
+        meanings=meanings,
+        note=note,
+    )
