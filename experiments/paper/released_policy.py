@@ -1,15 +1,21 @@
-"""A policy on released weights: what it feels, how it is asked, and where its parameters come from."""
+"""A policy on released weights: its towers, prompts and parameters, and the memory that its training needs."""
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.core.results import Table, named_table
 from experiments.study.assembly import Assembly, TouchConfig, language_of
+from experiments.study.dataset import Dataset
+from experiments.study.training import TrainingConfig
+from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
+from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
+from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.load import Checkpoint
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
@@ -19,12 +25,13 @@ from touchr1_jax.text.language import Language
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import answer_text
 from touchr1_jax.text.tokenizer import Tokenizer
+from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, TouchBatch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReleasedModel(TouchConfig):
-    """What is felt and seen beside released towers, and in which type these are held."""
+    """Sizes of touch, picture and answer next to released towers, and the type of these towers' weights."""
 
     tactile: TactileViTConfig = TactileViTConfig(
         sensors=0, width=384, num_layers=8, num_heads=6, mlp_ratio=4, tokens_per_step=4
@@ -33,7 +40,7 @@ class ReleasedModel(TouchConfig):
     image_px: int = 224
     completion_tokens: int = 96
     view_px: int = 224
-    """Rows and columns of the object's picture; the released vision tower makes a token of 28² pixels."""
+    """Rows and columns of the object's picture; the released vision tower makes one token of 28² pixels."""
     dtype: Literal["bfloat16", "float32"] = "bfloat16"
 
     def __post_init__(self) -> None:
@@ -53,7 +60,7 @@ class ReleasedAssembly(Assembly):
         return ("vision", "decoder")
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
-        """The released towers as they are, and beside them a fresh tactile encoder."""
+        """The released towers as they are, and a fresh tactile encoder."""
         fns, layout = self.fns, self.layout
         key = jax.random.key(seed)
         prompt = layout.ids[0], layout.mask[0], fns.slots
@@ -61,7 +68,7 @@ class ReleasedAssembly(Assembly):
 
 
 def instruction(language: Language) -> str:
-    """What the system says: the form of an answer and the words for every level, such as
+    """The system prompt: the form of an answer and the words for every level, such as
 
     Answer about the touch as <perceive> SENSOR LEVEL … </perceive> <compare> LEVEL </compare> …
     """
@@ -74,7 +81,7 @@ def instruction(language: Language) -> str:
 
 
 def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[str, ...]) -> ReleasedAssembly:
-    """Put a checkpoint, prompts in its chat template and a tactile encoder together for a set of sensors.
+    """Combine a checkpoint, prompts in its chat template and a tactile encoder for a set of sensors.
 
     Raises:
       SizeError: completions that are too short for an answer.
@@ -110,14 +117,10 @@ def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[st
 
 
 def prove_released(assembly: ReleasedAssembly, batch: TouchBatch) -> None:
-    """Build the parameters in shapes alone, so that sizes which contradict each other show before data are made.
-
-    Args:
-      assembly: the policy.
-      batch: shapes of a batch.
+    """Build the parameters of a batch's shapes abstractly, so that contradicting sizes show before data are made.
 
     Raises:
-      SizeError: they do.
+      SizeError: sizes contradict each other.
     """
     try:
         jax.eval_shape(functools.partial(assembly.init, 0), batch)
@@ -126,12 +129,12 @@ def prove_released(assembly: ReleasedAssembly, batch: TouchBatch) -> None:
 
 
 def longest_answer(language: Language, tokenizer: Tokenizer) -> int:
-    """Tokens of the longest answer to a question for one attribute, with the one that ends it."""
+    """Tokens of the longest answer to a question for one attribute, the end token included."""
     return max(len(tokenizer.encode(text)) + 1 for text in plain_answers(language))
 
 
 def plain_answers(language: Language) -> Iterator[str]:
-    """For each level of each attribute the answer that gives it in every slot, felt by all sensors."""
+    """For each level of each attribute the answer that gives it in every slot, with all sensors."""
     sensors, attributes = len(language.sensors), len(language.attributes)
     for a, attribute in enumerate(language.attributes):
         for level in range(len(attribute.levels)):
@@ -143,3 +146,65 @@ def plain_answers(language: Language) -> Iterator[str]:
                 compare=np.full(attributes, level),
                 conclude=np.full(attributes, level),
             )
+
+
+STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encoded contacts, on the host"
+
+
+def memory_bytes(
+    config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, mesh: tuple[int, ...]
+) -> dict[str, int]:
+    """Bytes of training, counted from shapes: the first two on each device, or on the first one of each process.
+
+    The step holds the decoder that SFT left; the released towers, from which other seeds and the baseline without touch
+    start, are held besides.  SFT holds less than GRPO, since it samples nothing.
+
+    Args:
+      config: of the training.
+      assembly: the policy.
+      data: its contacts are encoded once for GRPO, once for the test.
+      mesh: devices along its axes.
+
+    Raises:
+      SizeError: as `grpo_shape`.
+    """
+    released, layout, streams = assembly.checkpoint.config, assembly.layout, len(assembly.language.sensors)
+    touch, view = layout.touch.size // streams, len(layout.view)
+    shape = grpo_shape(config, assembly, mesh)
+    text = layout.ids.shape[1] - streams * touch - view
+    prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
+    step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.grpo_lora)
+    lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
+    contacts = len(data.parts["grpo"]) + len(data.parts["test"])
+    of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)
+    weights = sum(x.nbytes for x in jax.tree.leaves(assembly.checkpoint.params))
+    return {STEP: counted_peak(lines), WEIGHTS: weights, CONTACTS: contacts * of_contact}
+
+
+def grpo_shape(config: TrainingConfig, assembly: ReleasedAssembly, mesh: tuple[int, ...]) -> GRPOShape:
+    """The sizes that the memory of a GRPO step depends on; needs no data.
+
+    Raises:
+      SizeError: prompts or heads that the mesh cannot share.
+    """
+    data, fsdp, tensor = mesh
+    try:
+        return GRPOShape(
+            decoder=assembly.checkpoint.config.decoder,
+            grpo=config.grpo,
+            mesh=MeshConfig(data=data, fsdp=fsdp, tensor=tensor),
+            prompt_tokens=assembly.layout.ids.shape[1],
+        )
+    except ValueError as error:
+        raise SizeError(f"GRPO cannot be shared by the devices of the mesh: {error}") from error
+
+
+def memory_table(lines: Mapping[str, int]) -> Table:
+    """The bytes of `memory_bytes`."""
+    return named_table(
+        "Memory, counted from shapes",
+        [{"part": name, "memory": size / 1e9} for name, size in lines.items()],
+        units={"memory": "GB"},
+        note="On each device, except the encoded contacts; the compiler's own buffers and the pictures of a batch are "
+        "not counted. `scale_paper` compares the count with XLA's figures; no run of this size has.",
+    )

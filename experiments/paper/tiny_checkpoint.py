@@ -1,8 +1,13 @@
-"""A tiny checkpoint in the released format with drawn weights, to try the code where there are no released ones.
+"""A tiny checkpoint in the released format, to try the code without released weights, and how it learns to answer.
+
+Its weights are drawn; `teach` trains all weights of the decoder to write answers, by the step of SFT that trains
+policies, since a released model knows language and nothing of touch.  A prompt names its sensors and shows neither
+touch nor picture, and the levels of an answer are drawn: the form of answers can be learned, the right level cannot.
 
 `chat_template.jinja` is that of Qwen/Qwen2.5-VL-7B-Instruct (Alibaba Cloud, Apache License 2.0), unchanged.
 """
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -10,19 +15,29 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import tokenizers
 from tokenizers import decoders, models, pre_tokenizers, trainers
 
-from experiments.paper.released_policy import plain_answers
+from experiments.core.context import Context
+from experiments.paper.released_policy import ReleasedAssembly, ReleasedModel, assemble_released, plain_answers
+from experiments.study.assembly import touch_shapes
+from experiments.study.feeds import random_streams
+from sensors_io.schema import SENSORS
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.models.load import TOKENIZER_FILE
+from touchr1_jax.models.load import TOKENIZER_FILE, load_checkpoint
 from touchr1_jax.models.qwen.config import CONFIG_FILE, QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.model import init_params
 from touchr1_jax.models.qwen.pictures import PREPROCESSOR_FILE
 from touchr1_jax.models.qwen.weights import SINGLE, save_params
+from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.text.chat import MARKS, SYSTEM
 from touchr1_jax.text.language import Language
-from touchr1_jax.text.template import QUESTIONS
+from touchr1_jax.text.template import QUESTIONS, answer_text, encode_answer
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
+from touchr1_jax.types import TouchBatch
+from touchr1_jax.validation import at_least, within
 
 TEMPLATE = Path(__file__).parent / "chat_template.jinja"
 
@@ -51,7 +66,7 @@ def write_tiny(
     """Write config, tokenizer, template, picture settings and weights in bfloat16.
 
     Args:
-      directory: made if need be.
+      directory: created if missing.
       language: the tokenizer is trained on its answers, so that they are short.
       system: text that the tokenizer is trained on too.
       seed: of the weights.
@@ -92,7 +107,7 @@ def trained_tokenizer(language: Language, system: str) -> tokenizers.Tokenizer:
 
 
 def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST) -> QwenConfig:
-    """A decoder with the smallest vision tower beside it; the ids are the tokenizer's."""
+    """A decoder and the smallest vision tower; the ids are the tokenizer's."""
     ids = library.get_vocab(with_added_tokens=True)
     return QwenConfig(
         decoder=decoder,
@@ -114,7 +129,7 @@ def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST
 
 
 def published_config(config: QwenConfig) -> dict[str, Any]:
-    """The contents of a `config.json` that `parse_config` reads as this."""
+    """The contents of a `config.json` that `parse_config` reads as `config`."""
     d, v = config.decoder, config.vision
     return {
         "architectures": ["Qwen2_5_VLForConditionalGeneration"],
@@ -152,3 +167,100 @@ def published_config(config: QwenConfig) -> dict[str, Any]:
             "tokens_per_second": v.tokens_per_second,
         },
     }
+
+
+STAGE = "teach"
+
+UNUSED_TOUCH = ReleasedModel(
+    tactile=TactileViTConfig(sensors=0, width=8, num_layers=0, num_heads=1, stem_width=1),
+    frames=1,
+    image_px=28,
+    completion_tokens=48,
+    view_px=16,
+    dtype="float32",
+)
+"""Smallest encoder of touch and picture: it is shown nothing, learns nothing, and is dropped."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TeachingConfig:
+    """Training of a tiny checkpoint to write answers; 0 steps leave its weights as they were drawn."""
+
+    steps: int = 0
+    batch_size: int = 32
+    agreement: float = 0.7
+    """Probability that a sensor of a drawn answer perceives the answer's level; else it perceives any."""
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0)
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "steps")
+        at_least(self, 1, "batch_size")
+        within(self, 0, 1, "agreement")
+
+
+def teach(directory: Path, config: TeachingConfig, context: Context, seed: int = 0) -> None:
+    """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16.
+
+    Args:
+      directory: as `write_tiny` makes it; its weights are replaced.
+      config: steps, batches, learning rate.
+      context: the run, which logs the steps under `STAGE`.
+      seed: of the drawn answers.
+    """
+    if not config.steps:
+        return
+    found = load_checkpoint(directory, jnp.float32)
+    assembly = assemble_released(UNUSED_TOUCH, found, SENSORS)
+    shown = empty_touch(config.batch_size)
+    params = assembly.init(seed, shown)
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    step = make_sft_step(assembly.fns, optimizer)
+    state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
+    with context.timed(STAGE):
+        for t in context.each(STAGE, range(config.steps)):
+            state, metrics = step(state, drawn_batch(assembly, shown, config, np.random.default_rng((seed, t))))
+            context.log(STAGE, t, **jax.device_get(metrics))
+    taught = {"vision": state.params["vision"]["tower"], "decoder": state.params["decoder"]}
+    save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), taught), found.config)
+
+
+def drawn_batch(
+    assembly: ReleasedAssembly, shown: TouchBatch, config: TeachingConfig, rng: np.random.Generator
+) -> SFTBatch:
+    """One question with a drawn answer for each contact of a batch without touch."""
+    layout, (p, s) = assembly.layout, shown.stream_mask.shape
+    asked = rng.integers(len(layout.asked), size=p)
+    streams = random_streams(np.ones((p, s), bool), 0.5, rng)
+    pairs = [_answer(assembly, layout.asked[q], felt, config, rng) for q, felt in zip(asked, streams, strict=True)]
+    tokens, masks = (np.stack(x)[:, None] for x in zip(*pairs, strict=True))
+    written: dict[str, Any] = {
+        "ids": layout.ids[asked][:, None],
+        "mask": layout.mask[asked][:, None],
+        "streams": streams[:, None],
+        "tokens": tokens,
+        "token_mask": masks,
+    }
+    return SFTBatch(touch=shown, **written)
+
+
+def _answer(
+    assembly: ReleasedAssembly,
+    asked: np.ndarray,
+    streams: np.ndarray,
+    config: TeachingConfig,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """An answer whose sensors mostly agree: it compares to what most of them perceive, and concludes the same."""
+    levels = np.array(assembly.levels)
+    drawn_for, other = rng.integers(levels), rng.integers(levels, size=(len(streams), len(levels)))
+    perceive = np.where(rng.random(other.shape) < config.agreement, drawn_for, other)
+    most = np.array([np.bincount(perceive[streams, a]).argmax() for a in range(len(levels))])
+    text = answer_text(assembly.language, asked=asked, streams=streams, perceive=perceive, compare=most, conclude=most)
+    return encode_answer(assembly.tokenizer, text, assembly.model.completion_tokens)
+
+
+def empty_touch(contacts: int) -> TouchBatch:
+    """Contacts without recorded frames and without a picture, with the names of all sensors."""
+    shapes = touch_shapes(UNUSED_TOUCH, UNUSED_TOUCH.view_px, SENSORS)
+    zeros = jax.tree.map(lambda x: np.zeros((contacts, *x.shape[1:]), x.dtype), shapes)
+    return dataclasses.replace(zeros, stream_mask=np.ones_like(zeros.stream_mask))

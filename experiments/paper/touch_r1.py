@@ -48,19 +48,25 @@ from experiments.core.text import interval
 from experiments.paper.conflict_metrics import TouchGain, study_touch_gain, touch_gain_table
 from experiments.paper.eval_variants import control_name, control_variants
 from experiments.paper.presets import CURVES
-from experiments.paper.released_gain import kept_shares, kept_table, least_kept
-from experiments.paper.released_memory import counted, memory_table, shape_of
 from experiments.paper.released_policy import (
     ReleasedAssembly,
     ReleasedModel,
     assemble_released,
+    grpo_shape,
     instruction,
+    memory_bytes,
+    memory_table,
     prove_released,
 )
-from experiments.paper.released_resume import require_same
-from experiments.paper.released_teaching import TeachingConfig, teach
-from experiments.paper.released_variants import written, zero_shot
-from experiments.paper.tiny_checkpoint import SMALLEST, write_tiny
+from experiments.paper.released_weights import (
+    least_merged,
+    merged_shares,
+    merged_table,
+    require_same,
+    written,
+    zero_shot,
+)
+from experiments.paper.tiny_checkpoint import SMALLEST, TeachingConfig, teach, write_tiny
 from experiments.study.assembly import prove_rewards, touch_shapes
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.examples import rollout_examples
@@ -168,22 +174,22 @@ def run(config: TouchR1Config, context: Context) -> Results:
     }
     check_ways(ways, arms)
     assembly, start = begin(config, source, context)
-    memory = counted(config, assembly, start.data, context.devices.shape)
+    memory = memory_bytes(config, assembly, start.data, context.devices.shape)
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
     study = train_study(config, start, arms, context, ways=ways)
     scored = score_study(study)
     zero = [score(study, said) for said in study.further[ZERO]]
     baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
     pictures, tables = level_report(study)
-    gain, kept = study_touch_gain(study, ARM), kept_shares(ARM, config.seeds, context)
+    gain, kept = study_touch_gain(study, ARM), merged_shares(ARM, config.seeds, context)
     return Results(
         arms=scored.arms,
         baselines=baselines,
         settings=settings(config, source),
         comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
         verdict=verdict(config, {**scored.arms, **baselines}, gain),
-        requirements=(differing(study), least_kept(kept)),
-        tables=(touch_gain_table({f"{ARM}, all": gain}), kept_table(kept), memory_table(memory), *tables),
+        requirements=(differing(study), least_merged(kept)),
+        tables=(touch_gain_table({f"{ARM}, all": gain}), merged_table(kept), memory_table(memory), *tables),
         pictures=pictures,
         data=study.data.summary(),
         curves=CURVES,
@@ -195,7 +201,7 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     """The policy and its data; weights and sizes are looked at before data are made.
 
     Raises:
-      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `shape_of`.
+      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `grpo_shape`
     """
     model = config.model
     with context.progress_callback("reading weights, MB") as tell:
@@ -203,7 +209,7 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     require_same(source, context)
     ahead = assemble_released(model, found, SENSORS)
     prove_released(ahead, touch_shapes(model, model.view_px, SENSORS))
-    shape_of(config, ahead, context.devices.shape)
+    grpo_shape(config, ahead, context.devices.shape)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.paper.released_memory import shape_of
 from experiments.paper.released_policy import (
     assemble_released,
+    grpo_shape,
     instruction,
     longest_answer,
     plain_answers,
@@ -65,9 +65,9 @@ def test_sizes_that_contradict_each_other_are_named_before_there_is_data(checkpo
     ],
 )
 def test_a_mesh_that_cannot_share_the_work_is_named_before_there_is_data(policy, mesh, message):
-    assert shape_of(SMOKE, policy, (1, 1, 2)).mesh.tensor == 2
+    assert grpo_shape(SMOKE, policy, (1, 1, 2)).mesh.tensor == 2
     with pytest.raises(SizeError, match=f"GRPO cannot be shared by the devices of the mesh: {message}"):
-        shape_of(SMOKE, policy, mesh)
+        grpo_shape(SMOKE, policy, mesh)
 
 
 def test_the_released_towers_are_taken_as_they_are(policy, streamed, checkpoint):

@@ -1,4 +1,4 @@
-"""What a tiny checkpoint is taught: answers that parse and agree with themselves, and nothing of touch."""
+"""A tiny checkpoint learns answers that parse and agree with themselves, and nothing of touch."""
 
 import dataclasses
 
@@ -9,8 +9,15 @@ import pytest
 
 from experiments.core.context import read_metrics
 from experiments.paper.released_policy import assemble_released, instruction
-from experiments.paper.released_teaching import BESIDE, STAGE, TeachingConfig, drawn_batch, nothing, teach
-from experiments.paper.tiny_checkpoint import write_tiny
+from experiments.paper.tiny_checkpoint import (
+    STAGE,
+    UNUSED_TOUCH,
+    TeachingConfig,
+    drawn_batch,
+    empty_touch,
+    teach,
+    write_tiny,
+)
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.policy import Features, prompt_mask
@@ -21,12 +28,12 @@ from touchr1_jax.text.oracle import read
 
 @pytest.fixture(scope="module")
 def writer(checkpoint):
-    return assemble_released(BESIDE, checkpoint, SENSORS)
+    return assemble_released(UNUSED_TOUCH, checkpoint, SENSORS)
 
 
 @pytest.fixture(scope="module")
 def batch(writer):
-    return drawn_batch(writer, nothing(64), TeachingConfig(), np.random.default_rng(0))
+    return drawn_batch(writer, empty_touch(64), TeachingConfig(), np.random.default_rng(0))
 
 
 def answers(writer, batch):
@@ -47,14 +54,14 @@ def test_drawn_answers_parse_and_agree_with_themselves(writer, batch):
 
 
 def test_every_level_of_every_question_is_drawn_and_sensors_differ(writer):
-    many = drawn_batch(writer, nothing(512), TeachingConfig(), np.random.default_rng(1))
+    many = drawn_batch(writer, empty_touch(512), TeachingConfig(), np.random.default_rng(1))
     found = [(int(q), int(said.conclude[q])) for q, _, said in answers(writer, many)]
     assert set(found) == {(q, k) for q, levels in enumerate(writer.levels) for k in range(levels)}
     perceived = [np.asarray(said.perceive)[streams, q] for q, streams, said in answers(writer, many)]
     assert 0.2 < np.mean([len(set(levels)) > 1 for levels in perceived if len(levels) > 1]) < 0.9
 
 
-def test_the_prompt_names_sensors_and_shows_nothing(writer, batch):
+def test_the_prompt_names_sensors_and_shows_empty_touch(writer, batch):
     """Of the words of a prompt those alone are left out that stand for touch and picture."""
     layout, slots = writer.layout, writer.fns.slots
     touch = jax.tree.map(jnp.asarray, batch.touch)

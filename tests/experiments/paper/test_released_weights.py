@@ -1,12 +1,23 @@
-"""The tiny checkpoint, and a policy that is written and read back."""
+"""Released weights on disk: a run continues with the weights that it began with; a policy is written and read back."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.paper.released_written import TOUCH_FILE, read_policy, write_policy
+from experiments.paper.released_weights import (
+    TOUCH_FILE,
+    file_fingerprint,
+    least_merged,
+    merged_shares,
+    read_policy,
+    require_same,
+    write_policy,
+)
 from experiments.paper.tiny_checkpoint import published_config
+from experiments.paper.touch_r1 import ARM
+from experiments.study.stages import KEPT
+from experiments.study.study import BLIND, SFT
 from tests.experiments import tiny
 from touchr1_jax.models.load import Load, WeightsError, load_checkpoint
 from touchr1_jax.models.qwen.config import parse_config, released
@@ -78,3 +89,45 @@ def test_weights_that_do_not_fit_are_one_kind_of_error(folder, tmp_path):
     (tmp_path / "config.json").write_text('{"model_type": "qwen3_vl"}')
     with pytest.raises(WeightsError, match="model_type is 'qwen3_vl': must be 'qwen2_5_vl'"):
         load_checkpoint(tmp_path)
+
+
+@pytest.mark.parametrize("at", [0, 2**20 - 1, 3 * 2**20 - 1])
+def test_weights_of_the_same_size_with_another_byte_at_either_end_are_refused(tmp_path, context, at):
+    shard = np.zeros(3 * 2**20, np.uint8)
+    (tmp_path / "config.json").write_text("{}")
+    shard.tofile(tmp_path / "model.safetensors")
+    for _ in range(2):
+        require_same(tmp_path, context)
+    shard[at] = 1
+    shard.tofile(tmp_path / "model.safetensors")
+    with pytest.raises(WeightsError, match=r"not what this run began with: model\.safetensors changed; put it back"):
+        require_same(tmp_path, context)
+
+
+def test_a_file_that_came_later_is_named(tmp_path, context):
+    (tmp_path / "config.json").write_text("{}")
+    require_same(tmp_path, context)
+    (tmp_path / "model.safetensors").write_bytes(b"0")
+    with pytest.raises(WeightsError, match=r"model\.safetensors changed"):
+        require_same(tmp_path, context)
+
+
+def test_a_fingerprint_is_the_size_and_the_checksums_of_both_ends(tmp_path):
+    file = tmp_path / "file"
+    file.write_bytes(b"123456789")
+    assert file_fingerprint(file) == [9, 0xCBF43926, 0xCBF43926]  # the check value of CRC-32
+    file.write_bytes(b"")
+    assert file_fingerprint(file) == [0, 0, 0]
+
+
+def test_what_merging_keeps_is_the_least_of_all_seeds(context):
+    shares = {"sft": (0.97, 0.95), f"grpo/{ARM}": (0.4, 0.99), "blind": (1.0, 1.0)}
+    for stage, of_seeds in shares.items():
+        for seed, share in enumerate(of_seeds):
+            context.save_stage(f"{KEPT}/{stage}/{seed}", share)
+    found = merged_shares(ARM, 2, context)
+    assert found == {SFT: 0.95, ARM: 0.4, BLIND: 1.0}
+    least = least_merged(found)
+    assert least.measured == 0.4
+    assert not least.met
+    assert least_merged({SFT: 0.95}).met
