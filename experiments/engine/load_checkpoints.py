@@ -1,24 +1,67 @@
-"""Random checkpoints in the published layout, written shard by shard so that no more than one is ever in memory."""
+"""Checkpoints of random weights in the published layout, and readers of them, each measured in a process of its own."""
 
+import dataclasses
 import json
 import math
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from touchr1_jax.models.qwen.config import QwenConfig
-from touchr1_jax.models.qwen.names import published, sources
-from touchr1_jax.models.qwen.safetensors import Tell, write_file
-from touchr1_jax.models.qwen.weights import INDEX
+from experiments.engine.processes import in_own_process
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.load import peak_memory
+from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.names import published, read, sources
+from touchr1_jax.models.qwen.safetensors import Tell, read_tensor, write_file
+from touchr1_jax.models.qwen.weights import INDEX, find_tensors, load_params
+
+
+def with_released_tower(decoder: DecoderConfig) -> QwenConfig:
+    """The released vision tower and another decoder."""
+    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
+
+
+SHAPES: Mapping[str, QwenConfig] = {
+    "tiny": QwenConfig(
+        decoder=DecoderConfig(vocab_size=512, hidden_size=64, num_heads=2, intermediate_size=96, tie_embedding=False),
+        vision=QwenVisionConfig(
+            out_size=64, depth=2, hidden_size=32, num_heads=2, intermediate_size=48, full_layers=(1,)
+        ),
+        vision_start_id=0,
+        vision_end_id=1,
+        image_id=2,
+        video_id=3,
+    ),
+    "0.5B": with_released_tower(
+        dataclasses.replace(
+            RELEASED["3B"],
+            hidden_size=896,
+            num_layers=24,
+            num_heads=14,
+            head_dim=64,
+            intermediate_size=4864,
+            mrope_section=(8, 12, 12),
+        )
+    ),
+    "1.5B": with_released_tower(
+        dataclasses.replace(RELEASED["3B"], hidden_size=1536, num_layers=28, num_heads=12, intermediate_size=8960)
+    ),
+    "3B": released("3B"),
+    "7B": released("7B"),
+}
+"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL."""
 
 SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
-"""Bits of a bfloat16 that are drawn, and the exponent that is not: ±2⁻⁷ … ±2⁻⁶, of a trained weight's size."""
+"""Random bits of a bfloat16, and its fixed exponent: numbers of a trained weight's size, ±2⁻⁷ … ±2⁻⁶."""
 
 
 def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, seed: int, tell: Tell) -> int:
-    """Write weights of a shape in bfloat16 and their index; returns their size in bytes.
+    """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes.
 
     Args:
       directory: filled with shards and the index.
@@ -67,3 +110,65 @@ def draw(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Random bfloat16 numbers."""
     bits = np.frombuffer(rng.bytes(2 * int(np.prod(shape))), np.uint16)
     return ((bits & SIGN_AND_FRACTION) | SMALL).view(jnp.bfloat16).reshape(shape)
+
+
+Reader = Callable[[Path, QwenConfig, Tell], list[jax.Array]]
+"""(folder, shape, progress callback of bytes) → parameters."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoadMeasurement:
+    """Seconds of one reading, bytes of parameters, largest resident size, and that of the process before it."""
+
+    seconds: float
+    held: int
+    peak: int
+    before: int
+
+
+def streamed(directory: Path, config: QwenConfig, tell: Tell) -> list[jax.Array]:
+    """The library's reader, tensor by tensor."""
+    return jax.tree.leaves(load_params(directory, config, jnp.bfloat16, progress=tell))
+
+
+def whole_first(directory: Path, config: QwenConfig, tell: Tell) -> list[jax.Array]:
+    """Read all tensors into memory, then make the parameters from them."""
+    entries = find_tensors(directory)
+    done, size, tensors = 0, sum(entry.size for entry in entries.values()), {}
+    for key, entry in entries.items():
+        tensors[key] = read_tensor(entry)
+        done += entry.size
+        tell(done, size)
+    return [jnp.array(read(jnp.array(tensors[s.key]), s.turned)) for s in sources(config).values()]
+
+
+READERS: Mapping[str, Reader] = {"streamed": streamed, "whole first": whole_first}
+
+
+def measure(reader: Reader, directory: Path, config: QwenConfig, tell: Tell) -> LoadMeasurement:
+    """Read once in a fresh process, whose largest size is then that of the reading.
+
+    Args:
+      reader: a function of a module.
+      directory: of the checkpoint.
+      config: its shape.
+      tell: progress callback of the bytes read.
+
+    Raises:
+      RuntimeError: the process ended without an answer, as one that the system stops for its memory does.
+    """
+    try:
+        return in_own_process(_measure_here, reader, directory, config, tell=tell)
+    except BrokenProcessPool:
+        raise RuntimeError(
+            f"reader {reader.__name__!r} of {directory} ended without an answer: probably too little memory; choose "
+            "smaller sizes"
+        ) from None
+
+
+def _measure_here(reader: Reader, directory: Path, config: QwenConfig, tell: Tell) -> LoadMeasurement:
+    jax.block_until_ready(jnp.zeros(1))  # the runtime's own memory
+    before, began = peak_memory(), time.perf_counter()
+    leaves = jax.block_until_ready(reader(directory, config, tell))
+    seconds = time.perf_counter() - began
+    return LoadMeasurement(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)

@@ -2,10 +2,12 @@
 
     python -m experiments load_weights [--scale smoke] [--sizes 3B 7B] [--scratch DIR]
 
-Writes a checkpoint of a released shape with random contents in bfloat16, reads it in a process of its own, and holds
-the largest resident size of that process against the size of the weights; beside it the plain way, all tensors first,
-for the sizes in `compare`.  The 7B shape takes 17 GB of disk and of memory and some minutes; where there is less the
-run says so before it begins.  Expected: at most 1.2 times the weights from 0.5B to 7B; twice by the plain way.
+Writes a checkpoint of a released shape with random contents in bfloat16, reads it in a process of its own, and compares
+the largest resident size of that process with the size of the weights; for the sizes in `compare` also for a reader
+that reads all tensors first.  The 7B shape takes 17 GB of disk and of memory and some minutes; a machine that has less
+is refused before the run begins.
+
+Expected: at most 1.2 times the weights from 0.5B to 7B; twice with all tensors first.
 """
 
 import dataclasses
@@ -21,15 +23,15 @@ import jax
 from experiments.core.charts import bars
 from experiments.core.context import Context
 from experiments.core.progress import in_megabytes
-from experiments.core.results import Column, Picture, Requirement, Results, Table
+from experiments.core.results import Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.engine.load_checkpoints import random_checkpoint
-from experiments.engine.load_readers import LoadMeasurement, measure
-from experiments.engine.load_shapes import SHAPES
+from experiments.engine.load_checkpoints import READERS, SHAPES, LoadMeasurement, measure, random_checkpoint
 from touchr1_jax.models.qwen.model import abstract_params
 
 BOUND = 1.2
-OURS, PLAIN = "streamed", "whole first"
+"""Most memory of a reading, in weights."""
+
+OURS, PLAIN = READERS
 
 Measured = Mapping[str, Mapping[str, LoadMeasurement]]
 """Size → reader → reading."""
@@ -37,7 +39,7 @@ Measured = Mapping[str, Mapping[str, LoadMeasurement]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LoadWeightsConfig:
-    """Sizes to read, those to read the plain way too, largest shard, and where the checkpoints are written for a while.
+    """Sizes to read, those to read with all tensors first too, largest shard, and where checkpoints are written.
 
     Raises:
       ValueError: a size that has no shape, or one that is compared and not read.
@@ -98,7 +100,7 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
         for name in (OURS, PLAIN) if size in config.compare else (OURS,):
             with context.progress_callback(f"reading {size}, {name}, MB", still=True) as tell:
                 in_megabytes(tell)(0, weight_bytes(size))
-                readings[name] = measure(name, directory, SHAPES[size], in_megabytes(tell))
+                readings[name] = measure(READERS[name], directory, SHAPES[size], in_megabytes(tell))
     finally:
         shutil.rmtree(directory)
     for name, r in readings.items():
@@ -147,21 +149,26 @@ def verdict(readings: Measured) -> tuple[str, ...]:
 
 def table(readings: Measured) -> Table:
     """Every reading."""
-    return Table(
-        title="Readings, each in a process of its own",
-        columns=(
-            Column(name="size and reader"),
-            Column(name="weights", unit="GB", format=".2f"),
-            Column(name="peak", unit="GB", format=".2f", meaning="largest resident size of the process"),
-            Column(name="peak over weights", format=".3f"),
-            Column(name="process before", unit="GB", format=".2f", meaning="with the runtime, without weights"),
-            Column(name="time", unit="s", format=".1f"),
-        ),
-        rows=tuple(
-            (f"{size}, {name}", r.held / 1e9, r.peak / 1e9, r.peak / r.held, r.before / 1e9, r.seconds)
+    return named_table(
+        "Readings, each in a process of its own",
+        [
+            {
+                "size and reader": f"{size}, {name}",
+                "weights": r.held / 1e9,
+                "peak": r.peak / 1e9,
+                "peak over weights": r.peak / r.held,
+                "process before": r.before / 1e9,
+                "time": r.seconds,
+            }
             for size, by in readings.items()
             for name, r in by.items()
-        ),
+        ],
+        formats={"weights": ".2f", "peak": ".2f", "peak over weights": ".3f", "process before": ".2f", "time": ".1f"},
+        units={"weights": "GB", "peak": "GB", "process before": "GB", "time": "s"},
+        meanings={
+            "peak": "largest resident size of the process",
+            "process before": "with the runtime, without weights",
+        },
         note="The files were just written: they may come from the page cache, which the peak does not count.",
     )
 

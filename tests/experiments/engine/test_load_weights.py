@@ -10,9 +10,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import load_weights
-from experiments.engine.load_checkpoints import random_checkpoint, shards
-from experiments.engine.load_readers import READERS, measure
-from experiments.engine.load_shapes import SHAPES
+from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint, shards
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.load import peak_memory
 
@@ -66,24 +64,23 @@ def test_no_shard_is_larger_than_said_but_for_single_tensors():
 
 def test_a_reader_that_fails_says_why(tmp_path):
     with pytest.raises(FileNotFoundError, match="no weights; correct the directory"):
-        measure("streamed", tmp_path, TINY, silent)
+        measure(READERS["streamed"], tmp_path, TINY, silent)
 
 
 def end_at_once(*_: object) -> list[jax.Array]:
     os._exit(9)
 
 
-def test_a_reader_that_is_stopped_is_said_to_be(tmp_path, monkeypatch):
-    monkeypatch.setitem(READERS, "stopped", end_at_once)
+def test_a_reader_that_is_stopped_is_named(tmp_path):
     with pytest.raises(RuntimeError, match="ended without an answer: probably too little memory"):
-        measure("stopped", tmp_path, TINY, silent)
+        measure(end_at_once, tmp_path, TINY, silent)
 
 
 @pytest.mark.parametrize("reader", READERS)
 def test_bytes_are_told_from_the_process_that_reads(tmp_path, reader):
     size = random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
     told: list[tuple[int, int]] = []
-    measure(reader, tmp_path, TINY, lambda *word: told.append(word))
+    measure(READERS[reader], tmp_path, TINY, lambda *word: told.append(word))
     assert told == sorted(told)
     assert told[-1] == (size, size)
     assert len(told) > 3
@@ -102,5 +99,5 @@ def test_peak_memory_is_that_of_the_program_and_not_of_its_parent(tmp_path):
     """This process has imported more than the reader will, and has held what its child has not."""
     held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
     random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
-    assert measure("streamed", tmp_path, TINY, silent).before < peak_memory()
+    assert measure(READERS["streamed"], tmp_path, TINY, silent).before < peak_memory()
     assert peak_memory() >= held.nbytes
