@@ -7,6 +7,7 @@ import dataclasses
 from typing import NamedTuple
 
 from touchr1_jax.distributed.memory import FLOAT, HALF, GRPOShape, head_weights, layer_weights
+from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.rl.config import left_out
 
 FORWARD, BACKWARD = 2, 4
@@ -61,22 +62,22 @@ def grpo_work(shape: GRPOShape) -> dict[str, Work]:
 
 
 def seconds(shape: GRPOShape, machine: Machine) -> dict[str, float]:
-    """Time of each phase: the longest of computing, reading and gathering, which may overlap, and the sums beside it.
+    """Predicted time of each phase of a step."""
+    return {name: phase_seconds(work, machine, shape.mesh) for name, work in grpo_work(shape).items()}
+
+
+def phase_seconds(work: Work, machine: Machine, mesh: MeshConfig) -> float:
+    """Time of a phase: the longest of computing, reading and gathering, which may overlap, plus that of the sums.
 
     Neighbours on the mesh are neighbours in a machine: an axis that fits into one, behind the axes after it, exchanges
-    over its links, else over those between machines.
+    over its links, any other over those between machines.
     """
-    tensor = shape.mesh.tensor
-    gather_rate = machine.near_bytes if tensor * shape.mesh.fsdp <= machine.devices else machine.far_bytes
-    sum_rate = machine.near_bytes if tensor <= machine.devices else machine.far_bytes
-
-    def of(work: Work) -> float:
-        computing = work.flops / (machine.flops * machine.flops_share)
-        reading = work.read_bytes / (machine.read_bytes * machine.read_share)
-        gathering = work.gathered_bytes / (gather_rate * machine.link_share)
-        return max(computing, reading, gathering) + work.summed_bytes / (sum_rate * machine.link_share)
-
-    return {name: of(work) for name, work in grpo_work(shape).items()}
+    gather_rate = machine.near_bytes if mesh.tensor * mesh.fsdp <= machine.devices else machine.far_bytes
+    sum_rate = machine.near_bytes if mesh.tensor <= machine.devices else machine.far_bytes
+    computing = work.flops / (machine.flops * machine.flops_share)
+    reading = work.read_bytes / (machine.read_bytes * machine.read_share)
+    gathering = work.gathered_bytes / (gather_rate * machine.link_share)
+    return max(computing, reading, gathering) + work.summed_bytes / (sum_rate * machine.link_share)
 
 
 def model_flops(shape: GRPOShape) -> float:

@@ -7,7 +7,7 @@ import pytest
 from tests.touchr1_jax.distributed.sixteen import DECODER, GRPO, PROMPT
 from touchr1_jax.distributed.memory import GRPOShape, head_weights, layer_weights
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.work import Machine, Work, grpo_work, model_flops, seconds
+from touchr1_jax.distributed.work import Machine, Work, grpo_work, model_flops, phase_seconds, seconds
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.rl.config import Paper
 
@@ -61,12 +61,12 @@ def test_what_prompts_gather_is_there_for_sampling():
     assert work["sampling"].gathered_bytes == 0
 
 
-def test_a_phase_takes_what_is_longest_and_then_its_sums(monkeypatch):
+def test_a_phase_takes_its_longest_part_and_then_its_sums():
     machine = Machine(
         flops=10.0, read_bytes=5.0, near_bytes=4.0, far_bytes=1.0, flops_share=1.0, read_share=1.0, link_share=1.0
     )
-    work = {"learning": Work(flops=100.0, read_bytes=10.0, gathered_bytes=20.0, summed_bytes=8.0)}
-    monkeypatch.setattr("touchr1_jax.distributed.work.grpo_work", lambda shape: work)
-    near, far = shape(MeshConfig(fsdp=4, tensor=2)), shape(MeshConfig(fsdp=8, tensor=2))
-    assert seconds(near, machine)["learning"] == 100 / 10 + 8 / 4
-    assert seconds(far, machine)["learning"] == 20 / 1 + 8 / 4  # beyond one machine the weights take longest
+    work = Work(flops=100.0, read_bytes=10.0, gathered_bytes=20.0, summed_bytes=8.0)
+    assert phase_seconds(work, machine, MeshConfig(fsdp=4, tensor=2)) == 100 / 10 + 8 / 4
+    assert phase_seconds(work, machine, MeshConfig(fsdp=8, tensor=2)) == 20 / 1 + 8 / 4  # weights from other machines
+    there = shape(MeshConfig(fsdp=8, tensor=2))
+    assert seconds(there, machine) == {n: phase_seconds(w, machine, there.mesh) for n, w in grpo_work(there).items()}

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import pytest
 
 from experiments.study.scores import PUBLISHED as REPORTED
-from touchr1_jax.rewards import Reward, make_rewards, uniform_prior
-from touchr1_jax.rewards import __main__ as explanation
-from touchr1_jax.rewards.__main__ import PUBLISHED, main
+from tests.touchr1_jax.rewards.examples import make_parsed, make_target
+from touchr1_jax.rewards import Reward, RewardError, make_rewards, uniform_prior
+from touchr1_jax.rewards.__main__ import PUBLISHED, main, terms_table
 
 ANSWER = "<perceive> gelsight_mini soft xense firm </perceive> <compare> soft </compare> <conclude> firm </conclude>"
 
@@ -97,11 +97,10 @@ def test_wrong_arguments_are_named(capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-def test_what_cannot_be_trained_is_not_explained(capsys, monkeypatch):
-    branching = Reward(lambda parsed, target: jnp.float32(1 if parsed.length > 3 else 0))
-    monkeypatch.setattr(explanation, "make_rewards", lambda prior: {"mine": branching})
-    assert main(["explain", "--text", ANSWER, "--label", "hardness", "soft", "--weights", "mine", "1"]) == 1
-    assert "reward 'mine': value cannot be traced" in capsys.readouterr().err
+def test_what_cannot_be_trained_is_not_explained():
+    branching = {"mine": Reward(lambda parsed, target: jnp.float32(1 if parsed.length > 3 else 0))}
+    with pytest.raises(RewardError, match="reward 'mine': value cannot be traced"):
+        terms_table(branching, {"mine": 1.0}, make_parsed(), iter([("soft", make_target())]))
 
 
 def test_the_published_weights_are_those_that_reports_use():

@@ -100,7 +100,20 @@ def test_a_single_prompt_has_nobody_to_swap_with():
     np.testing.assert_array_equal(swapped.features.touch, one.touch)
 
 
-def test_one_stream_of_each_prompt_is_masked():
-    touch, stream = mask_one_stream(FEATURES, NOISE, jax.random.key(3))
-    changed = np.asarray((touch != FEATURES.touch).any((-1, -2)))
-    np.testing.assert_array_equal(changed, np.arange(tiny.S) == np.asarray(stream)[:, None])
+def test_one_present_stream_is_masked_uniformly():
+    p = 2000
+    features = tiny.features(0, 3)
+    present = jnp.array([[True, True], [False, True], [False, False]])
+    features = jax.tree.map(lambda x: jnp.repeat(x, p, 0), features.replace(stream_mask=present))
+    masked, stream = mask_one_stream(features, NOISE, jax.random.key(0))
+    changed = np.asarray(jnp.any(masked != features.touch, (-1, -2))).reshape(3, p, tiny.S)
+    np.testing.assert_array_equal(changed[0].sum(-1), 1)
+    np.testing.assert_array_equal(changed[0].argmax(-1), np.asarray(stream)[:p])
+    assert abs(changed[0, :, 0].mean() - 0.5) < 5 * 0.5 / p**0.5
+    np.testing.assert_array_equal(changed[1], [[False, True]] * p)
+    assert not changed[2].any()
+    replaced = np.asarray(masked).reshape(3, p, tiny.S, -1)[1, :, 1]
+    bank = np.asarray(NOISE).reshape(7, tiny.S, -1)
+    count = [(replaced == bank[k, 1]).all(-1).sum() for k in range(7)]  # a draw of this sensor's noise
+    assert sum(count) == p
+    assert min(count) > p / 7 - 5 * (p / 7) ** 0.5

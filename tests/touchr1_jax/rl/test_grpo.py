@@ -213,12 +213,6 @@ def assert_first_step(run, end: GRPOState, metrics: dict[str, jax.Array]) -> Non
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
-def test_step_outside_jit_is_the_compiled_one(run):
-    """The Python function itself; its loops are compiled one by one."""
-    plain = make_grpo_step(FNS, score, OPTIMIZER, CONFIG).__wrapped__
-    assert_first_step(run, *plain(state(), run.batches[0], FROZEN))
-
-
 @pytest.mark.slow
 def test_uncompiled_step_is_the_compiled_one(run):
     """Operation by operation, loops in Python, and no operation anywhere gives NaN."""
@@ -238,25 +232,6 @@ def test_weights_are_gathered_for_the_sampler_and_not_for_the_learner(run):
     _, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG, gather=zeros)(state(), run.batches[0], FROZEN)
     assert gathered == [jax.tree.structure(run.before[0].params)]
     assert metrics["grad_norm"] > 0
-
-
-def test_one_present_stream_is_masked_uniformly():
-    p = 2000
-    features = tiny.features(0, 3)
-    present = jnp.array([[True, True], [False, True], [False, False]])
-    features = jax.tree.map(lambda x: jnp.repeat(x, p, 0), features.replace(stream_mask=present))
-    masked, stream = mask_one_stream(features, FROZEN.noise, jax.random.key(0))
-    changed = np.asarray(jnp.any(masked != features.touch, (-1, -2))).reshape(3, p, tiny.S)
-    np.testing.assert_array_equal(changed[0].sum(-1), 1)
-    np.testing.assert_array_equal(changed[0].argmax(-1), np.asarray(stream)[:p])
-    assert abs(changed[0, :, 0].mean() - 0.5) < 5 * 0.5 / p**0.5
-    np.testing.assert_array_equal(changed[1], [[False, True]] * p)
-    assert not changed[2].any()
-    replaced = np.asarray(masked).reshape(3, p, tiny.S, -1)[1, :, 1]
-    bank = np.asarray(FROZEN.noise).reshape(K, tiny.S, -1)
-    count = [(replaced == bank[k, 1]).all(-1).sum() for k in range(K)]  # a draw of this sensor's noise
-    assert sum(count) == p
-    assert min(count) > p / K - 5 * (p / K) ** 0.5
 
 
 def test_rollout_metrics_by_hand():
