@@ -23,7 +23,7 @@ from experiments.core.results import Picture, Requirement, Results, Table, named
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
 from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
-from experiments.mechanics.tangential_tables import MAIN as FRICTION
+from experiments.mechanics.tangential_report import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
 GRPO_DEFAULT = "paper (default)"

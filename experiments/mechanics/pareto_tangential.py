@@ -3,19 +3,20 @@
     python -m experiments pareto_tangential [--scale smoke] [--data-dir DIR]
 
 Held-out contacts of spheres, rough and patterned bodies on the gels of the four sensors: pulled by a force below the
-friction limit, slid and twisted from rest, and dragged over sequences of 90 frames.  Time a frame against the error of
-the marker displacement, by a float64 solution on the same grid that its duality gap proves: the superposition of
-Ciavarella and Jäger, the package's solver at several tolerances, and a plain solver, the same projected gradients with
-a cold start and a fixed number of iterations.  Compares the two solvers at equal error, holds the superposition's
-promised error to contacts that it was not fitted to, and the solver to closed forms.  Measures what it changes, and
-costs, to couple friction to the sideways motion of the gel under pressure.  With DIR, a folder of the vendor's Tac3D
-recordings, also tells whether the loops of real presses are a loss of the gel or a lag of the force.
+friction limit, slid and twisted from rest, and dragged over sequences of 90 frames.  Time per frame against the error
+of the marker displacement, compared with a float64 solution on the same grid whose duality gap proves it: the
+superposition of Ciavarella and Jäger, the package's solver at several tolerances, and a plain solver, the same
+projected gradients with a cold start and a fixed number of iterations.  Compares the two solvers at equal error, the
+superposition's promised error with its error on contacts that it was not fitted to, and the solver with closed forms.
+Measures the effect and the cost of coupling friction to the sideways motion of the gel under pressure.  With DIR, a
+folder of the vendor's Tac3D recordings, also shows whether the loops of real presses are a loss of the gel or a lag of
+the force.
 
 Cost: under six minutes on two cores (`smoke` under one).
 
 Expected: at equal error the solver takes less time than the plain one, in sequences a fraction of it, since it begins
 where the frame before ended and stops when it is done; the superposition costs next to nothing after a press and errs
-by a few per cent, as it promises, but knows no twist and no reversal.
+by a few per cent, as it promises, but handles neither twist nor reversal.
 """
 
 import dataclasses
@@ -31,14 +32,16 @@ from experiments.core.context import Context
 from experiments.core.results import Requirement, Results
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
-from experiments.mechanics import coupling as tangential_coupling
-from experiments.mechanics import tangential_checks, tangential_loops, tangential_scenes, tangential_tables
-from experiments.mechanics import tangential_methods as ways
-from experiments.mechanics.coupling import CouplingEffect
+from experiments.mechanics import (
+    tangential_checks,
+    tangential_coupling,
+    tangential_methods,
+    tangential_report,
+    tangential_scenes,
+)
 from experiments.mechanics.tangential_checks import PromiseCheck
 from experiments.mechanics.tangential_methods import FrictionMethod
-from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
-from experiments.mechanics.tangential_tables import (
+from experiments.mechanics.tangential_report import (
     COMPARED,
     MAIN,
     PLAIN,
@@ -48,6 +51,7 @@ from experiments.mechanics.tangential_tables import (
     MethodErrors,
     Rows,
 )
+from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
 from sensors_io.scenes import tangential
 from sensors_io.schema import SENSORS
 
@@ -62,17 +66,17 @@ _Solve = Callable[[Any, FrictionKernels, jax.Array], Any]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TangentialConfig:
-    """What to measure.
+    """Contacts, methods' settings and grids of the study.
 
     Args:
-      contacts: of every kind of body on every gel.
-      sensors: whose gels.
+      contacts: number per kind of body on every gel.
+      sensors: names of those whose gels are used.
       grid: side of the contact grid.
-      frames: of a sequence.
+      frames: number per sequence.
       motions: of the protocol, one sequence of each on every gel.
       rounds: of timing.
       coupled_bodies: objects over which coupling is measured, on every gel with markers.
-      closed_grid: side of the grid that is held to closed forms.
+      closed_grid: side of the grid that is compared with closed forms.
       data_dir: Tac3D recordings; `None` leaves the loops of real presses out.
       seed: of the contacts.
     """
@@ -101,36 +105,36 @@ class GelContacts:
 
 
 def methods() -> dict[str, tuple[FrictionMethod, ...]]:
-    """What is compared, by task, cheapest first within each kind."""
+    """Methods by task, cheapest first within each kind."""
     return {
         "force": (
-            FrictionMethod(kind="scaled pressure", solve=ways.scaled_pull),
-            FrictionMethod(kind=FROM_PRESS, solve=ways.ramp_pull),
-            FrictionMethod(kind=SUPERPOSED, solve=ways.superposed_pull, setting=_PRESSURE_TOLERANCE),
-            *_to_tolerance(ways.spg_pull),
+            FrictionMethod(kind="scaled pressure", solve=tangential_methods.scaled_pull),
+            FrictionMethod(kind=FROM_PRESS, solve=tangential_methods.ramp_pull),
+            FrictionMethod(kind=SUPERPOSED, solve=tangential_methods.superposed_pull, setting=_PRESSURE_TOLERANCE),
+            *_to_tolerance(tangential_methods.spg_pull),
         ),
         "slide": (
-            FrictionMethod(kind="full slip", solve=ways.full_slip),
-            FrictionMethod(kind=FROM_PRESS, solve=ways.ramp_slide),
-            *_to_tolerance(ways.spg_slide),
-            *_plain(ways.plain_slide),
+            FrictionMethod(kind="full slip", solve=tangential_methods.full_slip),
+            FrictionMethod(kind=FROM_PRESS, solve=tangential_methods.ramp_slide),
+            *_to_tolerance(tangential_methods.spg_slide),
+            *_plain(tangential_methods.plain_slide),
         ),
         "twist": (
-            FrictionMethod(kind="full slip", solve=ways.full_twist),
-            *_to_tolerance(ways.spg_twist),
-            *_plain(ways.plain_twist),
+            FrictionMethod(kind="full slip", solve=tangential_methods.full_twist),
+            *_to_tolerance(tangential_methods.spg_twist),
+            *_plain(tangential_methods.plain_twist),
         ),
         SEQUENCE: (
-            FrictionMethod(kind="full slip", solve=ways.full_slip_frames),
-            *_to_tolerance(ways.spg_frames),
-            *_plain(ways.plain_frames),
+            FrictionMethod(kind="full slip", solve=tangential_methods.full_slip_frames),
+            *_to_tolerance(tangential_methods.spg_frames),
+            *_plain(tangential_methods.plain_frames),
         ),
     }
 
 
 def run(config: TangentialConfig, context: Context) -> Results:
     """Draw, solve exactly, measure, compare, chart."""
-    loops = () if config.data_dir is None else (tangential_loops.loop_table(config.data_dir),)
+    loops = () if config.data_dir is None else (tangential_checks.loop_table(config.data_dir),)
     with context.timed("contacts"):
         gels = make_gels(config, context)
     with context.timed("methods"):
@@ -140,20 +144,20 @@ def run(config: TangentialConfig, context: Context) -> Results:
         torque = tangential_checks.lubkin(config.closed_grid, context)
     with context.timed("coupling"):
         coupled = couple(config, context)
-    promises = hold_promises(gels, tasks["force"][SUPERPOSED])
+    promises = check_promises(gels, tasks["force"][SUPERPOSED])
     return Results(
         verdict=(*verdict(tasks, promises), tangential_coupling.verdict(coupled)),
         requirements=requirements(tasks, promises, mindlin, torque),
         tables=(
-            *(tangential_tables.task_table(task, rows, config.grid) for task, rows in tasks.items()),
-            tangential_tables.equal_table(tasks),
+            *(tangential_report.task_table(task, rows, config.grid) for task, rows in tasks.items()),
+            tangential_report.equal_table(tasks),
             tangential_checks.promise_table(promises),
             tangential_checks.decision_table(promises),
-            tangential_coupling.change_table(coupled),
+            tangential_coupling.effect_table(coupled),
             tangential_checks.closed_form_table(mindlin, torque, config.closed_grid),
             *loops,
         ),
-        pictures=(tangential_tables.speed_picture(tasks), tangential_tables.promise_picture(promises)),
+        pictures=(tangential_report.speed_picture(tasks), tangential_report.promise_picture(promises)),
         settings={
             "grid": f"{config.grid}², padded to {gels[0].kernels.normal_gel.shape[0]}²",
             "contacts": sum(len(gel.kinds) for gel in gels),
@@ -204,10 +208,10 @@ def measure(
     return tasks
 
 
-def couple(config: TangentialConfig, context: Context) -> list[CouplingEffect]:
-    """What coupling changes on every gel with markers."""
+def couple(config: TangentialConfig, context: Context) -> list[dict[str, Any]]:
+    """Effect of coupling on every gel with markers."""
     marked = [s for s in tangential_scenes.sensors(config.sensors) if s.marker_depth_mm is not None]
-    found: list[CouplingEffect] = []
+    found: list[dict[str, Any]] = []
     with context.progress("coupling", len(marked), still=True) as advance:
         for sensor in marked:
             found += tangential_coupling.measure(sensor, config.grid, config.frames, config.coupled_bodies, config.seed)
@@ -215,7 +219,7 @@ def couple(config: TangentialConfig, context: Context) -> list[CouplingEffect]:
     return found
 
 
-def hold_promises(gels: Sequence[GelContacts], superposed: MethodErrors) -> list[PromiseCheck]:
+def check_promises(gels: Sequence[GelContacts], superposed: MethodErrors) -> list[PromiseCheck]:
     """The superposition's error and promise on every contact."""
     errors = iter(superposed.errors.tolist())
     found = []
@@ -234,7 +238,7 @@ def requirements(
     kept, count = float(np.mean([p.kept for p in promises])), len(promises)
     equal = []
     for task in COMPARED:
-        ratio, reservation = tangential_tables.at_equal_error(tasks[task])
+        ratio, reservation = tangential_report.at_equal_error(tasks[task])
         name = f"{task}: time against {PLAIN} at equal error"
         equal.append(Requirement(name=name, measured=ratio, bound=1, better="lower", note=reservation))
     worst = max(rows[MAIN].high for rows in tasks.values())
@@ -257,17 +261,17 @@ def requirements(
 def verdict(tasks: Mapping[str, Rows], promises: Sequence[PromiseCheck]) -> tuple[str, ...]:
     """The answer in sentences."""
     frame, solved, read = tasks[SEQUENCE][MAIN], tasks["force"][SUPERPOSED], tasks["force"][FROM_PRESS]
-    ratios = {task: tangential_tables.at_equal_error(tasks[task])[0] for task in COMPARED}
+    ratios = {task: tangential_report.at_equal_error(tasks[task])[0] for task in COMPARED}
     kept = float(np.mean([p.kept for p in promises]))
     return (
-        f"Friction takes {frame.ms:.2f} ms a frame of a sequence and errs by {frame.median:.1%} (median; 95th "
-        f"percentile {frame.high:.1%}) at the default tolerance.",
+        f"Friction takes {frame.ms:.2f} ms per frame of a sequence at the default tolerance; its error is "
+        f"{frame.median:.1%} (median; 95th percentile {frame.high:.1%}).",
         "At equal error the solver takes "
         + ", ".join(f"{ratio:.2f} of the plain one's time in a {task}" for task, ratio in ratios.items())
         + ".",
         f"After a press the superposition takes {read.ms:.3f} ms and errs by {read.median:.1%} ({solved.median:.1%} "
-        f"with a contact solved for it, {solved.ms:.2f} ms); {kept:.0%} of {len(promises)} held-out contacts keep to "
-        "what it promises.",
+        f"with a contact solved for it, {solved.ms:.2f} ms); its error is within its promise on {kept:.0%} of "
+        f"{len(promises)} held-out contacts.",
     )
 
 
@@ -282,8 +286,8 @@ def _plain(solve: _Solve) -> list[FrictionMethod]:
 def _exact(task: str, gels: Sequence[GelContacts]) -> list[np.ndarray]:
     """Exact tractions: one array a gel, or a sequence."""
     if task == SEQUENCE:
-        return [ways.exact_sequence(motion, gel.kernels) for gel in gels for motion in gel.sequences]
-    return [ways.exact(task, gel.cases, gel.kernels) for gel in gels]
+        return [tangential_methods.exact_sequence(motion, gel.kernels) for gel in gels for motion in gel.sequences]
+    return [tangential_methods.exact(task, gel.cases, gel.kernels) for gel in gels]
 
 
 def _call(task: str, method: FrictionMethod, gels: Sequence[GelContacts]) -> Callable[[], list[Any]]:
@@ -291,8 +295,8 @@ def _call(task: str, method: FrictionMethod, gels: Sequence[GelContacts]) -> Cal
     setting = jnp.asarray(method.setting)
     if task == SEQUENCE:
         runs = [(motion, gel.kernels) for gel in gels for motion in gel.sequences]
-        return lambda: [ways.sequence(method.solve, *each, setting)[0] for each in runs]
-    return lambda: [ways.every(method.solve, gel.cases, gel.kernels, setting) for gel in gels]
+        return lambda: [tangential_methods.sequence(method.solve, *each, setting)[0] for each in runs]
+    return lambda: [tangential_methods.every(method.solve, gel.cases, gel.kernels, setting) for gel in gels]
 
 
 def _errors(task: str, found: list[Any], true: list[np.ndarray], gels: Sequence[GelContacts]) -> np.ndarray:
@@ -301,7 +305,8 @@ def _errors(task: str, found: list[Any], true: list[np.ndarray], gels: Sequence[
     errors = []
     for tractions, exact, kernels in zip(found, true, benches, strict=True):
         ours, seen = (
-            np.asarray(ways.marker_motion(jnp.asarray(t, jnp.complex64), kernels)) for t in (tractions, exact)
+            np.asarray(tangential_methods.marker_motion(jnp.asarray(t, jnp.complex64), kernels))
+            for t in (tractions, exact)
         )
         size = np.linalg.norm(seen, axis=(1, 2))
         moved = size > 0

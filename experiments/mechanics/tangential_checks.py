@@ -1,14 +1,16 @@
-"""The friction solver against closed forms, and the promise of the cheap tier against held-out contacts."""
+"""Checks of friction: closed forms, promised errors on held-out contacts, load–unload loops of real presses."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Table
-from sensors_io.scenes import partial_slip, tangential
+from experiments.core.errors import require
+from experiments.core.results import Cell, Table, named_table
+from sensors_io.scenes import history, partial_slip, tangential
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.sensors import BODY, SensorModel
 from sensors_io.scenes.traction import Compliance, rigid_field
@@ -21,12 +23,19 @@ SPHERE = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS_MPA, force_n=2
 PULL_SHARES = (0.3, 0.6, 0.9)
 STICK_RATIOS = (0.8, 0.5, 0.2)
 ACCEPTED_AT = (0.02, 0.05, 0.1, 0.2)
-"""Tolerances at which the cheap tier is asked whether it is enough."""
+"""Tolerances at which the superposition is accepted where it promises them."""
+
+RECORDING = "example_1_AD2-0065L.npz"
+"""The vendor's longer recording, 20 × 20 markers, frames 32.7 ms apart."""
+
+LAGS_S = (0.0, 0.03, 0.06, 0.09)
+TOUCHES_N = 0.05
+"""Force above which the sensor is touched."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PromiseCheck:
-    """One contact: kind of body, sensor, error of the superposition, and the error that it was promised to keep to."""
+    """One contact: kind of body, sensor, error of the superposition, and the error that it promises not to exceed."""
 
     kind: str
     sensor: str
@@ -35,12 +44,12 @@ class PromiseCheck:
 
     @property
     def kept(self) -> bool:
-        """Whether the promise holds."""
+        """True if the promise holds."""
         return self.error <= self.promised
 
 
 def cattaneo_mindlin(grid: int, context: Context) -> dict[str, float]:
-    """How far the solver is from Cattaneo (1938) and Mindlin (1949): the worst over three forces, relative.
+    """Deviation of the solver from Cattaneo (1938) and Mindlin (1949): the worst over three forces, relative.
 
         δ = 3μF/(8Ga) [1 − (1 − Q/μF)^⅔],   c = a (1 − Q/μF)^⅓,   τ = μ [p_a(r) − (c/a) p_c(r)]
 
@@ -65,7 +74,7 @@ def cattaneo_mindlin(grid: int, context: Context) -> dict[str, float]:
 
 
 def lubkin(grid: int, context: Context) -> float:
-    """How far the torque of a twisted sphere is from Lubkin (1951): the worst over three twists, relative.
+    """Deviation of the torque of a twisted sphere from Lubkin (1951): the worst over three twists, relative.
 
     A stack of twisted punches of radius t (Reissner & Sagoci 1944: torque 16/3 G t³ each) makes τ = μp outside the
     stick radius c:  θ(c) = 3μF/(4πGa²) [K(k) − E(k)],  k² = 1 − c²/a²;  the torque is ∫ 16/3 G t³ dθ(t).
@@ -82,79 +91,124 @@ def lubkin(grid: int, context: Context) -> float:
 
 
 def promise(sensor: SensorModel, kind: str, error: float, modulus_mpa: float, radius_mm: float) -> PromiseCheck:
-    """What the superposition was promised to keep to on one contact, and its error."""
+    """Error of the superposition on one contact, and the error that `promised_error` predicts for it."""
     body = dataclasses.replace(BODY, modulus_mpa=modulus_mpa)
     promised = partial_slip.promised_error(sensor.gel, body, radius_mm)
     return PromiseCheck(kind=kind, sensor=sensor.name, error=error, promised=promised)
 
 
-def promise_table(promises: Iterable[PromiseCheck]) -> Table:
-    """By kind of body, by sensor, and of all."""
-    found = list(promises)
+def promise_table(promises: Sequence[PromiseCheck]) -> Table:
+    """Errors and promises by kind of body, by sensor, and of all."""
     groups: dict[str, list[PromiseCheck]] = {}
-    for p in found:
-        groups.setdefault(p.kind, []).append(p)
-    for p in found:
-        groups.setdefault(p.sensor, []).append(p)
-    rows = [_promise_row(name, group) for name, group in {**groups, "all": found}.items()]
-    return Table(
-        title="What the superposition promises, on contacts that its constants were not fitted to",
-        columns=(
-            Column(name="contacts"),
-            Column(name="count", format="d"),
-            Column(name="error", unit="%", format=".1f", meaning="median, of the marker displacement, relative L₂"),
-            Column(name="error, 95th", unit="%", format=".1f"),
-            Column(name="promised", unit="%", format=".1f", meaning="median of what `promised_error` says"),
-            Column(name="kept", unit="%", format=".0f", meaning="share of contacts within their promise; 95 is said"),
-        ),
-        rows=tuple(rows),
+    for name, p in [
+        *((p.kind, p) for p in promises),
+        *((p.sensor, p) for p in promises),
+        *(("all", p) for p in promises),
+    ]:
+        groups.setdefault(name, []).append(p)
+    rows: list[dict[str, Cell]] = []
+    for name, group in groups.items():
+        errors = 100 * np.array([p.error for p in group])
+        rows.append(
+            {
+                "contacts": name,
+                "count": len(group),
+                "error": float(np.median(errors)),
+                "error, 95th": float(np.quantile(errors, 0.95)),
+                "promised": 100 * float(np.median([p.promised for p in group])),
+                "kept": 100 * float(np.mean([p.kept for p in group])),
+            }
+        )
+    return named_table(
+        "What the superposition promises, on contacts that its constants were not fitted to",
+        rows,
+        formats={"count": "d", "error": ".1f", "error, 95th": ".1f", "promised": ".1f", "kept": ".0f"},
+        units=dict.fromkeys(("error", "error, 95th", "promised", "kept"), "%"),
+        meanings={
+            "error": "median, of the marker displacement, relative L₂",
+            "promised": "median of `promised_error`",
+            "kept": "share of contacts within their promise; 95 is promised",
+        },
     )
 
 
-def decision_table(promises: Iterable[PromiseCheck]) -> Table:
-    """Where the superposition is taken at a tolerance, and whether it was right to."""
-    found = list(promises)
-    rows: list[tuple[Cell, ...]] = []
+def decision_table(promises: Sequence[PromiseCheck]) -> Table:
+    """Contacts on which the superposition is accepted at a tolerance, and the share of right decisions."""
+    rows: list[dict[str, Cell]] = []
     for tolerance in ACCEPTED_AT:
-        taken = [p for p in found if p.promised <= tolerance]
-        right = [p for p in taken if p.error <= tolerance]
-        would_do = sum(p.error <= tolerance for p in found)
+        taken = [p for p in promises if p.promised <= tolerance]
+        right = sum(p.error <= tolerance for p in taken)
         rows.append(
-            (
-                f"{100 * tolerance:g} %",
-                100 * len(taken) / len(found),
-                100 * len(right) / len(taken) if taken else None,
-                100 * would_do / len(found),
-            )
+            {
+                "tolerance": f"{100 * tolerance:g} %",
+                "taken": 100 * len(taken) / len(promises),
+                "of these within": 100 * right / len(taken) if taken else None,
+                "in hindsight": 100 * sum(p.error <= tolerance for p in promises) / len(promises),
+            }
         )
-    return Table(
-        title="The cheap tier, where its promise lets it in",
-        columns=(
-            Column(name="tolerance"),
-            Column(name="taken", unit="%", format=".0f", meaning="share of contacts that promise it"),
-            Column(name="of these within", unit="%", format=".0f"),
-            Column(name="in hindsight", unit="%", format=".0f", meaning="share of contacts where it would have done"),
-        ),
-        rows=tuple(rows),
+    figures = ("taken", "of these within", "in hindsight")
+    return named_table(
+        "The cheap tier, where its promise lets it in",
+        rows,
+        formats=dict.fromkeys(figures, ".0f"),
+        units=dict.fromkeys(figures, "%"),
+        meanings={
+            "taken": "share of contacts that promise it",
+            "in hindsight": "share of contacts whose error is within it",
+        },
     )
 
 
 def closed_form_table(mindlin: Mapping[str, float], torque: float, grid: int) -> Table:
-    """All of them."""
-    rows = [(f"Cattaneo–Mindlin: {name}", 100 * value) for name, value in mindlin.items()]
-    return Table(
-        title=f"Closed forms at {grid}², {SPHERE.contact_radius_mm / SIDE_MM * grid:.1f} pixels a contact radius",
-        columns=(Column(name="figure"), Column(name="worst error", unit="%", format=".2f")),
-        rows=(*rows, ("Lubkin: torque", 100 * torque)),
+    """Deviations from all closed forms."""
+    errors = {f"Cattaneo–Mindlin: {name}": value for name, value in mindlin.items()} | {"Lubkin: torque": torque}
+    return named_table(
+        f"Closed forms at {grid}², {SPHERE.contact_radius_mm / SIDE_MM * grid:.1f} pixels a contact radius",
+        [{"figure": name, "worst error": 100 * value} for name, value in errors.items()],
+        formats={"worst error": ".2f"},
+        units={"worst error": "%"},
         note="The traction's error is that of the edge of the contact, which cuts through pixels.",
     )
 
 
-def _promise_row(name: str, group: list[PromiseCheck]) -> tuple[Cell, ...]:
-    errors = 100 * np.array([p.error for p in group])
-    promised = 100 * float(np.median([p.promised for p in group]))
-    kept = 100 * float(np.mean([p.kept for p in group]))
-    return name, len(group), float(np.median(errors)), float(np.quantile(errors, 0.95)), promised, kept
+def loop_table(data_dir: Path) -> Table:
+    """Area of the loop of force over mean indentation, relative to the work of loading, for every press.
+
+    An elastic gel makes 0, a lossy one a positive area, a force that is read before the displacement a negative one.
+
+    Args:
+      data_dir: holds `RECORDING`.
+
+    Raises:
+      ResultsError: no such file.
+    """
+    path = data_dir / RECORDING
+    require(path.is_file(), "data_dir", data_dir, f"must hold {RECORDING}", "give the folder of the recordings")
+    with np.load(path) as recording:
+        force = -recording["3D_ResultantForce"].reshape(-1, 3)[:, 2]
+        depth = -recording["3D_Displacements"][..., 2].mean(1)
+        time = recording["sendTimestamp"].ravel() - recording["sendTimestamp"].ravel()[0]
+    heading = {lag: f"force read {1000 * lag:.0f} ms later" for lag in LAGS_S}
+    rows: list[dict[str, Cell]] = []
+    for press in _presses(force):
+        t = time[press]
+        returned = {lag: history.returned_share(np.interp(t + lag, time, force), depth[press]) for lag in LAGS_S}
+        areas = {heading[lag]: 100 * (1 - share) for lag, share in returned.items()}
+        rows.append({"press": f"{t[0]:.1f}–{t[-1]:.1f} s", "peak": float(force[press].max()), **areas})
+    return named_table(
+        "Loops of force over indentation in real presses",
+        rows,
+        formats={"peak": ".2f", **dict.fromkeys(heading.values(), ".1f")},
+        units={"peak": "N", **dict.fromkeys(heading.values(), "%")},
+        note="Area over the work of loading, by a Tac3D's own force and mean indentation; positive: energy is lost.",
+    )
+
+
+def _presses(force_n: np.ndarray) -> list[slice]:
+    """Frames of every press that begins and ends within a recording, one untouched frame included on either side."""
+    edges = np.diff((force_n > TOUCHES_N).astype(int))
+    begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
+    return [slice(int(b), int(ends[ends > b][0]) + 2) for b in begins if np.any(ends > b)]
 
 
 def _sphere(grid: int) -> tuple[np.ndarray, float, jnp.ndarray, Compliance]:

@@ -1,4 +1,4 @@
-"""Ways to find the traction of a contact with friction: the package's tiers, and what they are measured against.
+"""Methods for the traction of a contact with friction: those of the package, and those that they are compared with.
 
 A solver maps one contact, the spectra of its gel and a number (tolerance or iterations) to the traction [N, N], MPa,
 x + iy; one of sequences maps a motion likewise to tractions [F, N, N] and to the displacement that the markers show.
@@ -21,7 +21,7 @@ from sensors_io.scenes.traction import Compliance, displacement, in_series, rigi
 Solver = Callable[[FrictionContact, FrictionKernels, Array], Any]
 SequenceSolver = Callable[[FrictionSequence, FrictionKernels, Array], tuple[Array, Any]]
 FrameSolver = Callable[[Array, Array, Compliance, Array], tuple[Array, Any]]
-"""μp, target, compliance and the traction before → the traction, and what else is to be kept."""
+"""μp, target, compliance and the previous traction → the traction, and anything else to return."""
 
 MOST_ITERATIONS = 400
 EXACT_TOLERANCE, EXACT_ITERATIONS = 1e-8, 4000
@@ -46,7 +46,7 @@ class FrictionMethod:
 
 @functools.partial(jax.jit, static_argnames="solve")
 def every(solve: Solver, cases: FrictionContact, kernels: FrictionKernels, setting: Array) -> Any:
-    """What a solver finds of S contacts, one after the other, so that each stops on its own."""
+    """Solutions of S contacts, one after the other, so that each stops on its own."""
     return jax.lax.map(lambda case: solve(case, kernels, setting), cases)
 
 
@@ -54,12 +54,12 @@ def every(solve: Solver, cases: FrictionContact, kernels: FrictionKernels, setti
 def sequence(
     solve: SequenceSolver, motion: FrictionSequence, kernels: FrictionKernels, setting: Array
 ) -> tuple[Array, Any]:
-    """Tractions [F, N, N] of a sequence, and what its markers show."""
+    """Tractions [F, N, N] of a sequence, and the displacement of its markers."""
     return solve(motion, kernels, setting)
 
 
 def exact(task: str, cases: FrictionContact, kernels: FrictionKernels) -> np.ndarray:
-    """Tractions [S, N, N] of a task of `TASKS` in float64, whose duality gap of 1e-8 proves them, whatever found them.
+    """Tractions [S, N, N] of a task of `TASKS` in float64, which a duality gap below 1e-8 proves.
 
     Raises:
       RuntimeError: a gap that stays wider.
@@ -106,13 +106,13 @@ def superposed_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: 
 
 
 def ramp_pull(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
-    """The same, the smaller contact read off the press that went before."""
+    """The same, the smaller contact read from the press that went before."""
     stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, case.ramp_n[-1] * (1 - case.pull_share))
     return partial_slip.ciavarella_jaeger(case.ramp_mpa[-1], stuck, case.friction, case.direction)
 
 
 def ramp_slide(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
-    """The same for a prescribed slide, whose force the press tells."""
+    """The same for a prescribed slide, whose force follows from the press."""
     slides = partial_slip.core_slide(case.ramp_mpa, _series(case, kernels), case.direction)
     left = partial_slip.stuck_force(case.ramp_n, slides, case.ramp_n[-1], case.friction, case.slide_mm)
     stuck = partial_slip.in_ramp(case.ramp_mpa, case.ramp_n, left)
@@ -193,7 +193,7 @@ def spg_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Ar
 
 
 def plain_frames(motion: FrictionSequence, kernels: FrictionKernels, iterations: Array) -> tuple[Array, Any]:
-    """A sequence by the plain solver, which begins every frame anew."""
+    """A sequence by the plain solver, which starts every frame from zero."""
     return _frames(motion, kernels, lambda limit, target, c, _: (plain_spg(limit, target, c, iterations), None))
 
 
@@ -219,7 +219,7 @@ def _tight_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance:
 
 
 def _frames(motion: FrictionSequence, kernels: FrictionKernels, solve: FrameSolver) -> tuple[Array, Any]:
-    """What sticks carries its displacement on: every frame's target is what was carried and the motion since."""
+    """Regions that stick keep their displacement: the target of a frame is that of the last frame plus the motion."""
     compliance = _series(motion, kernels)
 
     def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.Step]) -> tuple[tuple[Array, Array], Any]:

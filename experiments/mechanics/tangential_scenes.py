@@ -1,4 +1,4 @@
-"""Contacts with friction to measure by: three kinds of bodies on the gels of the sensors, pushed, slid and twisted.
+"""Contacts with friction: three kinds of bodies on the gels of the sensors, pushed, slid and twisted.
 
 None of them is among the contacts that `partial_slip.promised_error` was fitted to: other gels, other shapes.
 """
@@ -53,7 +53,7 @@ class FrictionKernels:
 
 @struct.dataclass
 class FrictionContact:
-    """One contact and what is done to it; of many contacts every array has a leading axis.
+    """One contact and the motion applied to it; of many contacts every array has a leading axis.
 
     The press went through the forces `ramp_n`, the last of which is the one that holds.  Either a tangential force of
     `pull_share` times the friction limit is applied along `direction`, or a slide along it, or a twist.

@@ -1,4 +1,4 @@
-"""The measurement of friction, shrunk; the methods that it compares; the loops that it reads."""
+"""The friction experiment, shrunk; the methods that it compares; the loops of real presses that it reads."""
 
 import dataclasses
 
@@ -8,16 +8,10 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.core.errors import ResultsError
-from experiments.mechanics import (
-    pareto_tangential,
-    tangential_checks,
-    tangential_loops,
-    tangential_scenes,
-    tangential_tables,
-)
-from experiments.mechanics import tangential_methods as ways
+from experiments.mechanics import pareto_tangential, tangential_checks, tangential_report, tangential_scenes
+from experiments.mechanics import tangential_methods as methods
 from experiments.mechanics.tangential_checks import PromiseCheck
-from experiments.mechanics.tangential_tables import MAIN, PLAIN, SOLVER, MethodErrors
+from experiments.mechanics.tangential_report import MAIN, PLAIN, SOLVER, MethodErrors
 from sensors_io.scenes.sensors import XENSE
 from tests.experiments.shrunk import run_shrunk
 
@@ -41,8 +35,8 @@ def contacts():
 @pytest.mark.slow
 def test_every_method_has_a_row(directory):
     tables = read_json(directory / "results.json")["tables"]
-    for table, methods in zip(tables, pareto_tangential.methods().values(), strict=False):
-        assert [row[0] for row in table["rows"]] == [m.name for m in methods]
+    for table, compared in zip(tables, pareto_tangential.methods().values(), strict=False):
+        assert [row[0] for row in table["rows"]] == [m.name for m in compared]
         assert np.all(np.isfinite([row[1:] for row in table["rows"]]))
     assert {p.name for p in (directory / "plots").iterdir()} == {"pareto_tangential.svg", "promise.svg"}
 
@@ -73,11 +67,14 @@ def test_closed_forms_are_kept(directory, context):
 @pytest.mark.parametrize("task", ["slide", "twist"])
 def test_two_solvers_meet_at_the_exact_traction(contacts, task):
     kernels, cases, _ = contacts
-    true = ways.exact(task, cases, kernels)
+    true = methods.exact(task, cases, kernels)
     assert true.dtype == np.complex128
-    tight, plain = {"slide": (ways.spg_slide, ways.plain_slide), "twist": (ways.spg_twist, ways.plain_twist)}[task]
+    tight, plain = {
+        "slide": (methods.spg_slide, methods.plain_slide),
+        "twist": (methods.spg_twist, methods.plain_twist),
+    }[task]
     for solve, setting in ((tight, 1e-5), (plain, 300)):
-        found = ways.every(solve, cases, kernels, jnp.asarray(setting))
+        found = methods.every(solve, cases, kernels, jnp.asarray(setting))
         off = np.linalg.norm(found - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
         assert off.max() < 0.02
 
@@ -86,8 +83,8 @@ def test_a_force_is_carried_by_every_method(contacts):
     kernels, cases, _ = contacts
     most = np.asarray(cases.friction * cases.ramp_mpa[:, -1].sum((1, 2))) * float(kernels.spacing_mm) ** 2
     pull = most * np.asarray(cases.pull_share * cases.direction)
-    for solve in (ways.scaled_pull, ways.ramp_pull, ways.superposed_pull, ways.spg_pull):
-        found = np.asarray(ways.every(solve, cases, kernels, jnp.asarray(1e-3)))
+    for solve in (methods.scaled_pull, methods.ramp_pull, methods.superposed_pull, methods.spg_pull):
+        found = np.asarray(methods.every(solve, cases, kernels, jnp.asarray(1e-3)))
         np.testing.assert_allclose(found.sum((1, 2)) * float(kernels.spacing_mm) ** 2, pull, rtol=0.03)
         assert np.all(np.abs(found) <= np.asarray(cases.limit_mpa) * (1 + 1e-4) + 1e-9)
 
@@ -120,15 +117,15 @@ def _rows(**ladders):
 def test_times_at_equal_error_by_hand():
     ours = [(MAIN, 2.0, 0.01), ("tight", 4.0, 0.001)]
     rows = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.1), ("", 16.0, 0.001)]})
-    assert tangential_tables.time_at(rows, PLAIN, 0.01) == pytest.approx(8.0)
-    assert tangential_tables.time_at(rows, PLAIN, 0.2) is None
-    assert tangential_tables.time_at(rows, SOLVER, 0.0001) is None
-    assert tangential_tables.at_equal_error(rows) == (pytest.approx(0.25), "")
+    assert tangential_report.time_at(rows, PLAIN, 0.01) == pytest.approx(8.0)
+    assert tangential_report.time_at(rows, PLAIN, 0.2) is None
+    assert tangential_report.time_at(rows, SOLVER, 0.0001) is None
+    assert tangential_report.at_equal_error(rows) == (pytest.approx(0.25), "")
     worse = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.1), ("", 16.0, 0.02)]})
-    ratio, reservation = tangential_tables.at_equal_error(worse)
+    ratio, reservation = tangential_report.at_equal_error(worse)
     assert (ratio, reservation[:7]) == (pytest.approx(2 / 16), "at most")
     better = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.005), ("", 16.0, 0.001)]})
-    ratio, reservation = tangential_tables.at_equal_error(better)
+    ratio, reservation = tangential_report.at_equal_error(better)
     assert (ratio, reservation[:8]) == (pytest.approx(2 / 4), "at least")
 
 
@@ -150,20 +147,20 @@ def test_a_lag_of_the_force_makes_a_negative_loop_and_a_loss_a_positive_one(tmp_
     press = lambda at: np.maximum(np.sin(np.pi * at / 3), 0) ** 1.5  # one press of 3 s, then another after a rest
     depth, late = press(t), press(t - 0.06)
     np.savez(
-        tmp_path / tangential_loops.RECORDING,
+        tmp_path / tangential_checks.RECORDING,
         **{
             "3D_ResultantForce": np.stack([0 * t, 0 * t, -5 * late], -1)[:, None],
             "3D_Displacements": np.repeat(np.stack([0 * t, 0 * t, -depth], -1)[:, None], 4, 1),
             "sendTimestamp": t[:, None] + 100,
         },
     )
-    (row,) = tangential_loops.loop_table(tmp_path).rows[:1]
-    by_lag = dict(zip(tangential_loops.LAGS_S, row[2:], strict=True))
+    (row,) = tangential_checks.loop_table(tmp_path).rows[:1]
+    by_lag = dict(zip(tangential_checks.LAGS_S, row[2:], strict=True))
     assert row[1] == pytest.approx(5, rel=0.01)
     assert by_lag[0.0] < by_lag[0.03] < -0.5
     assert by_lag[0.06] == pytest.approx(0, abs=0.5)
     with pytest.raises(ResultsError, match="must hold example_1"):
-        tangential_loops.loop_table(tmp_path / "nowhere")
+        tangential_checks.loop_table(tmp_path / "nowhere")
 
 
 @pytest.mark.slow
