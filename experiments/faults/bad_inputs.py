@@ -1,18 +1,23 @@
-"""Some forty kinds of bad input through the public command lines; each must be answered by name, place and way out."""
+"""Some forty kinds of bad input to the public command lines; each must be answered with error, place and way out."""
 
 import contextlib
 import dataclasses
 import functools
+import hashlib
+import io
+import shlex
 import shutil
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Literal
 
 import jax.numpy as jnp
 
-from experiments.core import runs
-from experiments.faults.bad_input import BadInput, Kind
+from experiments.bench import __main__ as bench
+from experiments.core import runner, runs
 from experiments.faults.fixtures import (
-    counting_paths,
+    COUNTING,
     cut,
     emptied,
     flipped,
@@ -23,292 +28,278 @@ from experiments.faults.fixtures import (
     write_pictures,
     write_records,
 )
+from experiments.faults.trainings import PACKAGE
+from sensors_io import __main__ as sensors_io
+from touchr1_jax.rewards import __main__ as rewards
 from touchr1_jax.training.checkpoint import Checkpoints
 
+PROGRAMS: Mapping[str, Callable[[list[str]], int]] = {
+    "experiments": runner.main,
+    "trainings": lambda arguments: runner.main(arguments, package=PACKAGE),
+    "sensors_io": sensors_io.main,
+    "bench": bench.main,
+    "rewards": rewards.main,
+}
+
+REWRITTEN = frozenset({"metrics.jsonl", "timing.json", "report.html"})
+"""Files of a run that a session rewrites as it goes on, whole each time."""
+
+LOCKS = frozenset({".lock", ".lockfile"})
+"""Empty files that only serve as locks."""
+
 FULL_BYTES = 6_000
-"""The counting run's small files fit into so many; its report, which grows with its log, does not."""
+"""Largest file on a full disk: the counting run's small files fit, its report, which grows with its log, does not."""
+
+Kind = Literal["command line", "configuration", "records", "recordings", "run", "checkpoint", "answers", "disk"]
+
+Prepare = Callable[[Path], None]
+"""Put something into a folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BadInput:
+    """One kind of bad input.
+
+    Args:
+      kind, name: where the fault lies, and what it is.
+      command: the command line, a program of `PROGRAMS` first; {folder} stands for the folder that it works in.
+      error, where, way_out: texts that the message must hold.
+      prepare: puts the input into the folder.
+      around: what holds while the command runs, such as a limit.
+    """
+
+    kind: Kind
+    name: str
+    command: str
+    error: str
+    where: str
+    way_out: str
+    prepare: Prepare = lambda folder: None
+    around: Callable[[Path], contextlib.AbstractContextManager[None]] = lambda folder: contextlib.nullcontext()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InputOutcome:
+    """The end of a command that met a bad input: exit code, output, and files that were lost or left half-written."""
+
+    case: BadInput
+    code: int
+    output: str
+    lost: tuple[str, ...]
+    half: tuple[str, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Everything that is wrong with the answer; empty for a good one."""
+        wanted = {"error": self.case.error, "place": self.case.where, "fix": self.case.way_out}
+        missing = [f"the message names no {name} {text!r}" for name, text in wanted.items() if text not in self.output]
+        code = ["the exit code is 0"] if self.code == 0 else []
+        files = [*(f"lost {name}" for name in self.lost), *(f"half-written {name}" for name in self.half)]
+        return (*code, *missing, *files)
+
+    @property
+    def line(self) -> str:
+        """The line of the output that names the place, or else the error; empty if none does."""
+        lines = [line.strip(" │") for line in self.output.splitlines()]
+        named = [line for text in (self.case.where, self.case.error) for line in lines if text in line]
+        return named[0] if named else ""
+
+
+def provoke(case: BadInput, folder: Path) -> InputOutcome:
+    """Prepare a case in an empty folder, run its command in this process, and compare the files before and after."""
+    case.prepare(folder)
+    before = contents(folder)
+    program, *arguments = (word.replace("{folder}", str(folder)) for word in shlex.split(case.command))
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), case.around(folder):
+        code = _exit_code(PROGRAMS[program], arguments)
+    after = contents(folder)
+    kept = set(after.values())
+    return InputOutcome(
+        case=case,
+        code=code,
+        output=err.getvalue() + out.getvalue(),
+        lost=tuple(name for name, digest in before.items() if digest not in kept and Path(name).name not in REWRITTEN),
+        half=tuple(name for name in after if name not in before and _half_written(name)),
+    )
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, by path, without locks and links."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.is_symlink() and path.name not in LOCKS
+    }
+
+
+def _exit_code(program: Callable[[list[str]], int], arguments: list[str]) -> int:
+    """The exit code that a shell would see; an exception is printed as the interpreter would print it."""
+    try:
+        return program(arguments)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 1
+    except Exception as error:  # the interpreter itself would print it
+        sys.stderr.write(f"{type(error).__name__}: {error}\n")
+        return 1
+
+
+def _half_written(name: str) -> bool:
+    parts = Path(name).parts
+    return any(part.startswith(".") or "tmp" in part for part in parts) and parts[-1] not in LOCKS
 
 
 def cases(unfinished: Path) -> tuple[BadInput, ...]:
     """All cases.
 
     Args:
-      unfinished: a folder that `inputs.unfinished_run` filled.
+      unfinished: a folder that `fixtures.unfinished_run` filled.
     """
     return (*command_lines(), *configurations(), *records(), *recordings(), *answers(), *run_files(unfinished))
 
 
 def command_lines() -> tuple[BadInput, ...]:
-    """What is typed wrong."""
-    study = ["ablation_ordinal"]
+    """Typing mistakes."""
+    study = "experiments ablation_ordinal"
+    typed = functools.partial(BadInput, "command line")
     return (
-        BadInput(
-            kind="command line",
-            name="an experiment that there is not",
-            program="experiments",
-            arguments=lambda folder: ["ablation_ordinl"],
-            error="There is no experiment",
-            where="'ablation_ordinl'",
-            fix="Did you mean ablation_ordinal",
-        ),
-        BadInput(
-            kind="command line",
-            name="an option that there is not",
-            program="experiments",
-            arguments=lambda folder: [*study, "--grpo-stepz", "3"],
-            error="Unrecognized",
-            where="--grpo-stepz",
-            fix="--grpo-steps",
-        ),
-        BadInput(
-            kind="command line",
-            name="a number that is none",
-            program="experiments",
-            arguments=lambda folder: [*study, "--seeds", "many"],
-            error="Error parsing",
-            where="--seeds",
-            fix="INT",
-        ),
-        BadInput(
-            kind="command line",
-            name="a scale that there is not",
-            program="experiments",
-            arguments=lambda folder: [*study, "--scale", "huge"],
-            error="invalid choice",
-            where="'huge'",
-            fix="smoke",
-        ),
-        BadInput(
-            kind="command line",
-            name="a run that there is not",
-            program="experiments",
-            arguments=lambda folder: ["compare", "nothing", "nowhere", "--runs-dir", str(folder)],
-            error="FileNotFoundError",
-            where="'nothing'",
-            fix="must be a directory with config.json",
-        ),
-        BadInput(
-            kind="command line",
-            name="a label that no object has",
-            program="rewards",
-            arguments=lambda folder: ["explain", "--text", "soft", "--label", "hardness", "pink"],
-            error="ExplainError",
-            where="'pink'",
-            fix="correct the word",
-        ),
-    )
+        typed("an experiment that there is not", "experiments ablation_ordinl", "There is no experiment",
+              "'ablation_ordinl'", "Did you mean ablation_ordinal"),
+        typed("an option that there is not", f"{study} --grpo-stepz 3", "Unrecognized", "--grpo-stepz", "--grpo-steps"),
+        typed("a number that is none", f"{study} --seeds many", "Error parsing", "--seeds", "INT"),
+        typed("a scale that there is not", f"{study} --scale huge", "invalid choice", "'huge'", "smoke"),
+        typed("a run that there is not", "experiments compare nothing nowhere --runs-dir {folder}", "FileNotFoundError",
+              "'nothing'", "must be a directory with config.json"),
+        typed("a label that no object has", "rewards explain --text soft --label hardness pink", "ExplainError",
+              "'pink'", "correct the word"),
+    )  # fmt: skip
 
 
 def configurations() -> tuple[BadInput, ...]:
-    """Values that contradict each other or mean nothing."""
-    study = ["ablation_ordinal"]
+    """Values that contradict each other or make no sense."""
+    study = "experiments ablation_ordinal"
+    configured = functools.partial(BadInput, "configuration")
     return (
-        BadInput(
-            kind="configuration",
-            name="micro-batches that do not divide the batch",
-            program="experiments",
-            arguments=lambda folder: [*study, "--sft.micro-contacts", "5"],
-            error="Value error",
-            where="micro_contacts is 5",
-            fix="must divide batch_size",
-        ),
-        BadInput(
-            kind="configuration",
-            name="answers of two lengths",
-            program="experiments",
-            arguments=lambda folder: [*study, "--grpo.length", "9"],
-            error="ValueError",
-            where="grpo.length is 9",
-            fix="set both",
-        ),
-        BadInput(
-            kind="configuration",
-            name="a negative weight",
-            program="experiments",
-            arguments=lambda folder: [*study, "grpo.algorithm:paper", "--grpo.algorithm.beta", "-1"],
-            error="Value error",
-            where="beta is -1.0",
-            fix="must be ≥ 0",
-        ),
-        BadInput(
-            kind="configuration",
-            name="a checkpoint every zero steps",
-            program="faults",
-            arguments=lambda folder: ["counting", "--save-every", "0", *counting_paths(folder)],
-            error="ValueError",
-            where="save_every is 0",
-            fix="must be at least 1",
-        ),
-        BadInput(
-            kind="configuration",
-            name="recordings without a folder",
-            program="experiments",
-            arguments=lambda folder: [*study, "--data", "records", *counting_paths(folder)],
-            error="ValueError",
-            where="data_dir is None",
-            fix="needs data_dir",
-        ),
-        BadInput(
-            kind="configuration",
-            name="scenes without an object",
-            program="sensors_io",
-            arguments=lambda folder: ["generate", "--out", folder / "new", "--objects", "0"],
-            error="Value error",
-            where="objects",
-            fix="must be",
-        ),
-    )
+        configured("micro-batches that do not divide the batch", f"{study} --sft.micro-contacts 5", "Value error",
+                   "micro_contacts is 5", "must divide batch_size"),
+        configured("answers of two lengths", f"{study} --grpo.length 9", "ValueError", "grpo.length is 9", "set both"),
+        configured("a negative weight", f"{study} grpo.algorithm:paper --grpo.algorithm.beta -1", "Value error",
+                   "beta is -1.0", "must be ≥ 0"),
+        configured("a checkpoint every zero steps", f"{COUNTING} --save-every 0", "ValueError", "save_every is 0",
+                   "must be at least 1"),
+        configured("recordings without a folder",
+                   f"{study} --data records --runs-dir {{folder}}/runs --cache-dir {{folder}}/cache", "ValueError",
+                   "data_dir is None", "needs data_dir"),
+        configured("scenes without an object", "sensors_io generate --out {folder}/new --objects 0", "Value error",
+                   "objects", "must be"),
+    )  # fmt: skip
 
 
 def records() -> tuple[BadInput, ...]:
-    """Records that are damaged, each met by `check`."""
+    """Damaged records that `check` reads, and paths at which no records can be written."""
+    corrupt, again = "CorruptRecordsError", "copy it again"
+    index, shard, objects = "index.json", "contacts-00000.arrayrecord", "objects-00000.arrayrecord"
+    other_version = functools.partial(replaced, old='"version":2', new='"version":9')
+    damaged: tuple[tuple[str, str, Prepare, str, str, str], ...] = (
+        ("no index", index, Path.unlink, "MissingIndexError", "records", "give the directory"),
+        ("an index cut in half", index, cut, corrupt, "records", "write it again"),
+        ("an empty index", index, emptied, corrupt, "records", "write it again"),
+        ("an index that cannot be read", index, _unreadable, "RecordsError", "records", again),
+        ("an index of another version", index, other_version, "RecordsVersionError", "records",
+         "write the records again"),
+        ("a missing shard", shard, Path.unlink, corrupt, "is missing", again),
+        ("a shard cut in half", shard, cut, corrupt, "bytes where", again),
+        ("an empty shard", shard, emptied, corrupt, "has 0 bytes", again),
+        ("a flipped byte in a shard", shard, flipped, corrupt, "records", "copy the file again"),
+        ("a flipped byte in the objects", objects, flipped, corrupt, "records", "copy"),
+    )  # fmt: skip
+
+    def prepared(file: str, damage: Prepare, folder: Path) -> None:
+        write_records(folder)
+        damage(folder / "records" / file)
+
+    check = functools.partial(BadInput, "records")
+    unended = functools.partial(write_records, complete=False)
     return (
-        _checked("no index", lambda r: (r / "index.json").unlink(), "MissingIndexError", "give the directory"),
-        _checked("an index cut in half", lambda r: cut(r / "index.json"), _CORRUPT, "write it again"),
-        _checked("an empty index", lambda r: emptied(r / "index.json"), _CORRUPT, "write it again"),
-        _checked("an index that cannot be read", _unreadable, "RecordsError", "copy it again"),
-        _checked(
-            "an index of another version",
-            lambda r: replaced(r / "index.json", '"version":2', '"version":9'),
-            "RecordsVersionError",
-            "write the records again",
+        *(
+            check(name, "sensors_io check {folder}/records", error, where, way_out,
+                  functools.partial(prepared, file, damage))
+            for name, file, damage, error, where, way_out in damaged
         ),
-        _checked("a missing shard", lambda r: _shard(r).unlink(), _CORRUPT, "copy it again", "is missing"),
-        _checked("a shard cut in half", lambda r: cut(_shard(r)), _CORRUPT, "copy it again", "bytes where"),
-        _checked("an empty shard", lambda r: emptied(_shard(r)), _CORRUPT, "copy it again", "has 0 bytes"),
-        _checked("a flipped byte in a shard", lambda r: flipped(_shard(r)), _CORRUPT, "copy the file again"),
-        _checked("a flipped byte in the objects", lambda r: flipped(_shard(r, "objects")), _CORRUPT, "copy"),
-        BadInput(
-            kind="records",
-            name="records whose writing has not ended",
-            program="sensors_io",
-            arguments=lambda folder: ["check", folder / "records"],
-            prepare=lambda folder: write_records(folder, complete=False),
-            error="IncompleteRecordsError",
-            where="records",
-            fix="run its command again",
-        ),
-        BadInput(
-            kind="records",
-            name="records of another making in the way",
-            program="sensors_io",
-            arguments=lambda folder: ["generate", "--out", folder / "records"],
-            prepare=write_records,
-            error="RecordsExistError",
-            where="made by config 'made up'",
-            fix="choose another directory",
-        ),
-        BadInput(
-            kind="records",
-            name="a file where records should go",
-            program="sensors_io",
-            arguments=lambda folder: ["generate", "--out", folder / "taken"],
-            prepare=_text("taken", "something else"),
-            error="RecordsExistError",
-            where="taken",
-            fix="choose another path",
-        ),
-    )
+        check("records whose writing has not ended", "sensors_io check {folder}/records", "IncompleteRecordsError",
+              "records", "run its command again", unended),
+        check("records of another making in the way", "sensors_io generate --out {folder}/records", "RecordsExistError",
+              "made by config 'made up'", "choose another directory", write_records),
+        check("a file where records should go", "sensors_io generate --out {folder}/taken", "RecordsExistError",
+              "taken", "choose another path", _text("taken", "something else")),
+    )  # fmt: skip
 
 
 def recordings() -> tuple[BadInput, ...]:
-    """Pictures and folders that are not what a command needs."""
-    rest = lambda folder: ["--background", folder / "rest.png", "--out", folder / "out.npz", "--mm-per-px", "0.06"]
+    """Pictures and folders that a command cannot use."""
+    recorded = functools.partial(BadInput, "recordings")
+    rest = "--background {folder}/rest.png --out {folder}/out.npz --mm-per-px 0.06"
+    tac3d = "sensors_io import tac3d {folder}"
     return (
-        _extract(
-            "a picture that there is not", lambda folder: [folder / "no.png", *rest(folder)], "no.png", "replace it"
+        *(
+            recorded(name, f"sensors_io extract {{folder}}/{picture} {rest}", "Error", where, way_out, write_pictures)
+            for name, picture, where, way_out in (
+                ("a picture that there is not", "no.png", "no.png", "replace it"),
+                ("a picture that is none", "none.png", "none.png", "picture"),
+                ("sizes that differ", "press.png", "(120, 160)", "crop them"),
+            )
         ),
-        _extract("a picture that is none", lambda folder: [folder / "none.png", *rest(folder)], "none.png", "picture"),
-        _extract("sizes that differ", lambda folder: [folder / "press.png", *rest(folder)], "(120, 160)", "crop them"),
-        BadInput(
-            kind="recordings",
-            name="a folder to import that there is not",
-            program="sensors_io",
-            arguments=lambda folder: ["import", "tac3d", folder / "nowhere", "--out", folder / "new"],
-            error="ImportSourceError",
-            where="nowhere",
-            fix="give",
-        ),
-        BadInput(
-            kind="recordings",
-            name="a folder to import that holds nothing",
-            program="sensors_io",
-            arguments=lambda folder: ["import", "tac3d", folder / "empty", "--out", folder / "new"],
-            prepare=lambda folder: (folder / "empty").mkdir(),
-            error="ImportSourceError",
-            where="empty",
-            fix="give",
-        ),
-    )
+        recorded("a folder to import that there is not", f"{tac3d}/nowhere --out {{folder}}/new", "ImportSourceError",
+                 "nowhere", "give"),
+        recorded("a folder to import that holds nothing", f"{tac3d}/empty --out {{folder}}/new", "ImportSourceError",
+                 "empty", "give", lambda folder: (folder / "empty").mkdir()),
+    )  # fmt: skip
 
 
 def answers() -> tuple[BadInput, ...]:
     """Files of questions and answers."""
-    return (
-        BadInput(
-            kind="answers",
-            name="a line that is no JSON",
-            program="bench",
-            arguments=lambda folder: ["score", folder / "questions.jsonl", folder / "answers.jsonl"],
-            prepare=_text("questions.jsonl", '{"id": 1\n'),
-            error="LinesError",
-            where="line 1",
-            fix="must be one JSON object",
-        ),
+    command = "bench score {folder}/questions.jsonl {folder}/answers.jsonl"
+    broken = _text("questions.jsonl", '{"id": 1\n')
+    one = BadInput(
+        "answers", "a line that is no JSON", command, "LinesError", "line 1", "must be one JSON object", broken
     )
+    return (one,)
 
 
 def run_files(unfinished: Path) -> tuple[BadInput, ...]:
-    """Files of a run that is about to go on, its data, and its disk."""
-    struck = functools.partial(_struck, unfinished)
-    held = struck("run", "another process in the run", _nothing, ("RunInUse", "runs/counting", "--fresh"))
-    full = struck("disk", "a disk that fills up", _nothing, ("UnwrittenError", "cannot be written", "free some space"))
+    """Files of an unfinished run, its data, and its disk; each case continues a copy of the run."""
+    damaged, none_left, unwritten = "DamagedFileError", "DamagedCheckpointError", "UnwrittenError"
+
+    def case(
+        kind: Kind, name: str, error: str, where: str, way_out: str, damage: Prepare = lambda folder: None
+    ) -> BadInput:
+        def prepare(folder: Path) -> None:
+            shutil.copytree(unfinished, folder, dirs_exist_ok=True, symlinks=True)
+            damage(folder)
+
+        return BadInput(kind, name, COUNTING, error, where, way_out, prepare)
+
+    locked = case("run", "another process in the run", "RunInUse", "runs/counting", "--fresh")
+    full = case("disk", "a disk that fills up", unwritten, "cannot be written", "free some space")
     return (
-        struck("run", "a damaged configuration", _run_file("config.json"), (_DAMAGED, "config.json", "move the run")),
-        struck("run", "damaged wall times", _run_file("timing.json"), (_DAMAGED, "timing.json", "put a copy back")),
-        struck("run", "a damaged line in the log", _spoiled_log, (_DAMAGED, "metrics.jsonl", "put a copy back")),
-        dataclasses.replace(held, around=_held),
-        struck("checkpoint", "every checkpoint cut", _every_state(cut), (_NO_CHECKPOINT, "damaged-*", "put copies")),
-        struck(
-            "checkpoint", "every checkpoint empty", _every_state(emptied), (_NO_CHECKPOINT, "[12, 8]", "put copies")
-        ),
-        struck("checkpoint", "a changed iterator", _changed_data, (_NO_CHECKPOINT, "its data does not hold", "copies")),
-        struck("checkpoint", "other shapes", _other_shapes, ("CheckpointError", "holds another state", "go back to")),
-        struck("checkpoint", "a file in their place", _file_for_folder, ("UnwrittenError", "count/0", "move away")),
+        case("run", "a damaged configuration", damaged, "config.json", "move its run away", _cut_file("config.json")),
+        case("run", "damaged wall times", damaged, "timing.json", "put a copy back", _cut_file("timing.json")),
+        case("run", "a damaged line in the log", damaged, "metrics.jsonl", "put a copy back", _damaged_log),
+        dataclasses.replace(locked, around=lambda folder: runs.locked(run_directory(folder))),
+        case("checkpoint", "every checkpoint cut", none_left, "damaged-*", "put copies", _every_state(cut)),
+        case("checkpoint", "every checkpoint empty", none_left, "[12, 8]", "put copies", _every_state(emptied)),
+        case("checkpoint", "a changed iterator", none_left, "its data does not hold", "copies", _changed_iterator),
+        case("checkpoint", "other shapes", "CheckpointError", "holds another state", "go back to", _other_shapes),
+        case("checkpoint", "a file in their place", unwritten, "count/0", "move away", _file_for_folder),
         BadInput(
-            kind="run",
-            name="targets that are NaN from step 5 on",
-            program="faults",
-            arguments=lambda folder: ["counting", "--poison-from", "5", *counting_paths(folder)],
-            error="NonFiniteGradientError",
-            where="step 8",
-            fix="lower the learning rate",
+            "run", "targets that are NaN from step 5 on", f"{COUNTING} --poison-from 5", "NonFiniteGradientError",
+            "step 8", "lower the learning rate",
         ),
         dataclasses.replace(full, around=full_disk(FULL_BYTES)),
-    )
-
-
-_CORRUPT, _DAMAGED, _NO_CHECKPOINT = "CorruptRecordsError", "DamagedFileError", "DamagedCheckpointError"
-
-Says = tuple[str, str, str]
-"""Error, place and way out that a message must name."""
-
-
-def _checked(name: str, spoil: Callable[[Path], None], error: str, fix: str, where: str = "records") -> BadInput:
-    """Records that `check` meets after `spoil` had them."""
-
-    def prepare(folder: Path) -> None:
-        write_records(folder)
-        spoil(folder / "records")
-
-    check = lambda folder: ["check", folder / "records"]
-    return BadInput(
-        kind="records", name=name, program="sensors_io", arguments=check, prepare=prepare, error=error, where=where,
-        fix=fix,
     )  # fmt: skip
 
 
-def _text(name: str, text: str) -> Callable[[Path], None]:
+def _text(name: str, text: str) -> Prepare:
     """Puts a file of that text into a folder."""
 
     def write(folder: Path) -> None:
@@ -317,69 +308,38 @@ def _text(name: str, text: str) -> Callable[[Path], None]:
     return write
 
 
-def _shard(records: Path, kind: str = "contacts") -> Path:
-    return records / f"{kind}-00000.arrayrecord"
-
-
-def _unreadable(records: Path) -> None:
+def _unreadable(path: Path) -> None:
     """A file that opens and whose bytes cannot be read, as on a failing disk (EIO); root may read all others."""
-    (records / "index.json").unlink()
-    (records / "index.json").symlink_to("/proc/self/mem")
+    path.unlink()
+    path.symlink_to("/proc/self/mem")
 
 
-def _extract(name: str, arguments: Callable[[Path], list[Path | str]], where: str, fix: str) -> BadInput:
-    command = lambda folder: ["extract", *arguments(folder)]
-    return BadInput(
-        kind="recordings", name=name, program="sensors_io", arguments=command, prepare=write_pictures, error="Error",
-        where=where, fix=fix,
-    )  # fmt: skip
-
-
-def _struck(unfinished: Path, kind: Kind, name: str, spoil: Callable[[Path], None], says: Says) -> BadInput:
-    """A run of `counting` that goes on after `spoil` had its folder."""
-
-    def prepare(folder: Path) -> None:
-        shutil.copytree(unfinished, folder, dirs_exist_ok=True, symlinks=True)
-        spoil(folder)
-
-    error, where, fix = says
-    command = lambda folder: ["counting", *counting_paths(folder)]
-    return BadInput(
-        kind=kind, name=name, program="faults", arguments=command, prepare=prepare, error=error, where=where, fix=fix
-    )
-
-
-def _nothing(folder: Path) -> None:
-    """Spoils nothing; what is wrong lies around the command."""
-    del folder
-
-
-def _run_file(name: str) -> Callable[[Path], None]:
+def _cut_file(name: str) -> Prepare:
     return lambda folder: cut(run_directory(folder) / name)
 
 
-def _spoiled_log(folder: Path) -> None:
+def _damaged_log(folder: Path) -> None:
     replaced(run_directory(folder) / "metrics.jsonl", '"step": 1,', '"step": 1;')
 
 
-def _every_state(spoil: Callable[[Path], None]) -> Callable[[Path], None]:
-    """Spoils what holds the arrays of every checkpoint."""
+def _every_state(damage: Prepare) -> Prepare:
+    """Damages the files that hold the arrays of every checkpoint."""
 
     def prepare(folder: Path) -> None:
         for checkpoint in newest_checkpoints(folder):
             for path in (checkpoint / "state" / "d").iterdir():
-                spoil(path)
+                damage(path)
 
     return prepare
 
 
-def _changed_data(folder: Path) -> None:
+def _changed_iterator(folder: Path) -> None:
     for checkpoint in newest_checkpoints(folder):
         replaced(checkpoint / "data" / "metadata", '"next_index": ', '"next_index": 1')
 
 
 def _other_shapes(folder: Path) -> None:
-    """A newer checkpoint, of a state that has four numbers."""
+    """Adds a newer checkpoint, of a state that has four numbers."""
     with Checkpoints(newest_checkpoints(folder)[0].parent) as checkpoints:
         checkpoints.save(13, {"params": jnp.zeros(4)}, None)
 
@@ -388,9 +348,3 @@ def _file_for_folder(folder: Path) -> None:
     stage = newest_checkpoints(folder)[0].parent
     shutil.rmtree(stage)
     stage.write_text("no folder", encoding="utf-8")
-
-
-@contextlib.contextmanager
-def _held(folder: Path) -> Iterator[None]:
-    with runs.locked(run_directory(folder)):
-        yield

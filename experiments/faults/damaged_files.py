@@ -1,4 +1,4 @@
-"""Every file of a run that is about to go on, damaged in four ways: the same end, or a word about what is wrong."""
+"""Every file of an unfinished run, damaged in four ways: the run ends the same or names the damage."""
 
 import contextlib
 import dataclasses
@@ -8,86 +8,84 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from experiments.core.context import Context
-from experiments.core.runner import main
 from experiments.faults.digests import differences, digests
-from experiments.faults.fixtures import counting_paths, cut, emptied, flipped, newest_checkpoints, run_directory
-from experiments.faults.trainings import PACKAGE
+from experiments.faults.fixtures import cut, emptied, flipped, newest_checkpoints, run_counting, run_directory
 
-WAYS: Mapping[str, Callable[[Path], None]] = {
+DAMAGES: Mapping[str, Callable[[Path], None]] = {
     "a byte flipped": flipped,
     "cut in half": cut,
     "emptied": emptied,
-    "removed": lambda path: path.unlink(),
+    "removed": Path.unlink,
 }
 
 SAME, OLDER, NAMED, WRONG = "same end", "same end from an older checkpoint", "named error", "WRONG"
 OUTCOMES = (SAME, OLDER, NAMED, WRONG)
-"""What a damaged run can come to; the last is another end, or one that half a file took part in."""
+"""Ends of a run with a damaged file; the last is a different end, or one that used half a file."""
 
 RUN_FILES = ("config.json", "metrics.jsonl", "timing.json")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Damage:
-    """One damaged file: what it is, how it was damaged, what the run came to, what was said."""
+    """One damaged file: its kind, the damage, the end of the run, the first line that names an error or the damage."""
 
     file: str
-    way: str
+    damage: str
     outcome: str
-    said: str
+    message: str
 
 
-def strike(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
-    """Damage a copy of the run, go on with it, and compare its end with the one that it would have had.
+def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
+    """Damage one file of a copy of the run, continue it, and compare its end with that of an undamaged copy.
 
     Args:
-      unfinished: a folder that `inputs.unfinished_run` filled.
+      unfinished: a folder that `fixtures.unfinished_run` filled.
       scratch: an empty folder.
-      context: shows how far it is.
-      most: so many files at most; `None` takes all.
+      context: shows progress.
+      most: files to damage at most; `None` takes all.
     """
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
-    _go_on(whole)
+    _continued(whole)
     wanted = digests(run_directory(whole))
-    files = enumerate(_files(unfinished)[:most])
-    every = [(i, path, way) for i, path in files for way in WAYS if path.stat().st_size or way == "removed"]
-    with context.progress("damaging files", len(every), still=True) as advance:  # what a run prints is caught
-        for i, path, way in every:
-            folder = scratch / f"{i}-{way.replace(' ', '-')}"
-            shutil.copytree(unfinished, folder, symlinks=True)
-            WAYS[way](folder / path.relative_to(unfinished))
-            code, said = _go_on(folder)
-            yield Damage(file=_kind(path), way=way, outcome=_outcome(folder, code, said, wanted), said=said)
-            shutil.rmtree(folder)
-            advance()
+    files = [path for path in sorted(newest_checkpoints(unfinished)[0].rglob("*")) if path.is_file()]
+    files += [run_directory(unfinished) / name for name in RUN_FILES]
+    every = [
+        (i, path, damage)
+        for i, path in enumerate(files[:most])
+        for damage in DAMAGES
+        if path.stat().st_size or damage == "removed"
+    ]
+    for i, path, damage in context.each("damaging files", every, still=True):  # the run's own output is captured
+        folder = scratch / f"{i}-{damage.replace(' ', '-')}"
+        shutil.copytree(unfinished, folder, symlinks=True)
+        DAMAGES[damage](folder / path.relative_to(unfinished))
+        code, output = _continued(folder)
+        message = next((s for s in output.splitlines() if "Error" in s or "is kept as damaged" in s), "")
+        outcome = _outcome(folder, code, output, wanted)
+        yield Damage(file=_kind(path), damage=damage, outcome=outcome, message=message)
+        shutil.rmtree(folder)
 
 
-def _go_on(folder: Path) -> tuple[int, str]:
+def _continued(folder: Path) -> tuple[int, str]:
+    """Exit code and output of the run's next session."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = main(["counting", *counting_paths(folder)], package=PACKAGE)
+        code = run_counting(folder)
     return code, err.getvalue() + out.getvalue()
 
 
-def _outcome(folder: Path, code: int, said: str, wanted: Mapping[str, str]) -> str:
+def _outcome(folder: Path, code: int, output: str, wanted: Mapping[str, str]) -> str:
     if code:
-        return NAMED if "Error: " in said else WRONG
-    finished = [p for p in (folder / "runs" / "counting").iterdir() if (p / "results.json").exists()]
-    ends = {p for p in finished if not p.is_symlink()}
-    if len(ends) != 1 or differences(wanted, digests(ends.pop())):
+        return NAMED if "Error: " in output else WRONG
+    ends = [p.parent for p in (folder / "runs" / "counting").glob("*/results.json") if not p.parent.is_symlink()]
+    if len(ends) != 1 or differences(wanted, digests(ends[0])):
         return WRONG
-    return OLDER if "is kept as damaged" in said else SAME
-
-
-def _files(unfinished: Path) -> list[Path]:
-    """Of the newest checkpoint all, of the run those that its next session reads."""
-    files = [path for path in sorted(newest_checkpoints(unfinished)[0].rglob("*")) if path.is_file()]
-    return [*files, *(run_directory(unfinished) / name for name in RUN_FILES)]
+    return OLDER if "is kept as damaged" in output else SAME
 
 
 def _kind(path: Path) -> str:
-    """Name of a file without what differs from run to run."""
+    """The file's path in its run without names that differ from run to run."""
     if path.name in RUN_FILES:
         return path.name
     parts = path.parts[path.parts.index("0") + 2 :]

@@ -1,4 +1,4 @@
-"""What a run came to, as hashes: two runs that ended in the same bits have the same."""
+"""Digests of a finished run: two runs have the same ones exactly if they ended in the same bits."""
 
 import hashlib
 import json
@@ -16,32 +16,28 @@ from experiments.core.artifacts import read_json
 
 
 def digests(directory: Path) -> dict[str, str]:
-    """SHA-256 of all that a run came to: log lines, answers, what every stage kept at its end, results."""
+    """SHA-256 of log lines, answers, results, and the checkpoints that every stage kept."""
     found = {"metrics.jsonl": _hash((directory / "metrics.jsonl").read_bytes())}
     for path in sorted((directory / "answers").glob("*.npz")):
         found[f"answers/{path.name}"] = _hash(path.read_bytes())
     results = read_json(directory / "results.json")
     found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
     checkpoints = directory / "checkpoints"
-    for stage in sorted(path.parent for path in checkpoints.rglob("*") if path.name.isdigit() and _holds_state(path)):
+    for stage in sorted({s.parent.parent for s in checkpoints.rglob("state") if s.parent.name.isdigit()}):
         kept = sorted((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
         found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
     return found
 
 
 def differences(a: Mapping[str, str], b: Mapping[str, str]) -> tuple[str, ...]:
-    """What two runs came to differently."""
+    """Names of what differs between two runs."""
     return tuple(sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name)))
 
 
-def _holds_state(path: Path) -> bool:
-    return (path / "state").is_dir()
-
-
 def _state_hash(checkpoint: Path) -> str:
-    """Of step, data iterator, score and every array of a checkpoint."""
+    """Digest of step, data iterator, score and every array of a checkpoint."""
     digest = hashlib.sha256(checkpoint.name.encode() + (checkpoint / "data" / "metadata").read_bytes())
-    score = checkpoint / "metrics" / "metrics"  # beside it Orbax writes its own path
+    score = checkpoint / "metrics" / "metrics"  # next to it Orbax writes its own path
     digest.update(score.read_bytes() if score.exists() else b"")
     for path, array in jax.tree.leaves_with_path(_arrays(checkpoint / "state")):
         digest.update(jax.tree_util.keystr(path).encode() + array.tobytes())
@@ -49,8 +45,9 @@ def _state_hash(checkpoint: Path) -> str:
 
 
 def _arrays(state: Path) -> Any:
-    """The arrays of a saved state on the host, without the file that says which devices held them: it may be damaged,
-    and training that names its own devices goes on all the same.
+    """The arrays of a saved state on the host, read without the file that names the devices that held them.
+
+    Training names its own devices, so damage of that file has no effect on it.
     """
     with tempfile.TemporaryDirectory() as home, ocp.PyTreeCheckpointer() as checkpointer:
         path = shutil.copytree(state, Path(home) / "state", ignore=shutil.ignore_patterns("_sharding"))

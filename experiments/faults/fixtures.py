@@ -1,4 +1,4 @@
-"""The smallest good inputs, for cases to spoil."""
+"""The smallest good inputs, and ways to damage them."""
 
 import contextlib
 import io
@@ -13,6 +13,9 @@ from experiments.core.runner import main
 from experiments.faults.trainings import PACKAGE
 from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard, Sequence
+
+COUNTING = "trainings counting --runs-dir {folder}/runs --cache-dir {folder}/cache"
+"""The command line that runs or continues `counting` in a folder."""
 
 META = RecordsMeta(source="made up", licence="that of this code", config_hash="made up", sensors=("xense",))
 
@@ -29,7 +32,7 @@ def write_records(folder: Path, *, complete: bool = True) -> None:
 
 
 def write_pictures(folder: Path) -> None:
-    """Two pictures of different sizes, and a file that is none."""
+    """Two pictures of different sizes, and a file that is not a picture."""
     for name, shape in (("press", (120, 160, 3)), ("rest", (96, 128, 3))):
         picture = np.random.default_rng(0).integers(80, 120, shape, np.uint8)
         cv2.imwrite(str(folder / f"{name}.png"), cv2.GaussianBlur(picture, (5, 5), 2))
@@ -39,15 +42,16 @@ def write_pictures(folder: Path) -> None:
 def unfinished_run(folder: Path) -> None:
     """A run of `counting` in `folder/runs` that has two checkpoints and no results."""
     with contextlib.redirect_stdout(io.StringIO()):
-        code = main(["counting", *counting_paths(folder)], package=PACKAGE)
+        code = run_counting(folder)
     if code:
-        raise RuntimeError(f"the run that faults should strike ended with exit code {code}")
+        raise RuntimeError(f"the run to be damaged ended with exit code {code}: must end well; correct `counting`")
     run_directory(folder).joinpath("results.json").unlink()
 
 
-def counting_paths(folder: Path) -> tuple[str, ...]:
-    """Where `counting` keeps its runs and programs."""
-    return "--runs-dir", str(folder / "runs"), "--cache-dir", str(folder / "cache")
+def run_counting(folder: Path, *options: str) -> int:
+    """Run or continue `counting` in `folder/runs`; returns the exit code."""
+    folders = ["--runs-dir", str(folder / "runs"), "--cache-dir", str(folder / "cache")]
+    return main(["counting", *folders, *options], package=PACKAGE)
 
 
 def run_directory(folder: Path) -> Path:
@@ -66,8 +70,8 @@ def newest_checkpoints(folder: Path) -> list[Path]:
 def flipped(path: Path) -> None:
     """Flip all bits of one byte, the middle one of those that are not 0, which may be padding."""
     content = bytearray(path.read_bytes())
-    told = np.flatnonzero(np.frombuffer(content, np.uint8))
-    content[told[len(told) // 2]] ^= 255
+    data = np.flatnonzero(np.frombuffer(content, np.uint8))
+    content[data[len(data) // 2]] ^= 255
     path.write_bytes(content)
 
 
@@ -78,7 +82,7 @@ def cut(path: Path) -> None:
 
 
 def emptied(path: Path) -> None:
-    """Leave nothing in a file."""
+    """Remove the content of a file."""
     path.write_bytes(b"")
 
 
@@ -86,7 +90,7 @@ def replaced(path: Path, old: str, new: str) -> None:
     """Replace a text in a file, which must hold it."""
     text = path.read_text(encoding="utf-8")
     if old not in text:
-        raise ValueError(f"{path} holds no {old!r}: the case that would spoil it spoils nothing; correct the case")
+        raise ValueError(f"{path} holds no {old!r}: must hold the text to replace; correct the case")
     path.write_text(text.replace(old, new), encoding="utf-8")
 
 

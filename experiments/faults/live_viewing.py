@@ -1,7 +1,7 @@
-"""A recording that is watched: what browsers see and when, and what the recorder notices of them.
+"""A recording that browsers watch, and a bridge that carries pictures: the delays, and the samples lost.
 
 A camera is replayed at its true rate and recorded into a journal as a session does it, while browsers in processes of
-their own follow the page: each hears of every state and asks for all of its pictures.
+their own follow the page: each receives every state and requests all of its pictures.
 """
 
 import contextlib
@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from experiments.core.results import Requirement, Table, at_least, at_most, named_table
 from experiments.faults.replayed_camera import NoiseCamera
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Identity
@@ -28,53 +29,59 @@ from sensors_io.recording.journal import JournalWriter
 from sensors_io.viewer.presenter import Channel, Presenter
 from sensors_io.viewer.server import LiveView
 
+BRIDGE_SHAPE = (480, 640, 3)
+"""Of a picture through the bridge: the cameras of Xense and DM-Tac."""
+
+FASTEST_HZ = 120.0
+"""Rate of the vendors' fastest camera, a DM-Tac."""
+
 _IDLE_S = 0.002  # between looks of a session at its devices
 _FIELD = (18, 24)  # rows and columns of the fields that are shown
 
 BROWSER = """
 import http.client, json, sys, threading, time, urllib.parse
 host, port, seconds = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
-newest, heard = [None], threading.Event()
+newest, changed = [None], threading.Event()
 def listen():
     events = http.client.HTTPConnection(host, port)
     events.request("GET", "/numbers")
     for line in events.getresponse():
         if line.startswith(b"data: "):
             newest[0] = json.loads(line[6:])
-            heard.set()
+            changed.set()
 threading.Thread(target=listen, daemon=True).start()
 pictures = http.client.HTTPConnection(host, port)
-end, ages, size = time.monotonic() + seconds, [], 0
+end, ages = time.monotonic() + seconds, []
 while time.monotonic() < end:
-    if not heard.wait(0.1):
+    if not changed.wait(0.1):
         continue
-    heard.clear()
-    said = newest[0]
-    for name in said["panels"]:
+    changed.clear()
+    state = newest[0]
+    for name in state["panels"]:
         pictures.request("GET", "/panel/" + urllib.parse.quote(name))
-        size += len(pictures.getresponse().read())
-    ages.append(time.monotonic() - said["time_s"])
-print(json.dumps({"ages_s": ages, "bytes": size}))
+        pictures.getresponse().read()
+    ages.append(time.monotonic() - state["time_s"])
+print(json.dumps({"ages_s": ages}))
 """
-"""A browser as far as the server can tell: it hears of every state and skips pictures rather than fall behind, as the
-page does.  What it shows is as old as the stamp of the sample that it heard of when the last panel is in."""
+"""A browser as the server sees it: it receives every state and, like the page, skips pictures rather than fall behind.
+The age of what it shows is the time from the sample's stamp until the last panel is there."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NoiseFieldCamera:
-    """The camera of `endurance.Loop` with fields to be shown."""
+    """A noise camera that also gives fields to show."""
 
-    loop: NoiseCamera
+    camera: NoiseCamera
 
     @property
     def identity(self) -> Identity:
-        return self.loop.identity
+        return self.camera.identity
 
     def samples(self) -> Iterator[Recorded]:
         depth = np.linspace(0, 1, _FIELD[0] * _FIELD[1], dtype=np.float32).reshape(_FIELD)
         shift = np.stack([depth, depth[::-1]], -1) * np.float32(0.3)
         arrays = {"depth_mm": depth, "deformation_mm": shift, "shear_mm": shift}
-        for recorded in self.loop.samples():
+        for recorded in self.camera.samples():
             yield dataclasses.replace(recorded, arrays=arrays)
 
 
@@ -83,11 +90,11 @@ class ViewedRecording:
     """One recording.
 
     Args:
-      name: who watched.
-      shown_hz: states that a browser showed a second, mean over browsers; NaN without any.
-      ages_s: of the pictures when they were there, all browsers.
-      looks_s: time between two looks of the recorder at its device.
-      written, lost: samples journaled, and those that were not.
+      name: number of browsers.
+      shown_hz: states that a browser showed in a second, mean over browsers; NaN without any.
+      ages_s: of the pictures of all browsers when they were shown, [N].
+      looks_s: times between two looks of the recorder at its device, [L].
+      written, lost: samples in the journal, and those that are not.
     """
 
     name: str
@@ -98,31 +105,25 @@ class ViewedRecording:
     lost: int
 
 
-def watched(loop: NoiseCamera, seconds: float, browsers: int | None) -> ViewedRecording:
-    """Record for so long.
-
-    Args:
-      loop: the camera.
-      seconds: of recording.
-      browsers: that watch; `None` records without a page.
-    """
+def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedRecording:
+    """Record a camera for some seconds, watched by so many browsers; `None` records without a page."""
     with contextlib.ExitStack() as stack:
         home = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        reader = stack.enter_context(Reader(Replay(NoiseFieldCamera(loop=loop))))
+        reader = stack.enter_context(Reader(Replay(NoiseFieldCamera(camera=camera))))
         journal = stack.enter_context(JournalWriter(home / "journal"))
-        watchers: list[subprocess.Popen[str]] = []
+        watching: list[subprocess.Popen[str]] = []
         if browsers is not None:
             live = stack.enter_context(LiveView(port=0))
             stack.enter_context(Presenter([Channel(reader)], None, live).beside())
-            watchers = [_browser(live, seconds) for _ in range(browsers)]
+            watching = [_browser(live, seconds) for _ in range(browsers)]
         looks, written = _record(reader, journal, seconds)
         counts = reader.counts  # nobody reads on while the browsers end
-        told = [json.loads(watcher.communicate()[0]) for watcher in watchers]
-    ages = np.concatenate([np.array(t["ages_s"]) for t in told]) if told else np.zeros(0)
+        ages = [json.loads(browser.communicate()[0])["ages_s"] for browser in watching]
+    total = sum(map(len, ages))
     return ViewedRecording(
         name="no page" if browsers is None else f"{browsers} browser" + "s" * (browsers != 1),
-        shown_hz=len(ages) / seconds / len(told) if told else float("nan"),
-        ages_s=ages,
+        shown_hz=total / seconds / len(ages) if ages else float("nan"),
+        ages_s=np.array([age for each in ages for age in each]),
         looks_s=looks,
         written=written,
         lost=counts.lost,
@@ -130,7 +131,7 @@ def watched(loop: NoiseCamera, seconds: float, browsers: int | None) -> ViewedRe
 
 
 def _record(reader: Reader, journal: JournalWriter, seconds: float) -> tuple[np.ndarray, int]:
-    """Journal everything that comes, as a session does; times between looks, and how many samples."""
+    """Write all samples into a journal, as a session does; returns times between looks and the number of samples."""
     looks, written = [time.monotonic()], 0
     while looks[-1] - looks[0] < seconds:
         samples = reader.drain()
@@ -152,15 +153,22 @@ def _browser(live: LiveView, seconds: float) -> subprocess.Popen[str]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BridgeTransfer:
-    """What a bridge carried: pictures a second, and how old each was when it was read, [N]."""
+    """Pictures through a bridge: how many in a second, and the age of each when it was read, [N]."""
 
     rate_hz: float
     ages_s: np.ndarray
 
 
+def frames(count: str) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
+    """An adapter for `bridge_server` in place of a vendor's SDK: pictures of noise, stamped when they are made."""
+    noise = np.random.default_rng(0).integers(0, 256, BRIDGE_SHAPE, dtype=np.uint8)
+    for n in range(int(count)):
+        yield time.monotonic_ns(), n, {"frame_bgr": noise}
+
+
 def bridged(count: int) -> BridgeTransfer:
-    """Read pictures of 640 × 480 from a bridge as fast as it gives them; the first is left out."""
-    config = BridgeConfig(python=sys.executable, adapter="experiments.faults.picture_flood:frames", serial=str(count))
+    """Read so many pictures from a bridge as fast as it gives them; the first is left out."""
+    config = BridgeConfig(python=sys.executable, adapter=f"{__name__}:{frames.__name__}", serial=str(count))
     stamps: list[tuple[int, int]] = []
     with config.open() as device, contextlib.suppress(DeviceLostError):  # it ends after so many
         device.read(60.0)
@@ -173,6 +181,60 @@ def bridged(count: int) -> BridgeTransfer:
     )
 
 
-def quantiles_ms(seconds: np.ndarray, shares: Sequence[float]) -> list[float | None]:
-    """Quantiles in ms; `None` of nothing."""
-    return [1e3 * float(np.quantile(seconds, share)) if len(seconds) else None for share in shares]
+def requirements(views: Sequence[ViewedRecording], transfer: BridgeTransfer) -> tuple[Requirement, ...]:
+    """Bounds on losses, on the age of pictures and on the rate of the bridge."""
+    oldest = max(float(np.quantile(w.ages_s, 0.95)) for w in views if len(w.ages_s))
+    return (
+        at_most("samples lost while watched", sum(w.lost for w in views), 0),
+        at_most("age of what a browser shows, p95, worst", 1e3 * oldest, 150, "ms"),
+        at_least("pictures of 640 × 480 through a bridge", transfer.rate_hz, FASTEST_HZ, "Hz"),
+    )
+
+
+def viewing_table(views: Sequence[ViewedRecording]) -> Table:
+    """What browsers show, and how often the recorder looks at its device."""
+    rows = [
+        {
+            "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
+            "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
+            "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
+            "recorded": view.written, "lost": view.lost,
+        }
+        for view in views
+    ]  # fmt: skip
+    formats = dict(zip(list(rows[0])[1:], (".1f", ".0f", ".0f", ".1f", ".1f", "d", "d"), strict=True))
+    return named_table(
+        "A recording that is watched",
+        rows,
+        formats=formats,
+        units={"shown": "Hz"} | dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms"),
+        meanings={
+            "shown": "states that one browser shows",
+            "age, median": "of all panels when the last is there",
+            "look, p99": "between two looks of the recorder",
+        },
+        note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
+    )
+
+
+def bridge_table(transfer: BridgeTransfer) -> Table:
+    """Rate of a bridge and age of its pictures."""
+    bytes_per_picture = float(np.prod(BRIDGE_SHAPE))
+    row = {
+        "picture": " × ".join(map(str, BRIDGE_SHAPE)),
+        "rate": transfer.rate_hz,
+        "carried": transfer.rate_hz * bytes_per_picture / 1e6,
+        "age when read, median": _quantile_ms(transfer.ages_s, 0.5),
+        "age when read, p95": _quantile_ms(transfer.ages_s, 0.95),
+    }
+    return named_table(
+        "Pictures through a bridge",
+        [row],
+        formats=dict(zip(list(row)[1:], (".0f", ".0f", ".1f", ".1f"), strict=True)),
+        units=dict(zip(list(row)[1:], ("Hz", "MB/s", "ms", "ms"), strict=True)),
+        note="The adapter gives pictures as fast as they are taken, so the age is that of a full pipe.",
+    )
+
+
+def _quantile_ms(seconds: np.ndarray, share: float) -> float | None:
+    return 1e3 * float(np.quantile(seconds, share)) if len(seconds) else None

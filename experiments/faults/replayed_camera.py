@@ -1,4 +1,4 @@
-"""An hour of a camera in compressed time: what the reader's books say against what was injected."""
+"""A camera replayed in compressed time: the reader's counts compared with the faults that were injected."""
 
 import dataclasses
 import threading
@@ -15,14 +15,13 @@ from sensors_io.devices.reader import Pump, ReaderConfig
 from sensors_io.devices.replay import Faults, Replay, Truth
 from sensors_io.devices.sources import Recorded
 
-_PAGE_BYTES = 4096  # of Linux, in which /proc tells a process's memory
-_MB = 1e6
+_PAGE_MB = 4096 / 1e6  # of Linux, in which /proc counts a process's memory
 _PICTURES = 100_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NoiseCamera:
-    """A source of pictures of noise, no two of 100,000 alike: each is the same noise, begun elsewhere.
+    """A source of pictures of noise, no two of 100,000 alike: each begins elsewhere in one long noise.
 
     Args:
       rate_hz: of the pictures.
@@ -47,12 +46,12 @@ class NoiseCamera:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReplayOutcome:
-    """One replay: what happened, what the books say, how late the stamps are, how memory went.
+    """One replay: faults of the device, counts of the reader, lateness of the stamps, memory.
 
     Args:
       truth, counts: of the device, of the reader.
-      late_s: of the samples' host stamps behind the true times, [3]: median, 99th percentile, largest.
-      memory_mb: of the process at every tenth of the hour, [11].
+      late_s: of the samples' host stamps after the true times, [3]: median, 99th percentile, largest.
+      memory_mb: of the process at every tenth of the time, [11].
       traced_growth_kb: of Python's own memory from the first tenth to the end; NaN where it was not traced.
     """
 
@@ -64,7 +63,7 @@ class ReplayOutcome:
 
     @property
     def wrong(self) -> dict[str, int]:
-        """Each account, less the truth: all 0 if every loss was found."""
+        """Each count minus the truth: all 0 if every loss was found."""
         t, c = self.truth, self.counts
         return {
             "missing": c.missing - (t.dropped + t.away - t.unseen),
@@ -77,7 +76,7 @@ class ReplayOutcome:
         }
 
 
-def endure(
+def replay_camera(
     source: NoiseCamera,
     seconds: float,
     faults: Faults,
@@ -85,25 +84,25 @@ def endure(
     capacity: int,
     every: int = 1,
     traced: bool = False,
-    tell: ProgressCallback = lambda done_s, all_s: None,
+    report: ProgressCallback = lambda done_s, all_s: None,
 ) -> ReplayOutcome:
-    """Replay for so long; the consumer reads `every`-th time only, so that a small ring overflows.
+    """Replay a camera through the package's reader.
 
     Args:
-      source: what is replayed.
+      source: of the pictures.
       seconds: of device time.
-      faults: what goes wrong.
-      capacity: of the ring.
-      every: samples between two visits of the consumer, which then reads half of the ring.
+      faults: to inject.
+      capacity: of the reader's ring.
+      every: samples between two visits of the consumer, which reads half of the ring each time; with many, a small
+        ring overflows.
       traced: whether Python's memory is traced, which takes twice the time.
-      tell: told of the seconds of device time, at every tenth.
+      report: receives the seconds of device time at every tenth.
     """
     clock = JumpingClock()
     replay = Replay(source, seconds=seconds, faults=faults, clock=clock)
     intake = Intake(capacity=capacity, clock=clock)
     pump = Pump(replay, intake, ReaderConfig(capacity=capacity), clock, threading.Event())
-    late = _Late(source.rate_hz)
-    memory = _Memory(seconds, traced)
+    late, memory = _Lateness(source.rate_hz), _MemoryLog(seconds, traced)
     pump.open()
     visits = 0
     while pump.step():
@@ -112,22 +111,22 @@ def endure(
             for _ in range(min(intake.counts.waiting, max(1, capacity // 2))):
                 late.add(intake.next(0.0).host_time_ns)
         if memory.look(clock.now_ns() / NS_PER_S):
-            tell(round(clock.now_ns() / NS_PER_S), round(seconds))
+            report(round(clock.now_ns() / NS_PER_S), round(seconds))
     while intake.counts.waiting:
         intake.next(0.0)
     memory.look(seconds)
-    tell(round(seconds), round(seconds))
+    report(round(seconds), round(seconds))
     return ReplayOutcome(
         truth=replay.truth,
         counts=intake.counts,
-        late_s=late.quantiles(),
-        memory_mb=np.array(memory.seen_mb),
-        traced_growth_kb=memory.growth_kb(),
+        late_s=late.quantiles_s(),
+        memory_mb=np.array(memory.resident_mb),
+        traced_growth_kb=memory.traced_growth_kb(),
     )
 
 
-class _Late:
-    """How far stamps lie behind the nearest tick of the device's true clock, in bounded memory."""
+class _Lateness:
+    """Histogram of the time from the last tick of the device's true clock to a stamp, in bounded memory."""
 
     _BINS = np.linspace(0, 1, 2001)
 
@@ -139,41 +138,36 @@ class _Late:
         phase = (stamp_ns / self._period_ns) % 1.0
         self._histogram[int(phase * (len(self._BINS) - 1))] += 1
 
-    def quantiles(self) -> np.ndarray:
+    def quantiles_s(self) -> np.ndarray:
         share = np.cumsum(self._histogram) / max(1, self._histogram.sum())
         at = self._BINS[[int(np.searchsorted(share, q)) for q in (0.5, 0.99, 1.0 - 1e-12)]]
         return at * self._period_ns / NS_PER_S
 
 
-class _Memory:
+class _MemoryLog:
     """Memory of the process at every tenth of the time, and of Python's objects from the first tenth on."""
 
     def __init__(self, seconds: float, traced: bool):
         self._every_s, self._next_s = seconds / 10, 0.0
         self._traced, self._first_kb = traced, np.nan
-        self.seen_mb: list[float] = []
+        self.resident_mb: list[float] = []
         if traced:
             tracemalloc.start()
 
     def look(self, now_s: float) -> bool:
-        """Whether it was time to look."""
+        """Log the memory if it is time; returns whether it was."""
         if now_s < self._next_s:
             return False
         self._next_s += self._every_s
-        self.seen_mb.append(resident_mb())
-        if self._traced and len(self.seen_mb) == 2:
+        with open("/proc/self/statm") as file:
+            self.resident_mb.append(int(file.read().split()[1]) * _PAGE_MB)
+        if self._traced and len(self.resident_mb) == 2:
             self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
         return True
 
-    def growth_kb(self) -> float:
+    def traced_growth_kb(self) -> float:
         if not self._traced:
             return float("nan")
         last_kb = tracemalloc.get_traced_memory()[0] / 1e3
         tracemalloc.stop()
         return last_kb - self._first_kb
-
-
-def resident_mb() -> float:
-    """Resident memory of this process, MB."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * _PAGE_BYTES / _MB

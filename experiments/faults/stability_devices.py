@@ -3,15 +3,17 @@
     python -m experiments stability_devices [--data-dir DIR] [--scale smoke]
 
 One hour of a 120 Hz camera in compressed time, with 2 % drops, duplicates, jitter, a clock that gains 50 ppm and three
-disconnects, read through the package's reader: with the device's counter, without it (losses estimated from the stamps,
-duplicates told by their pictures), and by a consumer too slow for its ring.  What the reader's books say is held
-against what was injected; memory is looked at every tenth of the hour, once with Python's own traced.  Then the
-vendor's Tac3D recordings in DIR/tac3d, whose real gaps must come out exactly, and the time to decode a message, cached
-and by YAML where ruamel.yaml is installed.  Last, a camera at its true rate is recorded while browsers watch it, and a
-bridge carries the pictures of a vendor's camera.  Two minutes on one core (`smoke` twenty seconds).  Expected: with a
-counter nothing is ever unaccounted for; without one the estimate is off by one in a thousand of the losses until
-stamps jitter by a quarter of the period; memory stays flat; a message decodes in a hundredth of a millisecond, hundreds
-of times faster than by YAML; watching costs the recording nothing but time of the core.
+disconnects, read through the package's reader: with the device's counter, without it (losses are then estimated from
+the stamps, duplicates recognised by their pictures), and by a consumer too slow for its ring.  The reader's counts are
+compared with the injected faults; memory is logged at every tenth of the hour, once with Python's own traced.  Then
+come the vendor's Tac3D recordings in DIR/tac3d, whose real gaps must be counted exactly, and the time to decode a
+message, cached and by YAML where ruamel.yaml is installed.  Last, a camera at its true rate is recorded while browsers
+watch it, and a bridge carries the pictures of a vendor's camera.
+
+Two minutes on one core (`smoke` twenty seconds).  Expected: with a counter every sample is accounted for; without one
+the estimate is off by one in a thousand of the losses until stamps jitter by a quarter of the period; memory stays
+flat; a message decodes in a hundredth of a millisecond, hundreds of times faster than by YAML; browsers cost the
+recording nothing but processor time.
 """
 
 import dataclasses
@@ -19,35 +21,34 @@ import pathlib
 import warnings
 from collections.abc import Mapping, Sequence
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
-from experiments.core.charts import LOOK, PALETTE, svg
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.results import Picture, Requirement, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.faults import live_viewing as watching
-from experiments.faults import live_viewing_tables as watching_tables
-from experiments.faults import tac3d_recordings as vendor
-from experiments.faults.replayed_camera import NoiseCamera, ReplayOutcome, endure
+from experiments.faults import live_viewing as viewing
+from experiments.faults import tac3d_recordings as tac3d
+from experiments.faults.replayed_camera import NoiseCamera, ReplayOutcome, replay_camera
 from sensors_io.devices.errors import OverloadWarning
 from sensors_io.devices.replay import Disconnect, Faults
 
-_MOST_GAINED_MB = 5.0  # by an hour's replay
 BY_COUNTER, BY_STAMPS, SLOW = "with a counter", "without a counter", "slow consumer"
+
+MOST_GAINED_MB = 5.0
+"""Resident memory that an hour's replay may gain."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DeviceStabilityConfig:
-    """Length, rate and faults of the replay; rounds of timing.
+    """Length, rate and faults of the replay; sizes of the other measurements.
 
     Args:
       seconds: of device time; the disconnects lie at a quarter, a half and three quarters.
       rate_hz: of the camera.
       size_px: rows and columns of its pictures.
       drop_share, duplicate_share, jitter_s, skew: see `Faults`.
-      away_s: how long each disconnect lasts.
+      away_s: duration of each disconnect.
       traced_seconds: of a shorter replay in which Python's memory is traced.
       sweep_seconds, jitter_shares: of the replays over jitter, in periods of the camera.
       rounds: of timing the decoders.
@@ -78,152 +79,62 @@ class DeviceStabilityConfig:
 
 
 def run(config: DeviceStabilityConfig, context: Context) -> Results:
-    """Replay, check the vendor's recordings, time the decoders."""
+    """Replay the camera, check the vendor's recordings, time the decoders, watch a recording."""
     outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
     short = dataclasses.replace(config, seconds=config.traced_seconds)
-    faults = _faults(short, hidden=False)
-    with context.progress_callback("device time with Python's memory traced, s") as tell:
-        traced = endure(_source(short), short.seconds, faults, capacity=256, traced=True, tell=tell)
+    faults = injected(short, hidden=False)
+    with context.progress_callback("device time with Python's memory traced, s") as report:
+        traced = replay_camera(_camera(short), short.seconds, faults, capacity=256, traced=True, report=report)
     sweep = over_jitter(config, context)
-    paths = recordings(config.data_dir)
-    checked = [vendor.check(path) for path in context.each("recordings", paths)]
+    paths = tac3d.recordings(config.data_dir)
+    checks = [tac3d.check(path) for path in context.each("recordings", paths)]
     rounds = context.rounds("timing decoders", config.rounds)
-    decode = vendor.decode_ms(vendor.message(paths[0] if paths else None), rounds)
-    watchers = context.each("watched recordings", (None, *config.browsers))
-    seen = [watching.watched(_source(config), config.watch_seconds, n) for n in watchers]
-    carried = watching.bridged(config.bridge_frames)
+    decode = tac3d.decode_ms(tac3d.message(paths[0] if paths else None), rounds)
+    browsers = context.each("watched recordings", (None, *config.browsers))
+    views = [viewing.viewed(_camera(config), config.watch_seconds, number) for number in browsers]
+    transfer = viewing.bridged(config.bridge_frames)
     return Results(
-        verdict=(*verdict(outcomes, checked, decode), _watched(seen, carried)),
+        verdict=verdict(outcomes, checks, decode, views, transfer),
         requirements=(
-            *requirements(outcomes, traced, checked, decode),
-            *watching_tables.requirements(seen, carried),
+            *replay_requirements(outcomes, traced),
+            *tac3d.requirements(checks, decode),
+            *viewing.requirements(views, transfer),
         ),
         tables=(
-            _accounts(outcomes),
-            *([_recorded(checked)] if checked else []),
-            _decoders(decode),
-            *watching_tables.tables(seen, carried),
+            account_table(outcomes),
+            *([tac3d.recording_table(checks)] if checks else []),
+            tac3d.decoder_table(decode),
+            viewing.viewing_table(views),
+            viewing.bridge_table(transfer),
         ),
-        pictures=(_jitter_picture(sweep, config), _memory_picture(outcomes, config)),
+        pictures=(jitter_picture(sweep, config), memory_picture(outcomes, config)),
         settings={
             "samples": round(config.seconds * config.rate_hz),
             "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
             "faults": f"{config.drop_share:.1%} drops, {config.duplicate_share:.1%} duplicates, jitter "
             f"{1e3 * config.jitter_s:g} ms, {1e6 * config.skew:g} ppm, away {config.away_s} s",
-            "vendor's recordings": ", ".join(c.name for c in checked) or "no --data-dir",
-            "vendor's parser installed": vendor.YAML,
+            "vendor's recordings": ", ".join(c.name for c in checks) or "no --data-dir",
+            "vendor's parser installed": tac3d.YAML,
         },
         data={name: o.wrong for name, o in outcomes.items()},
     )
 
 
-def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
-    """The vendor's recordings below a directory.
-
-    Raises:
-      FileNotFoundError: a directory without any.
-    """
-    if data_dir is None:
-        return []
-    found = sorted((data_dir / "tac3d").glob("*.npz"))
-    if not found:
-        raise FileNotFoundError(
-            f"data_dir is {data_dir}: must hold tac3d/*.npz; give another directory or leave it out"
-        )
-    return found
-
-
-def over_jitter(config: DeviceStabilityConfig, context: Context) -> dict[str, np.ndarray]:
-    """Share of the losses by which the count is off, with a counter and without one, for every jitter, [J] each."""
-    short = dataclasses.replace(config, seconds=config.sweep_seconds)
-    found: dict[str, list[float]] = {BY_COUNTER: [], BY_STAMPS: []}
-    for share in context.each("jitter", config.jitter_shares):
-        jittery = dataclasses.replace(short, jitter_s=share / config.rate_hz)
-        for name, values in found.items():
-            o = endure(_source(short), short.seconds, _faults(jittery, hidden=name == BY_STAMPS), capacity=256)
-            values.append(abs(o.wrong["missing"]) / max(1, o.truth.dropped + o.truth.away))
-    return {name: np.array(values) for name, values in found.items()}
-
-
-def requirements(
-    outcomes: Mapping[str, ReplayOutcome],
-    traced: ReplayOutcome,
-    checked: Sequence[vendor.RecordingCheck],
-    decode: Mapping[str, np.ndarray],
-) -> tuple[Requirement, ...]:
-    """The figures that must be kept."""
-    exact = sum(abs(n) for name in (BY_COUNTER, SLOW) for n in outcomes[name].wrong.values())
-    memory = outcomes[BY_COUNTER].memory_mb
-    kept = [
-        _most("losses, duplicates, disconnects not counted", exact, 0),
-        _most("samples unaccounted for", sum(o.counts.unaccounted for o in outcomes.values()), 0),
-        _most("memory gained from the first tenth to the last", float(memory[-1] - memory[1]), _MOST_GAINED_MB, "MB"),
-        _most("Python's memory gained, traced", traced.traced_growth_kb, 100, "kB"),
-        _most("Tac3D message decoded", float(np.median(decode["cached layout"])), 0.05, "ms"),
-    ]
-    if checked:
-        off = sum(abs(c.missing - c.counts.missing) for c in checked)
-        gap = max(abs(c.gap_s - c.seen_gap_s) for c in checked)
-        kept += [
-            _most("Tac3D recordings: missing indices not counted", off, 0),
-            _most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
-        ]
-    return tuple(kept)
-
-
-def verdict(
-    outcomes: Mapping[str, ReplayOutcome], checked: Sequence[vendor.RecordingCheck], decode: Mapping[str, np.ndarray]
-) -> tuple[str, ...]:
-    """The answer in sentences."""
-    counter, stamps, slow = (outcomes[name] for name in (BY_COUNTER, BY_STAMPS, SLOW))
-    truth = counter.truth
-    lost = truth.dropped + truth.away
-    off, fast = stamps.wrong, np.median(decode["cached layout"])
-    said = [
-        f"With a counter the books are exact: of {truth.produced} samples {truth.dropped} dropped, {truth.away} "
-        f"produced while away, {truth.duplicated} twice; {sum(map(abs, counter.wrong.values()))} wrongly counted.",
-        f"Without one the {stamps.truth.dropped + stamps.truth.away} losses are estimated {off['missing']:+d} off "
-        f"({abs(off['missing']) / max(1, lost):.2%}) and duplicates {off['duplicates']:+d}.",
-        f"A consumer too slow for its ring loses {slow.counts.overwritten} samples, all of them counted.",
-        f"A Tac3D message decodes in {fast:.4f} ms"
-        + (
-            f", {np.median(decode[vendor.BY_YAML]) / fast:.0f} times faster than by YAML."
-            if vendor.YAML
-            else "; the vendor's parser is not installed."
-        ),
-    ]
-    said += [
-        f"{c.name}: {c.counts.missing} of {c.frames + c.missing} indices are missing, the largest gap is "
-        f"{1e3 * c.seen_gap_s:.0f} ms."
-        for c in checked
-    ]
-    return tuple(said)
-
-
-def _watched(seen: Sequence[watching.ViewedRecording], carried: watching.BridgeTransfer) -> str:
-    most = seen[-1]
-    age = 1e3 * float(np.median(most.ages_s))
-    return (
-        f"Watched by {most.name}, a recording at full rate loses {most.lost} of {most.written} samples; each sees "
-        f"{most.shown_hz:.0f} states a second, {age:.0f} ms old.  A bridge carries {carried.rate_hz:.0f} pictures of "
-        "640 × 480 a second."
-    )
-
-
 def _replay(name: str, config: DeviceStabilityConfig, context: Context) -> ReplayOutcome:
     capacity, every = (16, 24) if name == SLOW else (256, 1)
-    faults = _faults(config, hidden=name == BY_STAMPS)
-    shown = context.progress_callback(f"device time {name}, s")
-    with context.timed(name.replace(" ", "_")), shown as tell, warnings.catch_warnings():
-        warnings.simplefilter("ignore", OverloadWarning)  # meant, and counted
-        return endure(_source(config), config.seconds, faults, capacity=capacity, every=every, tell=tell)
+    faults = injected(config, hidden=name == BY_STAMPS)
+    progress = context.progress_callback(f"device time {name}, s")
+    with context.timed(name.replace(" ", "_")), progress as report, warnings.catch_warnings():
+        warnings.simplefilter("ignore", OverloadWarning)  # intended, and counted
+        return replay_camera(_camera(config), config.seconds, faults, capacity=capacity, every=every, report=report)
 
 
-def _source(config: DeviceStabilityConfig) -> NoiseCamera:
+def _camera(config: DeviceStabilityConfig) -> NoiseCamera:
     return NoiseCamera(rate_hz=config.rate_hz, size_px=config.size_px)
 
 
-def _faults(config: DeviceStabilityConfig, *, hidden: bool) -> Faults:
+def injected(config: DeviceStabilityConfig, *, hidden: bool) -> Faults:
+    """The faults of a replay; hidden, the device gives neither counter nor clock."""
     at = [config.seconds * share for share in (0.25, 0.5, 0.75)]
     scale = min(1.0, config.seconds / 200)  # so that a shrunken run is not away most of its time
     return Faults(
@@ -238,108 +149,127 @@ def _faults(config: DeviceStabilityConfig, *, hidden: bool) -> Faults:
     )
 
 
-def _most(name: str, measured: float, bound: float, unit: str = "") -> Requirement:
-    return Requirement(name=name, measured=float(measured), bound=bound, better="lower", unit=unit)
+def over_jitter(config: DeviceStabilityConfig, context: Context) -> dict[str, np.ndarray]:
+    """Error of the count of losses as a share of the losses, with a counter and without one, by jitter, [J] each."""
+    short = dataclasses.replace(config, seconds=config.sweep_seconds)
+    found: dict[str, list[float]] = {BY_COUNTER: [], BY_STAMPS: []}
+    for share in context.each("jitter", config.jitter_shares):
+        jittery = dataclasses.replace(short, jitter_s=share / config.rate_hz)
+        for name, values in found.items():
+            faults = injected(jittery, hidden=name == BY_STAMPS)
+            o = replay_camera(_camera(short), short.seconds, faults, capacity=256)
+            values.append(abs(o.wrong["missing"]) / max(1, o.truth.dropped + o.truth.away))
+    return {name: np.array(values) for name, values in found.items()}
 
 
-def _accounts(outcomes: Mapping[str, ReplayOutcome]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for name, o in outcomes.items():
-        t, c = o.truth, o.counts
-        late = 1e3 * o.late_s
-        rows.append(
-            (
-                name, t.produced, t.dropped, t.away, c.missing, o.wrong["missing"], t.duplicated, o.wrong["duplicates"],
-                t.disconnects, c.reconnects, c.overwritten, c.unaccounted, float(late[0]), float(late[1]),
-            )
-        )  # fmt: skip
-    heads = (
-        "replay", "produced", "dropped", "away", "counted missing", "off by", "twice", "twice, off by", "disconnects",
-        "reconnects", "overwritten", "unaccounted", "late, median", "late, p99",
-    )  # fmt: skip
-    return Table(
-        title="The books against what was injected",
-        columns=tuple(
-            Column(name=h, unit="ms" if h.startswith("late") else "", format=".2f" if h.startswith("late") else "d")
-            for h in heads
+def verdict(
+    outcomes: Mapping[str, ReplayOutcome],
+    checks: Sequence[tac3d.RecordingCheck],
+    decode: Mapping[str, np.ndarray],
+    views: Sequence[viewing.ViewedRecording],
+    transfer: viewing.BridgeTransfer,
+) -> tuple[str, ...]:
+    """The answer in sentences."""
+    counter, stamps, slow = (outcomes[name] for name in (BY_COUNTER, BY_STAMPS, SLOW))
+    truth, off, most = counter.truth, stamps.wrong, views[-1]
+    fast = np.median(decode[tac3d.CACHED])
+    yaml = "; the vendor's parser is not installed"
+    if tac3d.YAML:
+        yaml = f", {np.median(decode[tac3d.BY_YAML]) / fast:.0f} times faster than by YAML"
+    return (
+        f"With a counter all counts are exact: of {truth.produced} samples {truth.dropped} dropped, {truth.away} "
+        f"produced while away, {truth.duplicated} twice; {sum(map(abs, counter.wrong.values()))} wrongly counted.",
+        f"Without one the {stamps.truth.dropped + stamps.truth.away} losses are estimated {off['missing']:+d} off "
+        f"({abs(off['missing']) / max(1, truth.dropped + truth.away):.2%}) and duplicates {off['duplicates']:+d}.",
+        f"A consumer too slow for its ring loses {slow.counts.overwritten} samples, all of them counted.",
+        f"A Tac3D message decodes in {fast:.4f} ms{yaml}.",
+        *(
+            f"{c.name}: {c.counts.missing} of {c.frames + c.missing} indices are missing, the largest gap is "
+            f"{1e3 * c.read_gap_s:.0f} ms."
+            for c in checks
         ),
-        rows=tuple(rows),
-        note="Losses before the first sample and after the last are left out: nobody can see them.  Late: stamps "
-        "behind the device's true time; by running minimum where it tells its clock, else as they arrived.",
+        f"Watched by {most.name}, a recording at full rate loses {most.lost} of {most.written} samples; each sees "
+        f"{most.shown_hz:.0f} states a second, {1e3 * float(np.median(most.ages_s)):.0f} ms old. A bridge carries "
+        f"{transfer.rate_hz:.0f} pictures of 640 × 480 a second.",
     )
 
 
-def _recorded(checked: Sequence[vendor.RecordingCheck]) -> Table:
-    return Table(
-        title="The vendor's Tac3D recordings",
-        columns=(
-            Column(name="recording"),
-            Column(name="frames", format="d"),
-            Column(name="missing", format="d", meaning="by the arrays"),
-            Column(name="counted", format="d", meaning="by the reader"),
-            Column(name="largest gap", unit="ms", format=".3f"),
-            Column(name="as seen", unit="ms", format=".3f"),
-            Column(name="late, median", unit="ms", format=".1f", meaning="arrival behind the running minimum's stamp"),
-            Column(name="late, worst", unit="ms", format=".1f"),
-        ),
-        rows=tuple(_recording_row(c) for c in checked),
+def replay_requirements(outcomes: Mapping[str, ReplayOutcome], traced: ReplayOutcome) -> tuple[Requirement, ...]:
+    """Bounds on the errors of the counts and on memory."""
+    exact = sum(abs(n) for name in (BY_COUNTER, SLOW) for n in outcomes[name].wrong.values())
+    memory = outcomes[BY_COUNTER].memory_mb
+    return (
+        at_most("losses, duplicates, disconnects not counted", exact, 0),
+        at_most("samples unaccounted for", sum(o.counts.unaccounted for o in outcomes.values()), 0),
+        at_most("memory gained from the first tenth to the last", memory[-1] - memory[1], MOST_GAINED_MB, "MB"),
+        at_most("Python's memory gained, traced", traced.traced_growth_kb, 100, "kB"),
     )
 
 
-def _recording_row(c: vendor.RecordingCheck) -> tuple[Cell, ...]:
-    late = [None if np.isnan(s) else 1e3 * float(s) for s in c.late_s]
-    return (c.name, c.frames, c.missing, c.counts.missing, 1e3 * c.gap_s, 1e3 * c.seen_gap_s, *late)
-
-
-def _decoders(decode: Mapping[str, np.ndarray]) -> Table:
-    fast = float(np.median(decode["cached layout"]))
-    return Table(
-        title="Time to decode one Tac3D message",
-        columns=(
-            Column(name="way"),
-            Column(name="median", unit="ms", format=".4f"),
-            Column(name="p95", unit="ms", format=".4f"),
-            Column(name="against cached", format=".1f"),
-        ),
-        rows=tuple(
-            (name, float(np.median(ms)), float(np.quantile(ms, 0.95)), float(np.median(ms)) / fast)
-            for name, ms in decode.items()
-        ),
+def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
+    """The reader's counts and the truth."""
+    rows = [
+        {
+            "replay": name, "produced": o.truth.produced, "dropped": o.truth.dropped, "away": o.truth.away,
+            "counted missing": o.counts.missing, "off by": o.wrong["missing"], "twice": o.truth.duplicated,
+            "twice, off by": o.wrong["duplicates"], "disconnects": o.truth.disconnects,
+            "reconnects": o.counts.reconnects, "overwritten": o.counts.overwritten,
+            "unaccounted": o.counts.unaccounted, "late, median": 1e3 * float(o.late_s[0]),
+            "late, p99": 1e3 * float(o.late_s[1]),
+        }
+        for name, o in outcomes.items()
+    ]  # fmt: skip
+    late = ("late, median", "late, p99")
+    return named_table(
+        "The books against what was injected",
+        rows,
+        formats=dict.fromkeys(rows[0], "d") | dict.fromkeys(late, ".2f"),
+        units=dict.fromkeys(late, "ms"),
+        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: stamps "
+        "after the device's true time; by running minimum where the device gives its clock, else at arrival.",
     )
 
 
-def _jitter_picture(sweep: Mapping[str, np.ndarray], config: DeviceStabilityConfig) -> Picture:
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(6.6, 3.2), layout="constrained")
-        axes = figure.subplots()
-        for (name, off), colour in zip(sweep.items(), PALETTE, strict=False):
-            axes.plot(config.jitter_shares, 100 * off, "o-", color=colour, ms=4, lw=1.3, label=name)
-        axes.set_yscale("symlog", linthresh=0.1)
-        axes.set(
-            xlabel="mean jitter of arrival, periods of the camera", ylabel="losses miscounted, %", ylim=(-0.01, None)
-        )
-        axes.legend(loc="best")
-        content = svg(figure)
-    caption = "Losses are counted exactly with a counter whatever the delays; stamps alone tell them while delays stay "
-    caption += "well below half a period. The axis is linear up to 0.1 %."
-    return Picture(name="jitter", title="Where counting without a counter breaks", caption=caption, content=content)
+def jitter_picture(sweep: Mapping[str, np.ndarray], config: DeviceStabilityConfig) -> Picture:
+    """Error of the count of losses over jitter."""
+    panel = Panel(
+        [Series(name, x=config.jitter_shares, y=100 * off, marker="o") for name, off in sweep.items()],
+        x_label="mean jitter of arrival, periods of the camera",
+        y_label="losses miscounted, %",
+        y_scale="symlog",
+        y_limits=(-0.01, None),
+        linear_to=0.1,
+    )
+    return Picture(
+        name="jitter",
+        title="Where counting without a counter breaks",
+        caption="With a counter losses are counted exactly whatever the delays; stamps alone give the number while "
+        "delays stay well below half a period. The axis is linear up to 0.1 %.",
+        content=draw([panel], size=(6.6, 3.4)),
+    )
 
 
-def _memory_picture(outcomes: Mapping[str, ReplayOutcome], config: DeviceStabilityConfig) -> Picture:
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(6.6, 3.2), layout="constrained")
-        axes = figure.subplots()
-        for (name, o), colour in zip(outcomes.items(), PALETTE, strict=False):
-            minutes = np.linspace(0, config.seconds / 60, len(o.memory_mb))
-            axes.plot(minutes, o.memory_mb - o.memory_mb[0], "o-", color=colour, ms=3, lw=1.3, label=name)
-        axes.axhline(_MOST_GAINED_MB, color="black", lw=0.8, ls=":")
-        axes.set(xlabel="device time, minutes", ylabel="resident memory gained, MB", ylim=(-1, 1.2 * _MOST_GAINED_MB))
-        axes.legend(loc="center right")
-        content = svg(figure)
+def memory_picture(outcomes: Mapping[str, ReplayOutcome], config: DeviceStabilityConfig) -> Picture:
+    """Resident memory over the time of each replay."""
+    series = [
+        Series(name, x=np.linspace(0, config.seconds / 60, len(o.memory_mb)), y=o.memory_mb - o.memory_mb[0])
+        for name, o in outcomes.items()
+    ]
+    panel = Panel(
+        series,
+        x_label="device time, minutes",
+        y_label="resident memory gained, MB",
+        y_limits=(-1, 1.2 * MOST_GAINED_MB),
+        rules=[Rule(y=MOST_GAINED_MB)],
+    )
     start = ", ".join(f"{o.memory_mb[0]:.0f}" for o in outcomes.values())
-    caption = "Memory of the process since each replay began, one after the other in the same process (at the start "
-    caption += f"{start} MB); dotted, what may be gained."
-    return Picture(name="memory", title="Memory stays flat", caption=caption, content=content)
+    return Picture(
+        name="memory",
+        title="Memory stays flat",
+        caption="Memory of the process since each replay began, one after the other in the same process (at the start "
+        f"{start} MB); dotted, the bound.",
+        content=draw([panel], size=(6.6, 3.4)),
+    )
 
 
 DEFAULT = DeviceStabilityConfig()

@@ -1,41 +1,43 @@
-"""Does training that is killed, starved or fed nonsense end in the same bits, or say what is wrong?
+"""Does training that is killed, starved or fed nonsense end in the same bits, or name what is wrong?
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
 Four parts. Kills: training is ended by `kill -9` at random moments, a quarter of them while it starts and the others
-spread over the whole run, and goes on until it is done; logs, answers and the final state of every stage are held bit
-by bit to those of a run that nobody killed. Two victims, with networks so small that the loop
-around a step is most of it: one run of a study's GRPO, whose session starts in seconds, killed 200 times, and a whole
-study, supervised fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of a run that is about
-to go on, in four ways. Bad input: some forty kinds through the public command lines. Waiting: the share of a step that
-waits for data, at the sizes of the studies, on a CPU.
+spread over the whole run, and continued until it is done; logs, answers and the final state of every stage are compared
+bit by bit with those of an undisturbed run. Two trainings are killed, with networks so small that the loop around a
+step takes most of its time: a study's GRPO, whose session starts in seconds, 200 times, and a whole study of supervised
+fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of an unfinished run, in four ways. Bad
+input: some forty kinds through the public command lines. Waiting: the share of a step that waits for data, at the sizes
+of the studies, on a CPU.
 
 Cost: about 25 minutes on one core, most of it the 200 kills; `--scale smoke` about a minute and a half.
 
-Expected: no difference in any bit; no end that is wrong; every bad input answered by name, place and way out; waits
-below 2 % of a step.
+Expected: no difference in any bit; no wrong end; every bad input answered with error, place and way out; waits below
+2 % of a step.
 """
 
 import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.progress import Advance
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.faults.bad_input import provoke
-from experiments.faults.bad_inputs import cases
-from experiments.faults.damaged_files import OUTCOMES, WRONG, strike
+from experiments.faults.bad_inputs import cases, provoke
+from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
 from experiments.faults.data_waits import WaitingConfig, Waits, waits
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import unfinished_run
-from experiments.faults.kill_charts import where_kills_struck
-from experiments.faults.killable_session import PHASES, START, Kill, KillableTraining
-from experiments.faults.kills import ALONE, Campaign, KillConfig, UndisturbedRun
-from experiments.faults.trainings.small_grpo import EXPERIMENT as REINFORCING
-from experiments.faults.trainings.small_study import EXPERIMENT as STUDY
+from experiments.faults.kills import UNDISTURBED, Campaign, KillConfig, UndisturbedRun
+from experiments.faults.sessions import PHASES, START, Kill, KillableTraining
+from experiments.faults.trainings.small_grpo import EXPERIMENT as SMALL_GRPO
+from experiments.faults.trainings.small_study import EXPERIMENT as SMALL_STUDY
 
 MOST_WAITING = 0.02
 """Share of a step that may wait for data."""
@@ -44,30 +46,38 @@ KILLS = 200
 """Kills that training must survive."""
 
 GRPO = "GRPO run"
-"""Name of the victim that must survive them."""
+"""Name of the training that must survive them."""
 
 CELL = 110
-"""Characters of a message that a cell of a table shows."""
+"""Characters of a message in a table."""
+
+InputRow = Mapping[str, Any]
+"""Row of a bad input: input, kind, exit code, answer, faults (empty if there are none)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaultsConfig:
-    """Kills of both victims and their moments, steps of the GRPO run, files to damage, steps to time."""
+    """Sizes of the four parts.
+
+    Args:
+      grpo, study: kills of the two trainings.
+      grpo_steps, study_scale: size of the two trainings.
+      damaged_files, bad_inputs: files and inputs to try at most; `None` tries all.
+      waiting: stages to time.
+    """
 
     grpo: KillConfig = KillConfig(kills=KILLS)
     grpo_steps: int = 2000
     study: KillConfig = KillConfig(kills=10, startup_share=0.2)
     study_scale: str = "default"
     damaged_files: int | None = None
-    """Most files to damage; all by default."""
     bad_inputs: int | None = None
-    """Most bad inputs to try; all by default."""
     waiting: WaitingConfig = WaitingConfig()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class KilledRuns:
-    """What became of one victim: its kills, the runs that they were spread over, and what differed at their ends."""
+    """Kills of one training, the number of runs that they were spread over, and what differed at their ends."""
 
     kills: tuple[Kill, ...]
     runs: int
@@ -76,54 +86,44 @@ class KilledRuns:
 
 def run(config: FaultsConfig, context: Context) -> Results:
     """Kill, damage, feed nonsense, time."""
-    victims = {GRPO: (_grpo(config.grpo_steps), config.grpo), "study": (_study(config.study_scale), config.study)}
-    killed = {name: _killed(name, *each, context) for name, each in victims.items()}
+    study = SMALL_STUDY.configs()[config.study_scale]
+    steps = {"sft": study.sft.steps, "grpo": study.grpo_steps, "blind": study.blind.steps}
+    grpo_options = ("--steps", str(config.grpo_steps))
+    grpo = KillableTraining(name=SMALL_GRPO.name, options=grpo_options, steps={"grpo": config.grpo_steps})
+    whole = KillableTraining(name=SMALL_STUDY.name, options=("--scale", config.study_scale), steps=steps)
+    killed = {
+        name: kill_training(name, training, kills, context)
+        for name, training, kills in ((GRPO, grpo, config.grpo), ("study", whole, config.study))
+    }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
-        damage, outcomes = _damage(config, context, Path(scratch)), _bad_inputs(config, context, Path(scratch))
+        damage = damage_files(config.damaged_files, context, Path(scratch))
+        inputs = try_inputs(config.bad_inputs, context, Path(scratch))
     waited = waits(config.waiting, context)
     return Results(
-        verdict=_verdict(killed, damage, outcomes, waited),
-        requirements=_requirements(killed, damage, outcomes, waited),
-        tables=(_kill_table(killed), _damage_table(damage), _input_table(outcomes), _waiting_table(waited)),
-        pictures=(
-            Picture(
-                name="stability_faults",
-                title="Where the kills struck",
-                caption="Left: the phase that the session was in, told by what it left on the disk.  Right: how much "
-                "of the run had been logged by then.",
-                content=where_kills_struck({name: each.kills for name, each in killed.items()}),
-            ),
-        ),
-        settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(outcomes)},
+        verdict=verdict(killed, damage, inputs, waited),
+        requirements=requirements(killed, damage, inputs, waited),
+        tables=(kill_table(killed), damage_table(damage), input_table(inputs), waiting_table(waited)),
+        pictures=(kill_picture({name: each.kills for name, each in killed.items()}),),
+        settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(inputs)},
     )
 
 
-def _grpo(steps: int) -> KillableTraining:
-    return KillableTraining(name=REINFORCING.name, options=("--steps", str(steps)), steps={"grpo": steps})
-
-
-def _study(scale: str) -> KillableTraining:
-    study = STUDY.configs()[scale]
-    steps = {"sft": study.sft.steps, "grpo": study.grpo_steps, "blind": study.blind.steps}
-    return KillableTraining(name=STUDY.name, options=("--scale", scale), steps=steps)
-
-
-def _killed(name: str, victim: KillableTraining, config: KillConfig, context: Context) -> KilledRuns:
-    """Runs of a victim until all kills have struck; a stopped session of this experiment goes on behind the last."""
-    stage = f"kill/{victim.name}"
-    campaign = Campaign(context.directory / "victims" / victim.name, context.cache_dir / "programs", victim, config)
+def kill_training(name: str, training: KillableTraining, config: KillConfig, context: Context) -> KilledRuns:
+    """Runs of a training until all kills have struck; every run and every kill of an earlier session counts."""
+    stage = f"kill/{training.name}"
+    campaign = Campaign(context.directory / "killed" / training.name, context.cache_dir / "programs", training, config)
     kills: list[Kill] = []
     differs: list[str] = []
     number = 0
     with context.progress(f"killing the {name}", config.kills, _struck_before(stage, context)) as advance:
-        if not context.done(f"{stage}/{ALONE}"):
-            context.save_stage(f"{stage}/{ALONE}", campaign.left_alone()._asdict())
-        alone = UndisturbedRun(**context.load_stage(f"{stage}/{ALONE}"))
+        if not context.done(f"{stage}/{UNDISTURBED}"):
+            context.save_stage(f"{stage}/{UNDISTURBED}", campaign.run_undisturbed()._asdict())
+        undisturbed = UndisturbedRun(**context.load_stage(f"{stage}/{UNDISTURBED}"))
         while len(kills) < config.kills:
             here = f"{stage}/{number}"
             if not context.done(here):
-                struck = _one_run(campaign, here, number, config.kills - len(kills), alone, context, advance)
-                found = differences(alone.digests, digests(campaign.directory(str(number))))
+                struck = _one_run(campaign, here, number, config.kills - len(kills), undisturbed, context, advance)
+                found = differences(undisturbed.digests, digests(campaign.directory(str(number))))
                 context.save_stage(here, {"kills": struck, "differs": found})
             kept = context.load_stage(here)
             kills += [Kill(**kill) for kill in kept["kills"]]
@@ -133,7 +133,7 @@ def _killed(name: str, victim: KillableTraining, config: KillConfig, context: Co
 
 
 def _struck_before(stage: str, context: Context) -> int:
-    """Kills that struck a victim's runs in earlier sessions of this experiment."""
+    """Kills that struck a training's runs in earlier sessions of this experiment."""
     number, before = 0, 0
     while context.done(here := f"{stage}/{number}"):
         before, number = before + len(context.load_stage(here)["kills"]), number + 1
@@ -141,9 +141,15 @@ def _struck_before(stage: str, context: Context) -> int:
 
 
 def _one_run(
-    campaign: Campaign, here: str, number: int, kills: int, alone: UndisturbedRun, context: Context, advance: Advance
+    campaign: Campaign,
+    here: str,
+    number: int,
+    kills: int,
+    undisturbed: UndisturbedRun,
+    context: Context,
+    advance: Advance,
 ) -> tuple[Kill, ...]:
-    """Kills of one run, each of which is kept at once."""
+    """Kills of one run, each of which is saved at once."""
     stage = f"{here}-struck"
     before = [Kill(**kill) for kill in context.load_stage(stage)] if context.done(stage) else []
 
@@ -151,160 +157,158 @@ def _one_run(
         context.save_stage(stage, struck)
         advance()
 
-    return campaign.killed(number, kills, alone, before=before, keep=keep)
+    return campaign.run_killed(number, kills, undisturbed, before=before, keep=keep)
 
 
-def _damage(config: FaultsConfig, context: Context, scratch: Path) -> list[tuple[str, str, str, str]]:
-    """File, way, outcome and message of every damaged file."""
+def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
+    """Every damaged file and the end of its run."""
     if not context.done("damage"):
-        (scratch / "unfinished").mkdir()
-        (scratch / "damaged").mkdir()
-        _unfinished(scratch / "unfinished", context)
-        found = strike(scratch / "unfinished", scratch / "damaged", context, config.damaged_files)
-        struck = [(one.file, one.way, one.outcome, _first_error(one.said)) for one in found]
-        context.save_stage("damage", struck)
-    return [(file, way, outcome, said) for file, way, outcome, said in context.load_stage("damage")]
+        unfinished, damaged = scratch / "unfinished", scratch / "damaged"
+        unfinished.mkdir()
+        damaged.mkdir()
+        unfinished_run(unfinished)
+        context.save_stage("damage", list(damage_each(unfinished, damaged, context, most)))
+    return [Damage(**one) for one in context.load_stage("damage")]
 
 
-def _unfinished(folder: Path, context: Context) -> None:
-    with context.progress("making a run to damage", 1, still=True) as advance:  # its output is caught
-        unfinished_run(folder)
-        advance()
-
-
-def _bad_inputs(config: FaultsConfig, context: Context, scratch: Path) -> list[tuple[str, str, int, str, str]]:
-    """Kind, name, exit code, message and faults of every bad input."""
+def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputRow]:
+    """Every bad input and its answer."""
     if not context.done("inputs"):
-        _unfinished(scratch / "inputs", context)
-        tried = cases(scratch / "inputs")[: config.bad_inputs]
+        unfinished_run(scratch / "inputs")
         rows = []
-        with context.progress("trying bad inputs", len(tried), still=True) as advance:
-            for i, case in enumerate(tried):
-                folder = scratch / f"case-{i}"
-                folder.mkdir()
-                found = provoke(case, folder)
-                line = found.line.replace(str(folder), "…")
-                rows.append((case.kind, case.name, found.code, line, ", ".join(found.faults)))
-                advance()
+        tried = enumerate(cases(scratch / "inputs")[:most])
+        for i, case in context.each("trying bad inputs", tried, still=True):  # the commands' output is captured
+            folder = scratch / f"case-{i}"
+            folder.mkdir()
+            found = provoke(case, folder)
+            answer = {"exit code": found.code, "answer": found.line.replace(str(folder), "…")}
+            rows.append({"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)})
         context.save_stage("inputs", rows)
-    return [tuple(row) for row in context.load_stage("inputs")]
+    return context.load_stage("inputs")
 
 
-def _first_error(said: str) -> str:
-    return next((line for line in said.splitlines() if "Error" in line or "is kept as damaged" in line), "")
-
-
-Damages = Sequence[tuple[str, str, str, str]]
-Inputs = Sequence[tuple[str, str, int, str, str]]
-
-
-def _requirements(
-    killed: Mapping[str, KilledRuns], damage: Damages, inputs: Inputs, waited: Waits
+def requirements(
+    killed: Mapping[str, KilledRuns], damage: Sequence[Damage], inputs: Sequence[InputRow], waited: Waits
 ) -> tuple[Requirement, ...]:
-    """Kills survived, ends that are wrong, inputs that are answered, waits."""
-    differ = sum(len(k.differs) for k in killed.values())
+    """Kills survived, wrong ends, inputs that are answered, waits."""
     at_start = max(sum(k.phase == START for k in each.kills) / len(each.kills) for each in killed.values())
-    answered = sum(not faults for *_, faults in inputs)
-    wrong = sum(outcome == WRONG for _, _, outcome, _ in damage)
+    answered = sum(not row["faults"] for row in inputs)
     return (
-        Requirement(name="kills of the GRPO run", measured=len(killed[GRPO].kills), bound=KILLS, better="higher"),
-        Requirement(name="runs that they were spread over", measured=killed[GRPO].runs, bound=1, better="lower"),
-        Requirement(name="files that differ after them", measured=differ, bound=0, better="lower"),
-        Requirement(
-            name="share of kills at start-up", measured=at_start, bound=0.5, better="lower", note="the larger victim's"
-        ),
-        Requirement(name="damaged files with a wrong end", measured=wrong, bound=0, better="lower"),
-        Requirement(name="kinds of bad input answered", measured=answered, bound=25, better="higher"),
-        Requirement(
-            name="kinds of bad input not answered", measured=len(inputs) - answered, bound=0, better="lower"
-        ),
+        at_least("kills of the GRPO run", len(killed[GRPO].kills), KILLS),
+        at_most("runs that they were spread over", killed[GRPO].runs, 1),
+        at_most("files that differ after them", sum(len(k.differs) for k in killed.values()), 0),
+        at_most("share of kills at start-up", at_start, 0.5, note="of the training with the larger share"),
+        at_most("damaged files with a wrong end", sum(one.outcome == WRONG for one in damage), 0),
+        at_least("kinds of bad input answered", answered, 25),
+        at_most("kinds of bad input not answered", len(inputs) - answered, 0),
         *(
-            Requirement(
-                name=f"{stage}: share of a step that waits for data", measured=wait_s / steps_s, bound=MOST_WAITING,
-                better="lower",
-            )
+            at_most(f"{stage}: share of a step that waits for data", wait_s / steps_s, MOST_WAITING)
             for stage, (steps_s, wait_s) in waited.items()
         ),
-    )  # fmt: skip
+    )
 
 
-def _verdict(killed: Mapping[str, KilledRuns], damage: Damages, inputs: Inputs, waited: Waits) -> tuple[str, ...]:
+def verdict(
+    killed: Mapping[str, KilledRuns], damage: Sequence[Damage], inputs: Sequence[InputRow], waited: Waits
+) -> tuple[str, ...]:
+    """The answer in sentences."""
     ends = [
         f"the {name} was killed {len(k.kills)} times in {k.runs} run{'s' if k.runs > 1 else ''} and "
         + ("ended in the same bits" if not k.differs else f"differs in {', '.join(k.differs)}")
         for name, k in killed.items()
     ]
-    counts = ", ".join(f"{sum(row[2] == o for row in damage)} {o}" for o in OUTCOMES)
-    answered = sum(not faults for *_, faults in inputs)
+    counts = ", ".join(f"{sum(one.outcome == outcome for one in damage)} {outcome}" for outcome in OUTCOMES)
+    answered = sum(not row["faults"] for row in inputs)
     worst = max(wait_s / steps_s for steps_s, wait_s in waited.values())
     return (
         f"By kill -9 {'; '.join(ends)}.",
         f"Of {len(damage)} damaged files: {counts}.",
-        f"Of {len(inputs)} kinds of bad input {answered} are answered by name, place and way out, with nothing lost.",
+        f"Of {len(inputs)} kinds of bad input {answered} are answered with error, place and way out; nothing is lost.",
         f"At most {worst:.2%} of a training step waits for data.",
     )
 
 
-def _kill_table(killed: Mapping[str, KilledRuns]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
-    for name, each in killed.items():
-        counts = [sum(k.phase == phase for k in each.kills) for phase in PHASES]
-        torn = sum(k.torn for k in each.kills)
-        rows.append((name, len(each.kills), each.runs, *counts, torn, len(each.differs)))
-    return Table(
-        title="Kills by what they struck",
-        columns=(
-            Column(name="victim"),
-            Column(name="kills"),
-            Column(name="runs", meaning="that they were spread over; each ended on its own after its last kill"),
-            *(Column(name=phase) for phase in PHASES),
-            Column(name="torn lines", meaning="kills that left half a line in the log"),
-            Column(name="differences", meaning="from the run that nobody killed, in any bit"),
-        ),
-        rows=tuple(rows),
+def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
+    """Kills by phase."""
+    return named_table(
+        "Kills by what they struck",
+        [
+            {"victim": name, "kills": len(each.kills), "runs": each.runs}
+            | {phase: sum(k.phase == phase for k in each.kills) for phase in PHASES}
+            | {"torn lines": sum(k.torn for k in each.kills), "differences": len(each.differs)}
+            for name, each in killed.items()
+        ],
+        meanings={
+            "runs": "that they were spread over; each ended by itself after its last kill",
+            "torn lines": "kills that left half a line in the log",
+            "differences": "from the undisturbed run, in any bit",
+        },
         note="Compared are metrics.jsonl, all answers, results, and step, iterator and every array of every stage.",
     )
 
 
-def _damage_table(damage: Damages) -> Table:
-    kinds = tuple(dict.fromkeys((file, way) for file, way, _, _ in damage))
-    rows: list[tuple[Cell, ...]] = []
-    for file, way in kinds:
-        same = [row for row in damage if row[:2] == (file, way)]
-        rows.append((f"{file}, {way}", *(sum(r[2] == o for r in same) for o in OUTCOMES), same[0][3][:CELL]))
-    return Table(
-        title="Damaged files of a run that goes on",
-        columns=(Column(name="damage"), *(Column(name=o) for o in OUTCOMES), Column(name="said")),
-        rows=tuple(rows),
-        note="Of the newest of two checkpoints all files, and those of the run that its next session reads.",
+def damage_table(damage: Sequence[Damage]) -> Table:
+    """Ends by kind of file and damage."""
+    by_kind: dict[str, list[Damage]] = {}
+    for one in damage:
+        by_kind.setdefault(f"{one.file}, {one.damage}", []).append(one)
+    return named_table(
+        "Damaged files of a run that goes on",
+        [
+            {"damage": kind}
+            | {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
+            | {"said": same[0].message[:CELL]}
+            for kind, same in by_kind.items()
+        ],
+        note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
     )
 
 
-def _input_table(inputs: Inputs) -> Table:
-    return Table(
-        title="Bad inputs",
-        columns=(
-            Column(name="input"),
-            Column(name="kind"),
-            Column(name="exit code"),
-            Column(name="answer"),
-            Column(name="faults", meaning="what the answer lacks, and what was lost or left half-written"),
-        ),
-        rows=tuple((name, kind, code, line[:CELL], faults or "none") for kind, name, code, line, faults in inputs),
+def input_table(inputs: Sequence[InputRow]) -> Table:
+    """Every bad input and its answer."""
+    return named_table(
+        "Bad inputs",
+        [{**row, "answer": row["answer"][:CELL], "faults": row["faults"] or "none"} for row in inputs],
+        meanings={"faults": "what the answer lacks, and what was lost or left half-written"},
     )
 
 
-def _waiting_table(waited: Waits) -> Table:
-    return Table(
-        title="Waiting for data, on a CPU",
-        columns=(
-            Column(name="stage"),
-            Column(name="in steps", unit="s", format=".2f", meaning="after the first, which compiles"),
-            Column(name="waiting", unit="s", format=".4f", meaning="the device idle, the next batch not there"),
-            Column(name="share", unit="%", format=".3f"),
-        ),
-        rows=tuple((stage, steps_s, wait_s, 100 * wait_s / steps_s) for stage, (steps_s, wait_s) in waited.items()),
-        note="In every run the same is kept in timing.json and printed at the end of each stage.",
+def waiting_table(waited: Waits) -> Table:
+    """Waits of every stage."""
+    rows = [
+        {"stage": stage, "in steps": steps_s, "waiting": wait_s, "share": 100 * wait_s / steps_s}
+        for stage, (steps_s, wait_s) in waited.items()
+    ]
+    return named_table(
+        "Waiting for data, on a CPU",
+        rows,
+        formats={"in steps": ".2f", "waiting": ".4f", "share": ".3f"},
+        units={"in steps": "s", "waiting": "s", "share": "%"},
+        meanings={"in steps": "after the first, which compiles", "waiting": "device idle, the next batch not ready"},
+        note="Every run writes the same times to timing.json and prints them at the end of each stage.",
+    )
+
+
+def kill_picture(kills: Mapping[str, Sequence[Kill]]) -> Picture:
+    """Kills by phase, and by the share of the run's steps that were done, over all trainings."""
+    phases = [phase for phase in PHASES if any(kill.phase == phase for each in kills.values() for kill in each)]
+    edges = np.linspace(0, 100, 21)
+    by_phase, by_share = [], []
+    for name, each in kills.items():
+        by_phase.append(Series(name, x=[sum(k.phase == phase for k in each) for phase in phases], bar=True))
+        counts = np.histogram([100 * kill.done for kill in each], edges)[0]
+        by_share.append(Series(name, x=counts[::-1], bar=True))
+    shares = [f"{low:.0f}–{low + 5:.0f}" for low in edges[-2::-1]]
+    panels = [
+        Panel(by_phase, rows=phases, stacked=True, written=".0f", x_label="kills"),
+        Panel(by_share, rows=shares, stacked=True, x_label="kills", title="steps of the run done, %"),
+    ]
+    return Picture(
+        name="stability_faults",
+        title="Where the kills struck",
+        caption="Left: the phase of the session, from the files that it left on the disk. Right: the share of the run "
+        "that had been logged by then.",
+        content=draw(panels, columns=2),
     )
 
 

@@ -1,15 +1,17 @@
-"""The vendor's Tac3D recordings: what is missing in them, and how fast their messages decode."""
+"""The vendor's Tac3D recordings: the gaps that the reader counts in them, and the time to decode their messages."""
 
 import dataclasses
+import functools
 import importlib.util
 import pathlib
 import struct
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from experiments.core.results import Requirement, Table, at_most, named_table
 from experiments.core.timing import interleaved
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices import tac3d_messages
@@ -20,10 +22,12 @@ from sensors_io.devices.sources import Tac3dRecording
 from sensors_io.sync import ClockMap
 
 YAML = importlib.util.find_spec("ruamel") is not None and importlib.util.find_spec("ruamel.yaml") is not None
-"""Whether the vendor's parser is installed, so that its way can be timed."""
+"""Whether the vendor's parser is installed, so that it can be timed."""
 
-BY_YAML = "YAML each time, as the vendor does"
+CACHED, BY_YAML = "cached layout", "YAML each time, as the vendor does"
+
 _PART_BYTES = 1400  # of a packet: below the Ethernet's 1500
+_REPEATS = 20  # decodings in a round of timing
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,10 +37,10 @@ class RecordingCheck:
     Args:
       name: of the recording.
       frames: in it.
-      missing, gap_s: indices that are not there, largest time between two frames; by the arrays.
+      missing, gap_s: missing indices, largest time between two frames; by the arrays.
       counts: of the reader.
-      seen_gap_s: largest time between two samples that the reader gave.
-      late_s: of arrival behind the mapped stamps, median and largest, [2]; NaN where arrival was not recorded.
+      read_gap_s: largest time between two samples of the reader.
+      late_s: of arrival after the mapped stamps, median and largest, [2]; NaN where arrival was not recorded.
     """
 
     name: str
@@ -44,12 +48,28 @@ class RecordingCheck:
     missing: int
     gap_s: float
     counts: Counts
-    seen_gap_s: float
+    read_gap_s: float
     late_s: np.ndarray
 
 
+def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
+    """The vendor's recordings below a directory.
+
+    Raises:
+      FileNotFoundError: a directory without any.
+    """
+    if data_dir is None:
+        return []
+    found = sorted((data_dir / "tac3d").glob("*.npz"))
+    if not found:
+        raise FileNotFoundError(
+            f"data_dir is {data_dir}: must hold tac3d/*.npz; give another directory or leave it out"
+        )
+    return found
+
+
 def check(path: pathlib.Path) -> RecordingCheck:
-    """Replay a recording through a reader in compressed time, and hold its books against the arrays."""
+    """Replay a recording through a reader in compressed time, and count its gaps by its arrays too."""
     truth = tac3d_messages.load_recording(path)
     clock = JumpingClock()
     intake = Intake(capacity=len(truth.index) + 1, clock=clock)
@@ -61,20 +81,19 @@ def check(path: pathlib.Path) -> RecordingCheck:
     while intake.counts.waiting:
         times.append(intake.next(0.0).device_time_ns or 0)
     present = set(truth.index.tolist())
-    missing = sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1))
     return RecordingCheck(
         name=path.stem,
         frames=len(truth.index),
-        missing=missing,
+        missing=sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1)),
         gap_s=float(np.diff(truth.send_time_s).max()),
         counts=intake.counts,
-        seen_gap_s=float(np.diff(times).max()) / NS_PER_S,
+        read_gap_s=float(np.diff(times).max()) / NS_PER_S,
         late_s=_lateness_s(truth),
     )
 
 
 def _lateness_s(recording: tac3d_messages.Recording) -> np.ndarray:
-    """How much later messages arrived than the running minimum says they were sent, median and largest."""
+    """Time of arrival after the stamp by running minimum, median and largest."""
     if recording.receive_time_s is None:
         return np.full(2, np.nan)
     clock = ClockMap()
@@ -84,7 +103,7 @@ def _lateness_s(recording: tac3d_messages.Recording) -> np.ndarray:
 
 
 def message(path: pathlib.Path | None) -> list[bytes]:
-    """The middle message of a recording as the vendor's program sends it, in packets; random numbers without one."""
+    """Packets of the middle message of a recording as the vendor's program sends it; of random numbers without one."""
     if path is None:
         rng = np.random.default_rng(0)
         arrays = {
@@ -108,31 +127,28 @@ def message(path: pathlib.Path | None) -> list[bytes]:
     return [struct.pack("=IHH", 1, len(parts) - 1, k) + part for k, part in enumerate(parts)]
 
 
-def decode_ms(packets: list[bytes], rounds: Iterable[object], repeats: int = 20) -> dict[str, np.ndarray]:
-    """Time of one message by every way, ms [rounds]: decoding alone, from the packets, as samples, by YAML."""
-    whole = _joined(packets)
+def decode_ms(packets: list[bytes], rounds: Iterable[object]) -> dict[str, np.ndarray]:
+    """Milliseconds to decode one message by every method, [rounds]."""
+    layout, data = _joined(packets)
     decoder = tac3d_messages.Decoder()
     calls: dict[str, Callable[[], Any]] = {
-        "cached layout": lambda: decoder.decode(*whole),
-        "cached layout, packets joined, schema's arrays": lambda: tac3d_messages.to_schema(
+        CACHED: lambda: decoder.decode(layout, data),
+        f"{CACHED}, packets joined, schema's arrays": lambda: tac3d_messages.to_schema(
             decoder.decode(*_joined(packets)).matrices
         ),
-        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(*whole),
+        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(layout, data),
     }
     if YAML:
-        calls[BY_YAML] = _by_yaml(*whole)
+        calls[BY_YAML] = functools.partial(_decode_by_yaml, layout, data)
 
-    def repeated(call: Callable[[], Any]) -> Callable[[], None]:
-        def run() -> None:
-            for _ in range(repeats):
-                call()
+    def repeated(call: Callable[[], Any]) -> None:
+        for _ in range(_REPEATS):
+            call()
 
-        return run
-
-    ready = {name: repeated(call) for name, call in calls.items()}
+    ready = {name: functools.partial(repeated, call) for name, call in calls.items()}
     for call in ready.values():
         call()
-    return {name: 1e3 * s / repeats for name, s in interleaved(ready, rounds).items()}
+    return {name: 1e3 * s / _REPEATS for name, s in interleaved(ready, rounds).items()}
 
 
 def _joined(packets: list[bytes]) -> tuple[bytes, bytes]:
@@ -141,19 +157,67 @@ def _joined(packets: list[bytes]) -> tuple[bytes, bytes]:
     return found[0]
 
 
-def _by_yaml(layout: bytes, data: bytes) -> Callable[[], Mapping[str, np.ndarray]]:
-    """The vendor's way: the whole layout through a YAML parser for every message."""
+@functools.cache
+def _yaml_parser() -> Any:
     from ruamel.yaml import YAML as Parser
 
-    parser = Parser()
+    return Parser()
 
-    def decode() -> Mapping[str, np.ndarray]:
-        tree = parser.load(layout.decode("ascii"))
-        return {
-            item["name"]: np.frombuffer(data[item["offset"] : item["offset"] + item["length"]]).reshape(
-                item["height"], item["width"]
-            )
-            for item in tree["data"]
+
+def _decode_by_yaml(layout: bytes, data: bytes) -> Mapping[str, np.ndarray]:
+    """The vendor's method: the whole layout through a YAML parser for every message."""
+    arrays = {}
+    for item in _yaml_parser().load(layout.decode("ascii"))["data"]:
+        content = data[item["offset"] : item["offset"] + item["length"]]
+        arrays[item["name"]] = np.frombuffer(content).reshape(item["height"], item["width"])
+    return arrays
+
+
+def requirements(checks: Sequence[RecordingCheck], decode: Mapping[str, np.ndarray]) -> tuple[Requirement, ...]:
+    """Bounds on the time of a message and on the errors of the reader on the vendor's recordings."""
+    speed = at_most("Tac3D message decoded", float(np.median(decode[CACHED])), 0.05, "ms")
+    if not checks:
+        return (speed,)
+    off = sum(abs(c.missing - c.counts.missing) for c in checks)
+    gap = max(abs(c.gap_s - c.read_gap_s) for c in checks)
+    return (
+        speed,
+        at_most("Tac3D recordings: missing indices not counted", off, 0),
+        at_most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
+    )
+
+
+def recording_table(checks: Sequence[RecordingCheck]) -> Table:
+    """Gaps and lateness of the vendor's recordings."""
+    late = lambda seconds: None if np.isnan(seconds) else 1e3 * float(seconds)
+    rows = [
+        {
+            "recording": c.name, "frames": c.frames, "missing": c.missing, "counted": c.counts.missing,
+            "largest gap": 1e3 * c.gap_s, "as seen": 1e3 * c.read_gap_s, "late, median": late(c.late_s[0]),
+            "late, worst": late(c.late_s[1]),
         }
+        for c in checks
+    ]  # fmt: skip
+    counts, gaps, lates = (list(rows[0])[i:j] for i, j in ((1, 4), (4, 6), (6, 8)))
+    return named_table(
+        "The vendor's Tac3D recordings",
+        rows,
+        formats=dict.fromkeys(counts, "d") | dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
+        units=dict.fromkeys([*gaps, *lates], "ms"),
+        meanings={
+            "missing": "by the arrays",
+            "counted": "by the reader",
+            "late, median": "arrival after the stamp by running minimum",
+        },
+    )
 
-    return decode
+
+def decoder_table(decode: Mapping[str, np.ndarray]) -> Table:
+    """Time of one message by every method."""
+    median = {name: float(np.median(ms)) for name, ms in decode.items()}
+    rows = [
+        {"way": name, "median": m, "p95": float(np.quantile(decode[name], 0.95)), "against cached": m / median[CACHED]}
+        for name, m in median.items()
+    ]
+    formats = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}
+    return named_table("Time to decode one Tac3D message", rows, formats=formats, units={"median": "ms", "p95": "ms"})

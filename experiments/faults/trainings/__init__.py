@@ -1,4 +1,4 @@
-"""Three small trainings for faults to strike: a loop of three numbers, GRPO alone, a whole study."""
+"""Three small trainings to be disturbed: a loop of three numbers, GRPO alone, a whole study."""
 
 PACKAGE = __name__
 """The package in which the command line finds them: `main(["counting"], package=PACKAGE)`."""

@@ -8,14 +8,13 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.core.loops import run_loop
-from experiments.core.runner import main
 from experiments.faults.digests import differences, digests
-from experiments.faults.fixtures import counting_paths, run_directory
-from experiments.faults.trainings import PACKAGE, counting
+from experiments.faults.fixtures import run_counting, run_directory
+from experiments.faults.trainings import counting
 
 
 def run(folder, *options: str) -> int:
-    return main(["counting", *counting_paths(folder), *options], package=PACKAGE)
+    return run_counting(folder, *options)
 
 
 def lines(folder) -> list[dict]:

@@ -1,11 +1,10 @@
-"""Bad input through the public command lines: named, placed, with a way out, nothing lost and nothing half-written."""
+"""Bad input through the public command lines: error, place and way out are named, nothing is lost or half-written."""
 
 from pathlib import Path
 
 import pytest
 
-from experiments.faults.bad_input import BadInput, contents, provoke
-from experiments.faults.bad_inputs import cases
+from experiments.faults.bad_inputs import BadInput, cases, contents, provoke
 from experiments.faults.fixtures import flipped, replaced, unfinished_run, write_records
 from sensors_io.records import RecordStore
 
@@ -13,6 +12,9 @@ from sensors_io.records import RecordStore
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 NAMES = [case.name for case in cases(unfinished=Path())]
+
+SLOW = {"recordings without a folder", "targets that are NaN from step 5 on", "a scale that there is not"}
+"""Half of the time of all: programs are compiled or many modules imported for them."""
 
 
 @pytest.fixture(scope="module")
@@ -26,66 +28,48 @@ def test_there_are_at_least_25_kinds():
     assert len(set(NAMES)) == len(NAMES) >= 25
 
 
-SLOW = {"recordings without a folder", "targets that are NaN from step 5 on", "a scale that there is not"}
-"""Half of the time of all: programs are compiled or many modules imported for them."""
-
-
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in NAMES])
 def test_bad_input_is_answered(unfinished, tmp_path, name):
     (case,) = (case for case in cases(unfinished) if case.name == name)
     found = provoke(case, tmp_path)
-    assert not found.faults, found.said
+    assert not found.faults, found.output
     assert found.line
 
 
 def test_good_input_is_a_fault_of_its_case(tmp_path):
-    """A case that spoils nothing is noticed: the command succeeds and says nothing of an error."""
-    case = BadInput(
-        kind="records",
-        name="good records",
-        program="sensors_io",
-        arguments=lambda folder: ["check", folder / "records"],
-        prepare=write_records,
-        error="CorruptRecordsError",
-        where="records",
-        fix="copy it again",
-    )
+    """A case whose input is not bad is noticed: the command succeeds and names no error."""
+    command = "sensors_io check {folder}/records"
+    case = BadInput("records", "good", command, "CorruptRecordsError", "records", "copy it again", write_records)
     found = provoke(case, tmp_path)
     assert found.faults[0] == "the exit code is 0"
     assert "the message names no error 'CorruptRecordsError'" in found.faults
     assert len(RecordStore(tmp_path / "records")) == 2
 
 
-def test_lost_and_half_written_files_are_seen(tmp_path):
-    def lose(folder):
+def test_lost_and_half_written_files_are_noticed(tmp_path):
+    class Losing:
+        def __enter__(self):
+            (tmp_path / "lost").unlink()
+            (tmp_path / ".half.tmp").write_text("x")
+
+        def __exit__(self, *error):
+            pass
+
+    def prepare(folder):
         (folder / "kept").write_text("one")
         (folder / "lost").write_text("two")
 
-    def command(folder):
-        (folder / "lost").unlink()
-        (folder / ".half.tmp").write_text("x")
-        return ["nothing"]
-
-    case = BadInput(
-        kind="run",
-        name="a program that loses a file",
-        program="faults",
-        arguments=command,
-        prepare=lose,
-        error="There is no experiment",
-        where="'nothing'",
-        fix="experiments:",
-    )
-    found = provoke(case, tmp_path)
-    assert found.faults == ("lost lost", "half-written .half.tmp")
+    expected = ("There is no experiment", "'nothing'", "Did you mean")
+    case = BadInput("run", "a loss", "trainings nothing", *expected, prepare, lambda folder: Losing())
+    assert provoke(case, tmp_path).faults == ("lost lost", "half-written .half.tmp")
 
 
-def test_spoiling_spoils(tmp_path):
+def test_damage_changes_a_file(tmp_path):
     path = tmp_path / "file"
     path.write_bytes(bytes(10) + b"abc" + bytes(10))
     flipped(path)
     assert path.read_bytes() == bytes(10) + b"a\x9dc" + bytes(10)
     path.write_text("abc")
-    with pytest.raises(ValueError, match="spoils nothing"):
+    with pytest.raises(ValueError, match="must hold the text"):
         replaced(path, "z", "y")
     assert set(contents(tmp_path)) == {"file"}

@@ -1,16 +1,16 @@
-"""What a checkpoint comes to: its numbers and its data iterator, whoever held them and whatever lies beside."""
+"""Digests of a run depend on the numbers of its checkpoints and of its data iterator, not on the devices used."""
 
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
 import pytest
 
 from experiments.core.artifacts import write_json
-from experiments.faults.digests import digests
+from experiments.faults.digests import differences, digests
 
 
 @pytest.fixture
 def run(tmp_path):
-    """A finished run by the numbers of its one checkpoint."""
+    """A finished run with one checkpoint of these numbers."""
 
     def make(name: str, weight: float = 1.0, drawn: bytes = b"3"):
         directory = tmp_path / name
@@ -26,18 +26,20 @@ def run(tmp_path):
     return make
 
 
-STATE = "state of sft/0"
-
-
 def test_numbers_and_the_data_iterator_count(run):
-    a = digests(run("a"))[STATE]
-    assert a == digests(run("b"))[STATE]
-    assert a != digests(run("c", weight=1.0 + 1e-7))[STATE]
-    assert a != digests(run("d", drawn=b"4"))[STATE]
+    a = digests(run("a"))
+    assert a == digests(run("b"))
+    for name, change in (("c", {"weight": 1.0 + 1e-7}), ("d", {"drawn": b"4"})):
+        assert differences(a, digests(run(name, **change))) == ("state of sft/0",)
 
 
-def test_a_damaged_note_of_who_held_the_arrays_does_not(run):
+def test_the_file_that_names_the_devices_does_not_count(run):
     whole, damaged = run("a"), run("b")
-    note = damaged / "checkpoints" / "sft" / "0" / "12" / "state" / "_sharding"
-    note.write_bytes(b"\x80" + note.read_bytes()[1:])
+    sharding = damaged / "checkpoints" / "sft" / "0" / "12" / "state" / "_sharding"
+    sharding.write_bytes(b"\x80" + sharding.read_bytes()[1:])
     assert digests(whole) == digests(damaged)
+
+
+def test_differences_are_named():
+    assert differences({"a": "1", "b": "2"}, {"a": "1", "b": "3", "c": "4"}) == ("b", "c")
+    assert differences({"a": "1"}, {"a": "1"}) == ()

@@ -1,4 +1,4 @@
-"""The replay, shrunk: every account is exact, the vendor's gaps are found."""
+"""The experiment, shrunk: every sample is accounted for, the vendor's gaps are found."""
 
 import dataclasses
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.runner import main
 from experiments.faults import stability_devices
+from experiments.faults.tac3d_recordings import recordings
+from tests.experiments.shrunk import run_shrunk
 
 TINY = dataclasses.replace(
     stability_devices.SMOKE,
@@ -29,15 +30,11 @@ def results(tmp_path_factory):
     index = np.array([7, 8, 9, 12, 13, 20])
     arrays = {"3D_Displacements": np.zeros((6, 400, 3)), "3D_ResultantForce": np.zeros((6, 1, 3))}
     np.savez(data / "tac3d" / "AD2-1.npz", index=index, sendTimestamp=index * 0.0327, **arrays)
-    with pytest.MonkeyPatch.context() as patch:
-        small = dataclasses.replace(stability_devices.EXPERIMENT, config=dataclasses.replace(TINY, data_dir=data))
-        patch.setattr(stability_devices, "EXPERIMENT", small)
-        assert main(["stability_devices", "--runs-dir", str(home)]) == 0
-    (directory,) = (p for p in (home / "stability_devices").iterdir() if not p.is_symlink())
+    directory = run_shrunk(stability_devices, dataclasses.replace(TINY, data_dir=data), home)
     return read_json(directory / "results.json")
 
 
-def test_the_books_are_exact(results):
+def test_all_counts_are_exact(results):
     timed = {  # by the clock, by the process
         "Tac3D message decoded",
         "memory gained from the first tenth to the last",
@@ -61,5 +58,5 @@ def test_every_replay_and_recording_is_reported(results):
 
 def test_a_directory_without_recordings_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="must hold tac3d"):
-        stability_devices.recordings(tmp_path)
-    assert stability_devices.recordings(None) == []
+        recordings(tmp_path)
+    assert recordings(None) == []

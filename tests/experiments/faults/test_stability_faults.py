@@ -1,4 +1,4 @@
-"""The experiment from parts that are known, and, slowly, as a whole."""
+"""Requirements and tables from known parts, and, slowly, the experiment as a whole."""
 
 import dataclasses
 
@@ -6,60 +6,48 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.faults import stability_faults
-from experiments.faults.damaged_files import OLDER, SAME, WRONG, strike
+from experiments.faults.damaged_files import OLDER, OUTCOMES, SAME, WRONG, Damage, damage_each
 from experiments.faults.data_waits import WaitingConfig
 from experiments.faults.fixtures import unfinished_run
-from experiments.faults.kill_charts import where_kills_struck
-from experiments.faults.killable_session import START, STEPPING, Kill
+from experiments.faults.sessions import START, STEPPING, Kill
+from experiments.faults.stability_faults import GRPO, KilledRuns, damage_table, kill_picture, kill_table, requirements
 from tests.experiments import tiny
 from tests.experiments.encoder.test_pretrain_encoder import PRETRAIN
 from tests.experiments.shrunk import run_shrunk
 
 STRUCK = Kill(phase=STEPPING["sft"], after_s=2.0, done=0.5, torn=True)
 AT_START = dataclasses.replace(STRUCK, phase=START, torn=False)
+KILLED = KilledRuns(kills=(STRUCK,) * 150 + (AT_START,) * 50, runs=1, differs=())
+DAMAGE = Damage(file="config.json", damage="removed", outcome=SAME, message="")
+ANSWERED = [{"input": f"{i}", "kind": "run", "exit code": 1, "answer": "Error", "faults": ""} for i in range(25)]
 
 
-def findings(differs=(), damage=(), inputs=()):
-    """Figures of the report from 150 kills in steps and 50 at start-up."""
-    struck = (STRUCK,) * 150 + (AT_START,) * 50
-    killed = {stability_faults.GRPO: stability_faults.KilledRuns(kills=struck, runs=1, differs=differs)}
-    waited = {"sft/0": (10.0, 0.1)}
-    parts = (killed, damage, inputs, waited)
-    met = {r.name: r.met for r in stability_faults._requirements(*parts)}
-    return met, stability_faults._verdict(*parts), stability_faults._kill_table(killed)
-
-
-GOOD = [("run", f"input {i}", 1, "Error: as it must be", "") for i in range(25)]
+def unmet(killed=KILLED, damage=(DAMAGE,), inputs=ANSWERED):
+    """Names of the requirements that are not met, where 0.1 s of 10 s are waited."""
+    found = requirements({GRPO: killed}, list(damage), list(inputs), {"sft/0": (10.0, 0.1)})
+    return {r.name for r in found if not r.met}
 
 
 def test_all_is_met_where_nothing_differs():
-    met, verdict, table = findings(damage=[("config.json", "removed", SAME, "")], inputs=GOOD)
-    assert all(met.values())
-    assert "the GRPO run was killed 200 times in 1 run and ended in the same bits" in verdict[0]
-    assert "1.00% of a training step waits" in verdict[3]
-    assert dict(zip((c.name for c in table.columns), table.rows[0], strict=True))["torn lines"] == 150
+    assert unmet() == set()
 
 
-def test_tables_hold_a_row_for_each_thing():
-    damage = [("config.json", "removed", SAME, ""), ("x", "emptied", OLDER, "it is kept as damaged-12")]
-    struck, tried = stability_faults._damage_table(damage), stability_faults._input_table(GOOD)
-    assert [row[0] for row in struck.rows] == ["config.json, removed", "x, emptied"]
-    assert [sum(row[1:-1]) for row in struck.rows] == [1, 1]
-    assert len(tried.rows) == len(GOOD)
-    assert stability_faults._waiting_table({"sft/0": (10.0, 0.1)}).rows == (("sft/0", 10.0, 0.1, 1.0),)
-    assert where_kills_struck({"study": [STRUCK, AT_START]}).startswith(b"<?xml")
+def test_every_fault_breaks_its_requirement():
+    differs = dataclasses.replace(KILLED, differs=("run 0: metrics.jsonl",))
+    assert unmet(killed=differs) == {"files that differ after them"}
+    assert unmet(damage=[DAMAGE, dataclasses.replace(DAMAGE, outcome=WRONG)]) == {"damaged files with a wrong end"}
+    silent = {**ANSWERED[0], "faults": "the exit code is 0"}
+    assert unmet(inputs=[*ANSWERED, silent]) == {"kinds of bad input not answered"}
 
 
-def test_a_difference_a_wrong_end_and_an_answer_that_lacks_something_are_not_met():
-    damage = [("config.json", "removed", WRONG, ""), ("x", "emptied", OLDER, "")]
-    bad = [*GOOD, ("run", "one more", 0, "", "the exit code is 0")]
-    met, verdict, _ = findings(differs=("run 0: metrics.jsonl",), damage=damage, inputs=bad)
-    assert {name for name, ok in met.items() if not ok} == {
-        "files that differ after them",
-        "damaged files with a wrong end",
-        "kinds of bad input not answered",
-    }
-    assert "differs in run 0: metrics.jsonl" in verdict[0]
+def test_kills_and_damage_are_counted():
+    table = kill_table({GRPO: KILLED})
+    row = dict(zip((column.name for column in table.columns), table.rows[0], strict=True))
+    assert (row["kills"], row[START], row[STEPPING["sft"]], row["torn lines"]) == (200, 50, 150, 150)
+    other = dataclasses.replace(DAMAGE, file="x", outcome=OLDER)
+    by_kind = [dict(zip(OUTCOMES, row[1:], strict=False)) for row in damage_table([DAMAGE, DAMAGE, other]).rows]
+    assert [(row[SAME], row[OLDER]) for row in by_kind] == [(2, 0), (0, 1)]
+    assert kill_picture({"study": [STRUCK, AT_START]}).content.startswith(b"<?xml")
 
 
 @pytest.mark.slow
@@ -69,7 +57,7 @@ def test_a_damaged_checkpoint_ends_the_same_or_names_what_is_wrong(tmp_path, con
     for folder in (unfinished, scratch):
         folder.mkdir()
     unfinished_run(unfinished)
-    outcomes = [one.outcome for one in strike(unfinished, scratch, context, most=3)]
+    outcomes = [one.outcome for one in damage_each(unfinished, scratch, context, most=3)]
     assert outcomes
     assert WRONG not in outcomes
 
