@@ -4,10 +4,10 @@
 
 On the first device, in bfloat16 but for the tactile encoder, which computes in float32: a plain matrix product as the
 yardstick; causal attention of prompts at the 7B's shapes, by the engine and by flash attention through
-`jax.nn.dot_product_attention`, both held to float32; the tactile encoder and Qwen2.5-VL's vision tower, forward and
-backward; decoding, and one GRPO step of a policy of Qwen2.5's 1.5B shape with the reference and the counterfactual
-pass.  What a step reserves is held against the count by hand that `scale_paper` rests on.  Without a GPU it refuses;
-`--scale smoke` is tiny and runs anywhere, to try the code.
+`jax.nn.dot_product_attention`, both compared with float32; the tactile encoder and Qwen2.5-VL's vision tower, forward
+and backward; decoding, and one GRPO step of a policy of Qwen2.5's 1.5B shape with the reference and the counterfactual
+pass.  The memory that the compiler reserves for a step is compared with the count by hand that `scale_paper` uses.
+Without a GPU it refuses to run; `--scale smoke` is tiny and runs anywhere, to try the code.
 
 Cost: not measured, for no GPU was at hand yet; `--scale smoke` under a minute.
 
@@ -15,6 +15,7 @@ Expected: the product reaches 60 to 80 % of the data sheet, flash attention seve
 is bound by the memory, so that a GRPO step stays below a third of the peak.
 """
 
+import dataclasses
 import functools
 import re
 from collections.abc import Callable, Mapping
@@ -23,22 +24,23 @@ import jax
 
 from experiments.core.charts import bars
 from experiments.core.context import Context
-from experiments.core.results import Column, Picture, Requirement, Results, Table
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
-from experiments.engine.attention import AttentionInputs, draw_heads, errors
-from experiments.engine.gpu_config import GpuConfig
-from experiments.engine.gpu_device import DataSheet, accelerator, sheet_of
-from experiments.engine.gpu_pieces import (
+from experiments.engine.gpu_workloads import (
+    AttentionInputs,
+    GpuConfig,
     PolicyWorkloads,
+    TimedWorkload,
     Workload,
-    attention,
+    attention_errors,
+    attention_variants,
+    attention_workload,
+    draw_heads,
     product,
     tactile_encoder,
     vision_tower,
-    ways,
 )
-from experiments.engine.gpu_tables import TimedWorkload, time_table
 from experiments.engine.peers import JobSize
 from touchr1_jax.distributed.memory import Compiled
 from touchr1_jax.models.qwen.config import QwenVisionConfig
@@ -49,29 +51,71 @@ PRODUCT, STEP = "matrix product", "GRPO step"
 TACTILE = "tactile encoder, float32"
 
 OFF_FLOAT32 = 0.02
-"""Most that attention in bfloat16, which rounds by .004, may be off, over the largest number."""
+"""Largest error of attention in bfloat16, which rounds by .004, over the largest number."""
 
 GB = 1e9
 
 
+class NoAccelerator(OSError):
+    """JAX sees no GPU."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DataSheet:
+    """Promised rates: dense bfloat16 operations and bytes of memory read, a second."""
+
+    flops: float
+    read_bytes: float
+
+
+SHEETS = {
+    "H200": DataSheet(flops=989e12, read_bytes=4.8e12),
+    "H100 PCIe": DataSheet(flops=756e12, read_bytes=2.0e12),
+    "H100": DataSheet(flops=989e12, read_bytes=3.35e12),
+    "A100": DataSheet(flops=312e12, read_bytes=2.0e12),
+    "L40S": DataSheet(flops=362e12, read_bytes=0.864e12),
+}
+"""Part of the driver's name of a device → NVIDIA's data sheet; the first that fits counts."""
+
+
+def sheet_of(kind: str) -> DataSheet | None:
+    """The data sheet of a device by its name; `None` where it is not known."""
+    return next((sheet for name, sheet in SHEETS.items() if name in kind), None)
+
+
+def accelerator(*, anywhere: bool) -> jax.Device:
+    """The first device; `anywhere` accepts a CPU too.
+
+    Raises:
+      NoAccelerator: it is no GPU.
+    """
+    device = jax.devices()[0]
+    if device.platform != "gpu" and not anywhere:
+        raise NoAccelerator(
+            f"the first device is {device.device_kind} on {device.platform}: must be a GPU; install JAX with CUDA "
+            '(pip install "jax[cuda12]") on a machine that has one, or try the code with --scale smoke'
+        )
+    return device
+
+
 def run(config: GpuConfig, context: Context) -> Results:
-    """Time every piece, then compare attention and memory with what they must be."""
+    """Time every workload, then compare attention with float32 and memory with the count."""
     device = accelerator(anywhere=config.anywhere)
-    with context.progress("drawing what attends", 1) as advance:
+    with context.progress("drawing the attention inputs", 1) as advance:
         heads = draw_heads(config.prompts, config.tokens, config.heads, config.kv_heads, config.head_dim)
         advance()
     timed = measured("pieces", without_policy(config, heads), config.rounds, context)
-    off = errors(heads, ways(config), context)
+    off = attention_errors(heads, attention_variants(config), context)
     del heads
     with context.progress("making the policy", 2) as advance:
-        learning = PolicyWorkloads(config)
+        policy = PolicyWorkloads(config)
         advance()
-        reserved, counted = learning.memory()
+        reserved, counted = policy.memory()
         advance()
-    timed |= measured("the policy", {"decoding": learning.decoding, STEP: learning.step}, config.rounds, context)
+    timed |= measured("the policy", {"decoding": policy.decoding, STEP: policy.step}, config.rounds, context)
     sheet = sheet_of(device.device_kind)
     first = timed[PRODUCT]
-    peak = first.flops / min(first.seconds) if sheet is None else sheet.flops
+    peak = first.workload.flops / min(first.seconds) if sheet is None else sheet.flops
     return Results(
         verdict=verdict(device, timed, peak, sheet),
         requirements=tuple(
@@ -84,7 +128,9 @@ def run(config: GpuConfig, context: Context) -> Results:
                 name="share",
                 title="Share of the peak",
                 caption="Operations that no program can avoid, over the time that they took and the device's peak.",
-                content=bars({n: 100 * t.share(peak) for n, t in timed.items()}, "share of the peak, %", written=".1f"),
+                content=bars(
+                    {n: 100 * t.flops / peak for n, t in timed.items()}, "share of the peak, %", written=".1f"
+                ),
             ),
         ),
         settings={"device": device.device_kind, "platform": device.platform, "jax": jax.__version__},
@@ -92,12 +138,12 @@ def run(config: GpuConfig, context: Context) -> Results:
 
 
 def without_policy(config: GpuConfig, heads: AttentionInputs) -> dict[str, Callable[[], Workload]]:
-    """How to make the product, attention and the encoders."""
+    """Makers of the product, attention and the encoders by name."""
     pieces: dict[str, Callable[[], Workload]] = {PRODUCT: functools.partial(product, config)}
-    for name, way in ways(config).items():
+    for name, attend in attention_variants(config).items():
         for gradient in (False, True):
             title = f"attention, {name}{', with gradient' if gradient else ''}"
-            pieces[title] = functools.partial(attention, config, heads, way, gradient=gradient)
+            pieces[title] = functools.partial(attention_workload, config, heads, attend, gradient=gradient)
     return pieces | {
         TACTILE: functools.partial(tactile_encoder, config),
         "vision tower": functools.partial(vision_tower, config),
@@ -107,58 +153,90 @@ def without_policy(config: GpuConfig, heads: AttentionInputs) -> dict[str, Calla
 def measured(
     title: str, pieces: Mapping[str, Callable[[], Workload]], rounds: int, context: Context
 ) -> dict[str, TimedWorkload]:
-    """The times of some pieces."""
+    """Make and time some workloads, one after the other."""
     shown = context.each(title, pieces.items(), still=True)
     return {name: measure(name, make, rounds, context) for name, make in shown}
 
 
 def measure(name: str, make: Callable[[], Workload], rounds: int, context: Context) -> TimedWorkload:
-    """Make a piece, run it twice, time it."""
+    """Make a workload, run it twice, time it."""
     with context.timed(re.sub(r"\W+", "_", name)):
         piece = make()
         for _ in range(2):
             jax.block_until_ready(piece.call())
         seconds = interleaved({name: piece.call}, context.rounds(f"timing {name}", rounds))[name]
-    timed = TimedWorkload(tuple(seconds.tolist()), piece.flops, piece.read_bytes, piece.made, piece.unit)
-    context.print(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / timed.median_s / 1e12:.3g} TFLOP/s")
+    timed = TimedWorkload(tuple(seconds.tolist()), piece)
+    context.print(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / 1e12:.3g} TFLOP/s")
     return timed
-
-
-def memory_table(reserved: Compiled, counted: int, device: jax.Device) -> Table:
-    """What the compiler reserves for a GRPO step, what the count says, and what the allocator saw so far."""
-    seen = device.memory_stats() or {}
-    most = seen.get("peak_bytes_in_use")
-    return Table(
-        title="Memory of a GRPO step",
-        columns=(
-            Column(name="who says so"),
-            Column(name="memory", unit="GB", format=".3g"),
-        ),
-        rows=(
-            ("counted by hand", counted / GB),
-            ("XLA's compiler: arguments and what passes", reserved.peak / GB),
-            ("the allocator's peak in this process", None if most is None else most / GB),
-        ),
-        note="The allocator has seen all pieces; the step is the largest of them.",
-    )
 
 
 def verdict(
     device: jax.Device, timed: Mapping[str, TimedWorkload], peak: float, sheet: DataSheet | None
 ) -> tuple[str, ...]:
-    """What the device is, what a step takes of it, what flash attention would gain."""
+    """Time and share of the peak of a step, decoding speed, and the gain of flash attention."""
     step, decoding = timed[STEP], timed["decoding"]
-    read = decoding.read_share(sheet)
     engine, flash = (t for name, t in timed.items() if name.startswith("attention") and name.endswith("gradient"))
-    said = [
-        f"On {device.device_kind} a GRPO step takes {step.median_s:.3g} s, {step.share(peak):.1%} of the peak; "
-        f"decoding makes {decoding.made / decoding.median_s:,.0f} tokens a second"
-        + ("." if read is None else f", {read:.1%} of what the memory can deliver."),
+    read = memory_share(decoding, sheet)
+    memory = "" if read is None else f", {read:.1%} of what the memory can deliver"
+    sentences = (
+        f"On {device.device_kind} a GRPO step takes {step.median_s:.3g} s, {step.flops / peak:.1%} of the peak; "
+        f"decoding makes {decoding.made}{memory}.",
         f"Flash attention with its gradient takes {flash.median_s / engine.median_s:.2f} of the time of the engine's.",
-    ]
+    )
     if device.platform != "gpu":
-        said.insert(0, "This device is no GPU: the code was tried, and no figure here says anything about one.")
-    return tuple(said)
+        return "This device is no GPU: the code was tried, and no figure here holds for one.", *sentences
+    return sentences
+
+
+def memory_share(timed: TimedWorkload, sheet: DataSheet | None) -> float | None:
+    """Bytes read a second over the data sheet's, where both are known."""
+    return None if sheet is None or timed.read_bytes is None else timed.read_bytes / sheet.read_bytes
+
+
+def time_table(timed: Mapping[str, TimedWorkload], sheet: DataSheet | None, peak_flops: float) -> Table:
+    """Every workload against the peak."""
+    rows: list[dict[str, Cell]] = []
+    for name, t in timed.items():
+        read = memory_share(t, sheet)
+        rows.append(
+            {
+                "piece": name,
+                "median": 1e3 * t.median_s,
+                "spread": 1e3 * (max(t.seconds) - min(t.seconds)),
+                "makes": t.made,
+                "work": t.flops / 1e12,
+                "of peak": 100 * t.flops / peak_flops,
+                "of memory": None if read is None else 100 * read,
+            }
+        )
+    peak = "the data sheet" if sheet is not None else "the plain product, for the device's data sheet is not known here"
+    return named_table(
+        "Time and share of the peak",
+        rows,
+        units={"median": "ms", "spread": "ms", "work": "TFLOP/s", "of peak": "%", "of memory": "%"},
+        meanings={
+            "spread": "slowest less fastest round",
+            "work": "operations that no program can avoid, over time",
+            "of memory": "bytes that must be read, over what the memory delivers",
+        },
+        note=f"The peak is that of {peak}: {peak_flops / 1e12:.4g} TFLOP/s.",
+    )
+
+
+def memory_table(reserved: Compiled, counted: int, device: jax.Device) -> Table:
+    """Bytes of a GRPO step: counted, reserved by the compiler, and the allocator's peak so far."""
+    peak = (device.memory_stats() or {}).get("peak_bytes_in_use")
+    figures = {
+        "counted by hand": counted / GB,
+        "XLA's compiler: arguments and what passes": reserved.peak / GB,
+        "the allocator's peak in this process": None if peak is None else peak / GB,
+    }
+    return named_table(
+        "Memory of a GRPO step",
+        [{"who says so": name, "memory": size} for name, size in figures.items()],
+        units={"memory": "GB"},
+        note="The allocator has seen all pieces; the step is the largest of them.",
+    )
 
 
 DEFAULT = GpuConfig()

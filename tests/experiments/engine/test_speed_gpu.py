@@ -8,10 +8,18 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.engine import speed_gpu
-from experiments.engine.attention import draw_heads, engine_attention, errors, flash_attention, pairs, with_gradient
-from experiments.engine.gpu_config import GpuConfig
-from experiments.engine.gpu_device import NoAccelerator, accelerator, sheet_of
-from experiments.engine.gpu_tables import TimedWorkload
+from experiments.engine.gpu_workloads import (
+    GpuConfig,
+    TimedWorkload,
+    Workload,
+    attention_errors,
+    draw_heads,
+    engine_attention,
+    flash_attention,
+    pairs,
+    with_gradient,
+)
+from experiments.engine.speed_gpu import NoAccelerator, accelerator, sheet_of
 from tests.experiments.shrunk import run_shrunk
 
 
@@ -40,20 +48,19 @@ def test_sizes_that_do_not_fit_are_named(changes, message):
 
 def test_both_ways_to_attend_are_one_in_float32_and_near_it_in_bfloat16(context):
     heads = draw_heads(2, 12, 4, 2, 8)
-    ways = {"engine": engine_attention, "flash": flash_attention("xla")}
+    variants = {"engine": engine_attention, "flash": flash_attention("xla")}
     wide = jax.tree.map(lambda x: x.astype(jnp.float32), heads)
-    a, b = (jax.jit(with_gradient(way))(wide) for way in ways.values())
+    a, b = (jax.jit(with_gradient(attend))(wide) for attend in variants.values())
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
-    off = errors(heads, ways, context)
+    off = attention_errors(heads, variants, context)
     assert all(0 < e < speed_gpu.OFF_FLOAT32 for e in off.values())
 
 
 def test_work_and_shares_by_hand():
-    """Three tokens look at 1 + 2 + 3 keys; half of 8 operations a second is a half."""
+    """Three tokens look at 1 + 2 + 3 keys; 8 operations in a median of 2 seconds are 4 a second."""
     assert pairs(2, 3, 4) == 2 * 4 * 6
-    timed = TimedWorkload((1.0, 2.0, 5.0), 8.0, 6.0, 4.0, "tokens")
-    assert timed.share(8.0) == 0.5
-    assert timed.read_share(None) is None
+    timed = TimedWorkload((1.0, 2.0, 5.0), Workload(lambda: None, 8.0, 6.0, 4.0, "tokens"))
+    assert (timed.flops, timed.read_bytes, timed.made) == (4.0, 3.0, "2 tokens/s")
 
 
 @pytest.mark.slow
