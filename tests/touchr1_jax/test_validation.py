@@ -9,7 +9,7 @@ from touchr1_jax.validation import above, at_least, within
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
+class Bounded:
     share: float
 
 
@@ -23,7 +23,7 @@ class Config:
 )
 def test_bounds(check, kept, refused, said):
     for value in kept:
-        check(Config(value))
+        check(Bounded(value))
     for value in refused:
         with pytest.raises(ValueError, match=f"share is {value}: {said}"):
-            check(Config(value))
+            check(Bounded(value))

@@ -1,4 +1,4 @@
-"""What devices exchange inside the loops of a compiled GRPO step: `python -m tests.touchr1_jax.distributed.exchanges`.
+"""Collectives inside the loops of a compiled GRPO step: `python -m tests.touchr1_jax.distributed.exchanges`.
 
 Writes as JSON the number of collective operations in the body of every loop, and in the whole program.
 """

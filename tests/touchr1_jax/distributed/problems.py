@@ -36,7 +36,7 @@ OPTIMIZER = make_optimizer(OptimizerConfig(learning_rate=1e-5, warmup_steps=2), 
 
 
 @dataclasses.dataclass(frozen=True)
-class Problem:
+class TrainingProblem:
     """A training: its step for a given gather of weights, first state, batches, and inputs that never change."""
 
     make_step: Callable[[Gather], Callable[..., Any]]
@@ -56,7 +56,7 @@ class Problem:
         return self.make_step(functools.partial(gather_params, mesh))
 
 
-def feed(problem: Problem, own: np.ndarray | None = None) -> Any:
+def feed(problem: TrainingProblem, own: np.ndarray | None = None) -> Any:
     """Batches of `ROWS` items in random order, or those rows of them that a process reads."""
     mine = np.arange(ROWS) if own is None else own
     drawn = grain.MapDataset.range(64).seed(3).shuffle().repeat().batch(ROWS)
@@ -79,7 +79,7 @@ class Words(nn.Module):
         return nn.Dense(16, name="head")(x + GatedMLP(32, name="mlp")(RMSNorm(name="norm")(x)))
 
 
-def words() -> Problem:
+def words() -> TrainingProblem:
     """The number after next, modulo 16: quick to compile."""
     model = Words()
     params = draw_params(jax.eval_shape(lambda: model.init(jax.random.key(0), jnp.zeros(1, jnp.int32)))["params"])
@@ -93,12 +93,12 @@ def words() -> Problem:
         return SFTState(params=params, opt_state=opt_state, step=state.step + 1), {"loss": value}
 
     state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
-    return Problem(
+    return TrainingProblem(
         lambda gather: jax.jit(step), state, lambda i: {"token": np.int32(i % 16), "label": np.int32((i + 2) % 16)}
     )
 
 
-def sft() -> Problem:
+def sft() -> TrainingProblem:
     """The whole policy, one question a contact, random answers of several lengths."""
 
     def item(i: int) -> SFTBatch:
@@ -114,10 +114,10 @@ def sft() -> Problem:
 
     params = {**tiny.params(loud=0.2), **tiny.shallow_params(loud=0.2)}
     state = SFTState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0))
-    return Problem(lambda gather: make_sft_step(FNS, OPTIMIZER), state, item)
+    return TrainingProblem(lambda gather: make_sft_step(FNS, OPTIMIZER), state, item)
 
 
-def packed() -> Problem:
+def packed() -> TrainingProblem:
     """The same in rows, which the questions of two contacts share; a mesh of eight splits each two between devices."""
     problem = sft()
 
@@ -129,7 +129,7 @@ def packed() -> Problem:
     return dataclasses.replace(problem, finish=finish)
 
 
-def adapters() -> Problem:
+def adapters() -> TrainingProblem:
     """SFT whose decoder stands still under adapters of rank 2, beside encoders that are trained in full."""
     plain = sft()
     base, towers = _apart(plain.state.params)
@@ -139,10 +139,10 @@ def adapters() -> Problem:
     def step(state: SFTState, batch: SFTBatch, base: Params) -> tuple[SFTState, dict[str, jax.Array]]:
         return make_sft_step(adapt(FNS, base, LORA), OPTIMIZER)(state, batch)
 
-    return Problem(lambda gather: jax.jit(step, donate_argnums=0), state, plain.item, (base,))
+    return TrainingProblem(lambda gather: jax.jit(step, donate_argnums=0), state, plain.item, (base,))
 
 
-def adapters_grpo() -> Problem:
+def adapters_grpo() -> TrainingProblem:
     """GRPO of adapters; others are the reference."""
     plain = grpo()
     base, _ = _apart(plain.state.params)
@@ -157,7 +157,7 @@ def adapters_grpo() -> Problem:
 
         return jax.jit(step, donate_argnums=0)
 
-    return Problem(make_step, state, plain.item, (frozen, base))
+    return TrainingProblem(make_step, state, plain.item, (frozen, base))
 
 
 def _apart(params: Params) -> tuple[Params, Params]:
@@ -188,7 +188,7 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
     return right, {"right": right}, parsed
 
 
-def grpo() -> Problem:
+def grpo() -> TrainingProblem:
     """The decoder, groups of four; both divergences count."""
     optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
     state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), GRPO)
@@ -197,10 +197,10 @@ def grpo() -> Problem:
     item = lambda i: jax.tree.map(lambda x: np.asarray(x[i % 16]), questions)
     questions = tiny.question_batch(0, 16)
     make_step = lambda gather: make_grpo_step(FNS, score, optimizer, GRPO, gather=gather)
-    return Problem(make_step, state, item, (frozen,))
+    return TrainingProblem(make_step, state, item, (frozen,))
 
 
-def dynamics() -> Problem:
+def dynamics() -> TrainingProblem:
     """Encoder and predictor of stage 1."""
     config = DynamicsConfig(
         encoder=dataclasses.replace(tiny.CONFIG.tactile, causal=True),
@@ -216,10 +216,10 @@ def dynamics() -> Problem:
         step=jnp.int32(0),
         key=jax.random.key(1),
     )
-    return Problem(lambda gather: make_dynamics_step(config, OPTIMIZER), state, contact)
+    return TrainingProblem(lambda gather: make_dynamics_step(config, OPTIMIZER), state, contact)
 
 
-PROBLEMS: dict[str, Callable[[], Problem]] = {
+PROBLEMS: dict[str, Callable[[], TrainingProblem]] = {
     "words": words,
     "sft": sft,
     "packed": packed,

@@ -1,4 +1,4 @@
-"""What a process puts on the mesh; more than one device is what `test_training` is about."""
+"""States and batches on a mesh of one device; `test_training` uses several."""
 
 import jax
 import jax.numpy as jnp

@@ -28,7 +28,7 @@ MESH = MeshConfig(data=2, fsdp=4, tensor=2).abstract()
 
 
 def specs(tree) -> dict[str, P]:
-    """Where each leaf lies, by its path."""
+    """Partition of each leaf, by its path."""
     found = jax.tree_util.tree_leaves_with_path(state_shardings(MESH, tree))
     return {jax.tree_util.keystr(path, simple=True, separator="/"): s.spec for path, s in found}
 

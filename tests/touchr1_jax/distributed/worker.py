@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from tests.touchr1_jax.distributed.problems import PROBLEMS, ROWS, STEPS, Problem, feed
+from tests.touchr1_jax.distributed.problems import PROBLEMS, ROWS, STEPS, TrainingProblem, feed
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.placement import local_rows, place_batch, place_state, shard_step
 from touchr1_jax.training.checkpoint import Checkpoints
@@ -30,7 +30,7 @@ class Placed:
         return place_batch(self.mesh, next(self.batches), ROWS)
 
 
-def plain_losses(problem: Problem) -> list[dict[str, float]]:
+def plain_losses(problem: TrainingProblem) -> list[dict[str, float]]:
     """Metrics of the step as it is, on one device, without anything of a mesh."""
     state, batches, found = jax.tree.map(jax.numpy.copy, problem.state), feed(problem), []
     for _ in range(STEPS):

@@ -39,7 +39,7 @@ def test_unknown_label_earns_nothing(answer):
 
 
 def mean_credit(level: int, prior: tuple[float, ...]) -> float:
-    """What a constant answer earns on average."""
+    """Mean credit of a constant answer."""
     earned = [accuracy(constant(level), make_target(label=(y, 0, 0))) for y in range(3)]
     return sum(p * float(reward) for p, reward in zip(prior, earned, strict=True))
 

@@ -1,4 +1,4 @@
-"""`python -m touchr1_jax.rewards`: an answer's slots, its terms and its total, and what it says to wrong arguments."""
+"""`python -m touchr1_jax.rewards`: an answer's slots, terms and total, and errors of arguments."""
 
 import jax.numpy as jnp
 import pytest
@@ -12,7 +12,7 @@ ANSWER = "<perceive> gelsight_mini soft xense firm </perceive> <compare> soft </
 
 
 def cells(line: str) -> list[str]:
-    """What stands between the lines of a table; a line outside of one is a single cell."""
+    """Cells of a table row; a line outside a table is a single cell."""
     inside = line.strip()[1:-1] if line.strip().startswith("│") else line
     return [cell.strip() for cell in inside.split("│")]
 

@@ -90,7 +90,7 @@ draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
 
 
 def experience_of(before: GRPOState, batch):
-    """What the step must have drawn, by the documented use of its key: fold in the step, split for sample and mask."""
+    """Rollouts and masked touch of a step, by the documented use of its key: fold in the step, split for each."""
     sample_key, mask_key = jax.random.split(jax.random.fold_in(before.key, before.step))
     return draw(before.params, batch, sample_key), mask_one_stream(batch.features, FROZEN.noise, mask_key)[0]
 

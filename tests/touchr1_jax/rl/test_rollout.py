@@ -15,7 +15,7 @@ from touchr1_jax.text.parser import compile_parser
 V, PAD, END, STOP = 8, 0, 1, 2
 CONFIG = SampleConfig(group=2, length=6, end_ids=(END, STOP), pad_id=PAD, greedy=True)
 SCRIPT = np.array([[5, 4, END, 7, 7, 7], [3, 6, 5, STOP, 7, 7]])
-"""What each of two prompts goes on to say."""
+"""Completions of two prompts."""
 
 
 def scripted(script: np.ndarray = SCRIPT, calls: list | None = None):

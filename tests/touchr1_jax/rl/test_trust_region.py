@@ -53,7 +53,7 @@ def test_a_short_update_stays(shorten):
 
 @pytest.mark.parametrize("size", [0.1, 3.0], ids=["a little too long", "far too long"])
 def test_a_long_update_ends_near_its_bound(shorten, size):
-    """Where KL is quadratic once is enough; from afar, where it is flat, the first shortening is far from it."""
+    """One shortening is enough where KL is quadratic; a far update, where KL is flat, needs several."""
     _, long = shorten(size)
     assert long["update_kl"] > 2 * DELTA
     assert long["update_scale"] < 1

@@ -82,7 +82,7 @@ def layout():
 
 
 def test_prompts_are_rendered_conversations(layout):
-    """What stands at true places is the template's text with pads repeated."""
+    """Tokens under the mask are the template's text with repeated pads."""
     parts = [Media.PICTURE]
     for sensor in TOUCH_LANGUAGE.sensors:
         parts += [sensor.phrases[0], Media.VIDEO]
