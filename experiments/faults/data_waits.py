@@ -1,4 +1,4 @@
-"""How long training waits for data, at the sizes of the studies."""
+"""Share of training time that waits for data, at the sizes of the studies."""
 
 import dataclasses
 from collections.abc import Mapping

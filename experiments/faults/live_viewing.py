@@ -192,7 +192,7 @@ def requirements(views: Sequence[ViewedRecording], transfer: BridgeTransfer) -> 
 
 
 def viewing_table(views: Sequence[ViewedRecording]) -> Table:
-    """What browsers show, and how often the recorder looks at its device."""
+    """Ages of what browsers show, and times between two looks of the recorder at its device."""
     rows = [
         {
             "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,

@@ -22,7 +22,7 @@ from sensors_io.devices.sources import Tac3dRecording
 from sensors_io.sync import ClockMap
 
 YAML = importlib.util.find_spec("ruamel") is not None and importlib.util.find_spec("ruamel.yaml") is not None
-"""Whether the vendor's parser is installed, so that it can be timed."""
+"""True if the vendor's parser is installed and can be timed."""
 
 CACHED, BY_YAML = "cached layout", "YAML each time, as the vendor does"
 

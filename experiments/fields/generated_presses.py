@@ -45,7 +45,7 @@ def fitted_optics(profiles: Profiles, touch: np.ndarray | None, axis_mm: np.ndar
 
 
 def near_lamps(profiles: Profiles, touch: np.ndarray | None, axis_mm: np.ndarray) -> np.ndarray:
-    """Three rows of point lamps beside the window over a glossy coating.
+    """Three rows of point lamps next to the window, over a glossy coating.
 
         I = (v Σ_lamps colour (max(0, n·l) + g max(0, n·h)^m) / d²)^(1/γ)
 

@@ -3,7 +3,7 @@
     python -m experiments pareto_fields [--data-dir DIR] [--scale smoke]
 
 Speed against error of each method of each field, on one core.  Depth: integrators on analytic slopes; maps from colour
-to slope on real ball presses left out of the calibration, whose circles nobody labelled; balls of other diameters;
+to slope on real ball presses left out of the calibration, with circles found without labels; balls of other diameters;
 presses at known depth; pictures without contact.  Motion: markers, dense fields, shear and force.  DIR holds the public
 recordings by folder (gelslam, FOTS, gelsight_sim2real, feelanyforce, …); without it only generated input is measured.
 

@@ -1,9 +1,9 @@
-"""Where do three numbers go that follow random targets?
+"""Where do three numbers end that follow random targets?
 
     main(["counting"], package="experiments.faults.trainings")
 
-The smallest training that has all that training has: a data iterator, AdamW, a random key, checkpoints, a log.  A
-session starts in a second, so that faults can strike it by the hundred.
+The smallest training with all parts of a training: a data iterator, AdamW, a random key, checkpoints, a log.  A session
+starts in a second, so that it can be disturbed hundreds of times.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ STAGE = "count/0"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CountingConfig:
-    """Steps, every how many a checkpoint is saved, and the targets between which a NaN begins and ends."""
+    """Steps, steps between checkpoints, and the steps from and to which targets are NaN."""
 
     steps: int = 12
     save_every: int = 4
@@ -40,13 +40,13 @@ class CountingConfig:
         self.loop()  # refuses its own values
 
     def loop(self) -> LoopConfig:
-        """The loop's part; three updates in a row may be left out."""
+        """Settings of the loop; at most three updates in a row may be skipped."""
         return LoopConfig(steps=self.steps, save_every=self.save_every, most_skipped=3)
 
 
 @struct.dataclass
 class CountingState:
-    """What a step changes."""
+    """State that a step changes."""
 
     params: Float[Array, "3"]
     opt_state: optax.OptState
@@ -55,7 +55,7 @@ class CountingState:
 
 
 def run(config: CountingConfig, context: Context) -> Results:
-    """Follow the targets to the end."""
+    """Train to the end."""
     optimizer = falling_adamw(0.1, 1.0, config.steps, max_grad_norm=1.0)
     params = jnp.zeros(3)
     zero, key = jnp.zeros((), jnp.int32), jax.random.key(0)
@@ -65,7 +65,7 @@ def run(config: CountingConfig, context: Context) -> Results:
 
 
 def targets(config: CountingConfig) -> grain.DatasetIterator:
-    """Three random numbers a step, NaN between the two steps of the config."""
+    """Three random numbers a step, NaN between two steps of the config."""
     first = config.steps if config.poison_from is None else config.poison_from
     last = config.steps if config.poison_to is None else config.poison_to
 
