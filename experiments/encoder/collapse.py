@@ -1,4 +1,4 @@
-"""Small encoders driven into collapse, many seeds at once, with the alarms watching."""
+"""Small encoders driven into collapse, many seeds at once, with the measurements that raise the alarms."""
 
 import dataclasses
 import functools
@@ -27,22 +27,15 @@ from touchr1_jax.training.dynamics import (
 from touchr1_jax.training.probes import contact_features, rank_me, told_apart
 from touchr1_jax.types import TouchBatch
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CollapseArm:
-    """One way to train: guards, learning rate, and which arm's failure it is meant to cure, if any."""
-
-    name: str
-    guards: Guards
-    rate: float
-    cures: str = ""
+COPY_FLOOR = 1e-6
+"""Error of copying the last latent below which all latents are one; any prediction then counts as unskilled."""
 
 
 @struct.dataclass
 class LatentMeasures:
-    """What is measured of an encoder on held-out contacts; `telling` is `probes.told_apart`."""
+    """Measurements of an encoder on held-out contacts: `probes.told_apart`, effective rank over width, skill."""
 
-    telling: Float[Array, ""]
+    told_apart: Float[Array, ""]
     rank_share: Float[Array, ""]
     skill: Float[Array, ""]
 
@@ -52,20 +45,20 @@ class CollapseRun:
     """One run.
 
     Args:
-      untrained, looks: measurements on the contacts that are watched, before training and after every block of steps.
-      start, end: measurements on the contacts that judge the run.
-      before, after: features of all contacts but those watched.
+      untrained, blocks: measurements on the watched contacts, before training and after every block of steps.
+      start, end: measurements on the test contacts, before and after training.
+      before, after: features of all contacts but the watched ones.
     """
 
     untrained: LatentMeasures
-    looks: LatentMeasures
+    blocks: LatentMeasures
     start: LatentMeasures
     end: LatentMeasures
     before: Float[Array, "n D"]
     after: Float[Array, "n D"]
 
 
-Runner = Callable[[Guards, Float[Array, ""], Array], CollapseRun]
+CollapseRunner = Callable[[Guards, Float[Array, ""], Array], CollapseRun]
 
 
 def make_runner(
@@ -77,18 +70,18 @@ def make_runner(
     batch_size: int,
     blocks: int,
     block_steps: int,
-) -> Runner:
-    """A compiled function (guards, rate, keys [seed]) → courses [seed, …]; one program serves all arms.
+) -> CollapseRunner:
+    """A compiled function (guards, rate, keys [seed]) → runs [seed, …]; one program serves all arms.
 
     Args:
       config: networks.
       contacts: all contacts, in memory.
-      train: which of them are trained on; the others judge a run when it has ended.
-      watched: contacts of other objects, which the alarms are read on during training.
+      train: those that are trained on; the others are the test contacts.
+      watched: contacts of other objects, for the alarms during training.
       batch_size: contacts of a step, drawn with replacement.
-      blocks, block_steps: measurements, and steps between them.
+      blocks, block_steps: number of measurements, and steps between them.
     """
-    rows, held = np.flatnonzero(train), _take(contacts, np.flatnonzero(~train))
+    rows, test = np.flatnonzero(train), _take(contacts, np.flatnonzero(~train))
 
     def run(guards: Guards, rate: Float[Array, ""], key: Array) -> CollapseRun:
         optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(b2=0.95), optax.scale(-rate))
@@ -99,15 +92,15 @@ def make_runner(
         def block(state: DynamicsState, drawn: Int[Array, "steps batch"]) -> tuple[DynamicsState, LatentMeasures]:
             step = lambda s, i: (dynamics_update(config, optimizer, guards, s, _take(contacts, i))[0], None)
             state, _ = jax.lax.scan(step, state, drawn)
-            return state, look_at(config, state, watched)
+            return state, measure_latents(config, state, watched)
 
-        end, looks = jax.lax.scan(block, start, draws)
+        end, measured = jax.lax.scan(block, start, draws)
         features = functools.partial(_features, config, contacts)
         return CollapseRun(
-            untrained=look_at(config, start, watched),
-            looks=looks,
-            start=look_at(config, start, held),
-            end=look_at(config, end, held),
+            untrained=measure_latents(config, start, watched),
+            blocks=measured,
+            start=measure_latents(config, start, test),
+            end=measure_latents(config, end, test),
             before=features(start),
             after=features(end),
         )
@@ -115,23 +108,19 @@ def make_runner(
     return jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
 
 
-def look_at(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> LatentMeasures:
-    """Held-out skill, and how the averaged encoder's latents differ between contacts."""
+def measure_latents(config: DynamicsConfig, state: DynamicsState, batch: TouchBatch) -> LatentMeasures:
+    """Held-out skill, and the differences between contacts of the averaged encoder's latents."""
     steps = steps_of(batch, config.encoder.frames_per_step)
     latent = encode_batch(config.encoder, state.target, batch)
     goal = layer_norm(latent)
-    seen = encode_batch(config.encoder, state.params["encoder"], batch)
-    predicted = predict_next(config, state.params["predictor"], seen, steps, batch.stream_mask)
+    online = encode_batch(config.encoder, state.params["encoder"], batch)
+    predicted = predict_next(config, state.params["predictor"], online, steps, batch.stream_mask)
     error, copied = prediction_errors(predicted, goal, steps)
     return LatentMeasures(
-        telling=told_apart(latent, steps.exists),
+        told_apart=told_apart(latent, steps.exists),
         rank_share=rank_me(residuals(latent, steps.exists)) / latent.shape[-1],
         skill=1.0 - error / jnp.maximum(copied, COPY_FLOOR),
     )
-
-
-COPY_FLOOR = 1e-6
-"""Error of copy-last below which all latents are one; any prediction then counts as unskilled."""
 
 
 def _features(config: DynamicsConfig, contacts: TouchBatch, state: DynamicsState) -> Float[Array, "n D"]:
@@ -145,6 +134,6 @@ def _take(contacts: TouchBatch, rows: Array | np.ndarray) -> TouchBatch:
 
 
 def in_memory(parts: list[TouchBatch]) -> TouchBatch:
-    """Several batches as one, pictures of the objects left out."""
+    """Several batches as one, without the pictures of the objects."""
     joined: TouchBatch = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
     return dataclasses.replace(joined, view=joined.view[:, :1, :1])

@@ -1,4 +1,4 @@
-"""The recordings that encoders learn from: other scenes than those of the later stages, split by object."""
+"""Recordings for encoders: other scenes than those of the later stages, split by object."""
 
 import dataclasses
 from pathlib import Path
@@ -16,12 +16,12 @@ from sensors_io.schema import Flag
 from touchr1_jax.training.evidence import ProbeConfig
 
 STAGE_ONE_SEED = 1
-"""Seed of the scenes of stage 1: its objects are none of those, of seed 0, that later stages train and test on."""
+"""Seed of the scenes of stage 1: its objects differ from those of seed 0, on which later stages train and test."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StageOneDataConfig:
-    """Which recordings, and how many labelled contacts the probes are fitted on (at most)."""
+    """The recordings, and the largest number of labelled contacts to fit the probes on."""
 
     data: Source = "generated"
     """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
@@ -34,7 +34,7 @@ class StageOneDataConfig:
 
 
 def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
-    """The records, made first where the cache lacks them; frames past the strain limit stay in, as in the studies."""
+    """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
     source = SourceConfig(
         kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
     )
@@ -43,18 +43,18 @@ def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: 
 
 
 def training_rows(data: Dataset) -> np.ndarray:
-    """Contacts of all training objects, ascending: no later stage shares these scenes, so none is kept back."""
+    """Contacts of all training objects, ascending; all are used, since no later stage shares these scenes."""
     return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
 
 
-def watched(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
-    """Probes fitted on training contacts and read on a part.
+def held_out_contacts(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
+    """Contacts of a part to measure on, and training contacts to fit the probes on.
 
     Args:
       data: the records.
       part: "val" for choosing, "test" for reporting.
-      config: how many contacts to fit on, and the probe.
-      fit: another number of them.
+      config: number of contacts to fit on, and the probe.
+      fit: another number of contacts to fit on.
     """
     return HeldOutContacts(
         store=data.store,

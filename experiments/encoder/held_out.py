@@ -1,4 +1,4 @@
-"""What an encoder knows about contacts that it was not trained on: skill of its predictions, probes, rank."""
+"""Measurements of an encoder on held-out contacts: skill of its predictions, linear probes, rank; with intervals."""
 
 import dataclasses
 import functools
@@ -15,6 +15,7 @@ from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax import masked
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.training.dynamics import (
     FLAT,
@@ -35,12 +36,15 @@ BATCH = 32
 """Contacts that are encoded at once."""
 
 RANK_ROWS = 4096
-"""Latents whose rank is taken: twenty for each of two hundred dimensions."""
+"""Latents whose rank is computed: twenty for each of two hundred dimensions."""
+
+RESAMPLES = 2000
+"""Resamples of each interval: the error of its ends is about a tenth of its width."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HeldOutContacts:
-    """Contacts to measure on: probes are fitted on `fit_rows` and everything is read on `read_rows`.
+    """Contacts to measure on: probes are fitted on `fit_rows`, everything is measured on `read_rows`.
 
     `label` int32 [contact, A] and `objects` [contact] are of the whole store.
     """
@@ -54,24 +58,29 @@ class HeldOutContacts:
     probe: ProbeConfig = ProbeConfig()
 
     @property
-    def fitted(self) -> np.ndarray:
-        """Which of all rows, those to fit first, are fitted on, bool [fit + read]."""
-        return np.arange(len(self.fit_rows) + len(self.read_rows)) < len(self.fit_rows)
+    def rows(self) -> np.ndarray:
+        """All contacts, those to fit on first, [fit + read]."""
+        return np.concatenate([self.fit_rows, self.read_rows])
 
-    def ordinal_labels(self) -> np.ndarray:
-        """Labels of all rows, int32 [fit + read, 3]."""
-        columns = [ATTRIBUTES.index(name) for name in ORDINAL]
-        return self.label[np.concatenate([self.fit_rows, self.read_rows])][:, columns]
+    @property
+    def fitted(self) -> np.ndarray:
+        """True for the rows to fit on, bool [fit + read]."""
+        return np.arange(len(self.rows)) < len(self.fit_rows)
+
+    def probe_right(self, features: np.ndarray) -> np.ndarray:
+        """True where a linear probe on features [fit + read, D] is right, bool [read, 3]."""
+        label = self.label[self.rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
+        return probe_right(features, label, self.fitted, self.probe)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EncoderAssessment:
-    """Everything by contact, so that intervals can resample objects.
+    """Measurements of one encoder, by contact where intervals resample objects.
 
     Args:
       error, copied, constant: [n] mean error of the prediction, of the last latent, of each step's mean latent.
       right: [n, 3] whether the probe is right about hardness, roughness, protrusion.
-      told_apart: what contacts differ by, over the size of the latents.
+      told_apart: spread between contacts over the size of the latents.
       flat_share: share of latent dimensions that hardly vary between contacts.
       rank_share: effective rank over width.
     """
@@ -85,22 +94,17 @@ class EncoderAssessment:
     rank_share: float
 
     @property
-    def skill(self) -> float:
-        """1 − error / error of copying the last latent."""
-        return float(1 - self.error.mean() / max(float(self.copied.mean()), 1e-9))
-
-    @property
     def accuracy(self) -> float:
         """Mean of the three probes, percent."""
         return float(100 * self.right.mean())
 
     def summary(self) -> dict[str, float]:
-        """Numbers for the log, named as the alarms know them."""
-        by_name = {f"probe_{name}": float(100 * self.right[:, a].mean()) for a, name in enumerate(ORDINAL)}
+        """Numbers for the log, under the names that the alarms use."""
+        skill_over = lambda reference: float(1 - self.error.mean() / max(float(reference.mean()), 1e-9))
         return {
-            "skill": self.skill,
-            "skill_over_mean": float(1 - self.error.mean() / max(float(self.constant.mean()), 1e-9)),
-            **by_name,
+            "skill": skill_over(self.copied),
+            "skill_over_mean": skill_over(self.constant),
+            **{f"probe_{name}": float(100 * self.right[:, a].mean()) for a, name in enumerate(ORDINAL)},
             "probe": self.accuracy,
             "told_apart": self.told_apart,
             "flat_share": self.flat_share,
@@ -109,44 +113,59 @@ class EncoderAssessment:
 
 
 def assess(
-    networks: DynamicsConfig, state: DynamicsState, watched: HeldOutContacts, context: Context
+    networks: DynamicsConfig, state: DynamicsState, held_out: HeldOutContacts, context: Context
 ) -> EncoderAssessment:
-    """Measure; all streams that are there are shown."""
-    rows = np.concatenate([watched.fit_rows, watched.read_rows])
-    look = _look(networks)
-    seen = encode_rows(
-        lambda batch: look(state.params, state.target, batch), watched.store, rows, watched.clip, context
-    )
-    fitted = watched.fitted
-    goal, exists = seen["goal"], seen["exists"]
+    """Measure the averaged encoder and the predictor; all streams that exist are shown."""
+    compiled, fitted = _predict(networks), held_out.fitted
+    encode = lambda batch: compiled(state.params, state.target, batch)
+    found = encode_rows(encode, held_out.store, held_out.rows, held_out.clip, context)
+    goal, latent, exists = found["goal"], found["latent"], found["exists"]
     both = (exists[:, :, 1:] & exists[:, :, :-1])[..., None, None]
     mean = np.asarray(masked.mean(goal[fitted], exists[fitted][..., None, None], 0))
     constant = masked.mean(np.abs(goal[~fitted][:, :, 1:] - mean[:, 1:]), both[~fitted], (1, 2, 3, 4))
-    features = np.asarray(contact_features(seen["latent"], exists))
-    spread = spread_of(jnp.asarray(seen["latent"]), jnp.asarray(exists))
+    spread = spread_of(jnp.asarray(latent), jnp.asarray(exists))
+    rows = np.asarray(residuals(jnp.asarray(latent), jnp.asarray(exists)))
+    chosen = np.random.default_rng(0).permutation(len(rows))[:RANK_ROWS]
     return EncoderAssessment(
-        error=seen["error"][~fitted],
-        copied=seen["copied"][~fitted],
+        error=found["error"][~fitted],
+        copied=found["copied"][~fitted],
         constant=np.asarray(constant),
-        right=probe_right(features, watched.ordinal_labels(), fitted, watched.probe),
-        told_apart=float(told_apart(seen["latent"], exists)),
+        right=held_out.probe_right(np.asarray(contact_features(latent, exists))),
+        told_apart=float(told_apart(latent, exists)),
         flat_share=float(jnp.mean(spread < FLAT)),
-        rank_share=_rank_share(seen["latent"], exists),
+        rank_share=float(rank_me(jnp.asarray(rows[chosen]))) / rows.shape[1],
     )
 
 
-def probe_encoder(networks: DynamicsConfig, encoder: Params, watched: HeldOutContacts, context: Context) -> np.ndarray:
-    """Whether the probes on an encoder alone are right, bool [read, 3]."""
+@functools.cache
+def _predict(networks: DynamicsConfig) -> Callable[[Params, Params, TouchBatch], dict[str, Any]]:
+    """Compiled latents and errors of the prediction for one batch, made once."""
+
+    def predict(params: Params, target: Params, batch: TouchBatch) -> dict[str, Any]:
+        batch = read_frames(networks, batch)
+        steps = steps_of(batch, networks.encoder.frames_per_step)
+        latent = encode_each(networks.encoder, target, batch)
+        goal = layer_norm(latent)
+        online = encode_each(networks.encoder, params["encoder"], batch)
+        predicted = predict_next(networks, params["predictor"], online, steps, batch.stream_mask)
+        both = (steps.exists[:, :, 1:] & steps.exists[:, :, :-1])[..., None, None]
+        mean = lambda x: masked.mean(jnp.abs(x), both, (1, 2, 3, 4))
+        error, copied = mean(predicted - goal[:, :, 1:]), mean(goal[:, :, :-1] - goal[:, :, 1:])
+        return {"latent": latent, "goal": goal, "exists": steps.exists, "error": error, "copied": copied}
+
+    return jax.jit(predict)
+
+
+def probe_encoder(networks: DynamicsConfig, encoder: Params, held_out: HeldOutContacts, context: Context) -> np.ndarray:
+    """True where the probes on an encoder alone are right, bool [read, 3]."""
 
     def encode(batch: TouchBatch) -> dict[str, Any]:
         batch = read_frames(networks, batch)
         exists = steps_of(batch, networks.encoder.frames_per_step).exists
         return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
 
-    rows = np.concatenate([watched.fit_rows, watched.read_rows])
-    seen = encode_rows(jax.jit(encode), watched.store, rows, watched.clip, context)
-    features = np.asarray(contact_features(seen["latent"], seen["exists"]))
-    return probe_right(features, watched.ordinal_labels(), watched.fitted, watched.probe)
+    found = encode_rows(jax.jit(encode), held_out.store, held_out.rows, held_out.clip, context)
+    return held_out.probe_right(np.asarray(contact_features(found["latent"], found["exists"])))
 
 
 def encode_rows(
@@ -166,27 +185,28 @@ def encode_rows(
     return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
 
 
-@functools.cache
-def _look(networks: DynamicsConfig) -> Callable[[Params, Params, TouchBatch], dict[str, Any]]:
-    """Compiled measurement of one batch, made once."""
-
-    def look(params: Params, target: Params, batch: TouchBatch) -> dict[str, Any]:
-        batch = read_frames(networks, batch)
-        steps = steps_of(batch, networks.encoder.frames_per_step)
-        latent = encode_each(networks.encoder, target, batch)
-        goal = layer_norm(latent)
-        seen = encode_each(networks.encoder, params["encoder"], batch)
-        predicted = predict_next(networks, params["predictor"], seen, steps, batch.stream_mask)
-        both = (steps.exists[:, :, 1:] & steps.exists[:, :, :-1])[..., None, None]
-        mean = lambda x: masked.mean(jnp.abs(x), both, (1, 2, 3, 4))
-        error, copied = mean(predicted - goal[:, :, 1:]), mean(goal[:, :, :-1] - goal[:, :, 1:])
-        return {"latent": latent, "goal": goal, "exists": steps.exists, "error": error, "copied": copied}
-
-    return jax.jit(look)
+def points(values: np.ndarray, objects: np.ndarray) -> Interval:
+    """Mean in points of values [n] or [n, A] of n contacts, with an interval over objects [n]."""
+    clusters = np.repeat(objects, values[0].size)
+    return clustered_bootstrap(100.0 * values.astype(float).ravel(), clusters, resamples=RESAMPLES)
 
 
-def _rank_share(latent: np.ndarray, exists: np.ndarray) -> float:
-    """Effective rank of the latents' differences between contacts, over their width."""
-    rows = np.asarray(residuals(jnp.asarray(latent), jnp.asarray(exists)))
-    chosen = np.random.default_rng(0).permutation(len(rows))[:RANK_ROWS]
-    return float(rank_me(jnp.asarray(rows[chosen]))) / rows.shape[1]
+def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray) -> Interval:
+    """1 − Σ error / Σ reference over n contacts, with an interval over objects.
+
+    Args:
+      error, reference: [n] of the same contacts, reference > 0 in sum.
+      objects: [n].
+
+    Raises:
+      ValueError: a reference without error, for which no skill is defined.
+    """
+    if not reference.sum() > 0:
+        raise ValueError(f"reference sums to {reference.sum()}: must be > 0, or no skill is defined; choose another")
+    names, group = np.unique(objects, return_inverse=True)
+    sums = np.zeros((len(names), 2))
+    np.add.at(sums, group, np.stack([error, reference], 1).astype(float))
+    weights = np.random.default_rng(0).multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES)
+    drawn = weights @ sums
+    low, high = np.quantile(1 - drawn[:, 0] / drawn[:, 1], (0.025, 0.975))
+    return Interval(mean=float(1 - error.sum() / reference.sum()), low=float(low), high=float(high))

@@ -1,12 +1,13 @@
-"""How much of a touch must an encoder read, in milliseconds against what probes find in it?
+"""How much of a touch must an encoder read, in milliseconds against the accuracy of probes on it?
 
     make experiment EXP=pareto_encoder [ARGS="--scale smoke"]
 
 Prompts of 8 frames by four sensors at 112².  Every variant saves in one way: fewer tokens by joining frames, frames
-chosen by salience, patches chosen by contact, the quiet rest merged, fewer pixels, another width, fields instead of
+chosen by salience, patches chosen by contact, the quiet rest merged, fewer pixels, another width, fields in place of
 pictures; the reference has 256 tokens a stream.  Each is trained by stage 1 on the same contacts in the same order and
 read by linear probes on unseen objects; forward passes are timed interleaved, on the cores that the process has.  The
-fastest within a point of the reference is chosen on the validation objects; what is reported is of the test objects.
+fastest within a point of the reference is chosen on the validation objects; the reported figures are of the test
+objects.
 
 Cost: about fifteen minutes on one core with the data, `--scale smoke` under one.
 
@@ -17,18 +18,19 @@ nothing against 256; dropping patches outside the contact saves time in proporti
 import dataclasses
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.charts import accuracy_against_time
-from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows, watched
-from experiments.encoder.held_out import probe_encoder
-from experiments.encoder.intervals import points
+from experiments.core.text import bounds
+from experiments.encoder.data import StageOneDataConfig, held_out_contacts, open_touch, training_rows
+from experiments.encoder.held_out import points, probe_encoder
 from experiments.encoder.pretrain import PretrainConfig, clip_of, pretrain
-from experiments.encoder.speed import forward, matrix_product, medians, parts
+from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch
@@ -41,7 +43,7 @@ from touchr1_jax.types import Params, TouchBatch
 SEED = 0
 LEAST_RATE, MOST_LOSS = 150.0, 1.0  # prompts a second; points of probe accuracy
 TIMED = 8  # prompts of a timed batch
-NOISE = 0.02  # share of the time below which the difference of two programs says nothing
+NOISE = 0.02  # share of the total time below which a part's time is within the noise
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,13 +89,13 @@ class MeasuredVariant:
 def run(config: ParetoEncoderConfig, context: Context) -> Results:
     """Train, probe, time."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
-    ladder = variants(config.pretrain)
+    listed, sensors = variants(config.pretrain), len(data.clip.sensors)
     encoders, right = {}, {}
-    for number, variant in enumerate(context.each("variants", ladder)):
+    for number, variant in enumerate(context.each("variants", listed)):
         encoders[variant.name], right[variant.name] = learn(config, variant, data, context, f"variant{number}")
     programs = {
-        v.name: forward(v.config.dynamics(len(data.clip.sensors)), encoders[v.name], prompts(v, data))
-        for v in context.each("compiling variants", ladder)
+        v.name: forward(v.config.dynamics(sensors), encoders[v.name], prompts(v, data))
+        for v in context.each("compiling variants", listed)
     }
     product = matrix_product()
     seconds = medians({**programs, "product": product}, context.rounds("timing variants", config.rounds))
@@ -106,17 +108,15 @@ def run(config: ParetoEncoderConfig, context: Context) -> Results:
             seconds=seconds[v.name],
             gflop=programs[v.name].gflop,
         )
-        for v in ladder
+        for v in listed
     }
-    peak = product.gflop / seconds["product"]
-    objects = data.object_ids[data.parts["test"]]
     best = choose(measured)
-    networks = best.variant.config.dynamics(len(data.clip.sensors))
-    makers = parts(networks, encoders[best.variant.name], prompts(best.variant, data))
+    makers = parts(best.variant.config.dynamics(sensors), encoders[best.variant.name], prompts(best.variant, data))
     pieces = {name: make() for name, make in context.each("compiling parts", makers.items())}
     spent = medians(pieces, context.rounds("timing parts", config.rounds))
-    where = pieces_table(best, spent, {name: p.gflop for name, p in pieces.items()}, peak)
-    return findings(config, data, measured, best, peak, objects, where)
+    peak = product.gflop / seconds["product"]
+    objects = data.object_ids[data.parts["test"]]
+    return report(config, data, measured, best, peak, objects, part_table(best, pieces, spent, peak))
 
 
 def learn(
@@ -127,9 +127,13 @@ def learn(
     rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
     state = pretrain(variant.config, store, rows, data.clip, context, stage=stage, seed=SEED)
     if not context.done(answers := f"probes/{name}"):
-        clip = clip_of(variant.config, data.clip)
         both = np.concatenate([data.parts["val"], data.parts["test"]])
-        unseen = dataclasses.replace(watched(data, "test", config.touch), store=store, clip=clip, read_rows=both)
+        unseen = dataclasses.replace(
+            held_out_contacts(data, "test", config.touch),
+            store=store,
+            clip=clip_of(variant.config, data.clip),
+            read_rows=both,
+        )
         found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen, context)
         context.save_stage(answers, found)
     right = np.array(context.load_stage(answers))
@@ -138,7 +142,7 @@ def learn(
 
 
 def prompts(variant: EncoderVariant, data: Dataset) -> TouchBatch:
-    """A batch to time, pictures whatever the variant reads: both are bytes of one size."""
+    """A batch of pictures to time, also for the variant that reads fields: both are bytes of one size."""
     clip = clip_of(variant.config, data.clip)
     rows = np.resize(data.parts["test"], TIMED)
     return touch_batch(next(iter(clip_batches(data.store, rows, clip, batch_size=TIMED, seed=0, shuffle=False))))
@@ -155,7 +159,7 @@ def loss(m: MeasuredVariant, measured: Mapping[str, MeasuredVariant], objects: n
     return points(measured[REFERENCE].right.astype(float) - m.right, objects)
 
 
-def findings(
+def report(
     config: ParetoEncoderConfig,
     data: Dataset,
     measured: Mapping[str, MeasuredVariant],
@@ -164,14 +168,15 @@ def findings(
     objects: np.ndarray,
     where: Table,
 ) -> Results:
-    """The chart, the choice and where its time goes."""
-    lost = loss(best, measured, objects)
+    """The chart, the choice and where its time goes; `peak` is that of the matrix product, Gflop/s."""
+    losses = {name: loss(m, measured, objects) for name, m in measured.items()}
+    lost, reference = losses[best.variant.name], measured[REFERENCE]
     share = best.gflop / best.seconds / peak
     return Results(
         verdict=(
             f"'{best.variant.name}' reads {best.rate:.0f} prompts a second and its probes are right in "
-            f"{best.accuracy:.1f} %; the reference reads {measured[REFERENCE].rate:.0f} and is right in "
-            f"{measured[REFERENCE].accuracy:.1f} %.",
+            f"{best.accuracy:.1f} %; the reference reads {reference.rate:.0f} and is right in "
+            f"{reference.accuracy:.1f} %.",
             f"Its arithmetic runs at {share:.0%} of the {peak:.0f} Gflop/s of a matrix product on the same cores.",
         ),
         requirements=(
@@ -189,11 +194,19 @@ def findings(
                 bound=MOST_LOSS,
                 better="lower",
                 unit="points",
-                note=f"paired interval over objects [{lost.low:.1f}, {lost.high:.1f}]",
+                note=f"paired interval over objects {bounds(lost.low, lost.high, '.1f')}",
             ),
         ),
-        tables=(ladder_table(measured, objects, peak), where),
-        pictures=(picture(measured, objects),),
+        tables=(variant_table(measured, losses, peak), where),
+        pictures=(
+            Picture(
+                name="pareto_encoder",
+                title="Milliseconds against the accuracy of probes",
+                caption="Mean of three linear probes on unseen objects, bars are 95 % intervals over objects of the "
+                "paired difference to the reference; dotted: the corner that must be reached.",
+                content=accuracy_chart(measured, losses),
+            ),
+        ),
         settings={
             "cores": len(os.sched_getaffinity(0)),
             "matrix product": f"{peak:.0f} Gflop/s",
@@ -203,72 +216,93 @@ def findings(
     )
 
 
-def picture(measured: Mapping[str, MeasuredVariant], objects: np.ndarray) -> Picture:
-    """The chart."""
-    reference = measured[REFERENCE].accuracy
-    return Picture(
-        name="pareto_encoder",
-        title="Milliseconds against what the probes find",
-        caption="Mean of three linear probes on unseen objects, bars are 95 % intervals over objects of the paired "
-        "difference to the reference; dotted: the corner that must be reached.",
-        content=accuracy_against_time(
-            [
-                (name, m.variant.kind, 1e3 / m.rate, m.accuracy, loss(m, measured, objects))
-                for name, m in measured.items()
-            ],
-            reference,
-            (1e3 / LEAST_RATE, reference - MOST_LOSS),
-        ),
-    )
-
-
-def ladder_table(measured: Mapping[str, MeasuredVariant], objects: np.ndarray, peak: float) -> Table:
+def variant_table(measured: Mapping[str, MeasuredVariant], losses: Mapping[str, Interval], peak: float) -> Table:
     """All variants."""
-    rows: list[tuple[Cell, ...]] = []
-    for name, m in measured.items():
-        lost = loss(m, measured, objects)
-        by_attribute = tuple(float(100 * x) for x in m.right.mean(0))
-        speed = (m.variant.tokens, 1e3 / m.rate, m.rate, m.gflop / m.seconds / peak)
-        gained = (0.0 - lost.mean, f"[{0.0 - lost.high:.1f}, {0.0 - lost.low:.1f}]")  # 0 − 0 has no minus sign
-        rows.append((name, *speed, m.accuracy, *gained, *by_attribute))
-    return Table(
-        title="Variants",
-        columns=(
-            Column(name="variant"),
-            Column(name="tokens", format="d", meaning="of a stream inside the transformer"),
-            Column(name="a prompt", unit="ms", format=".2f", meaning="8 frames by four sensors, forward"),
-            Column(name="prompts/s", format=".0f"),
-            Column(name="share of peak", format=".2f", meaning="arithmetic a second over a matrix product's"),
-            Column(name="mean", unit="%", format=".1f", meaning="of the three probes"),
-            Column(name="gain", unit="points", format="+.1f", meaning="over the reference"),
-            Column(name="95 %", meaning="of the gain, over objects, paired"),
-            *(Column(name=name, unit="%", format=".1f") for name in ORDINAL),
-        ),
-        rows=tuple(rows),
+    rows: list[dict[str, Cell]] = [
+        {
+            "variant": name,
+            "tokens": m.variant.tokens,
+            "a prompt": 1e3 / m.rate,
+            "prompts/s": m.rate,
+            "share of peak": m.gflop / m.seconds / peak,
+            "mean": m.accuracy,
+            "gain": 0.0 - losses[name].mean,  # 0 − 0 has no minus sign
+            "95 %": bounds(0.0 - losses[name].high, 0.0 - losses[name].low, ".1f"),
+            **{attribute: float(100 * x) for attribute, x in zip(ORDINAL, m.right.mean(0), strict=True)},
+        }
+        for name, m in measured.items()
+    ]
+    return named_table(
+        "Variants",
+        rows,
+        formats={"tokens": "d", "a prompt": ".2f", "prompts/s": ".0f", "share of peak": ".2f", "mean": ".1f"}
+        | {"gain": "+.1f"}
+        | dict.fromkeys(ORDINAL, ".1f"),
+        units={"a prompt": "ms", "gain": "points"} | dict.fromkeys(("mean", *ORDINAL), "%"),
+        meanings={
+            "tokens": "of a stream inside the transformer",
+            "a prompt": "8 frames by four sensors, forward",
+            "share of peak": "arithmetic a second over a matrix product's",
+            "mean": "of the three probes",
+            "gain": "over the reference",
+            "95 %": "of the gain, over objects, paired",
+        },
     )
 
 
-def pieces_table(best: MeasuredVariant, spent: Mapping[str, float], gflop: Mapping[str, float], peak: float) -> Table:
-    """What each part adds to the time and to the arithmetic."""
-    rows: list[tuple[Cell, ...]] = []
+def part_table(
+    best: MeasuredVariant, pieces: Mapping[str, CompiledProgram], spent: Mapping[str, float], peak: float
+) -> Table:
+    """Time and arithmetic that each part adds to those before it.
+
+    Args:
+      best: the encoder.
+      pieces: programs that each do one thing more than the one before.
+      spent: their seconds.
+      peak: Gflop/s of a matrix product.
+    """
+    rows: list[dict[str, Cell]] = []
     before_s = before_gflop = 0.0
-    total = spent[list(spent)[-1]]
+    total = list(spent.values())[-1]
     for name, seconds in spent.items():
-        added, work = seconds - before_s, gflop[name] - before_gflop
-        rate = work / added / peak if added > NOISE * total else None
-        rows.append((name, 1e3 * added / TIMED, 100 * added / total, 1e3 * work / TIMED, rate))
-        before_s, before_gflop = seconds, gflop[name]
-    return Table(
-        title=f"Where the time of '{best.variant.name}' goes",
-        columns=(
-            Column(name="part", meaning="each row is what one part adds to those above it"),
-            Column(name="time", unit="ms a prompt", format=".2f"),
-            Column(name="share", unit="%", format=".0f"),
-            Column(name="arithmetic", unit="Mflop a prompt", format=".0f"),
-            Column(name="share of peak", format=".2f"),
-        ),
-        rows=tuple(rows),
+        added, work = seconds - before_s, pieces[name].gflop - before_gflop
+        rows.append(
+            {
+                "part": name,
+                "time": 1e3 * added / TIMED,
+                "share": 100 * added / total,
+                "arithmetic": 1e3 * work / TIMED,
+                "share of peak": work / added / peak if added > NOISE * total else None,
+            }
+        )
+        before_s, before_gflop = seconds, pieces[name].gflop
+    return named_table(
+        f"Where the time of '{best.variant.name}' goes",
+        rows,
+        formats={"time": ".2f", "share": ".0f", "arithmetic": ".0f", "share of peak": ".2f"},
+        units={"time": "ms a prompt", "share": "%", "arithmetic": "Mflop a prompt"},
+        meanings={"part": "each row is the addition of one part to those above it"},
     )
+
+
+def accuracy_chart(measured: Mapping[str, MeasuredVariant], losses: Mapping[str, Interval]) -> bytes:
+    """Probe accuracy over milliseconds a prompt, a colour and marker for each kind of saving."""
+    reference = measured[REFERENCE].accuracy
+    series = []
+    for kind in dict.fromkeys(m.variant.kind for m in measured.values()):
+        named = {name: m for name, m in measured.items() if m.variant.kind == kind}
+        look: dict[str, Any] = {"line": "", "size": 46.0, "labels": list(named)}
+        low, high = ([reference - getattr(losses[name], end) for name in named] for end in ("high", "low"))
+        x, y = [1e3 / m.rate for m in named.values()], [m.accuracy for m in named.values()]
+        series.append(Series(f"saving in {kind}", x=x, y=y, low=low, high=high, **look))
+    panel = Panel(
+        series,
+        x_label="forward, ms a prompt of 8 frames × 4 sensors",
+        y_label="probes right, %",
+        x_scale="log",
+        rules=[Rule(x=1e3 / LEAST_RATE, y=reference - MOST_LOSS, keep="above")],
+    )
+    return draw([panel], size=(8.4, 5.0))
 
 
 DEFAULT = ParetoEncoderConfig()

@@ -1,11 +1,10 @@
-"""Stage 1 as a stage of a run: feed, steps, held-out skill and probes on the way, what other studies start from."""
+"""Stage 1 as a stage of a run: pretraining with held-out skill and probes on the way, and the resulting encoder."""
 
 import dataclasses
 import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 
@@ -40,10 +39,10 @@ class PretrainConfig:
     predictor: PredictorConfig = PredictorConfig()
     frames: int = 4
     frames_kept: int | None = None
-    """How many of them are read, the most telling ones; all by default."""
+    """Number of these frames that are read, the most salient ones; all by default."""
     image_px: int = 112
     full_share: float = 0.5
-    """Share of contacts whose prediction sees all their streams; the others see a random subset."""
+    """Share of contacts that are predicted from all their streams; the others from a random subset."""
     variance: float = 1.0
     covariance: float = 0.04
     ema: float = 0.99
@@ -55,19 +54,19 @@ class PretrainConfig:
     augment: AugmentConfig = AugmentConfig()
 
     def dynamics(self, sensors: int) -> DynamicsConfig:
-        """The networks for that many streams."""
+        """The networks for this number of streams."""
         encoder = dataclasses.replace(self.encoder, sensors=sensors)
         return DynamicsConfig(
             encoder=encoder, predictor=self.predictor, full_share=self.full_share, frames_kept=self.frames_kept
         )
 
     def guards(self) -> Guards:
-        """What keeps the latents from collapsing."""
+        """The terms that keep the latents from collapsing."""
         return Guards(variance=self.variance, covariance=self.covariance, ema=self.ema)
 
 
 class ClipFeed(Feed):
-    """Clips of touch in random order, for ever."""
+    """Clips in random order, without end."""
 
     def __init__(
         self,
@@ -82,13 +81,13 @@ class ClipFeed(Feed):
         super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed, augment=augment), seed)
 
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch:
-        """The clips as they are."""
+        """The clips unchanged."""
         del rng
         return host_touch(element)
 
 
 def clip_of(config: PretrainConfig, clip: ClipConfig) -> ClipConfig:
-    """The clip that the encoder reads: that many frames of that size."""
+    """The clip with the number and size of frames that the encoder reads."""
     return dataclasses.replace(clip, frames=config.frames, image_px=config.image_px)
 
 
@@ -101,29 +100,26 @@ def pretrain(
     *,
     stage: str,
     seed: int,
-    watched: HeldOutContacts | None = None,
-    start: PretrainedEncoder | None = None,
+    held_out: HeldOutContacts | None = None,
 ) -> DynamicsState:
-    """Train encoder and predictor on some contacts, without their labels; a stopped stage goes on where it was.
+    """Train encoder and predictor on some contacts, without their labels; a stopped stage resumes.
 
     Args:
       config: networks and training.
-      store: where contacts come from.
-      rows: which of them.
-      clip: sensors and flags; frames and size are the config's.
+      store: source of the contacts.
+      rows: contacts to train on.
+      clip: sensors and flags; number and size of the frames are the config's.
       context: the run.
       stage: name of the stage, `PHASE/SEED`.
       seed: of parameters and order.
-      watched: contacts to measure on every `probe_every` steps; none leaves measuring out.
-      start: an encoder to go on from, of the same shape.
+      held_out: contacts to measure on every `probe_every` steps; nothing is measured by default.
     """
     clip = clip_of(config, clip)
     feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed, augment=config.augment)
     networks = config.dynamics(len(clip.sensors))
     _, step = dynamics_program(networks, config.optimizer, config.steps, config.guards())
     state = untrained(config, store, rows, clip, seed)
-    state = state if start is None else starting_from(state, start.for_sensors(clip.sensors))
-    measure = functools.partial(_measure, networks, context, f"probe/{stage.rpartition('/')[2]}", watched)
+    measure = functools.partial(_measure, networks, context, f"probe/{stage.rpartition('/')[2]}", held_out)
     measure(state, 0)
     for end in range(config.probe_every, config.steps + config.probe_every, config.probe_every):
         loop = LoopConfig(steps=min(end, config.steps), save_every=config.probe_every)
@@ -135,33 +131,20 @@ def pretrain(
 def encoder_of(
     config: PretrainConfig, state: DynamicsState, sensors: tuple[str, ...], **notes: Any
 ) -> PretrainedEncoder:
-    """What other studies start from: the averaged encoder."""
+    """The averaged encoder, from which other studies start."""
     encoder = dataclasses.replace(config.encoder, sensors=len(sensors))
     return PretrainedEncoder(config=encoder, sensors=sensors, params=jax.device_get(state.target), notes=notes)
 
 
 def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: ClipConfig, seed: int) -> DynamicsState:
-    """Where training begins; its target is an encoder that never learned anything."""
+    """The state before training; its target is an untrained encoder."""
     networks = config.dynamics(len(clip.sensors))
     optimizer, _ = dynamics_program(networks, config.optimizer, config.steps, config.guards())
     one = next(iter(clip_batches(store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
     start = jax.jit(lambda key, batch: start_dynamics(networks, optimizer, key, batch))
-    # bound to the device, as a restored state is: else the step would be compiled once for either
+    # committed to the device, as a restored state is: otherwise the step would be compiled twice
     state: DynamicsState = jax.device_put(start(jax.random.key(seed), touch_batch(one)), jax.devices()[0])
     return state
-
-
-def starting_from(state: DynamicsState, encoder: PretrainedEncoder) -> DynamicsState:
-    """The state with another encoder in both places; the predictor stays as it is.
-
-    Raises:
-      ValueError: the encoder has another shape.
-    """
-    shapes = [jax.tree.map(np.shape, params) for params in (encoder.params, state.target)]
-    if shapes[0] != shapes[1]:
-        raise ValueError(f"start has shapes {shapes[0]}: must be {shapes[1]}; give the config that it was trained with")
-    copies = [jax.tree.map(jnp.array, encoder.params) for _ in range(2)]  # the step gives its buffers away
-    return dataclasses.replace(state, params={**state.params, "encoder": copies[0]}, target=copies[1])
 
 
 @functools.cache
@@ -177,16 +160,16 @@ def _measure(
     networks: DynamicsConfig,
     context: Context,
     stage: str,
-    watched: HeldOutContacts | None,
+    held_out: HeldOutContacts | None,
     state: DynamicsState,
     step: int,
     before: int = 0,
 ) -> None:
-    """Log what the encoder knows after so many steps, and the alarms since the step measured before; once for a run."""
-    if watched is None or context.done(f"{stage}/at{step}"):
+    """Log the measurements after `step` steps, and the alarms since those after `before` steps; once in a run."""
+    if held_out is None or context.done(f"{stage}/at{step}"):
         return
-    found = assess(networks, state, watched, context).summary()
-    if step:  # a random encoder is what the probes are held against, and has no lead over itself
+    found = assess(networks, state, held_out, context).summary()
+    if step:  # the probes are compared with the random encoder, which has no lead over itself
         start = context.load_stage(f"{stage}/at0")
         found |= {"probe_lead": found["probe"] - start["probe"], "kept": found["told_apart"] / start["told_apart"]}
     if before:

@@ -1,39 +1,40 @@
-"""What does an encoder learn about touch by predicting what it will feel next, without a single label?
+"""What does an encoder learn about touch by predicting its next observation, without a single label?
 
     make experiment EXP=pretrain_encoder
     make experiment EXP=ablation_ordinal ARGS="--encoder runs/pretrain_encoder/latest"
 
 Stage 1: a causal tactile encoder and a predictor learn the dynamics of presses by four sensors, on objects that no
-later stage sees.  Measured on objects that neither training nor probes have seen: the skill of the predicted latents
-over copying the last one, and linear probes for hardness, roughness and protrusion against the same probes on the
-encoder as it was before training.  The averaged encoder lies in the run as `encoder.npz`.
+later stage uses.  Measured on objects that neither training nor probes have used: the skill of the predicted latents
+over copying the last one, and linear probes for hardness, roughness and protrusion, compared with the same probes on
+the untrained encoder.  The averaged encoder is written to the run as `encoder.npz`.
 
 Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
 
-Expected: a skill near .5, since most of what the next level of force changes can be foreseen.  The skill over each
+Expected: a skill near .5, since most of the changes up to the next level of force are predictable.  The skill over each
 step's mean latent, which knows the force but not the object, says more: .4.  A random encoder is hard to beat: it
-computes the energies of its filters by design, and probes read seven labels in ten in them, as in fixed statistics of
-the pictures; the same network taught with the labels of 1,200 contacts gains two points.  Prediction moves hardness
-up at first, which is dynamics, and texture and shape down throughout, which are not: by the end three points are lost.
+computes the energies of its filters by design, and probes read seven labels in ten from them, as from fixed statistics
+of the pictures; the same network trained with the labels of 1,200 contacts gains two points.  Prediction first improves
+hardness, which is dynamics, and makes texture and shape, which are not, worse throughout: at the end three points are
+lost.
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context, read_metrics
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.charts import learning_curves
-from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows, watched
-from experiments.encoder.held_out import EncoderAssessment, assess
-from experiments.encoder.intervals import points, skill
+from experiments.core.text import bounds, interval
+from experiments.encoder.data import StageOneDataConfig, held_out_contacts, open_touch, training_rows
+from experiments.encoder.held_out import EncoderAssessment, assess, points, skill
 from experiments.encoder.pretrain import PretrainConfig, clip_of, encoder_of, pretrain, untrained
-from experiments.study.dataset import Dataset
 from experiments.study.pretrained import save_encoder
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.bench.statistics import Interval
 
 SEED = 0
 LEAST_SKILL, LEAST_LEAD = 0.2, 15.0  # over copy-last; points over the random encoder
@@ -49,46 +50,43 @@ class PretrainEncoderConfig:
 
 
 def run(config: PretrainEncoderConfig, context: Context) -> Results:
-    """Train, measure on the test objects before and after, save the encoder."""
+    """Train, save the encoder, measure on the test objects before and after."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
-    rows = training_rows(data)
-    during = watched(data, "val", config.touch, config.watch_fit)
-    stage = f"dynamics/{SEED}"
-    state = pretrain(config.pretrain, data.store, rows, data.clip, context, stage=stage, seed=SEED, watched=during)
-    save_encoder(
-        context.directory / "encoder.npz",
-        encoder_of(
-            config.pretrain, state, data.clip.sensors, steps=config.pretrain.steps, source=data.store.meta.source
-        ),
+    rows, sensors = training_rows(data), data.clip.sensors
+    state = pretrain(
+        config.pretrain,
+        data.store,
+        rows,
+        data.clip,
+        context,
+        stage=f"dynamics/{SEED}",
+        seed=SEED,
+        held_out=held_out_contacts(data, "val", config.touch, config.watch_fit),
     )
+    notes = {"steps": config.pretrain.steps, "source": data.store.meta.source}
+    save_encoder(context.directory / "encoder.npz", encoder_of(config.pretrain, state, sensors, **notes))
     with context.timed("assess"):
-        test = watched(data, "test", config.touch)
-        networks = config.pretrain.dynamics(len(data.clip.sensors))
+        test, networks = held_out_contacts(data, "test", config.touch), config.pretrain.dynamics(len(sensors))
         after = assess(networks, state, test, context)
         start = untrained(config.pretrain, data.store, rows, clip_of(config.pretrain, data.clip), SEED)
         before = assess(networks, start, test, context)
-    return findings(config, context, data, before, after)
-
-
-def findings(
-    config: PretrainEncoderConfig, context: Context, data: Dataset, before: EncoderAssessment, after: EncoderAssessment
-) -> Results:
-    """Requirements, table, curves."""
     objects = data.object_ids[data.parts["test"]]
-    copied = skill(after.error, after.copied, objects)
-    constant = skill(after.error, after.constant, objects)
+    copied, constant = (skill(after.error, reference, objects) for reference in (after.copied, after.constant))
     lead = points(after.right.astype(float) - before.right, objects)
-    lines = read_metrics(context.directory)
     return Results(
         verdict=(
-            f"On unseen objects the predicted latents have a skill of {copied.mean:.2f} {_span(copied)} over the last "
-            f"ones, and of {constant.mean:.2f} {_span(constant)} over the mean latent of each step.",
-            f"Linear probes are right in {after.accuracy:.1f} % where they were in {before.accuracy:.1f} % before "
-            f"training: {lead.mean:+.1f} points [{lead.low:.1f}, {lead.high:.1f}].",
+            f"On unseen objects the predicted latents have a skill of {interval(copied, '.2f')} over the last ones, "
+            f"and of {interval(constant, '.2f')} over the mean latent of each step.",
+            f"Linear probes are right in {after.accuracy:.1f} %, before training in {before.accuracy:.1f} %: "
+            f"{interval(lead, '+.1f')} points.",
         ),
         requirements=(
             Requirement(
-                name="skill over copy-last", measured=copied.low, bound=LEAST_SKILL, better="higher", note=_LOW
+                name="skill over copy-last",
+                measured=copied.low,
+                bound=LEAST_SKILL,
+                better="higher",
+                note="lower end of the 95 % interval over objects",
             ),
             Requirement(
                 name="probes over a random encoder",
@@ -96,16 +94,16 @@ def findings(
                 bound=LEAST_LEAD,
                 better="higher",
                 unit="points",
-                note=f"interval over objects [{lead.low:.1f}, {lead.high:.1f}]",
+                note=f"interval over objects {bounds(lead.low, lead.high, '.1f')}",
             ),
         ),
-        tables=(_table(before, after, objects),),
+        tables=(probe_table(before, after, objects),),
         pictures=(
             Picture(
                 name="pretrain_encoder",
                 title="Learning",
                 caption="Loss terms of every step, and held-out skill and probes on the validation objects.",
-                content=learning_curves(lines, SEED),
+                content=learning_chart(read_metrics(context.directory)),
             ),
         ),
         settings={"steps": config.pretrain.steps, "contacts a step": config.pretrain.batch_size},
@@ -113,32 +111,59 @@ def findings(
     )
 
 
-_LOW = "lower end of the 95 % interval over objects"
-
-
-def _span(x: Interval) -> str:
-    return f"[{x.low:.2f}, {x.high:.2f}]"
-
-
-def _table(before: EncoderAssessment, after: EncoderAssessment, objects: np.ndarray) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+def probe_table(before: EncoderAssessment, after: EncoderAssessment, objects: np.ndarray) -> Table:
+    """Probes by attribute before and after training."""
+    rows: list[dict[str, Cell]] = []
     for a, name in enumerate((*ORDINAL, "mean of three")):
         pick = slice(a, a + 1) if a < len(ORDINAL) else slice(None)
-        was, now = points(before.right[:, pick], objects), points(after.right[:, pick], objects)
         gain = points(after.right[:, pick].astype(float) - before.right[:, pick], objects)
-        rows.append((name, was.mean, now.mean, gain.mean, f"[{gain.low:.1f}, {gain.high:.1f}]"))
-    return Table(
-        title=f"Linear probes on {len(np.unique(objects))} unseen objects",
-        columns=(
-            Column(name="attribute"),
-            Column(name="random encoder", unit="%", format=".1f", meaning="the same networks before training"),
-            Column(name="pretrained", unit="%", format=".1f", meaning="the averaged encoder"),
-            Column(name="gain", unit="points", format=".1f"),
-            Column(name="95 %", meaning="over objects, paired"),
-        ),
-        rows=tuple(rows),
+        rows.append(
+            {
+                "attribute": name,
+                "random encoder": points(before.right[:, pick], objects).mean,
+                "pretrained": points(after.right[:, pick], objects).mean,
+                "gain": gain.mean,
+                "95 %": bounds(gain.low, gain.high, ".1f"),
+            }
+        )
+    figures = ("random encoder", "pretrained", "gain")
+    return named_table(
+        f"Linear probes on {len(np.unique(objects))} unseen objects",
+        rows,
+        formats=dict.fromkeys(figures, ".1f"),
+        units=dict(zip(figures, ("%", "%", "points"), strict=True)),
+        meanings={
+            "random encoder": "the same networks before training",
+            "pretrained": "the averaged encoder",
+            "95 %": "over objects, paired",
+        },
         note="The probes read each stream's tokens, mean over its steps.",
     )
+
+
+def learning_chart(lines: Sequence[Mapping[str, Any]]) -> bytes:
+    """Loss terms, held-out skill and held-out probes over steps, from the logged lines of a run."""
+    trained, probed = ([line for line in lines if line["stage"] == f"{name}/{SEED}"] for name in ("dynamics", "probe"))
+
+    def curve(name: str, key: str, rows: Sequence[Mapping[str, Any]], **look: Any) -> Series:
+        return Series(name, x=[row["step"] for row in rows], y=[row[key] for row in rows], width=1.4, **look)
+
+    low = min((line["skill_over_mean"] for line in probed[1:]), default=0.0)
+    terms = {"prediction": "prediction error", "variance_term": "variance term"}
+    skills = {"skill": "over copy-last", "skill_over_mean": "over the step's mean"}
+    panels = [
+        Panel([curve(name, key, trained, marker="") for key, name in terms.items()], title="loss terms"),
+        Panel(
+            [
+                curve("skill on training batches", "skill", trained, marker="", colour="#b8c0c8", alpha=0.8),
+                *(curve(f"skill {name}", key, probed[1:]) for key, name in skills.items()),
+            ],
+            title="held-out skill",
+            y_limits=(min(-0.1, low - 0.05), 1),
+        ),
+        Panel([curve(name, f"probe_{name}", probed) for name in ORDINAL], title="linear probes, % right"),
+    ]
+    return draw([dataclasses.replace(panel, x_label="step") for panel in panels], size=(10.2, 3.4))
 
 
 DEFAULT = PretrainEncoderConfig()

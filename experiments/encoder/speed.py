@@ -1,4 +1,4 @@
-"""How fast an encoder reads prompts, how near the machine it comes, and where the rest of the time goes."""
+"""Time and arithmetic of an encoder's forward pass, of its parts, and of a matrix product for comparison."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
@@ -14,7 +14,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, kept_p
 from touchr1_jax.training.dynamics import DynamicsConfig, encode_each, read_frames
 from touchr1_jax.types import Params, TouchBatch
 
-MATRIX = 1024  # side of the matrices whose product is the yardstick of the machine
+MATRIX = 1024  # side of the matrices whose product gives the peak rate of the machine
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,14 +26,12 @@ class CompiledProgram:
 
 
 def forward(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> CompiledProgram:
-    """The encoder from the bytes of a batch to its tokens."""
+    """The encoder, from the bytes of a batch to its tokens."""
     return by_contact(lambda p, b: encode_each(networks.encoder, p, read_frames(networks, b)), params, batch)
 
 
 def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[str, Callable[[], CompiledProgram]]:
-    """How to compile programs that each do one thing more than the one before, contact by contact, up to the whole
-    encoder.
-    """
+    """Makers of programs that each do one thing more than the one before, up to the whole encoder."""
     e = networks.encoder
     shallow = dataclasses.replace(e, num_layers=0)
     few = {name: x for name, x in params.items() if not name.startswith("layer_")}
@@ -71,30 +69,30 @@ def matrix_product() -> CompiledProgram:
     """One product of square matrices."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
     product = lambda a: a @ a
-    return CompiledProgram(call=held(product, x), gflop=arithmetic(product, x))
+    return CompiledProgram(call=bind(product, x), gflop=arithmetic(product, x))
 
 
 def by_contact(function: Callable[..., Any], *arguments: Any) -> CompiledProgram:
     """A program that reads the contacts of a batch, its last argument, one after the other.
 
-    XLA counts one turn of a loop, however many it takes: the arithmetic is that of one contact, times their number.
+    XLA counts a loop's body once, so the arithmetic is that of one contact times their number.
     """
     *others, batch = arguments
     one = jax.tree.map(lambda x: x[:1], batch)
     return CompiledProgram(
-        call=held(function, *arguments), gflop=len(batch.frames) * arithmetic(function, *others, one)
+        call=bind(function, *arguments), gflop=len(batch.frames) * arithmetic(function, *others, one)
     )
 
 
-def held(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Compiled for some arguments, which are held on the device, so that a call takes none."""
+def bind(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """The function compiled for these arguments, which stay on the device."""
     placed = jax.device_put(arguments)
     program = jax.jit(function).lower(*placed).compile()
     return lambda: program(*placed)
 
 
 def arithmetic(function: Callable[..., Any], *arguments: Any) -> float:
-    """Gflop of a call as XLA counts them before it optimises, a loop's body once."""
+    """Gflop of a call as XLA counts them before optimisation, a loop's body once."""
     cost: Any = jax.jit(function).lower(*arguments).cost_analysis()
     return float(cost["flops"]) / 1e9
 

@@ -1,35 +1,37 @@
-"""What makes latent prediction collapse, is it noticed, and what cures it?
+"""What makes latent prediction collapse, do the alarms notice it, and what cures it?
 
     make experiment EXP=stability_encoder [ARGS="--scale smoke"]
 
-Stage 1 in small: pictures of 28 px of two sensors, an encoder of one layer, ten seeds in one program.  One guard after
-the other is taken away: stop-gradient, moving average, variance and covariance terms, and the learning rate is raised;
-then single guards are given back.  On validation objects every run is measured as it goes: what contacts differ by
-relative to the size of the latents, effective rank, skill over copying the last latent.  These are the alarms, and they
-strike when a bound is passed twice in a row and nothing recovers.  A run has failed if at its end contacts of the test
-objects differ by less than half of what they did before training.  Linear probes see little of it: they scale every
-feature to unit spread, however small it is, which a decoder cannot.
+Stage 1 in small: pictures of 28 px of two sensors, an encoder of one layer, ten seeds in one program.  The guards are
+removed one after the other: variance and covariance terms, moving average, stop-gradient, and the learning rate is
+raised; then single guards are restored.  Every run is measured during training on validation objects: the spread
+between contacts relative to the size of the latents, effective rank, skill over copying the last latent.  An alarm is
+raised if one of these passes its bound twice in a row and none recovers.  A run has failed if at its end the spread
+between contacts of the test objects is less than half of that before training.  Linear probes notice little of it: they
+scale every feature to unit spread, however small it is, which a decoder cannot.
 
 Cost: about six minutes on one core, `--scale smoke` under one.
 
-Expected: without any guard all contacts become one point, and the alarm says so at step 75; the two terms alone prevent
-it.  With the stop-gradient but without terms latents stay small without losing what tells contacts apart, and no alarm
-strikes.  Without the average either, contacts come together for some dozen steps and part again.  A rate thirty times
-too high costs skill, and some alarms.
+Expected: without any guard all contacts become one point, and the alarm is raised at step 75; the two terms alone
+prevent it.  With the stop-gradient but without terms latents stay small but still distinguish contacts, and there is no
+alarm.  Without the average either, contacts come together for some dozen steps and separate again.  A rate thirty times
+too high costs skill, and raises some alarms.
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
 from experiments.core.errors import DataError
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.charts import collapse_curves
-from experiments.encoder.collapse import CollapseArm, CollapseRun, Runner, in_memory, make_runner
+from experiments.encoder.collapse import CollapseRun, CollapseRunner, in_memory, make_runner
 from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows
 from experiments.study.dataset import Dataset
 from experiments.study.feeds import touch_batch
@@ -41,28 +43,40 @@ from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.training.dynamics import DynamicsConfig, Guards
 from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import collapse_alarms, probe_right
+from touchr1_jax.training.probes import BOUNDS, collapse_alarms, probe_right
 from touchr1_jax.types import TouchBatch
 
 RATE = 1e-3
 NONE = Guards(variance=0.0, covariance=0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CollapseArm:
+    """One way to train: guards, learning rate, and the arm whose failure it is meant to cure, if any."""
+
+    name: str
+    guards: Guards
+    rate: float = RATE
+    cures: str = ""
+
+
 ARMS = (
-    CollapseArm(name="all guards", guards=Guards(), rate=RATE),
-    CollapseArm(name="no terms", guards=NONE, rate=RATE),
-    CollapseArm(name="no terms, no average", guards=dataclasses.replace(NONE, ema=0.0), rate=RATE),
-    CollapseArm(name="no guards", guards=dataclasses.replace(NONE, ema=0.0, leak=1.0), rate=RATE),
-    CollapseArm(name="variance alone", guards=dataclasses.replace(NONE, variance=1.0), rate=RATE, cures="no terms"),
-    CollapseArm(name="terms without average", guards=Guards(ema=0.0), rate=RATE, cures="no terms, no average"),
-    CollapseArm(name="terms alone", guards=Guards(ema=0.0, leak=1.0), rate=RATE, cures="no guards"),
+    CollapseArm(name="all guards", guards=Guards()),
+    CollapseArm(name="no terms", guards=NONE),
+    CollapseArm(name="no terms, no average", guards=dataclasses.replace(NONE, ema=0.0)),
+    CollapseArm(name="no guards", guards=dataclasses.replace(NONE, ema=0.0, leak=1.0)),
+    CollapseArm(name="variance alone", guards=dataclasses.replace(NONE, variance=1.0), cures="no terms"),
+    CollapseArm(name="terms without average", guards=Guards(ema=0.0), cures="no terms, no average"),
+    CollapseArm(name="terms alone", guards=Guards(ema=0.0, leak=1.0), cures="no guards"),
     CollapseArm(name="all guards, rate × 30", guards=Guards(), rate=30 * RATE),
 )
-"""Guards taken away, then given back."""
+"""Guards removed, then restored."""
 
 GRACE = 1
-"""Measurements that no alarm looks at: a fresh encoder takes some dozen steps to spread."""
+"""Measurements that raise no alarm: the latents of a fresh encoder take some dozen steps to spread."""
 
 FAILED_SHARE = 0.5
-"""Share of the untrained encoder's `telling` that a run must keep."""
+"""Share of the untrained encoder's spread that a run must keep."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,34 +100,34 @@ class StabilityEncoderConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CollapseOutcome:
-    """One arm: what was seen of every seed, [seed, block].
+    """One arm.
 
     Args:
-      arm: how it was trained.
-      looks: the measurements that raise alarms.
-      kept: [seed], what test contacts differ by at the end, over what they did before training, `probes.told_apart`.
+      arm: guards and rate.
+      measured: the measurements that raise alarms, by name, [seed, block].
+      kept: [seed], `probes.told_apart` of the test contacts at the end, over that before training.
       lead: [seed], points of the probes over those on the untrained encoder, at the end.
     """
 
     arm: CollapseArm
-    looks: dict[str, np.ndarray]
+    measured: dict[str, np.ndarray]
     kept: np.ndarray
     lead: np.ndarray
 
     @property
     def failed(self) -> np.ndarray:
-        """Which seeds tell contacts apart by less than half of what they did untrained, bool [seed]."""
+        """Seeds that keep less than half of the untrained spread, bool [seed]."""
         return self.kept < FAILED_SHARE
 
     @property
     def alarmed(self) -> np.ndarray:
-        """Which seeds raised an alarm during training, bool [seed]; the probe's alarm comes too late to count."""
+        """Seeds with an alarm during training, bool [seed]."""
         return np.array([self.first_alarm(seed) is not None for seed in range(len(self.lead))])
 
     def first_alarm(self, seed: int) -> int | None:
-        """The measurement at which a seed raised its first alarm, those of the beginning left out."""
-        reading = lambda block: {name: float(x[seed, block]) for name, x in self.looks.items()}
-        for block in range(GRACE + 1, next(iter(self.looks.values())).shape[1]):
+        """The measurement at which a seed raised its first alarm, after the grace period."""
+        reading = lambda block: {name: float(x[seed, block]) for name, x in self.measured.items()}
+        for block in range(GRACE + 1, next(iter(self.measured.values())).shape[1]):
             if collapse_alarms(reading(block - 1), reading(block)):
                 return block
         return None
@@ -123,39 +137,28 @@ def run(config: StabilityEncoderConfig, context: Context) -> Results:
     """Every arm, all seeds at once.
 
     Raises:
-      DataError: a single contact to watch.
+      DataError: fewer than two contacts to watch.
     """
     data = open_touch(config.touch, config.frames, config.touch.scenes.image_px, context)
     if len(data.parts["val"]) < 2:
         raise DataError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
-    contacts, label, train = load(data, config, context)
-    watched = batch_of(data, config, data.parts["val"], context)
+    fit, test = training_rows(data), data.parts["test"]
+    rows = np.concatenate([fit, test])
+    label = data.label[rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
+    train = np.arange(len(rows)) < len(fit)
     encoder = dataclasses.replace(config.encoder, sensors=config.sensors)
-    networks = DynamicsConfig(encoder=encoder, predictor=config.predictor)
     runner = make_runner(
-        networks,
-        contacts,
+        DynamicsConfig(encoder=encoder, predictor=config.predictor),
+        batch_of(data, config, rows, context),
         train,
-        watched,
+        batch_of(data, config, data.parts["val"], context),
         batch_size=config.batch_size,
         blocks=config.blocks,
         block_steps=config.block_steps,
     )
     keys = jax.random.split(jax.random.key(0), config.seeds)
-    outcomes = []
-    with context.progress("arms", len(ARMS)) as advance:
-        for arm in ARMS:
-            outcomes.append(drive(runner, arm, keys, label, train, config.probe))
-            advance()
-    return findings(config, outcomes)
-
-
-def load(data: Dataset, config: StabilityEncoderConfig, context: Context) -> tuple[TouchBatch, np.ndarray, np.ndarray]:
-    """All contacts of training and test objects, their ordinal labels, and which are for training."""
-    fit, read = training_rows(data), data.parts["test"]
-    rows = np.concatenate([fit, read])
-    label = data.label[rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
-    return batch_of(data, config, rows, context), label, np.arange(len(rows)) < len(fit)
+    outcomes = [run_arm(runner, arm, keys, label, train, config.probe) for arm in context.each("arms", ARMS)]
+    return report(config, outcomes)
 
 
 def batch_of(data: Dataset, config: StabilityEncoderConfig, rows: np.ndarray, context: Context) -> TouchBatch:
@@ -170,41 +173,40 @@ def batch_of(data: Dataset, config: StabilityEncoderConfig, rows: np.ndarray, co
     return in_memory(found)
 
 
-def drive(
-    runner: Runner, arm: CollapseArm, keys: jax.Array, label: np.ndarray, train: np.ndarray, probe: ProbeConfig
+def run_arm(
+    runner: CollapseRunner, arm: CollapseArm, keys: jax.Array, label: np.ndarray, train: np.ndarray, probe: ProbeConfig
 ) -> CollapseOutcome:
     """Train all seeds of an arm and probe them."""
-    course: CollapseRun = jax.device_get(runner(arm.guards, jnp.float32(arm.rate), keys))
+    found: CollapseRun = jax.device_get(runner(arm.guards, jnp.float32(arm.rate), keys))
     lead = [
         100.0 * (probe_right(after, label, train, probe).mean() - probe_right(before, label, train, probe).mean())
-        for before, after in zip(course.before, course.after, strict=True)
+        for before, after in zip(found.before, found.after, strict=True)
     ]
-    kept = course.end.telling / course.start.telling
-    looks = {
-        "kept": np.asarray(course.looks.telling / course.untrained.telling[:, None]),
-        "rank_share": np.asarray(course.looks.rank_share),
-        "skill": np.asarray(course.looks.skill),
+    measured = {
+        "kept": np.asarray(found.blocks.told_apart / found.untrained.told_apart[:, None]),
+        "rank_share": np.asarray(found.blocks.rank_share),
+        "skill": np.asarray(found.blocks.skill),
     }
-    return CollapseOutcome(arm=arm, looks=looks, kept=np.asarray(kept), lead=np.array(lead))
+    kept = np.asarray(found.end.told_apart / found.start.told_apart)
+    return CollapseOutcome(arm=arm, measured=measured, kept=kept, lead=np.array(lead))
 
 
-def findings(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Results:
-    """Who failed, who was noticed, what cured it."""
-    failed = np.concatenate([o.failed for o in outcomes])
-    alarmed = np.concatenate([o.alarmed for o in outcomes])
+def report(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Results:
+    """Failures, alarms and cures."""
+    failed, alarmed = (np.concatenate([getattr(o, name) for o in outcomes]) for name in ("failed", "alarmed"))
     by = {o.arm.name: o for o in outcomes}
     noticed = float(alarmed[failed].mean()) if failed.any() else 1.0
     false = float(alarmed[~failed].mean()) if (~failed).any() else 0.0
-    cures = [o for o in outcomes if o.arm.cures and by[o.arm.cures].failed.any()]
+    cures = [(o, by[o.arm.cures]) for o in outcomes if o.arm.cures and by[o.arm.cures].failed.any()]
     return Results(
         verdict=(
-            f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training noticed "
-            f"{noticed:.0%} of them and struck in {false:.0%} of the others.",
+            f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training noticed {noticed:.0%} of them and "
+            f"were raised in {false:.0%} of the others.",
             *(
-                f"{o.arm.name}: {o.failed.mean():.0%} of the seeds fail where {by[o.arm.cures].failed.mean():.0%} of "
-                f"'{o.arm.cures}' do; contacts differ {np.median(o.kept):.2g} times as much as untrained, there "
-                f"{np.median(by[o.arm.cures].kept):.2g}."
-                for o in cures
+                f"{o.arm.name}: {o.failed.mean():.0%} of the seeds fail, of '{ill.arm.name}' {ill.failed.mean():.0%}; "
+                f"the spread between contacts is {np.median(o.kept):.2g} times the untrained one, there "
+                f"{np.median(ill.kept):.2g}."
+                for o, ill in cures
             ),
         ),
         requirements=(
@@ -233,51 +235,76 @@ def findings(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) ->
                 note=f"{config.seeds} seeds",
             ),
         ),
-        tables=(_table(config, outcomes),),
+        tables=(arm_table(config, outcomes),),
         pictures=(
             Picture(
                 name="stability_encoder",
-                title="Courses of collapse",
+                title="Runs into collapse",
                 caption="Held-out measurements, a thin line for each seed, a bold one for their median; dotted: the "
                 "bound of the alarm.",
-                content=collapse_curves({o.arm.name: o.looks for o in outcomes}, config.block_steps),
+                content=collapse_chart(outcomes, config.block_steps),
             ),
         ),
         settings={"seeds": config.seeds, "steps": config.blocks * config.block_steps, "learning rate": RATE},
     )
 
 
-def _table(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Table:
-    rows: list[tuple[Cell, ...]] = []
+def arm_table(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> Table:
+    """All arms at the end of training."""
+    rows: list[dict[str, Cell]] = []
     for o in outcomes:
-        first = [b for seed in range(config.seeds) if (b := o.first_alarm(seed)) is not None]
-        when = config.block_steps * (1 + float(np.median(first))) if first else None
-        ends = [float(np.median(o.looks[name][:, -1])) for name in ("rank_share", "skill")]
+        first = [block for seed in range(config.seeds) if (block := o.first_alarm(seed)) is not None]
         rows.append(
-            (
-                o.arm.name,
-                float(np.median(o.kept)),
-                *ends,
-                float(o.lead.mean()),
-                100 * o.failed.mean(),
-                100 * o.alarmed.mean(),
-                when,
-            )
+            {
+                "arm": o.arm.name,
+                "kept": float(np.median(o.kept)),
+                "rank": float(np.median(o.measured["rank_share"][:, -1])),
+                "skill": float(np.median(o.measured["skill"][:, -1])),
+                "probes": float(o.lead.mean()),
+                "failed": 100 * o.failed.mean(),
+                "alarm": 100 * o.alarmed.mean(),
+                "at": config.block_steps * (1 + float(np.median(first))) if first else None,
+            }
         )
-    return Table(
-        title=f"Ends of {config.seeds} seeds",
-        columns=(
-            Column(name="arm"),
-            Column(name="kept", format=".2f", meaning="what contacts differ by, over what they did untrained, median"),
-            Column(name="rank", format=".2f", meaning="effective rank over width, median over seeds"),
-            Column(name="skill", format=".2f", meaning="over copying the last latent, median over seeds"),
-            Column(name="probes", unit="pts", format="+.1f", meaning="over the untrained encoder, mean over seeds"),
-            Column(name="failed", unit="%", format=".0f", meaning="seeds that keep less than half"),
-            Column(name="alarm", unit="%", format=".0f", meaning="seeds with an alarm for what is kept, rank or skill"),
-            Column(name="at", unit="step", format=".0f", meaning="of the first alarm, median over seeds"),
-        ),
-        rows=tuple(rows),
+    return named_table(
+        f"Ends of {config.seeds} seeds",
+        rows,
+        formats={"kept": ".2f", "rank": ".2f", "skill": ".2f", "probes": "+.1f"}
+        | dict.fromkeys(("failed", "alarm", "at"), ".0f"),
+        units={"probes": "pts", "failed": "%", "alarm": "%", "at": "step"},
+        meanings={
+            "kept": "spread between contacts over that before training, median",
+            "rank": "effective rank over width, median over seeds",
+            "skill": "over copying the last latent, median over seeds",
+            "probes": "over the untrained encoder, mean over seeds",
+            "failed": "seeds that keep less than half",
+            "alarm": "seeds with an alarm for spread, rank or skill",
+            "at": "of the first alarm, median over seeds",
+        },
     )
+
+
+def collapse_chart(outcomes: list[CollapseOutcome], block_steps: int) -> bytes:
+    """One panel per alarm: the measurements of every arm over steps, and the alarm's bound."""
+    colours = dict(zip((o.arm.name for o in outcomes), (*PALETTE, SHARED, "#8c564b"), strict=False))
+
+    def series(o: CollapseOutcome, name: str) -> list[Series]:
+        values, colour = o.measured[name], colours[o.arm.name]
+        steps = block_steps * np.arange(1, values.shape[1] + 1)
+        thin = [Series(x=steps, y=seed, marker="", colour=colour, width=0.5, alpha=0.25) for seed in values]
+        line, median = "--" if o.arm.cures else "-", np.median(values, 0)
+        return [*thin, Series(o.arm.name, x=steps, y=median, marker="", colour=colour, line=line, width=1.7)]
+
+    def panel(name: str, title: str, **axes: Any) -> Panel:
+        every = [one for o in outcomes for one in series(o, name)]
+        return Panel(every, title=title, x_label="step", rules=[Rule(y=BOUNDS[name][0], width=0.9)], **axes)
+
+    panels = [
+        panel("kept", "spread between contacts, over untrained", y_scale="log"),
+        panel("rank_share", "effective rank, share of width", y_limits=(0, 1)),
+        panel("skill", "skill", y_limits=(-1, 1)),
+    ]
+    return draw(panels, size=(10.2, 3.9))
 
 
 DEFAULT = StabilityEncoderConfig()

@@ -1,4 +1,4 @@
-"""Encoders that read more or less of a scene of 8 frames by four sensors at 112²."""
+"""Variants of the encoder that read more or less of a prompt of 8 frames by four sensors at 112²."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -11,15 +11,15 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 
 FRAMES, IMAGE_PX = 8, 112
 REFERENCE = "256 tokens"
-"""The variant that the others are held against: 4 steps of two frames, 64 patches of 14 px."""
+"""The variant that the others are compared with: 4 steps of two frames, 64 patches of 14 px."""
 
 STUDIED = "4 frames by salience"
-"""The variant with the encoder of the studies: four frames, each a step of 16 patches of 28 px."""
+"""The variant that the studies use: four frames, each a step of 16 patches of 28 px."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EncoderVariant:
-    """One encoder: its kind of saving, its networks and clips, and whether it reads fields instead of pictures."""
+    """One encoder: its kind of saving, its networks and clips; with `fields` it reads fields instead of pictures."""
 
     name: str
     kind: str
@@ -40,7 +40,7 @@ class EncoderVariant:
 
 
 def variants(base: PretrainConfig) -> tuple[EncoderVariant, ...]:
-    """Every saving on its own, the reference first, then those that go together."""
+    """Every saving alone, the reference first, then savings combined."""
     two = dataclasses.replace(base.encoder, frames_per_step=2)
     kept = lambda count, rest: dataclasses.replace(two, patches_kept=count, rest=rest)
     fine = dataclasses.replace(two, stem_px=2)
@@ -69,7 +69,7 @@ def variants(base: PretrainConfig) -> tuple[EncoderVariant, ...]:
 
 
 class FieldsOnly:
-    """Contacts without their pictures, so that clips show deformation and depth."""
+    """Contacts without their pictures, so that clips are drawn from deformation and depth."""
 
     def __init__(self, store: Contacts) -> None:
         self._store = store
@@ -88,6 +88,6 @@ class FieldsOnly:
         return len(self._store)
 
     def contact(self, i: int, *, fields: bool = True) -> Mapping[str, Sequence]:
-        """Contact i by sensor; fields are read whatever is asked, for they are all there is."""
+        """Contact i by sensor; fields are always read, since nothing else is left."""
         del fields
         return {s: dataclasses.replace(x, frames=None) for s, x in self._store.contact(i, fields=True).items()}

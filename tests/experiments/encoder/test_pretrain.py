@@ -1,4 +1,4 @@
-"""Stage 1 as a stage: it resumes bit for bit, measures once, and others start from it."""
+"""Stage 1 as a stage and on the command line, shrunk: it resumes bit for bit, and a study starts from its encoder."""
 
 import dataclasses
 import io
@@ -8,44 +8,59 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
-from experiments.encoder import pretrain as module
-from experiments.encoder.data import StageOneDataConfig, watched
-from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain, starting_from, untrained
-from experiments.encoder.variants import STUDIED, FieldsOnly, variants
-from sensors_io.pipeline import make_clip
+from experiments.encoder import pretrain_encoder
+from experiments.encoder.data import StageOneDataConfig, held_out_contacts
+from experiments.encoder.pretrain import PretrainConfig, pretrain
+from experiments.study.assembly import assemble
+from experiments.study.pretrained import load_encoder
+from experiments.study.stages import run_sft
+from experiments.study.training import starting_model
 from tests.experiments import tiny
+from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.training.evidence import ProbeConfig
 
-CONFIG = PretrainConfig(
+PRETRAIN = PretrainConfig(
     encoder=dataclasses.replace(tiny.MODEL.tactile, causal=True),
     predictor=PredictorConfig(width=8, num_layers=1, num_heads=2),
     image_px=28,
-    steps=4,
+    steps=2,
     batch_size=2,
     probe_every=2,
 )
-TOUCH = StageOneDataConfig(probe_fit=6, probe=ProbeConfig(folds=2, iterations=3))
+DATA = StageOneDataConfig(scenes=tiny.SCENES, probe_fit=6, probe=ProbeConfig(folds=2, iterations=3))
 
 
 class Stop(RuntimeError):
     """The machine went away."""
 
 
-def run(data, context, **options):
-    rows = data.parts["sft"]
-    return pretrain(CONFIG, data.store, rows, data.clip, context, stage="dynamics/0", seed=0, **options)
+class StoppedContext(Context):
+    """A run that stops after the first checkpoint, before the measurement that follows it."""
+
+    def done(self, stage):
+        if stage == "probe/0/at2":
+            raise Stop
+        return super().done(stage)
+
+
+def run(data, directory, context_class=Context):
+    """Pretrain for four steps, measured every two; the state and the logged lines."""
+    context = context_class(directory, directory, Console(file=io.StringIO()))
+    held_out, config = held_out_contacts(data, "test", DATA), dataclasses.replace(PRETRAIN, steps=4)
+    stage = {"stage": "dynamics/0", "seed": 0}
+    try:
+        state = pretrain(config, data.store, data.parts["sft"], data.clip, context, **stage, held_out=held_out)
+    finally:
+        context.close()
+    return state, read_metrics(directory)
 
 
 @pytest.fixture(scope="module")
 def whole(data, tmp_path_factory):
-    """An uninterrupted run: its state and its lines."""
-    directory = tmp_path_factory.mktemp("whole")
-    context = Context(directory, directory, Console(file=io.StringIO()))
-    state = run(data, context, watched=watched(data, "test", TOUCH))
-    context.close()
-    return state, read_metrics(directory)
+    return run(data, tmp_path_factory.mktemp("whole"))
 
 
 def test_it_measures_before_during_and_after(whole):
@@ -56,55 +71,37 @@ def test_it_measures_before_during_and_after(whole):
     assert [line["step"] for line in whole[1] if line["stage"] == "dynamics/0"] == [0, 1, 2, 3]
 
 
-def test_a_stopped_run_goes_on_bit_for_bit(whole, data, context, monkeypatch):
-    """It stops right after the first checkpoint, before that is measured."""
-    calls = iter(range(9))
-    measure = module._measure
-    monkeypatch.setattr(module, "_measure", lambda *a: _raise() if next(calls) == 1 else measure(*a))
+def test_a_stopped_run_resumes_bit_for_bit(whole, data, tmp_path):
     with pytest.raises(Stop):
-        run(data, context, watched=watched(data, "test", TOUCH))
-    monkeypatch.setattr(module, "_measure", measure)
-    state = run(data, context, watched=watched(data, "test", TOUCH))
-    for a, b in zip(jax.tree.leaves(state.params), jax.tree.leaves(whole[0].params), strict=True):
-        np.testing.assert_array_equal(a, b)
+        run(data, tmp_path, StoppedContext)
+    state, lines = run(data, tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, state.params, whole[0].params)
     key = lambda line: (line["stage"], line["step"])
-    assert sorted(read_metrics(context.directory), key=key) == sorted(whole[1], key=key)
+    assert sorted(lines, key=key) == sorted(whole[1], key=key)
 
 
-def _raise():
-    raise Stop
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory, cache_dir):
+    config = pretrain_encoder.PretrainEncoderConfig(touch=DATA, pretrain=PRETRAIN, watch_fit=6)
+    return run_shrunk(pretrain_encoder, config, tmp_path_factory.mktemp("runs"), "--cache-dir", str(cache_dir))
 
 
-def test_training_can_start_from_an_encoder(whole, data):
-    encoder = encoder_of(CONFIG, whole[0], data.clip.sensors)
-    fresh = untrained(CONFIG, data.store, data.parts["sft"], data.clip, 0)
-    state = starting_from(fresh, encoder)
-    for a, b in zip(jax.tree.leaves(state.params["encoder"]), jax.tree.leaves(whole[0].target), strict=True):
-        np.testing.assert_array_equal(a, b)
-    narrow = dataclasses.replace(encoder, params={**encoder.params, "norm": {"scale": np.ones(3)}})
-    with pytest.raises(ValueError, match="start has shapes"):
-        starting_from(fresh, narrow)
+def test_everything_is_reported(directory):
+    results = read_json(directory / "results.json")
+    names = [r["name"] for r in results["requirements"]]
+    assert names == ["skill over copy-last", "probes over a random encoder"]
+    assert [row[0] for row in results["tables"][0]["rows"]] == ["hardness", "roughness", "protrusion", "mean of three"]
+    assert (directory / "plots" / "pretrain_encoder.svg").exists()
+    assert load_encoder(directory).notes == {"steps": 2, "source": "generated"}
 
 
-def test_fields_take_the_place_of_pictures(data):
-    fields = FieldsOnly(data.store)
-    clip = make_clip(fields.contact(0, fields=False), data.store.objects[data.object_ids[0]], data.clip)
-    pictures = make_clip(data.store.contact(0), data.store.objects[data.object_ids[0]], data.clip)
-    assert clip.frames.shape == pictures.frames.shape
-    assert (clip.frames[0] != pictures.frames[0]).any()
-    np.testing.assert_array_equal(clip.force_n, pictures.force_n)
-    assert len(fields) == len(data.store)
-
-
-def test_variants_say_how_many_tokens_they_have():
-    tokens = {v.name: v.tokens for v in variants(PretrainConfig(frames=8))}
-    assert tokens["256 tokens"] == 256
-    assert tokens["128 tokens"] == 128
-    assert tokens["64 tokens"] == tokens["4 frames by salience"] == tokens["56²"] == tokens["fields"] == 64
-    assert tokens["8 patches"] == tokens["32 tokens"] == tokens["4 frames, 8 patches"] == 32
-    assert (tokens["4 patches"], tokens["4 patches and the rest"]) == (16, 20)
-
-
-def test_one_variant_is_the_encoder_of_the_studies():
-    studied = next(v.config for v in variants(PretrainConfig(frames=8)) if v.name == STUDIED)
-    assert (studied.encoder, studied.frames_kept) == (PretrainConfig().encoder, PretrainConfig().frames)
+def test_a_study_starts_from_it(directory, data, context):
+    """Before the first step of SFT its encoder is the pretrained one, causal as it was trained."""
+    model, tactile = starting_model(tiny.STUDY.model, directory, data.clip.sensors)
+    assert model.tactile.causal
+    evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
+    untouched = dataclasses.replace(tiny.STUDY.sft, steps=0)
+    assembly = assemble(model, data.clip.sensors)
+    params = run_sft(assembly, data, evidence, untouched, context, seed=0, stage="sft/0", tactile=tactile)
+    jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
+    assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)

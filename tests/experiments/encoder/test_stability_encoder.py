@@ -1,4 +1,4 @@
-"""Collapse, shrunk, and how its outcomes are read."""
+"""Collapse, shrunk, and the failures and alarms of its outcomes."""
 
 import dataclasses
 
@@ -22,13 +22,9 @@ TINY = dataclasses.replace(
 )
 
 
-@pytest.fixture(scope="module")
-def directory(tmp_path_factory, cache_dir):
-    return run_shrunk(stability_encoder, TINY, tmp_path_factory.mktemp("runs"), "--cache-dir", str(cache_dir))
-
-
 @pytest.mark.slow
-def test_every_arm_is_reported(directory):
+def test_every_arm_is_reported(tmp_path, cache_dir):
+    directory = run_shrunk(stability_encoder, TINY, tmp_path, "--cache-dir", str(cache_dir))
     results = read_json(directory / "results.json")
     assert [row[0] for row in results["tables"][0]["rows"]] == [arm.name for arm in ARMS]
     assert (directory / "plots" / "stability_encoder.svg").exists()
@@ -41,14 +37,14 @@ def test_every_cure_names_an_arm():
     assert {arm.cures for arm in ARMS if arm.cures} < names
 
 
-def test_failure_is_told_by_what_is_left_and_alarms_by_measurements():
-    """Seed 0 falls and recovers, seed 1 falls for good and keeps a third of what told contacts apart."""
-    looks = {
-        "kept": np.array([[0.2, 0.3, 0.9], [0.9, 0.4, 0.3]]),  # what a fresh encoder shows raises no alarm
+def test_failure_is_defined_at_the_end_and_alarms_during_training():
+    """Seed 0 falls and recovers, seed 1 falls for good and keeps a third of its spread."""
+    measured = {
+        "kept": np.array([[0.2, 0.3, 0.9], [0.9, 0.4, 0.3]]),  # a fresh encoder raises no alarm
         "rank_share": np.full((2, 3), 0.5),
         "skill": np.full((2, 3), 0.3),
     }
-    outcome = CollapseOutcome(arm=ARMS[0], looks=looks, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
+    outcome = CollapseOutcome(arm=ARMS[0], measured=measured, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
     np.testing.assert_array_equal(outcome.failed, [False, True])
     np.testing.assert_array_equal(outcome.alarmed, [False, True])
     assert outcome.first_alarm(1) == 2

@@ -12,7 +12,7 @@ from experiments.faults.fixtures import unfinished_run
 from experiments.faults.sessions import START, STEPPING, Kill
 from experiments.faults.stability_faults import GRPO, KilledRuns, damage_table, kill_picture, kill_table, requirements
 from tests.experiments import tiny
-from tests.experiments.encoder.test_pretrain_encoder import PRETRAIN
+from tests.experiments.encoder.test_pretrain import PRETRAIN
 from tests.experiments.shrunk import run_shrunk
 
 STRUCK = Kill(phase=STEPPING["sft"], after_s=2.0, done=0.5, torn=True)

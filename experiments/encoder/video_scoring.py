@@ -1,4 +1,4 @@
-"""Scores of predicted frames, those of the baselines beside them."""
+"""Predicted frames and their scores: trained predictors, baselines, metrics."""
 
 import dataclasses
 import functools
@@ -27,21 +27,23 @@ from touchr1_jax.training.video import (
 from touchr1_jax.types import Params, TouchBatch
 
 COPY, MEAN = "copy last", "mean frame"
-"""The baselines: the last frame that is seen, and the mean frame of that sensor at that position in training."""
+"""The baselines: the last visible frame, and the mean training frame of that sensor at that position."""
+
+TARGET, EXISTS = "true frame", "exists"
 
 SCORE_BATCH = 8  # contacts that are scored at once; a clip of 8 frames by four sensors is 1.2 MB
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class VideoPredictor:
-    """A trained predictor."""
+class TrainedPredictor:
+    """A trained video predictor."""
 
     config: VideoConfig
     params: Params
 
     @functools.cached_property
     def predict(self) -> Callable[[TouchBatch, Asked], Any]:
-        """Predicted frames, cut to [0, 1]; compiled once."""
+        """Predicted frames, clipped to [0, 1]; compiled once."""
         apply = jax.jit(lambda p, b, a: jnp.clip(predict_frames(self.config, p, b, a), 0.0, 1.0))
         return functools.partial(apply, self.params)
 
@@ -50,41 +52,41 @@ class VideoPredictor:
 class FrameScores:
     """Scores of one method: metric → [contact, S, question], NaN where a stream or frame is missing.
 
-    Question q asks about the frame after `skips[q]` others.
+    Question q asks for the frame `skips[q]` frames ahead.
     """
 
     values: Mapping[str, np.ndarray]
     skips: np.ndarray
 
-    def of(self, metric: str, skip: int) -> np.ndarray:
-        """Mean of each contact over the sensors and the questions of one skip, [contact]."""
+    def by_contact(self, metric: str, skip: int) -> np.ndarray:
+        """Mean over the sensors and the questions of one skip, [contact]."""
         mean: np.ndarray = np.nanmean(self.values[metric][:, :, self.skips == skip], (1, 2))
         return mean
 
     def by_sensor(self, metric: str, skip: int) -> np.ndarray:
-        """Mean over contacts and questions of one skip, [S]."""
+        """Mean over the contacts and the questions of one skip, [S]."""
         mean: np.ndarray = np.nanmean(self.values[metric][:, :, self.skips == skip], (0, 2))
         return mean
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FrameMetrics:
-    """The metrics: L1 and SSIM, the distance of an encoder's features, LPIPS where there are weights for it."""
+    """The metrics: L1 and SSIM, the distance of an encoder's features, LPIPS if its weights are given."""
 
     encoder: TactileViTConfig
     params: Params
     lpips_weights: Mapping[str, np.ndarray] | None = None
 
-    def score(self, predicted: np.ndarray, goal: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
+    def score(self, predicted: np.ndarray, target: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
         """Metric → [P, S], of frames [P, S, H, W, 3] in [0, 1]."""
         found = {
-            "l1": np.abs(predicted - goal).mean((-3, -2, -1)),
-            "ssim": ssim(predicted, goal),
-            "encoder_distance": np.asarray(self._distance(self.params, predicted, goal, batch)),
+            "l1": np.abs(predicted - target).mean((-3, -2, -1)),
+            "ssim": ssim(predicted, target),
+            "encoder_distance": np.asarray(self._distance(self.params, predicted, target, batch)),
         }
         if self.lpips_weights is not None:
             flat = lambda x: jnp.asarray(x).reshape(-1, *x.shape[-3:])
-            found["lpips"] = np.asarray(self._lpips(flat(predicted), flat(goal))).reshape(predicted.shape[:2])
+            found["lpips"] = np.asarray(self._lpips(flat(predicted), flat(target))).reshape(predicted.shape[:2])
         return found
 
     @functools.cached_property
@@ -108,76 +110,80 @@ class FrameMetrics:
 
 
 def mean_frames(data: Dataset, rows: np.ndarray, context: Context) -> np.ndarray:
-    """Mean frame of every sensor at every position of its clip, float32 [S, F, H, W, 3] in [0, 1]; 0 where none was."""
+    """Mean frame of every sensor at every position of its clip, float32 [S, F, H, W, 3] in [0, 1]; 0 without frames."""
     total: Any = 0.0
     count: Any = 0.0
     with context.progress("mean frames", len(rows)) as advance:
         for clip in data.batches(rows, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
-            seen = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
-            total = total + np.where(seen, clip["frames"], 0).sum(0, dtype=np.float64)
-            count = count + seen.sum(0)
-            advance(len(seen))
+            exists = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
+            total = total + np.where(exists, clip["frames"], 0).sum(0, dtype=np.float64)
+            count = count + exists.sum(0)
+            advance(len(exists))
     return (total / np.maximum(count, 1) / 255.0).astype(np.float32)
 
 
-def judged(
-    films: Mapping[str, VideoPredictor],
+def score_frames(
+    predictors: Mapping[str, TrainedPredictor],
     mean: np.ndarray,
     data: Dataset,
     rows: np.ndarray,
-    judge: FrameMetrics,
+    metrics: FrameMetrics,
     context: Context,
 ) -> dict[str, FrameScores]:
-    """Scores of every predictor, which all know the same skips, and of the baselines on some contacts.
+    """Scores of the predictors, all of the same skips, and of the baselines.
 
     Args:
-      films: predictors by name.
+      predictors: by name.
       mean: `mean_frames`.
       data: the records.
       rows: contacts to score.
-      judge: metrics.
-      context: shows how far it is.
+      metrics: to score by.
+      context: shows the progress.
     """
-    skips = next(iter(films.values())).config.skips
+    skips = next(iter(predictors.values())).config.skips
     questions = every_question(data.clip.frames, skips)
-    blocks: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in (*films, COPY, MEAN)}
+    blocks: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in (*predictors, COPY, MEAN)}
     with context.progress("scoring", len(rows)) as advance:
         for batch, count in batches(data, rows):
-            answers = [answer_all(films, mean, batch, t, k, skips) for t, k in questions]
+            frames = [predict_all(predictors, mean, batch, t, k, skips) for t, k in questions]
             for name, parts in blocks.items():
-                found = [_masked(judge.score(a[name], a[GOAL], batch), a[EXISTS]) for a in answers]
-                parts.append({m: np.stack([f[m] for f in found], -1)[:count] for m in found[0]})
+                found = [metrics.score(one[name], one[TARGET], batch) for one in frames]
+                masked = lambda m, found=found, frames=frames: [
+                    np.where(one[EXISTS], scores[m], np.nan) for scores, one in zip(found, frames, strict=True)
+                ]
+                parts.append({m: np.stack(masked(m), -1)[:count] for m in found[0]})
             advance(count)
-    asked = np.array([skips[k] for _, k in questions])
+    skip_of = np.array([skips[k] for _, k in questions])
     return {
-        name: FrameScores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=asked)
+        name: FrameScores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=skip_of)
         for name, parts in blocks.items()
     }
 
 
-GOAL, EXISTS = "goal", "exists"
-
-
-def answer_all(
-    films: Mapping[str, VideoPredictor], mean: np.ndarray, batch: TouchBatch, t: int, k: int, skips: tuple[int, ...]
+def predict_all(
+    predictors: Mapping[str, TrainedPredictor],
+    mean: np.ndarray,
+    batch: TouchBatch,
+    t: int,
+    k: int,
+    skips: tuple[int, ...],
 ) -> dict[str, np.ndarray]:
-    """Every method's frames for the question (t, skip number k), the true ones and whether they exist."""
+    """Every method's frames `skips[k]` ahead of frame t, the true frames (`TARGET`) and whether they exist."""
     shape = batch.stream_mask.shape
     asked = Asked(last=jnp.full(shape, t, jnp.int32), skip=jnp.full(shape, k, jnp.int32))
-    goal, exists = target_of(batch, asked, skips)
-    found = {name: np.asarray(film.predict(batch, asked)) for name, film in films.items()}
-    steady = np.broadcast_to(mean[:, t + skips[k]], goal.shape)
-    last = np.asarray(frame_at(batch, asked.last))
-    return {**found, COPY: last, MEAN: steady, GOAL: np.asarray(goal), EXISTS: np.asarray(exists)}
+    target, exists = target_of(batch, asked, skips)
+    return {
+        **{name: np.asarray(predictor.predict(batch, asked)) for name, predictor in predictors.items()},
+        COPY: np.asarray(frame_at(batch, asked.last)),
+        MEAN: np.broadcast_to(mean[:, t + skips[k]], target.shape),
+        TARGET: np.asarray(target),
+        EXISTS: np.asarray(exists),
+    }
 
 
 def batches(data: Dataset, rows: np.ndarray) -> Iterator[tuple[TouchBatch, int]]:
-    """Batches of one size, and how many of their contacts count."""
+    """Batches of one size, the last one padded, and the number of their contacts that count."""
     padded = rows[np.minimum(np.arange(-(-len(rows) // SCORE_BATCH) * SCORE_BATCH), len(rows) - 1)]
     clips = data.batches(padded, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
     for start, clip in zip(range(0, len(padded), SCORE_BATCH), clips, strict=True):
         yield touch_batch(clip), min(SCORE_BATCH, len(rows) - start)
-
-
-def _masked(found: Mapping[str, np.ndarray], exists: np.ndarray) -> dict[str, np.ndarray]:
-    return {metric: np.where(exists, x, np.nan) for metric, x in found.items()}
