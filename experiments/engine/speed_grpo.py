@@ -1,20 +1,20 @@
-"""How fast is one GRPO iteration, what does it gain from encoding a group's prefix once, and how near is the machine?
+"""How fast is one GRPO iteration, what is gained by encoding a group's prefix once, and what share of the peak is used?
 
     make experiment EXP=speed_grpo [ARGS="--scale smoke"]
     make experiment EXP=speed_grpo ARGS="--trl-python TRL/bin/python --tunix-python TUNIX/bin/python"
 
 One iteration of 8 prompts × 8 rollouts × 64 new tokens on a 1.05-million-parameter decoder with a reference policy, at
-prefixes of 64 to 1024 tokens, each in processes of its own for their memory, one that compiles and one that reads the
-compiled programs.  Beside it the engine's options, and the same engine that repeats the prefix for every rollout; a
-vocabulary of a language model's size; ten thousand steps, for time and memory to stay flat; and other engines, TRL and
-Tunix, where they can be imported (`experiments/engine/harness_trl.py` and `harness_tunix.py` say how).  Matrix products
-are timed beside them, so that shares of the peak need no data sheet.
+prefixes of 64 to 1024 tokens, each in two processes of its own: one that compiles and one that reads the compiled
+programs.  It is compared with the engine's options and with an engine that encodes the prefix for every rollout; with a
+vocabulary of a language model's size; over ten thousand steps, whose time and memory must stay constant; and with TRL
+and Tunix where they can be imported (`experiments/engine/harness_trl.py` and `harness_tunix.py` explain how).  Matrix
+products are timed in the same process, so that shares of the peak need no data sheet.
 
 Cost: about six minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 
-Expected: time grows with the prefix as its once-encoded share does, four to eight times slower than the rollouts alone
-would suggest; the repeated way falls behind in proportion to the group at long prefixes, and so do the engines that go
-it.  On two cores of about 240 GFLOP/s: at most .55 s at prefix 64 and 1.3 s at 512, under 1 GB.
+Expected: time grows with the prefix, which is encoded once, four to eight times more slowly than it would if every
+rollout encoded it; repeating the prefix takes longer in proportion to the group at long prefixes, as in the other
+engines, which repeat it.  On two cores of about 240 GFLOP/s: at most .55 s at prefix 64 and 1.3 s at 512, under 1 GB.
 """
 
 import dataclasses
@@ -43,15 +43,15 @@ from experiments.engine.speed import (
     side_by_side,
     time_alone,
 )
-from experiments.engine.speed_charts import over_prefixes, over_steps
-from experiments.engine.speed_tables import (
+from experiments.engine.speed_report import (
     LIMITS_S,
-    MEMORY_LIMIT_GB,
     Peers,
     alone_table,
     compare_table,
     median,
     memory_table,
+    over_prefixes,
+    over_steps,
     peer_table,
     requirements,
 )
@@ -227,9 +227,9 @@ def pictures(
             name="prefixes",
             title="Time and memory over the length of the prompt",
             caption=f"One iteration of {size.prompts} prompts × {size.group} rollouts × {size.length} new tokens; each "
-            "engine in a process of its own that starts with nothing compiled.  The dotted line and the crosses are "
-            "what this engine must keep.",
-            content=over_prefixes(seconds, memory, {p: s for p, s in LIMITS_S.items() if p in alone}, MEMORY_LIMIT_GB),
+            "engine in a process of its own that starts with nothing compiled.  The dotted line and the black crosses "
+            "are the bounds of this engine.",
+            content=over_prefixes(seconds, memory, {p: s for p, s in LIMITS_S.items() if p in alone}),
         ),
         Picture(
             name="steps",

@@ -14,7 +14,7 @@ from experiments.engine.job import Job, config_of, init_decoder, make_batch, mak
 from experiments.engine.peers import JobSize, PeerFailed, PeerTimes
 from experiments.engine.processes import in_own_process
 from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
-from experiments.engine.speed_tables import steadiness
+from experiments.engine.speed_report import steadiness
 
 TINY = speed_grpo.SMOKE.size
 
