@@ -18,20 +18,36 @@ Expected: the records' own codec, at half to two thirds of the bytes of zstd-1, 
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
+from experiments.core.look import SHARED
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.scenes.storage_charts import size_against_rates
-from experiments.scenes.storage_clips import GENERATED, IMPORTED, generated_clips, recorded_clips
-from experiments.scenes.storage_codecs import OWN, PLAIN, Codec, all_codecs
+from experiments.scenes.storage_codecs import (
+    OWN,
+    PLAIN,
+    Codec,
+    CodecMeasurement,
+    all_codecs,
+    chosen_filters,
+    front,
+    measure,
+)
 from experiments.scenes.storage_feed import FeedConfig, feed_rates, make_store, stage_ms
-from experiments.scenes.storage_measure import CodecMeasurement, chosen_filters, measure
+from sensors_io.importers.keep import Keep
+from sensors_io.importers.pictures import numbered, read_picture
+from sensors_io.importers.video import read_video
+from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
+
+GENERATED, IMPORTED, WHOLE, STILLS = "generated", "videos as imported", "videos, whole frames", "camera stills"
+"""Kinds of clips, and what is found where: `<data_dir>/physiclear/videos`, `<data_dir>/gelslam/6.310mm`."""
+
 
 Rows = Mapping[str, Sequence[CodecMeasurement]]
 """Kind of clips → codecs measured on them."""
@@ -91,6 +107,39 @@ def run(config: StorageConfig, context: Context) -> Results:
             "not available here": "; ".join(missing.values()) or "nothing",
         },
     )
+
+
+def generated_clips(config: SceneConfig, contacts: Iterable[int]) -> list[np.ndarray]:
+    """Camera frames of each sensor of some contacts, uint8 [N, H, W, 3]."""
+    scenes = LiveScenes(config)
+    sequences = [sequence for i in contacts for sequence in scenes.contact(i).values()]
+    return [sequence.frames for sequence in sequences if sequence.frames is not None]
+
+
+def recorded_clips(data_dir: Path, videos: int, frames: int, context: Context) -> dict[str, list[np.ndarray]]:
+    """Clips of recordings by kind; a kind that is not there is left out.
+
+    Videos are evenly spread over the folder.  They were compressed with loss before; the stills were not.
+
+    Args:
+      data_dir: folder of recordings.
+      videos: how many are read.
+      frames: at most so many of each video in whole frames.
+      context: shows how far it is.
+    """
+    found: dict[str, list[np.ndarray]] = {}
+    files = sorted((data_dir / "physiclear" / "videos").glob("*.mov"))
+    if files:
+        chosen = [files[i] for i in np.linspace(0, len(files) - 1, videos).astype(int)]
+        found |= {IMPORTED: [], WHOLE: []}
+        for file in context.each("reading videos", chosen):
+            found[IMPORTED].append(read_video(file, Keep()).frames)
+            found[WHOLE].append(read_video(file, Keep(height=0, max_frames=0)).frames[:frames])
+    folders = (data_dir / "gelslam" / "6.310mm").glob("*")
+    stills = [picture for folder in sorted(folders) for picture in numbered(folder)]
+    if stills:
+        found[STILLS] = [read_picture(picture)[None] for picture in context.each("reading stills", stills)]
+    return found
 
 
 def fastest_small(rows: Rows, need_fps: float) -> Codec:
@@ -207,8 +256,44 @@ def _picture(number: int, kind: str, rows: Sequence[CodecMeasurement], need_fps:
         title=f"Size against rate: {kind}",
         caption="Ringed: what records use. The line joins those that no other one beats in size and read rate; the "
         "dotted line is the read rate that the rule asks for. Codecs that lose bits are left out.",
-        content=size_against_rates([row for row in rows if row.exact], OWN, need_fps),
+        content=_size_against_rates([row for row in rows if row.exact], need_fps),
     )
+
+
+def _size_against_rates(rows: Sequence[CodecMeasurement], need_fps: float) -> bytes:
+    """Bytes per frame over the read and over the write rate."""
+    kinds: dict[str, list[CodecMeasurement]] = {}
+    for row in rows:
+        kinds.setdefault(row.codec.kind, []).append(row)
+    best, own = front(rows), _of(rows, OWN)
+    panels = []
+    for label, rate in (("read", lambda row: row.read_fps), ("written", lambda row: row.write_fps)):
+        codecs = [
+            Series(
+                kind,
+                x=[rate(row) for row in group],
+                y=[row.bytes for row in group],
+                labels=[row.codec.name.removesuffix(" zstd-1") for row in group],
+                line="",
+            )
+            for kind, group in kinds.items()
+        ]
+        ring = Series(x=[rate(own)], y=[own.bytes], marker="o", hollow=True, size=130, colour="black")
+        beaten_by_none = Series(
+            x=[rate(r) for r in best], y=[r.bytes for r in best], marker="", colour=SHARED, width=0.8
+        )
+        panels.append(
+            Panel(
+                [*codecs, ring, *([beaten_by_none] if label == "read" else [])],
+                x_label=f"frames {label} a second of one core",
+                y_label="bytes a frame" if label == "read" else "",
+                x_scale="log",
+                y_scale="log",
+                y_format="{x:,.0f}",
+                rules=[Rule(x=need_fps, colour=SHARED)] if label == "read" else [],
+            )
+        )
+    return draw(panels, share_y=True, size=(11.0, 6.4))
 
 
 DEFAULT = StorageConfig()

@@ -15,19 +15,24 @@ import dataclasses
 
 import cv2
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 
-from experiments.core.charts import PALETTE
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Results, Table
+from experiments.core.look import SHARED
+from experiments.core.pictures import image_grid
+from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.scenes.sheets import depth_picture, field_picture, picture_rows, strips
 from sensors_io.scenes import appearance, objects, properties, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.protocol import contact_key, make_contact
 from sensors_io.schema import MATERIALS, SENSORS, Sequence
 
 VIEW_PX = 96
+ARROW = 4.0
+"""Length of an arrow over the displacement that it shows."""
+
 UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity": "share", "friction": ""}
 
 
@@ -89,7 +94,7 @@ def views(config: GalleryConfig) -> Picture:
         name="views",
         title="Views by material",
         caption="One row per material. The two objects on the right lie: they look like another material.",
-        content=picture_rows(rows, ["honest"] * (config.views - 2) + ["lie"] * 2, cell_inch=0.95),
+        content=image_grid(rows, ["honest"] * (config.views - 2) + ["lie"] * 2, cell_inch=0.95),
         kind="png",
     )
 
@@ -104,7 +109,7 @@ def presses(config: GalleryConfig) -> list[Picture]:
         max_force_n=10.0,
         seed=config.seed,
     )
-    return [_press_sheet(make_contact(scenes, index), index) for index in range(config.presses)]
+    return [press_sheet(make_contact(scenes, index), index) for index in range(config.presses)]
 
 
 def motions(config: GalleryConfig) -> Picture:
@@ -123,7 +128,7 @@ def motions(config: GalleryConfig) -> Picture:
         title="Motions over time",
         caption="Each motion by two sensors, from left to right in time: change of the Mini's picture, three times, "
         "and depth and marker displacement of the Tac3D.",
-        content=picture_rows(rows, cell_inch=0.95),
+        content=image_grid(rows, cell_inch=0.95),
         kind="png",
     )
 
@@ -139,33 +144,39 @@ def varied(config: GalleryConfig) -> Picture:
             solid = objects.sample(np.random.default_rng([config.seed, 7, i]), 0.0, 0.8, *shares)
             skin = surface.make_skin(solid, np.zeros(2), 0.0)
             picture = depth_picture(-np.asarray(surface.gap(skin, pose, x)))
-            cells.append(_mark_levels(picture, solid))
+            cells.append(mark_levels(picture, solid))
         rows[kind] = cells
     return Picture(
         name="varied",
         title="Objects that vary over their surface",
         caption="Relief and roughness of 24 mm, bodies flattened; the letters are the hardness (s, m, h) where a press "
         "would land.",
-        content=picture_rows(rows, cell_inch=1.9),
+        content=image_grid(rows, cell_inch=1.9),
         kind="png",
     )
 
 
 def ranges() -> Picture:
     """Where 90 % of the objects of each material lie, for every property, with the thresholds of the levels."""
-    panels = {}
+    panels: list[Panel] = []
     for name, prop in {**properties.PROPERTIES, **properties.DYNAMIC}.items():
-        spans = {
-            material: tuple(prop.value(mean + prop.spread * z) for z in (-1.645, 0.0, 1.645))
-            for material, mean in zip(MATERIALS, prop.means, strict=True)
-        }
-        panels[f"{name} ({UNITS[name]})" if UNITS[name] else name] = (spans, prop.thresholds)
+        spans = [[prop.value(mean + prop.spread * z) for mean in prop.means] for z in (-1.645, 0.0, 1.645)]
+        low, middle, high = spans
+        panels.append(
+            Panel(
+                [Series(x=middle, low=low, high=high)],
+                title=f"{name} ({UNITS[name]})" if UNITS[name] else name,
+                rows=MATERIALS if not panels else [""] * len(MATERIALS),
+                x_scale="log",
+                rules=[Rule(x=threshold, line="--", colour=SHARED, width=0.8) for threshold in prop.thresholds],
+            )
+        )
     return Picture(
         name="properties",
         title="Properties by material",
         caption="From the 5th to the 95th percentile, dot at the median; lines are the thresholds between the levels. "
         "Every material reaches every level.",
-        content=strips(panels, PALETTE[0]),
+        content=draw(panels, columns=len(panels), size=(2.2 * len(panels), 2.6)),
     )
 
 
@@ -173,19 +184,59 @@ def odds() -> Table:
     """How often each level comes of a material: what an honest picture tells at best."""
     every = {**properties.PROPERTIES, **properties.DYNAMIC}
     chances = {name: 100 * properties.level_odds(prop) for name, prop in every.items()}
-    rows: list[tuple[Cell, ...]] = []
-    for i, material in enumerate(MATERIALS):
-        rows.append((material, *(" · ".join(f"{share:.0f}" for share in found[i]) for found in chances.values())))
-    rows.append(("right by the likeliest level", *(f"{found.max(1).mean():.0f}" for found in chances.values())))
-    return Table(
-        title="Levels by material",
-        columns=(Column(name="material"), *(Column(name=name, unit="%", meaning="levels 0 · 1 · 2") for name in every)),
-        rows=tuple(rows),
+    cells = lambda shares: {name: " · ".join(f"{share:.0f}" for share in found) for name, found in shares.items()}
+    rows: list[dict[str, Cell]] = [
+        {"material": material, **cells({name: found[i] for name, found in chances.items()})}
+        for i, material in enumerate(MATERIALS)
+    ]
+    rows.append(
+        {
+            "material": "right by the likeliest level",
+            **{name: f"{found.max(1).mean():.0f}" for name, found in chances.items()},
+        }
+    )
+    return named_table(
+        "Levels by material",
+        rows,
+        units=dict.fromkeys(every, "%"),
+        meanings=dict.fromkeys(every, "levels 0 · 1 · 2"),
         note="Materials are drawn evenly.  Pictures lie about three objects in ten, so that they tell less.",
     )
 
 
-def _press_sheet(sequences: list[Sequence], index: int) -> Picture:
+def depth_picture(depth: np.ndarray) -> np.ndarray:
+    """A height map in colour, uint8 RGB, from its least to its greatest value."""
+    scaled = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
+    return _coloured(scaled)
+
+
+def field_picture(depth_mm: np.ndarray, displacement_mm: np.ndarray, top_mm: float, px: int = 160) -> np.ndarray:
+    """Depth in colour and displacement as arrows four times their length, uint8 RGB [px, px, 3].
+
+    Args:
+      depth_mm: [h, w], black at 0 and brightest at `top_mm`.
+      displacement_mm: [h, w, 2], in units of a node of 1 mm.
+      top_mm: brightest depth.
+      px: side of the picture.
+    """
+    field = cv2.resize(np.clip(depth_mm / max(top_mm, 1e-9), 0, 1), (px, px), interpolation=cv2.INTER_CUBIC)
+    picture = _coloured(np.clip(field, 0, 1))
+    cell = px / depth_mm.shape[0]
+    for row, column in np.ndindex(*depth_mm.shape):
+        start = (np.array([column, row]) + 0.5) * cell
+        end = start + ARROW * cell * displacement_mm[row, column]
+        begin, tip = ((int(p[0]), int(p[1])) for p in (start, end))
+        cv2.line(picture, begin, tip, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
+
+
+def _coloured(scaled: np.ndarray) -> np.ndarray:
+    """Values 0..1 in the colours of `magma`, uint8 RGB."""
+    picture: np.ndarray = (255 * mpl.colormaps["magma"](scaled)[..., :3]).astype(np.uint8)
+    return picture
+
+
+def press_sheet(sequences: list[Sequence], index: int) -> Picture:
     forces = sequences[0].target_force_n
     assert forces is not None
     rows = {s.sensor: _frames(s, len(forces)) for s in sequences}
@@ -197,7 +248,7 @@ def _press_sheet(sequences: list[Sequence], index: int) -> Picture:
         title=f"Object {index} pressed",
         caption="The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers, as of "
         "the dense pattern below; dark dots are nodes that were not read.",
-        content=picture_rows(rows, [f"{force:.1f} N" for force in forces]),
+        content=image_grid(rows, [f"{force:.1f} N" for force in forces]),
         kind="png",
     )
 
@@ -220,7 +271,7 @@ def _fields(sequence: Sequence, at: np.ndarray) -> list[np.ndarray]:
     return [field_picture(sequence.depth_mm[i], sequence.deformation_mm[i], top) for i in at]
 
 
-def _mark_levels(picture: np.ndarray, solid: objects.Solid) -> np.ndarray:
+def mark_levels(picture: np.ndarray, solid: objects.Solid) -> np.ndarray:
     """Writes the level of hardness at nine sites into the picture of 24 mm."""
     marked = picture.copy()
     size = picture.shape[0] / 160

@@ -23,11 +23,10 @@ import numpy as np
 
 from experiments.core.artifacts import write_text
 from experiments.core.context import Context
+from experiments.core.pictures import image_grid
 from experiments.core.results import Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.scenes import realism
-from experiments.scenes.shadows import shadow_gain
-from experiments.scenes.sheets import picture_rows
+from experiments.scenes import realism_fit
 from experiments.scenes.two_sample import PatchClassifier, PictureDistances, accuracy, distances
 from sensors_io.scenes import fitting, photometric
 
@@ -60,22 +59,23 @@ class RealismConfig:
 
 def run(config: RealismConfig, context: Context) -> Results:
     """Fit, render the held-out presses, compare."""
-    presses = realism.read(
+    presses = realism_fit.read(
         config.data_dir,
         ball=config.ball,
         diameter_mm=config.ball_diameter_mm,
         mm_per_px=config.mm_per_px,
         image_px=config.image_px,
     )
-    study = realism.fit(presses, context)
-    write_text(context.directory / "mini_optics.py", realism.source(study.fitted, study.noise, study.presses))
+    study = realism_fit.fit(presses, context)
+    write_text(context.directory / "mini_optics.py", realism_fit.source(study.fitted, study.noise, study.presses))
     real = _bytes(study.presses.pictures[study.held_out])
     rendered, rows = {}, {}
-    for name, way in context.each("candidates", realism.candidates(study).items()):
-        rendered[name] = realism.render(study, way, config.seed)
+    for name, candidate in context.each("candidates", realism_fit.candidates(study).items()):
+        rendered[name] = realism_fit.render(study, candidate, config.seed)
         rows[name] = compare(real, rendered[name], study, config.judge)
-    shadows = shadow_gain(study.presses, study.profiles, study.touches, study.fitted, study.held_out, context)
-    drift = float(np.sqrt(np.mean((realism.clean(study, study.fitted) - realism.clean(study, photometric.MINI)) ** 2)))
+    shadows = realism_fit.shadow_gain(study, context)
+    clean, stored = (realism_fit.clean(study, optics) for optics in (study.fitted, photometric.MINI))
+    drift = float(np.sqrt(np.mean((clean - stored) ** 2)))
     return Results(
         verdict=verdict(rows, shadows),
         requirements=(
@@ -96,7 +96,7 @@ def run(config: RealismConfig, context: Context) -> Results:
 
 
 def compare(
-    real: np.ndarray, made: np.ndarray, study: realism.PressFit, judge: PatchClassifier
+    real: np.ndarray, made: np.ndarray, study: realism_fit.PressFit, judge: PatchClassifier
 ) -> tuple[PictureDistances, float, float]:
     """Distances, accuracy of the classifier and its standard error, both in %."""
     axis = study.presses.axis_mm
@@ -128,7 +128,7 @@ def distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) ->
     )
 
 
-def fit_table(study: realism.PressFit) -> Table:
+def fit_table(study: realism_fit.PressFit) -> Table:
     """How much of what the ball changes the fit explains, near the contact."""
     axis, rows = study.presses.axis_mm, []
     for name, held_out in (("fitted", False), ("held out", True)):
@@ -161,7 +161,7 @@ def side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictur
         name="presses",
         title="Held-out presses",
         caption="One column per press: the recording, the same touch by lamps set by eye, and by the fitted optics.",
-        content=picture_rows(rows),
+        content=image_grid(rows),
         kind="png",
     )
 

@@ -1,15 +1,19 @@
-"""Lossless codecs of camera frames, all behind one interface: store some clips in a folder, load them again."""
+"""Lossless codecs of camera frames behind one interface, and their size, rates and exactness on some clips."""
 
 import dataclasses
-import pathlib
 import struct
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
-from sensors_io.deltas import accumulate, choose_filter, difference
+from experiments.core.context import Context
+from experiments.core.timing import interleaved
+from sensors_io.deltas import FILTERS, accumulate, choose_filter, difference
 
 Clips = Sequence[np.ndarray]
 """Sequences of frames, uint8 [N, H, W, 3] each."""
@@ -30,8 +34,8 @@ class Codec:
 
     name: str
     kind: str
-    store: Callable[[Clips, pathlib.Path], None]
-    load: Callable[[pathlib.Path], list[np.ndarray]]
+    store: Callable[[Clips, Path], None]
+    load: Callable[[Path], list[np.ndarray]]
 
 
 def all_codecs() -> tuple[Codec, ...]:
@@ -59,7 +63,7 @@ OWN, PLAIN = "chosen zstd-1", "zstd-1"
 _FIXED = ("time", "rows", "time+rows")
 
 
-def stored_bytes(folder: pathlib.Path) -> int:
+def stored_bytes(folder: Path) -> int:
     """Size of everything in a folder."""
     return sum(file.stat().st_size for file in folder.iterdir())
 
@@ -73,13 +77,13 @@ def _entries(
 ) -> Codec:
     """One entry per clip in an ArrayRecord file, as records are kept."""
 
-    def store(clips: Clips, folder: pathlib.Path) -> None:
+    def store(clips: Clips, folder: Path) -> None:
         writer = ArrayRecordWriter(str(folder / "clips.arrayrecord"), f"group_size:1,{options}")
         for clip in clips:
             writer.write(encode(clip))
         writer.close()
 
-    def load(folder: pathlib.Path) -> list[np.ndarray]:
+    def load(folder: Path) -> list[np.ndarray]:
         reader = ArrayRecordReader(str(folder / "clips.arrayrecord"))
         clips = [decode(reader.read([i])[0]) for i in range(reader.num_records())]
         reader.close()
@@ -169,7 +173,7 @@ def _pictures(name: str, kind: str, suffix: str, settings: tuple[int, int]) -> C
 def _video(name: str, fourcc: str, suffix: str) -> Codec:
     """Each clip as a video file."""
 
-    def store(clips: Clips, folder: pathlib.Path) -> None:
+    def store(clips: Clips, folder: Path) -> None:
         for n, clip in enumerate(clips):
             size = clip.shape[2], clip.shape[1]
             writer = cv2.VideoWriter(str(folder / f"{n:04d}{suffix}"), cv2.VideoWriter.fourcc(*fourcc), 30.0, size)
@@ -179,7 +183,7 @@ def _video(name: str, fourcc: str, suffix: str) -> Codec:
                 writer.write(frame)
             writer.release()
 
-    def load(folder: pathlib.Path) -> list[np.ndarray]:
+    def load(folder: Path) -> list[np.ndarray]:
         return [_decode(cv2.VideoCapture(str(file))) for file in sorted(folder.iterdir())]
 
     return Codec(name=name, kind="video", store=store, load=load)
@@ -194,3 +198,82 @@ def _decode(capture: cv2.VideoCapture) -> np.ndarray:
         frames.append(frame)
     capture.release()
     return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CodecMeasurement:
+    """One codec on some clips: bytes a frame, frames a second written and read, whether all bits came back."""
+
+    codec: Codec
+    bytes: float
+    write_fps: float
+    read_fps: float
+    exact: bool
+
+
+def measure(
+    codecs: Sequence[Codec], clips: Clips, rounds: int, context: Context
+) -> tuple[list[CodecMeasurement], dict[str, str]]:
+    """Every codec over the same clips, in turn within each round; and why a codec is missing, by name.
+
+    Args:
+      codecs: what to measure.
+      clips: what they store.
+      rounds: of timing; rates are medians.
+      context: shows how far it is.
+    """
+    frames = sum(map(len, clips))
+    with tempfile.TemporaryDirectory() as root:
+        folders = {codec.name: Path(root) / str(n) for n, codec in enumerate(codecs)}
+        present, exact, missing = [], {}, {}
+        for codec in context.each("codecs", codecs):
+            folders[codec.name].mkdir()
+            try:
+                codec.store(clips, folders[codec.name])
+            except RuntimeError as error:
+                missing[codec.name] = str(error)
+                continue
+            exact[codec.name] = _same(codec.load(folders[codec.name]), clips)
+            present.append(codec)
+        calls: dict[str, Callable[[], Any]] = {}
+        for codec in present:
+            calls[f"write {codec.name}"] = _bind(codec.store, clips, folders[codec.name])
+            calls[f"read {codec.name}"] = _bind(codec.load, folders[codec.name])
+        timed = interleaved(calls, context.rounds("timing codecs", rounds))
+        seconds = {name: float(np.median(s)) for name, s in timed.items()}
+        rows = [
+            CodecMeasurement(
+                codec=codec,
+                bytes=stored_bytes(folders[codec.name]) / frames,
+                write_fps=frames / seconds[f"write {codec.name}"],
+                read_fps=frames / seconds[f"read {codec.name}"],
+                exact=exact[codec.name],
+            )
+            for codec in present
+        ]
+    return rows, missing
+
+
+def front(rows: Sequence[CodecMeasurement]) -> list[CodecMeasurement]:
+    """Those that no other one beats in size and in read rate, by size."""
+    ordered = sorted(rows, key=lambda row: (row.bytes, -row.read_fps))
+    best, kept = 0.0, []
+    for row in ordered:
+        if row.read_fps > best:
+            kept.append(row)
+            best = row.read_fps
+    return kept
+
+
+def chosen_filters(clips: Iterable[np.ndarray]) -> dict[str, int]:
+    """How many clips want each filter."""
+    names = [choose_filter(clip) for clip in clips]
+    return {name: names.count(name) for name in FILTERS}
+
+
+def _bind(call: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    return lambda: call(*arguments)
+
+
+def _same(loaded: Sequence[np.ndarray], clips: Clips) -> bool:
+    return len(loaded) == len(clips) and all(map(np.array_equal, loaded, clips))

@@ -22,16 +22,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
+from experiments.core.look import SHARED
 from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
 from experiments.core.runner import Experiment
-from experiments.scenes import charts as scene_charts
-from experiments.scenes import kills as scene_kills
-from experiments.scenes import protocol as scene_protocol
-from experiments.scenes import rates as scene_rates
-from experiments.scenes import stages as scene_stages
-from experiments.scenes.kills import ResumedSet
-from experiments.scenes.rates import RecordRate
+from experiments.scenes import force_leaks, killed_writer, throughput_rates
+from experiments.scenes.killed_writer import ResumedSet
+from experiments.scenes.throughput_rates import RecordRate
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import padded_size
@@ -124,7 +122,7 @@ def run(config: ThroughputConfig, context: Context) -> Results:
         sequences=len(SENSORS) * round(config.leak_objects * PAPER_SEQUENCES / len(SENSORS) / PAPER_OBJECTS),
     )
     with context.progress("planning the paper's set", 1) as advance:
-        leaks = scene_protocol.leaks(paper)
+        leaks = force_leaks.leaks(paper)
         advance()
     return Results(
         verdict=_verdict(feed, large, written),
@@ -153,7 +151,7 @@ def _once(context: Context, stage: str, measure: Callable[[], RecordRate | Writt
 
 def _feed(config: ThroughputConfig, context: Context, contacts: int, image_px: int) -> RecordRate:
     with context.progress(f"feeding {image_px}²", contacts) as advance:
-        return scene_rates.feed_rate(config.scenes(contacts, image_px), contacts, config.threads, advance)
+        return throughput_rates.feed_rate(config.scenes(contacts, image_px), contacts, config.threads, advance)
 
 
 def _written(config: ThroughputConfig, context: Context) -> WrittenSet:
@@ -163,10 +161,10 @@ def _written(config: ThroughputConfig, context: Context) -> WrittenSet:
     shutil.rmtree(home, ignore_errors=True)
     whole, killed = home / "whole", home / "killed"
     with context.progress("writing", scenes.contact_count) as advance:
-        rate, size = scene_rates.write_rate(scenes, whole, advance)
+        rate, size = throughput_rates.write_rate(scenes, whole, advance)
     shards = len(list(whole.glob("contacts-*")))
     with context.progress("killing and going on", config.kills + 1) as advance:
-        kills = scene_kills.killed_and_resumed(
+        kills = killed_writer.killed_and_resumed(
             _arguments(scenes),
             killed,
             kills=config.kills,
@@ -176,7 +174,7 @@ def _written(config: ThroughputConfig, context: Context) -> WrittenSet:
             advance=advance,
         )
     with context.progress("comparing", scenes.contact_count) as advance:
-        kept = scene_kills.compare(whole, killed, advance)
+        kept = killed_writer.compare(whole, killed, advance)
     past = _past_limit(whole, context)
     shutil.rmtree(home)
     return WrittenSet(rate=rate, bytes=size, past_limit=past, kills=kills, kept=kept)
@@ -208,7 +206,7 @@ def _verdict(feed: RecordRate, large: RecordRate, written: WrittenSet) -> tuple[
 
 
 def _requirements(
-    feed: RecordRate, large: RecordRate, written: WrittenSet, leaks: list[scene_protocol.ForceLeak]
+    feed: RecordRate, large: RecordRate, written: WrittenSet, leaks: list[force_leaks.ForceLeak]
 ) -> tuple[Requirement, ...]:
     def needs(name: str, measured: float, bound: float, better: Literal["lower", "higher"], unit: str) -> Requirement:
         return Requirement(name=name, measured=measured, bound=bound, better=better, unit=unit)
@@ -264,17 +262,36 @@ def _rate_table(config: ThroughputConfig, feed: RecordRate, large: RecordRate, w
 def _picture(
     config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: WrittenSet, stages: Stages
 ) -> Picture:
-    rates = (
-        (f"feed {config.image_px}²", feed.per_second, FEED_RATE),
-        (f"feed {config.large_px}²", large.per_second, LARGE_RATE),
-        (f"written {config.image_px}²", written.rate.per_second, PAPER_RECORDS / WRITTEN_HOURS / 3600),
-    )
+    measured = {
+        f"feed {config.image_px}²": (feed.per_second, FEED_RATE),
+        f"feed {config.large_px}²": (large.per_second, LARGE_RATE),
+        f"written {config.image_px}²": (written.rate.per_second, PAPER_RECORDS / WRITTEN_HOURS / 3600),
+    }
+    rates, required = zip(*measured.values(), strict=True)
+    parts = next(iter(stages.values()))
+    panels = [
+        Panel(
+            [
+                Series(x=rates, bar=True),
+                Series("required", x=required, line="", marker="|", size=300, colour=SHARED),
+            ],
+            rows=list(measured),
+            x_label="records/s by the clock",
+            written=".0f",
+        ),
+        Panel(
+            [Series(part, x=[max(costs[part], 0.0) for costs in stages.values()], bar=True) for part in parts],
+            rows=list(stages),
+            stacked=True,
+            x_label="ms of one core a record",
+        ),
+    ]
     return Picture(
         name="throughput",
         title="How fast, and what takes the time",
         caption=f"Records a second on {config.threads} threads; the work on a record with a picture of "
         f"{config.image_px}², friction where the object moves.",
-        content=scene_charts.rates_and_stages(rates, stages),
+        content=draw(panels, size=(8.6, 1.1 + 0.34 * max(len(measured), len(stages) + 1))),
     )
 
 
@@ -282,7 +299,7 @@ def _stages(config: ThroughputConfig, context: Context) -> Stages:
     scenes = config.scenes(config.feed_contacts, config.image_px)
     stages = {}
     for name in context.each("timing stages", config.stage_sensors, still=True):
-        cost = scene_stages.stage_costs(scenes, SENSORS.index(name), config.stage_objects)
+        cost = throughput_rates.stage_costs(scenes, SENSORS.index(name), config.stage_objects)
         stages[name] = {
             "pressure": cost.normal,
             "friction": cost.friction,
@@ -311,7 +328,7 @@ def _floor_table(config: ThroughputConfig) -> Table:
     padded = padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm)
     rows: list[tuple[Cell, ...]] = []
     for px in (config.image_px, config.large_px):
-        machine = scene_stages.measure_machine(padded, grid, px)
+        machine = throughput_rates.measure_machine(padded, grid, px)
         flops = 4 * 2 * (px * grid * grid + px * grid * px)
         size = px * px * 3 * 5  # each float of the picture written once, one byte of the result
         floor = 1e3 * (flops / machine.flops_per_s + size / machine.bytes_per_s)
@@ -330,7 +347,7 @@ def _floor_table(config: ThroughputConfig) -> Table:
 
 
 def _left_out_table(paper: SceneConfig) -> Table:
-    bands, rows = scene_protocol.left_out_by_material(paper)
+    bands, rows = force_leaks.left_out_by_material(paper)
     counts = ("asked", "past the limit", "replaced", *(f"past, {band}" for band in bands))
     return Table(
         title="Frames past the strain limit, by material and force",
@@ -340,12 +357,12 @@ def _left_out_table(paper: SceneConfig) -> Table:
     )
 
 
-def _leak_table(leaks: list[scene_protocol.ForceLeak]) -> Table:
+def _leak_table(leaks: list[force_leaks.ForceLeak]) -> Table:
     return Table(
         title="What the peak force of a press tells",
         columns=(
             Column(name="design"),
-            *(Column(name=name, unit="%", format=".0f") for name in scene_protocol.ORDINAL),
+            *(Column(name=name, unit="%", format=".0f") for name in force_leaks.ORDINAL),
             Column(name="median peak", unit="N", format=".1f"),
             Column(name="presses that reach 20 N", unit="%", format=".0f"),
         ),

@@ -2,6 +2,7 @@
 
 import re
 
+import cv2
 import numpy as np
 import pytest
 
@@ -107,3 +108,16 @@ def test_a_grid_of_images_is_as_large_as_its_cells():
     sizes = [np.frombuffer(image_grid(rows)[16:24], ">u4") for rows in ({"a": [picture]}, {"a": [picture] * 3})]
     assert sizes[1][0] - sizes[0][0] == pytest.approx(2 * 1.25 * 150, abs=1)
     assert sizes[1][1] == sizes[0][1]
+
+
+def test_an_image_grid_places_pictures_by_row_and_column():
+    red, blue = (np.full((8, 8, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 0, 255)))
+    png = image_grid({"a": [red, red], "b": [blue]}, ["one", "two"], cell_inch=0.5)
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    np.testing.assert_allclose(image.shape, (150 * 1.25, 150 * 2.05, 3), atol=1)
+    half = round(150 * 0.25)
+    first, second = half + half, 3 * half + half
+    left, right = round(150 * 1.3), round(150 * 1.8)
+    assert tuple(image[first, left]) == tuple(image[first, right]) == (255, 0, 0)
+    assert tuple(image[second, left]) == (0, 0, 255)
+    assert tuple(image[second, right]) == (255, 255, 255)

@@ -8,10 +8,9 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.scenes import pareto_storage
-from experiments.scenes.storage_clips import GENERATED, IMPORTED, STILLS, WHOLE, recorded_clips
-from experiments.scenes.storage_codecs import OWN, all_codecs, stored_bytes
+from experiments.scenes.pareto_storage import GENERATED, IMPORTED, STILLS, WHOLE, recorded_clips
+from experiments.scenes.storage_codecs import OWN, CodecMeasurement, all_codecs, chosen_filters, front, stored_bytes
 from experiments.scenes.storage_feed import CHANGES, FeedConfig
-from experiments.scenes.storage_measure import CodecMeasurement, chosen_filters, front
 from tests.experiments import tiny
 from tests.sensors_io.importers.films import film, picture
 

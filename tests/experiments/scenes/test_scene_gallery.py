@@ -9,7 +9,6 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.scenes import scene_gallery
-from experiments.scenes import sheets as scene_sheets
 from sensors_io.records import RecordStore
 from sensors_io.scenes import objects
 from sensors_io.scenes.config import SceneConfig
@@ -34,10 +33,10 @@ def test_sheets_without_a_solver_are_drawn() -> None:
 
 def test_a_press_is_a_row_per_sensor(records: Path) -> None:
     contact = RecordStore(records).contact(0)
-    sheet = scene_gallery._press_sheet([contact[sensor] for sensor in SENSORS], 3)
+    sheet = scene_gallery.press_sheet([contact[sensor] for sensor in SENSORS], 3)
     image = cv2.imdecode(np.frombuffer(sheet.content, np.uint8), cv2.IMREAD_COLOR)
     assert sheet.name == "press-3"
-    assert image.shape[0] == pytest.approx(scene_sheets.DPI * (0.25 + 6 * scene_sheets.CELL_INCH), abs=1)
+    assert image.shape[0] == pytest.approx(150 * (0.25 + 6 * 1.25), abs=1)
 
 
 @pytest.mark.slow  # compiles eight programs
@@ -48,24 +47,11 @@ def test_every_sheet_is_drawn(tmp_path: Path) -> None:
     assert read_json(directory / "results.json")["verdict"] == ["5 sheets, drawn from seed 0."]
 
 
-def test_a_sheet_places_its_pictures_in_rows() -> None:
-    red, blue = (np.full((8, 8, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 0, 255)))
-    png = scene_sheets.picture_rows({"a": [red, red], "b": [blue]}, ["one", "two"], cell_inch=0.5)
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    np.testing.assert_allclose(image.shape, (150 * 1.25, 150 * 2.05, 3), atol=1)
-    half = round(150 * 0.25)
-    first, second = half + half, 3 * half + half
-    left, right = round(150 * 1.3), round(150 * 1.8)
-    assert tuple(image[first, left]) == tuple(image[first, right]) == (255, 0, 0)
-    assert tuple(image[second, left]) == (0, 0, 255)
-    assert tuple(image[second, right]) == (255, 255, 255)
-
-
 def test_arrows_point_along_the_displacement() -> None:
     still = np.zeros((4, 4))
     moved = np.zeros((4, 4, 2))
     moved[2, 1] = (0.5, 0.0)  # two cells to the right
-    picture = scene_sheets.field_picture(still, moved, 1.0, px=80)
+    picture = scene_gallery.field_picture(still, moved, 1.0, px=80)
     assert picture[50, 40:68].min() > 200
     assert picture[50, 75].max() < 60
 
@@ -73,7 +59,7 @@ def test_arrows_point_along_the_displacement() -> None:
 def test_letters_of_a_uniform_object_are_all_the_same() -> None:
     solid = objects.sample(np.random.default_rng(0), 0.0, 0.8)
     blank = np.zeros((120, 120, 3), np.uint8)
-    marked = scene_gallery._mark_levels(blank, solid)[..., 0]
+    marked = scene_gallery.mark_levels(blank, solid)[..., 0]
     corner, centre = marked[8:32, 10:34], marked[48:72, 50:74]
     assert corner.max() > 100
     assert marked.sum() == pytest.approx(9 * centre.sum(), rel=0.01)

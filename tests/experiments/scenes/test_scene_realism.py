@@ -11,8 +11,7 @@ from experiments.core.artifacts import read_json
 from experiments.core.context import Context
 from experiments.core.errors import ResultsError
 from experiments.core.runner import main
-from experiments.scenes import realism
-from experiments.scenes.shadows import shadow_gain
+from experiments.scenes import realism_fit
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
@@ -91,9 +90,9 @@ def test_the_report_shows_the_presses(directory: Path) -> None:
 
 
 def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: Context) -> None:
-    presses = realism.read(recordings, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
-    study = realism.fit(presses, context)
-    found = shadow_gain(presses, study.profiles, study.touches, study.fitted, study.held_out, context)
+    presses = realism_fit.read(recordings, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+    study = realism_fit.fit(presses, context)
+    found = realism_fit.shadow_gain(study, context)
     assert found["explained"] < 0.05
     assert json.dumps(found)
 
@@ -102,7 +101,7 @@ def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: C
 def test_a_folder_without_recordings_is_refused(data_dir: str | None, message: str, tmp_path: Path) -> None:
     where = None if data_dir is None else tmp_path / data_dir
     with pytest.raises(ResultsError, match=message):
-        realism.read(where, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+        realism_fit.read(where, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
 
 
 def test_a_broken_picture_is_named(recordings: Path, tmp_path: Path) -> None:
@@ -111,4 +110,4 @@ def test_a_broken_picture_is_named(recordings: Path, tmp_path: Path) -> None:
         path.parent.mkdir(parents=True)
         path.write_bytes((recordings / f"6.310mm/{i}/gelsight.png").read_bytes())
     with pytest.raises(ResultsError, match=r"background\.png: it is missing or no picture"):
-        realism.read(tmp_path, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+        realism_fit.read(tmp_path, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)

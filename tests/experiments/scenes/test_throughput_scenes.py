@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.scenes import kills as scene_kills
-from experiments.scenes import protocol as scene_protocol
-from experiments.scenes import rates as scene_rates
-from experiments.scenes import stages as scene_stages
-from experiments.scenes import throughput_scenes
+from experiments.scenes import force_leaks, killed_writer, throughput_rates, throughput_scenes
 from sensors_io import generate, live
 from sensors_io.records import RecordStore
 from sensors_io.scenes import protocol, strength
@@ -41,11 +37,11 @@ def look(skins, turn_rad, modulus_mpa):
 @pytest.fixture
 def cheap(monkeypatch):
     monkeypatch.setattr(live, "make_contact", make_contact)
-    monkeypatch.setattr(scene_rates, "make_contact", make_contact)
+    monkeypatch.setattr(throughput_rates, "make_contact", make_contact)
     monkeypatch.setattr(generate, "contacts", contacts)
     monkeypatch.setattr(strength, "look", look)
-    ones = scene_stages.StageCosts(normal=1.0, friction=1.0, fields=1.0, picture=1.0)
-    monkeypatch.setattr(scene_stages, "stage_costs", lambda *_: ones)
+    ones = throughput_rates.StageCosts(normal=1.0, friction=1.0, fields=1.0, picture=1.0)
+    monkeypatch.setattr(throughput_rates, "stage_costs", lambda *_: ones)
     protocol._plan.cache_clear()
     yield monkeypatch
     protocol._plan.cache_clear()
@@ -59,7 +55,7 @@ def test_the_experiment_runs_shrunken(cheap, tmp_path):
         return kills
 
     config = dataclasses.replace(throughput_scenes.SMOKE, written_contacts=8, kills=5)
-    cheap.setattr(scene_kills, "killed_and_resumed", killed)
+    cheap.setattr(killed_writer, "killed_and_resumed", killed)
     directory = run_shrunk(throughput_scenes, config, tmp_path / "runs", "--cache-dir", str(tmp_path / "cache"))
     results = read_json(directory / "results.json")
     named = {r["name"]: r for r in results["requirements"]}
@@ -76,19 +72,19 @@ def test_the_experiment_runs_shrunken(cheap, tmp_path):
 
 def test_what_kills_may_do_to_a_set_is_counted(tmp_path):
     a, b = fakes.write(tmp_path / "a", 4), fakes.write(tmp_path / "b", 4)
-    same = scene_kills.compare(a, b)
+    same = killed_writer.compare(a, b)
     assert (same.missing, same.repeated, same.damaged, same.differing) == (0, 0, 0, 0)
     assert same.records == sum(RecordStore(a).frames.values())
     fewer_sensors = fakes.write(tmp_path / "c", 4, sensors=SENSORS[:3])
-    assert scene_kills.compare(a, fewer_sensors).differing == 4
+    assert killed_writer.compare(a, fewer_sensors).differing == 4
     shorter = fakes.write(tmp_path / "d", 2)
-    assert scene_kills.compare(a, shorter).missing == 2
+    assert killed_writer.compare(a, shorter).missing == 2
     shard = min(b.glob("contacts-*"))
     data = bytearray(shard.read_bytes())
     for at in range(len(data) // 4, len(data) // 2, 97):
         data[at] ^= 0xFF
     shard.write_bytes(bytes(data))
-    assert scene_kills.compare(a, b).damaged > 0
+    assert killed_writer.compare(a, b).damaged > 0
 
 
 def test_a_writer_is_killed_at_random_moments_and_goes_on(tmp_path, monkeypatch):
@@ -103,15 +99,15 @@ def test_a_writer_is_killed_at_random_moments_and_goes_on(tmp_path, monkeypatch)
     module = types.SimpleNamespace(executable=str(tmp_path / "python"))
     (tmp_path / "python").write_text(f'#!/bin/sh\nexec {sys.executable} {script} "$@"\n')
     (tmp_path / "python").chmod(0o755)
-    monkeypatch.setattr(scene_kills, "sys", module)
+    monkeypatch.setattr(killed_writer, "sys", module)
     out = tmp_path / "out"
-    assert scene_kills.killed_and_resumed([], out, kills=3, shards=6, shard_s=0.1, seed=0) == 3
+    assert killed_writer.killed_and_resumed([], out, kills=3, shards=6, shard_s=0.1, seed=0) == 3
     assert len(list(out.iterdir())) == 6
 
 
 def test_force_tells_hardness_when_frames_are_dropped_and_not_when_matched(cheap):
     config = SceneConfig(objects=300, sequences=4 * 600)
-    dropped, rigid, kept, matched = scene_protocol.leaks(config)
+    dropped, rigid, kept, matched = force_leaks.leaks(config)
     assert max(kept.accuracy) < 45
     assert kept.full_share == 1
     assert dropped.accuracy[0] > 70
@@ -121,7 +117,7 @@ def test_force_tells_hardness_when_frames_are_dropped_and_not_when_matched(cheap
 
 
 def test_left_out_frames_are_tabled_by_material(cheap):
-    bands, rows = scene_protocol.left_out_by_material(SceneConfig(objects=40, sequences=4 * 80, frames=40))
+    bands, rows = force_leaks.left_out_by_material(SceneConfig(objects=40, sequences=4 * 80, frames=40))
     assert bands[0] == "0–2 N"
     assert bands[-1] == "15–20 N"
     assert rows[-1][0] == "all"

@@ -1,25 +1,98 @@
-"""What the parts of a generated record cost, and the least that this machine could make of them."""
+"""Rates of the generator: feeds without disk, written sets, the parts of a record, and the machine's own rates."""
 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.scenes.rates import Stopwatch
+from sensors_io.generate import generate_records
+from sensors_io.live import LiveScenes
+from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.scenes import contact, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels, record
+from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.schedule import Slot
 from sensors_io.scenes.sensors import MODELS, SensorModel
-from sensors_io.schema import FORCES_N
+from sensors_io.schema import FORCES_N, SENSORS
 
-_Scene = tuple[Press, Any, np.ndarray]  # what is touched, by which unit, the key of the noise
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordRate:
+    """Records, and the seconds of the clock and of the processors that they took."""
+
+    records: int
+    seconds: float
+    cpu_seconds: float
+
+    @property
+    def per_second(self) -> float:
+        """Records per second of the clock."""
+        return self.records / self.seconds
+
+    @property
+    def cpu_ms(self) -> float:
+        """Milliseconds of one core per record, which hardly depends on who shares the machine."""
+        return 1e3 * self.cpu_seconds / self.records
+
+
+class Stopwatch:
+    """Wall and processor time of this process since it was made."""
+
+    def __init__(self) -> None:
+        self._begin = (time.perf_counter(), time.process_time())
+
+    def rate(self, records: int) -> RecordRate:
+        """The rate of `records` made since then."""
+        wall, cpu = time.perf_counter() - self._begin[0], time.process_time() - self._begin[1]
+        return RecordRate(records=records, seconds=wall, cpu_seconds=cpu)
+
+
+def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callable[[int], None]) -> RecordRate:
+    """Rate of a feed without disk whose clips hold every frame; compiling and looking at objects are left out."""
+    clip = ClipConfig(frames=config.frame_count, image_px=config.image_px, view_px=config.view_px)
+    scenes = LiveScenes(config)
+    for row in _one_of_each_program(config):
+        make_contact(config, row)
+    order = np.arange(contacts) % len(scenes)
+    batches = clip_batches(scenes, order, clip, batch_size=1, seed=0, repeat=False, threads=threads)
+    watch = Stopwatch()
+    for batch in batches:
+        advance(len(batch["contact"]))
+    return watch.rate(contacts * len(SENSORS) * config.frame_count)
+
+
+def write_rate(config: SceneConfig, out: Path, advance: Callable[[int], None]) -> tuple[RecordRate, float]:
+    """Rate of a written set and its bytes per record; compiling and looking at objects are left out."""
+    for row in _one_of_each_program(config):
+        make_contact(config, row)
+    watch, seen = Stopwatch(), [0]
+
+    def report(done: int, total: int) -> None:
+        advance(done - seen[0])
+        seen[0] = done
+
+    generate_records(config, out, progress=report)
+    records = config.contact_count * len(SENSORS) * config.frame_count
+    return watch.rate(records), sum(f.stat().st_size for f in out.iterdir()) / records
+
+
+def _one_of_each_program(config: SceneConfig) -> Iterator[int]:
+    """A contact for every program that is compiled: one that stands, one that moves."""
+    moves = [key.motion.startswith("slide") for key in LiveScenes(config).contacts]
+    yield moves.index(False)
+    if True in moves:
+        yield moves.index(True)
+
+
+_Scene = tuple[Press, Any, np.ndarray]  # object, sensor unit, key of the noise
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,7 +106,7 @@ class StageCosts:
 
 
 def stage_costs(config: SceneConfig, order: int, objects: int) -> StageCosts:
-    """What the parts of the compiled program cost, by timing it with and without them, over `objects` objects."""
+    """Costs of the parts of the compiled program, by timing it with and without them, over `objects` objects."""
     sensor = MODELS[order]
     blind = dataclasses.replace(sensor, render=None)
     still = [_scene(config, i, order, "hold") for i in range(objects)]
@@ -69,7 +142,7 @@ def measure_machine(padded: int, grid: int, image_px: int) -> MachineRates:
 
 
 def _seconds(call: Callable[[], Any], times: int = 40) -> float:
-    """Least time of one call: what the machine can do when nobody disturbs it."""
+    """Least time of one call, which other load does not affect."""
     found = []
     for _ in range(times):
         begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""A generation that is killed at random moments and goes on: what is left of its records."""
+"""A generation that is killed at random moments and resumed, compared with one that was not interrupted."""
 
 import dataclasses
 import os
@@ -21,10 +21,10 @@ _SIGKILL = -int(signal.SIGKILL)  # return code of a process that it ended
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ResumedSet:
-    """What is left of a set after kills, against one that was written undisturbed.
+    """A set that was written with interruptions, compared with one that was not.
 
-    `records` that can be read; contacts that are missing, there more than once, or damaged by their checksums; contacts
-    that are whole and yet not the same, bit for bit and in the same place.
+    `records` that can be read; contacts that are missing, repeated, or damaged by their checksums; readable contacts
+    that differ in a bit or in their place.
     """
 
     records: int
@@ -44,7 +44,7 @@ def killed_and_resumed(
     seed: int,
     advance: Callable[[], None] = lambda: None,
 ) -> int:
-    """Run `python -m sensors_io generate`, kill it with SIGKILL at random moments, let the last run end.
+    """Run `python -m sensors_io generate`, kill it with SIGKILL at random moments, let the last run finish.
 
     A moment is a random shard, another each time, and a random part of the time in which it is written; the first shard
     takes in the start of the process and its compiling.
@@ -52,14 +52,14 @@ def killed_and_resumed(
     Args:
       arguments: of the command, without `--out`.
       out: directory of the records.
-      kills: how often to kill, < `shards`.
+      kills: number of kills, < `shards`.
       shards: that the finished set has.
       shard_s: seconds that an undisturbed writer takes for one.
       seed: of the moments.
       advance: called after each kill, and after the last run.
 
     Returns:
-      How often it was killed before its end.
+      Number of runs that were killed before they ended.
 
     Raises:
       ValueError: as many kills as shards, or more.

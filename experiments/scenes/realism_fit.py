@@ -1,4 +1,4 @@
-"""Real and generated pictures of the same touches: recordings of a GelSight Mini, the fit to them, renderings of it."""
+"""Real and generated pictures of the same touches: recordings of a GelSight Mini, the fit, renderings, shadows."""
 
 import dataclasses
 from pathlib import Path
@@ -22,7 +22,7 @@ BY_EYE = (
     Lamp(colour=(0.04, 1, 0.08), angle_deg=210, floor=0.28, peak=0.10, width=(0.8, 0.9)),
     Lamp(colour=(0.04, 0.10, 1), angle_deg=330, floor=0.22, peak=0.30, centre=(0, -0.2), width=(1.0, 0.65)),
 )
-"""What the generator had before: lamps set by eye to published pictures, with the noise below."""
+"""The earlier optics of the generator: lamps set by eye to published pictures, with the noise below."""
 
 
 BY_EYE_NOISE = Noise(read=(0.004,) * 3, shot=(0.008,) * 3, grain=(0.0,) * 3, shared=0.0)
@@ -30,7 +30,7 @@ BY_EYE_NOISE = Noise(read=(0.004,) * 3, shot=(0.008,) * 3, grain=(0.0,) * 3, sha
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RenderCandidate:
-    """One way to make pictures: a renderer and its noise."""
+    """A renderer and its noise."""
 
     render: Renderer
     noise: Noise
@@ -113,7 +113,7 @@ def located(presses: BallPresses, train: np.ndarray) -> np.ndarray:
 
 
 def candidates(study: PressFit) -> dict[str, RenderCandidate]:
-    """What is compared, from the first optics to the fit of this run."""
+    """Renderers to compare, from the first optics to the fit of this run."""
     stored = Noise(
         read=GELSIGHT_MINI.read_noise,
         shot=GELSIGHT_MINI.shot_noise,
@@ -190,8 +190,8 @@ def source(fitted: PhotometricOptics, noise: Noise, presses: BallPresses) -> str
 SOURCE_DOC = '''"""Constants of a real GelSight Mini, fitted by `python -m experiments scene_realism`; not to be edited.
 
 From {presses} presses of a ball of {ball:.2f} mm and one picture of the gel at rest, 320 × 240 px of 0.0634 mm, shrunk
-to 112 px a side: github.com/rpl-cmu/gelslam at e0ea7ded95c2288fcb8dc18bc806fce270fac483, MIT licence.  Their meaning is
-said in `photometric` and `fitting.Noise`.
+to 112 px a side: github.com/rpl-cmu/gelslam at e0ea7ded95c2288fcb8dc18bc806fce270fac483, MIT licence.  They are
+documented in `photometric` and `fitting.Noise`.
 """
 
 '''
@@ -218,3 +218,63 @@ def _light(texture: np.ndarray) -> Light:
     return Light(
         exposure=jnp.ones(()), led_gain=jnp.ones(3), pattern_shift_mm=jnp.zeros(2), texture=jnp.asarray(texture)
     )
+
+
+ELEVATIONS_DEG = (10.0, 20.0, 35.0)
+DIRECTIONS = 8
+REACH_MM = np.linspace(0.25, 4.0, 12)
+"""Distances along the ray to the lamp at which the gel may stand in its way."""
+
+
+def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:
+    """Regress the residual on shadow depths from eight sides and three elevations, and test on the held-out presses.
+
+        s_θα(r) = max_t (u(r + t θ) − u(r) − t tan α)₊
+
+    is the height of the gel above the ray from r to a lamp in direction θ at elevation α.  Each channel may darken
+    by any combination of them, which is more than lamps at fixed places could do: the share is an upper bound.
+
+    Returns:
+      `explained`, the share of the residual variance of the held-out presses; `residual_levels` and `left_levels`, its
+      standard deviation without and with shadows, in grey levels.
+    """
+    presses, profiles = study.presses, study.profiles
+    size = DIRECTIONS * len(ELEVATIONS_DEG)
+    normal, right, held = np.zeros((size, size)), np.zeros((size, 3)), []
+    for i, (touch, picture) in context.each("shadows", enumerate(zip(study.touches, presses.pictures, strict=True))):
+        rows, left = _shadows(presses, profiles, touch), _residual(presses, profiles, touch, picture, study.fitted)
+        if i in study.held_out:
+            held.append((rows, left))
+        else:
+            normal, right = normal + rows.T @ rows, right + rows.T @ left
+    ridge = fitting.RIDGE * np.trace(normal) * np.eye(len(normal))
+    weights = np.linalg.solve(normal + ridge, right)
+    before = np.concatenate([left for _, left in held])
+    after = np.concatenate([left - rows @ weights for rows, left in held])
+    return {
+        "explained": float(1 - after.var() / before.var()),
+        "residual_levels": float(255 * before.std()),
+        "left_levels": float(255 * after.std()),
+    }
+
+
+def _shadows(presses: BallPresses, profiles: Profiles, touch: np.ndarray) -> np.ndarray:
+    """s at the pixels near a touch, [n, directions × elevations]."""
+    x, y = fitting.points(presses.axis_mm, touch)
+    here = profiles.field(touch, x, y)[0]
+    found = []
+    for angle in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+        ray = x + REACH_MM[:, None] * np.cos(angle), y + REACH_MM[:, None] * np.sin(angle)
+        above = profiles.field(touch, *ray)[0] - here
+        tangents = np.tan(np.deg2rad(ELEVATIONS_DEG))
+        found += [np.maximum(above - REACH_MM[:, None] * tangent, 0).max(0) for tangent in tangents]
+    return np.stack(found, -1)
+
+
+def _residual(
+    presses: BallPresses, profiles: Profiles, touch: np.ndarray, picture: np.ndarray, optics: PhotometricOptics
+) -> np.ndarray:
+    """Change near a touch that the optics do not explain, [n, 3]."""
+    near = fitting.near(presses.axis_mm, touch)
+    made = fitting.change(optics, profiles, touch, presses.axis_mm, presses.window_mm)
+    return (picture - presses.background - made)[near]

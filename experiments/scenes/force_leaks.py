@@ -1,4 +1,4 @@
-"""What the protocol leaves out of generated scenes, and whether the forces that are left tell the labels."""
+"""Frames that the protocol leaves out, and accuracy of labels predicted from the remaining forces alone."""
 
 import dataclasses
 import itertools
@@ -27,7 +27,7 @@ class ForceLeak:
 
 
 def leaks(config: SceneConfig) -> list[ForceLeak]:
-    """Frames past the limit left out where they fail, by shape alone, not at all, and matched, which is the default."""
+    """Leaks of four designs: frames past the limit dropped, dropped by shape alone, all kept, and matched (default)."""
     labels = _labels(config)
     made = plan(config)
     matched = np.zeros(config.objects)
