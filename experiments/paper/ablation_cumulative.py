@@ -122,7 +122,7 @@ def _sft_is_largest(effects: tuple[ComponentEffect, ...]) -> Requirement:
 def verdict(found: ComponentComparison) -> tuple[str, ...]:
     """A sentence for SFT and for each step that the paper rests on, whichever way the figures fall."""
     if not found.effects:
-        return ("One seed: no step can be told from chance; train two seeds at least.",)
+        return ("One seed: no step can be distinguished from chance; train two seeds at least.",)
     sentences = []
     for arm, metric, subject in (
         (SFT, FOUR, "SFT over the commonest levels"),

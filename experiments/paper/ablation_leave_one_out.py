@@ -93,7 +93,7 @@ def run(config: StudyConfig, context: Context) -> Results:
 def verdict(found: ComponentComparison) -> tuple[str, ...]:
     """The components that are missed beyond chance, in accuracy, and those that are not."""
     if not found.effects:
-        return ("One seed: no effect can be told from chance; train two seeds at least.",)
+        return ("One seed: no effect can be distinguished from chance; train two seeds at least.",)
     effects = [e for e in found.effects if e.metric.metric == FOUR]
     missed = [f"{e.step.component} is missed: {e}." for e in effects if e.seeds.low > 0]
     better = [f"Without {e.step.component} answers are better: {e}." for e in effects if e.seeds.high < 0]

@@ -72,7 +72,7 @@ class SingleTouchAnswers:
         return SingleTouchAnswers(level=level, alone=alone)
 
     def strength(self, contact: int, attribute: int) -> float | None:
-        """How much of a property a contact has; `None` where its level is ⊥."""
+        """Strength of a property: its level and a fraction from single sensors; `None` where its level is ⊥."""
         level, alone = self.level[contact, attribute], self.alone[contact, :, attribute]
         if level == BOTTOM:
             return None
@@ -202,7 +202,7 @@ def comparison_table(
 
 
 def question_table(asks: Sequence[Ask]) -> Table:
-    """How many questions of each kind, about how many objects."""
+    """Number of questions of each kind, and of the objects that they are about."""
     counts = collections.Counter(ask.kind for ask in asks)
     rows: list[dict[str, Cell]] = [
         {

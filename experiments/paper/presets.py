@@ -1,4 +1,4 @@
-"""What the experiments of the paper share: scales (two cores, `smoke`, one accelerator, the paper's sizes) and curves.
+"""Scales of the paper's experiments (two cores, `smoke`, one accelerator, the paper's sizes), and their curves.
 
     SCALES = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}, refused on a machine that lacks what `NEEDS` says
 

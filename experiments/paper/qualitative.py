@@ -210,7 +210,7 @@ def _heading(ask: Ask, answer: tuple[int, ...]) -> str:
 
 
 def case_table(cases: Sequence[AnswerCase]) -> Table:
-    """How common each kind of answer is."""
+    """Number and share of each kind of answer."""
     rows: list[dict[str, Cell]] = [
         {
             "case": case.title,
@@ -244,7 +244,7 @@ def browser(study: Study, chosen: Sequence[tuple[str, Sequence[int]]]) -> Iterat
 
 
 def verdict(cases: Sequence[AnswerCase]) -> tuple[str, ...]:
-    """How common the cases of the paper's figure are, and how often the picture is followed."""
+    """Frequency of the cases in the paper's figure, and of answers that follow the picture."""
     hardness, material, level, followed = cases[:4]
     misled, overruled = (int(getattr(material, f).sum() + getattr(level, f).sum()) for f in ("among", "rows"))
     return (

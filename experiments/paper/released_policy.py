@@ -157,7 +157,7 @@ def memory_bytes(
     """Bytes of training, counted from shapes: the first two on each device, or on the first one of each process.
 
     The step holds the decoder that SFT left; the released towers, from which other seeds and the baseline without touch
-    start, are held besides.  SFT holds less than GRPO, since it samples nothing.
+    start, are kept in addition.  SFT needs less than GRPO, since it samples nothing.
 
     Args:
       config: of the training.

@@ -231,7 +231,9 @@ def drawn_batch(
     layout, (p, s) = assembly.layout, shown.stream_mask.shape
     asked = rng.integers(len(layout.asked), size=p)
     streams = random_streams(np.ones((p, s), bool), 0.5, rng)
-    pairs = [_answer(assembly, layout.asked[q], felt, config, rng) for q, felt in zip(asked, streams, strict=True)]
+    pairs = [
+        _answer(assembly, layout.asked[q], shown_by, config, rng) for q, shown_by in zip(asked, streams, strict=True)
+    ]
     tokens, masks = (np.stack(x)[:, None] for x in zip(*pairs, strict=True))
     written: dict[str, Any] = {
         "ids": layout.ids[asked][:, None],

@@ -1,22 +1,22 @@
-"""What does the paper's training make of released Qwen2.5-VL weights, and what is touch worth to the policy?
+"""What does the paper's training gain on released Qwen2.5-VL weights, and how much of it comes from touch?
 
     make experiment EXP=touch_r1 ARGS="--weights DIR"
     make experiment EXP=touch_r1 ARGS="--weights DIR --data records --data-dir RECORDS"
     make experiment EXP=touch_r1 ARGS="--scale small|smoke"
 
 DIR holds a released Qwen2.5-VL: config, tokenizer, chat template, picture settings and safetensors (see
-`python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own stands beside its towers, which stand still: SFT
+`python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own is added to its towers, which are frozen: SFT
 trains the encoder and adapters in the decoder on verified answers, GRPO with the published rewards and the
-counterfactual KL trains new adapters over that, and each stage merges its own.  Scored on unseen objects beside the
-model as it was released, which sees the picture and no touch, the same training without touch, and constants; asked
-again under each control of touch.  The policy is written to `weights/SEED` of the run, readable by whatever reads the
-release, with its tactile encoder beside it, and asked from there: what is scored is what was written, adapters rounded
-into weights of the released type, which keeps less of a change the smaller it is; how much is in the report.
+counterfactual KL trains new adapters on top, and each stage merges its own.  The policy is scored on unseen objects and
+compared with the released model, which sees the picture and no touch, with the same training without touch, and with
+constants; it is evaluated again under each control of touch.  It is written to `weights/SEED` of the run in the format
+of the release, together with its tactile encoder, and evaluated from there: the scores are those of the written
+weights, into which adapters are rounded; the smaller a change, the less of it is kept, and the report shows the share.
 
-`--scale smoke` makes a tiny checkpoint of the released format itself where none is given: it tries the code, and its
-figures say nothing.  Over its drawn embeddings, which stand still, no decoder can give a right token a chance of more
-than 0.8 %: answers parse where they are greedy, and GRPO samples noise.  `--scale small` first teaches such a
-checkpoint to write answers, without touch or pictures, and trains on it what a user without weights can watch learning.
+`--scale smoke` makes a tiny checkpoint of the released format where none is given: it tries the code, and its figures
+mean nothing.  With its drawn embeddings, which are frozen, no decoder can give the right token a probability above
+0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first teaches such a checkpoint to write answers,
+without touch or pictures, and then trains it: without released weights one can watch the training learn.
 
 Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
 Several devices: `--distributed --mesh.fsdp N` as in every study, with `--grpo.micro-prompts` a multiple of N; each
@@ -29,7 +29,7 @@ small` 24 of one core, of which scenes and teaching take 4 each.
 Expected: the released model without touch near the constant, and much above it after SFT; from GRPO what the paper's
 ladder has (`ablation_cumulative`), of which small policies show only a part.  At `small` the loss of SFT stands still
 for 500 steps before it falls; of ordinal questions about unseen objects 60 % are then answered right, 61 % after GRPO,
-26 % by the checkpoint that writes and never felt, 36 % after the same training without touch, 34 % by a constant.
+26 % by the checkpoint that writes and never had touch, 36 % after the same training without touch, 34 % by a constant.
 """
 
 import dataclasses
@@ -89,7 +89,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 
 ARM, ZERO, WRITTEN = "touch_r1", "zero_shot", "written"
 
-DRAWN = "These are drawn weights of a tiny model: the code was tried, and no figure here says anything."
+DRAWN = "These are drawn weights of a tiny model: this run tries the code, and its figures mean nothing."
 
 TAUGHT = (
     "These are weights of a tiny model that was taught to write answers, without touch or pictures, before anything "
@@ -133,7 +133,7 @@ class TouchR1Config(TrainingConfig):
     tiny_decoder: DecoderConfig = SMALLEST
     """Shape of its decoder."""
     teaching: TeachingConfig = TeachingConfig()
-    """How it is taught to write before anything else."""
+    """Its training to write answers, before anything else."""
     seeds: int = 1
     scenes: SceneConfig = SceneConfig(objects=2400, sites=1, image_px=224, view_px=224)
     clip_memory_gib: float = 8.0
@@ -178,7 +178,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
     study = train_study(config, start, arms, context, ways=ways)
     scored = score_study(study)
-    zero = [score(study, said) for said in study.further[ZERO]]
+    zero = [score(study, answers) for answers in study.further[ZERO]]
     baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
     pictures, tables = level_report(study)
     gain, kept = study_touch_gain(study, ARM), merged_shares(ARM, config.seeds, context)
@@ -259,7 +259,7 @@ def settings(config: TouchR1Config, source: Path) -> dict[str, str | float]:
 
 
 def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.ndarray, seeds: int) -> list[Comparison]:
-    """Each step of training and what it is held against, over objects, and over seeds where there are two."""
+    """Each step of training against an earlier one or a baseline, over objects, and over seeds where there are two."""
     found = []
     for a, b in ((ARM, SFT), (SFT, ZERO), (SFT, BLIND), (SFT, "constant")):
         for metric in COMPARED:
@@ -284,18 +284,20 @@ def differing(study: Study) -> Requirement:
 def verdict(
     config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], gain: TouchGain | None
 ) -> tuple[str, ...]:
-    """How often each stage is right, and what touch is worth."""
+    """Accuracy after each stage, and the gain from touch."""
     acc = lambda name: rows[name]["acc"].mean
-    said = [
+    sentences = [
         f"Of ordinal questions about unseen objects the model answers {acc(ZERO):.1f} % right as it was released and "
         f"without touch, {acc(SFT):.1f} % after SFT, {acc(ARM):.1f} % after GRPO; trained without touch "
         f"{acc(BLIND):.1f} %, a constant {acc('constant'):.1f} %."
     ]
     if gain is not None:
-        said.append(f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}.")
+        sentences.append(
+            f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}."
+        )
     if config.weights is None:
-        said.insert(0, TAUGHT if config.teaching.steps else DRAWN)
-    return tuple(said)
+        sentences.insert(0, TAUGHT if config.teaching.steps else DRAWN)
+    return tuple(sentences)
 
 
 DEFAULT = TouchR1Config()
