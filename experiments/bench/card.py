@@ -41,7 +41,7 @@ class CardCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether the bound is kept."""
+        """True if the bound is kept."""
         return self.measured <= self.bound
 
 
