@@ -1,4 +1,4 @@
-"""What every setting of the chooser's menu costs and how far it is off, and what the chooser makes of the same scenes.
+"""Time and error of every setting of the chooser's menu on random scenes.
 
 The error of a setting is that of its displacement, interpolated by cubic splines to the reference's grid and averaged
 to half of it, by a solution on a finer grid than any setting's, with more padding.
@@ -36,7 +36,7 @@ ROUNDS = 3
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MenuMeasurements:
-    """What was measured of S scenes in B batches under T settings, each solved from scratch.
+    """Measurements of S scenes in B batches under T settings, each solved from scratch.
 
     Features [S, K] and lengths [S] of the surveys; errors [S, T], the greater of displacement's and slope's; ms a scene
     of every setting, [B, T].

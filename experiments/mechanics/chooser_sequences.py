@@ -1,4 +1,4 @@
-"""Whether generated sequences keep the error asked for: frames of `SceneConfig.error`, against a finer solution.
+"""Errors of generated sequences with a requested error (`SceneConfig.error`), compared with a finer solution.
 
 Frames are drawn from those that touch, so most are not among the few that `effort.choose` looks at, and are solved as
 `press.record` solves them.  The reference is that of the chooser's measurement (`chooser_measure`).

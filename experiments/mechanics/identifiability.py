@@ -50,7 +50,7 @@ from touchr1_jax.training.evidence import ProbeConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class IdentifiabilityConfig:
-    """What to generate, at which tiers and noise, and how to ask.
+    """Scenes, contact tiers, noise and probes of the study.
 
     Args:
       presses: objects that are pressed, without `sequences`; the tiers replace its grid and tolerance.
@@ -87,7 +87,7 @@ class IdentifiabilityConfig:
 
     @property
     def exact(self) -> ContactTier:
-        """What stands for the exact solution."""
+        """The tier that stands for the exact solution."""
         return ContactTier(name=f"exact, {self.exact_grid}²", grid=self.exact_grid, tolerance=self.exact_tolerance)
 
     @property

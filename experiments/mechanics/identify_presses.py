@@ -76,7 +76,7 @@ def _scaled(noise: tuple[float, float, float], factor: float) -> tuple[float, fl
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactTier:
-    """How a contact is solved: side of its grid, tolerance, and whether springs stand for the gel's compliance."""
+    """A method of solving contacts: side of the grid, tolerance, and springs in place of the gel's compliance."""
 
     name: str
     grid: int

@@ -294,4 +294,4 @@ def _proven(tractions: Array, gap: Array) -> np.ndarray:
 
 _SOLVED = {"force": _solved_pull, "slide": _solved_slide, "twist": _solved_twist}
 TASKS = tuple(_SOLVED)
-"""What is prescribed."""
+"""Quantities that a task prescribes."""

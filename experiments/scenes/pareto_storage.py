@@ -55,7 +55,7 @@ Rows = Mapping[str, Sequence[CodecMeasurement]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StorageConfig:
-    """What to store and to feed.
+    """Clips to store, and the feed to time.
 
     Args:
       data_dir: folder of recordings; None for generated scenes alone.

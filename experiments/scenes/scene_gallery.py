@@ -38,7 +38,7 @@ UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity":
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GalleryConfig:
-    """What to draw.
+    """Sizes of the sheets.
 
     Args:
       views: objects per material, the last two of which lie.
@@ -181,7 +181,7 @@ def ranges() -> Picture:
 
 
 def odds() -> Table:
-    """How often each level comes of a material: what an honest picture tells at best."""
+    """Odds of each level by material, which bound the accuracy from an honest picture alone."""
     every = {**properties.PROPERTIES, **properties.DYNAMIC}
     chances = {name: 100 * properties.level_odds(prop) for name, prop in every.items()}
     cells = lambda shares: {name: " · ".join(f"{share:.0f}" for share in found) for name, found in shares.items()}

@@ -36,7 +36,7 @@ SHOWN = 6
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RealismConfig:
-    """What to compare.
+    """Recordings, pictures and classifier of the comparison.
 
     Args:
       data_dir: the recordings.
@@ -129,7 +129,7 @@ def distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) ->
 
 
 def fit_table(study: realism_fit.PressFit) -> Table:
-    """How much of what the ball changes the fit explains, near the contact."""
+    """Share of the change near the contact that the fit explains, and the residual."""
     axis, rows = study.presses.axis_mm, []
     for name, held_out in (("fitted", False), ("held out", True)):
         chosen = [i for i in range(len(study.touches)) if (i in study.held_out) == held_out]
@@ -167,7 +167,7 @@ def side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictur
 
 
 def verdict(rows: Mapping[str, tuple[PictureDistances, float, float]], shadows: Mapping[str, float]) -> tuple[str, ...]:
-    """What the figures say."""
+    """The answer in sentences."""
     (before, told_before, _), (after, told_after, error) = rows["lamps by eye"], rows["fitted, with grain"]
     return (
         f"Fitted optics bring generated presses from {before.pixel:.1f} to {after.pixel:.1f} grey levels of the real "

@@ -58,7 +58,7 @@ def all_codecs() -> tuple[Codec, ...]:
 
 
 OWN, PLAIN = "chosen zstd-1", "zstd-1"
-"""What records use, and what they used in version 1."""
+"""Codec of the records, and that of their version 1."""
 
 _FIXED = ("time", "rows", "time+rows")
 
@@ -266,7 +266,7 @@ def front(rows: Sequence[CodecMeasurement]) -> list[CodecMeasurement]:
 
 
 def chosen_filters(clips: Iterable[np.ndarray]) -> dict[str, int]:
-    """How many clips want each filter."""
+    """Number of clips for which each filter is chosen."""
     names = [choose_filter(clip) for clip in clips]
     return {name: names.count(name) for name in FILTERS}
 

@@ -1,4 +1,4 @@
-"""How fast clips come from records, and what of it takes how long."""
+"""Rate at which clips are read from records, and the time of each part of the work."""
 
 import contextlib
 import dataclasses
@@ -32,7 +32,7 @@ CHANGES: Mapping[str, AugmentConfig | None] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeedConfig:
-    """What the feed reads.
+    """Records and batches of the feed.
 
     Args:
       scenes: the records.

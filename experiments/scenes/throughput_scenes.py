@@ -39,10 +39,10 @@ from sensors_io.schema import SENSORS, Flag
 PAPER_OBJECTS, PAPER_SEQUENCES, PAPER_FRAMES = 1000, 14_700, 90
 PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
 FEED_RATE, LARGE_RATE, WRITTEN_HOURS = 400, 150, 1.5
-"""What is required: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
+"""Requirements: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
 
 KILLS, KILLED_RECORDS = 5, 20_000
-"""What is required of the killed writer: kills, records."""
+"""Requirements on the killed writer: kills, records."""
 
 Stages = Mapping[str, Mapping[str, float]]
 """Sensor → part of the work → milliseconds of one core a record."""
@@ -50,7 +50,7 @@ Stages = Mapping[str, Mapping[str, float]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ThroughputConfig:
-    """What to measure.
+    """Sizes of the measurements.
 
     Args:
       image_px: side of the ordinary pictures.
@@ -323,7 +323,7 @@ def _stage_table(config: ThroughputConfig, stages: Stages) -> Table:
 
 
 def _floor_table(config: ThroughputConfig) -> Table:
-    """What the counted operations and bytes of a picture and of a solve cost at the machine's measured rates."""
+    """Time of the counted operations and bytes of a picture and of a solve at the machine's measured rates."""
     sensor, grid = MODELS[1], config.contact_grid
     padded = padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm)
     rows: list[tuple[Cell, ...]] = []

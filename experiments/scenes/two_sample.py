@@ -1,4 +1,4 @@
-"""How far apart two sets of pictures are: statistics of intensity, gradient and spectrum, and a classifier's word.
+"""Distance between two sets of pictures: statistics of intensity, gradient and spectrum, and a classifier's accuracy.
 
 Pictures are RGB uint8 [P, N, N, 3]; picture p of both sets shows the same scene, so that appearance alone differs.
 """
@@ -99,7 +99,7 @@ def _train_and_ask(train: np.ndarray, test: np.ndarray, ridge: float) -> np.ndar
 
 
 def _statistics(patches: np.ndarray) -> np.ndarray:
-    """What the judge sees of patches [..., n, n, 3] in grey levels, [..., D]."""
+    """Statistics of patches [..., n, n, 3] in grey levels that the classifier uses, [..., D]."""
     flat = patches.reshape(-1, *patches.shape[-3:])
     n = flat.shape[1]
     mean = flat.mean((1, 2))
