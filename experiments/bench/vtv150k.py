@@ -45,7 +45,7 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.bench.statistics import Interval
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 MOTIONS = ("slide_x", "hold")
 """One that reveals friction, one that reveals the returned energy; both reveal the other attributes."""

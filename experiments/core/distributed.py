@@ -20,8 +20,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.placement import Step, gather_params, local_rows, place_batch, place_state, shard_step
-from touchr1_jax.training.loop import Batches
+from touchr1_jax.distributed.placement import gather_params, local_rows, place_batch, place_state, shard_step
+from touchr1_jax.training.loop import Batches, SingleDevice, Step
 
 MESSAGE_BYTES = 8192
 """Longest value that process 0 can send to the others: twice Linux's longest path."""
@@ -139,38 +139,6 @@ def join_processes(launch: Launch) -> ProcessGroup:
     return ProcessGroup(jax.process_count(), jax.process_index())
 
 
-class SingleDevice:
-    """Training steps run on one device, as they are."""
-
-    shape: tuple[int, ...] = (1, 1, 1)
-    """Devices along the axes of the mesh."""
-    gather_params: Callable[[Any], Any] = staticmethod(lambda params: params)
-    """All-gathers weights inside a traced step, as `make_grpo_step` takes it."""
-
-    def local_rows(self, batch_size: int) -> np.ndarray:
-        """Rows of a batch that this process must read, ascending."""
-        return np.arange(batch_size)
-
-    def shard(
-        self, step: Step, state: Any, batches: Batches, batch_size: int, *shared: Any
-    ) -> tuple[Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]], Any, Batches]:
-        """Place a step (state, batch) → (state, metrics), its first state and its batches on the devices.
-
-        Args:
-          step: (state, batch, *shared) → (state, metrics), jitted.
-          state: the first one.
-          batches: of the rows that this process reads.
-          batch_size: rows of a whole batch.
-          shared: arguments that never change during the run.
-        """
-        del batch_size
-        return lambda s, b: step(s, b, *shared), state, batches
-
-    def gather(self, tree: Any) -> Any:
-        """Arrays that every process holds completely."""
-        return tree
-
-
 class DeviceMesh(SingleDevice):
     """Training steps run on the devices of a mesh, including those of other processes."""
 
@@ -185,13 +153,13 @@ class DeviceMesh(SingleDevice):
         return local_rows(self._mesh, batch_size)
 
     def shard(
-        self, step: Step, state: Any, batches: Batches, batch_size: int, *shared: Any
-    ) -> tuple[Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]], Any, Batches]:
+        self, step: Step, state: Any, batches: Batches, batch_size: int, *constants: Any
+    ) -> tuple[Step, Any, Batches]:
         """The same, split by the sharding rules; one step is compiled once."""
         placed = PlacedBatches(batches, self._mesh, batch_size)
         if step not in self._compiled:
-            self._compiled[step] = shard_step(step, self._mesh, state, placed.shapes(), *shared)
-        on_mesh, there = self._compiled[step], [place_state(self._mesh, x) for x in shared]
+            self._compiled[step] = shard_step(step, self._mesh, state, placed.shapes(), *constants)
+        on_mesh, there = self._compiled[step], [place_state(self._mesh, x) for x in constants]
         return lambda s, b: on_mesh(s, b, *there), place_state(self._mesh, state), placed
 
     def gather(self, tree: Any) -> Any:

@@ -1,14 +1,18 @@
-"""A training loop as a stage of a run: checkpoints, log, progress bar, wall time, an end when a signal asks for it."""
+"""Training stages of a run: checkpoints, log, progress bar, wall time, a stop when a signal asks for it."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from experiments.core.context import Context
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import Batches, Log, LoopConfig, LoopTime, fit, resume
+from touchr1_jax.training.loop import Batches, Hooks, Log, LoopConfig, LoopTime, Step, fit
 
 STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
+
+KEPT = "kept"
+"""Stages whose results say how much of a stage's adapters is in the merged weights (see `lora.kept_share`)."""
 
 
 def plain_log(context: Context, stage: str, start: int) -> Log:
@@ -17,8 +21,66 @@ def plain_log(context: Context, stage: str, start: int) -> Log:
     return lambda t, metrics: context.log(stage, t, **metrics)
 
 
+@contextlib.contextmanager
+def stage_hooks(
+    context: Context,
+    stage: str,
+    steps: int,
+    *,
+    make_log: Callable[[Context, str, int], Log] = plain_log,
+    scored: bool = False,
+) -> Iterator[Hooks]:
+    """Hooks that make a training stage part of a run; inside the block the stage is timed.
+
+    Args:
+      context: the run.
+      stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
+      steps: of the whole stage, for the progress bar.
+      make_log: from context, stage and first step to what receives (step, metrics).
+      scored: keep the checkpoint of the highest held-out score too.
+    """
+    times, logs = LoopTime(), list[Log]()
+    with (
+        Checkpoints(
+            context.checkpoint_dir(stage), better="higher" if scored else None, say=context.print
+        ) as checkpoints,
+        context.timed(stage),
+        context.stopping.patient(context.processes.any) as stopping,
+        contextlib.ExitStack() as bar,
+    ):
+
+        def resumed(start: int) -> None:
+            context.require_logged(stage, start)
+            context.rewind(stage, start)
+            write = make_log(context, stage, start)
+            advance = bar.enter_context(context.progress(stage, steps, min(start, steps)))
+
+            def log(t: int, metrics: dict[str, float]) -> None:
+                write(t, metrics)
+                advance()
+
+            logs.append(log)
+
+        yield Hooks(
+            log=lambda t, metrics: logs[-1](t, metrics),
+            checkpoints=checkpoints,
+            resumed=resumed,
+            stopping=stopping,
+            merged=lambda kept: context.save_stage(f"{KEPT}/{stage}", kept),
+            times=times,
+            devices=context.devices,
+        )
+        bar.close()
+        if times.steps:
+            context.add_time(f"{STEPPING}/{stage}", times.total_s)
+            context.add_time(f"{WAITING}/{stage}", times.input_s)
+            context.print(
+                f"{stage}: {1e3 * times.total_s / times.steps:.3g} ms a step, {times.input_share:.2%} of it {WAITING}"
+            )
+
+
 def run_loop(
-    step: Callable[[Any, Any], Any],
+    step: Step,
     state: Any,
     batches: Batches,
     loop: LoopConfig,
@@ -28,44 +90,11 @@ def run_loop(
     make_log: Callable[[Context, str, int], Log] = plain_log,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
-    """Run `fit` as a stage, from its newest checkpoint, so that an interrupted stage ends in the same state.
+    """`fit` with `stage_hooks`: a stopped stage goes on from its newest checkpoint and ends in the same state.
 
     Args:
-      step: jitted (state, batch) → (state, metrics).
-      state: the first one of a stage without a checkpoint.
-      batches: training data.
-      loop: number of steps, and of those between checkpoints.
-      context: the run.
-      stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
-      make_log: from context, stage and first step to a function of (step, metrics).
-      held_out: score of a state on unseen data, higher is better, computed at every checkpoint; the best one is kept.
+      step, state, batches, loop, held_out: as in `fit`.
+      context, stage, make_log: as in `stage_hooks`.
     """
-    times = LoopTime()
-    with (
-        Checkpoints(
-            context.checkpoint_dir(stage), better=None if held_out is None else "higher", say=context.print
-        ) as checkpoints,
-        context.timed(stage),
-        context.stopping.patient(context.processes.any) as stopping,
-    ):
-        start, state = resume(state, batches, checkpoints)
-        context.require_logged(stage, start)
-        context.rewind(stage, start)
-        write = make_log(context, stage, start)
-        with context.progress(stage, loop.steps, min(start, loop.steps)) as advance:
-
-            def log(t: int, metrics: dict[str, float]) -> None:
-                write(t, metrics)
-                advance()
-
-            state = fit(
-                step, state, batches, loop,
-                checkpoints=checkpoints, log=log, start=start, stopping=stopping, held_out=held_out, times=times,
-            )  # fmt: skip
-        if times.steps:
-            context.add_time(f"{STEPPING}/{stage}", times.total_s)
-            context.add_time(f"{WAITING}/{stage}", times.input_s)
-            context.print(
-                f"{stage}: {1e3 * times.total_s / times.steps:.3g} ms a step, {times.input_share:.2%} of it {WAITING}"
-            )
-    return state
+    with stage_hooks(context, stage, loop.steps, make_log=make_log, scored=held_out is not None) as hooks:
+        return fit(step, state, batches, loop, hooks, held_out=held_out)

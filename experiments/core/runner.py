@@ -39,6 +39,7 @@ from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.loop import NonFiniteGradientError
+from touchr1_jax.training.questions import NoLabelsError
 
 EVENTS = "events"
 """Folder of a run that holds its TensorBoard events."""
@@ -53,6 +54,7 @@ KNOWN_ERRORS = (
     UserError,
     CheckpointError,
     NonFiniteGradientError,
+    NoLabelsError,
     DamagedFileError,
     ProcessesNotFoundError,
     MachineError,

@@ -24,7 +24,7 @@ from touchr1_jax.training.dynamics import (
     start_dynamics,
     steps_of,
 )
-from touchr1_jax.training.probes import contact_features, rank_me, told_apart
+from touchr1_jax.training.latent_probes import contact_features, rank_me, told_apart
 from touchr1_jax.types import TouchBatch
 
 COPY_FLOOR = 1e-6

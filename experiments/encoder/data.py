@@ -13,7 +13,7 @@ from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 STAGE_ONE_SEED = 1
 """Seed of the scenes of stage 1: its objects differ from those of seed 0, on which later stages train and test."""

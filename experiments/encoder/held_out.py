@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax import masked
@@ -28,8 +27,9 @@ from touchr1_jax.training.dynamics import (
     spread_of,
     steps_of,
 )
-from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import contact_features, probe_right, rank_me, told_apart
+from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.latent_probes import contact_features, probe_right, rank_me, told_apart
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Params, TouchBatch
 
 BATCH = 32

@@ -33,11 +33,11 @@ from experiments.encoder.pretrain import PretrainConfig, clip_of, pretrain
 from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.types import Params, TouchBatch
 
 SEED = 0

@@ -11,11 +11,10 @@ import optax
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.encoder.held_out import HeldOutContacts, assess
-from experiments.study.feeds import Feed, host_touch, touch_batch
-from experiments.study.pretrained import PretrainedEncoder
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from touchr1_jax.models.predictor import PredictorConfig
+from touchr1_jax.models.pretrained import PretrainedEncoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.training.dynamics import (
     DynamicsConfig,
@@ -25,9 +24,10 @@ from touchr1_jax.training.dynamics import (
     make_dynamics_step,
     start_dynamics,
 )
+from touchr1_jax.training.feeds import Feed, host_touch, touch_batch
+from touchr1_jax.training.latent_probes import collapse_alarms
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
-from touchr1_jax.training.probes import collapse_alarms
 from touchr1_jax.types import TouchBatch
 
 

@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.core.artifacts import write_bytes
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context, read_metrics
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
@@ -32,7 +33,6 @@ from experiments.core.text import bounds, interval
 from experiments.encoder.data import StageOneDataConfig, held_out_contacts, open_touch, training_rows
 from experiments.encoder.held_out import EncoderAssessment, assess, points, skill
 from experiments.encoder.pretrain import PretrainConfig, clip_of, encoder_of, pretrain, untrained
-from experiments.study.pretrained import save_encoder
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
 
@@ -64,7 +64,8 @@ def run(config: PretrainEncoderConfig, context: Context) -> Results:
         held_out=held_out_contacts(data, "val", config.touch, config.watch_fit),
     )
     notes = {"steps": config.pretrain.steps, "source": data.store.meta.source}
-    save_encoder(context.directory / "encoder.npz", encoder_of(config.pretrain, state, sensors, **notes))
+    encoder = encoder_of(config.pretrain, state, sensors, **notes)
+    write_bytes(context.directory / "encoder.npz", encoder.to_bytes())
     with context.timed("assess"):
         test, networks = held_out_contacts(data, "test", config.touch), config.pretrain.dynamics(len(sensors))
         after = assess(networks, state, test, context)

@@ -34,7 +34,6 @@ from experiments.core.runner import Experiment
 from experiments.encoder.collapse import CollapseRun, CollapseRunner, in_memory, make_runner
 from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import touch_batch
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES
@@ -42,8 +41,9 @@ from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.training.dynamics import DynamicsConfig, Guards
-from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import BOUNDS, collapse_alarms, probe_right
+from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.latent_probes import BOUNDS, collapse_alarms, probe_right
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import TouchBatch
 
 RATE = 1e-3

@@ -45,14 +45,14 @@ from experiments.encoder.video_scoring import (
 )
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import touch_batch
-from experiments.study.pretrained import PretrainedEncoder, load_encoder
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.image_similarity import check_weights
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig
+from touchr1_jax.models.pretrained import PretrainedEncoder, load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.video import VideoConfig, VideoState, every_question, make_video_step, start_video

@@ -11,10 +11,10 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import touch_batch
 from touchr1_jax.bench.image_similarity import lpips, ssim
 from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
+from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.video import (
     Asked,
     VideoConfig,

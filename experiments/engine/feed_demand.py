@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from experiments.study.assembly import Assembly
-from experiments.study.stages import SFTConfig, sft_program
+from experiments.study.stages import StudySFT
 from touchr1_jax.distributed.memory import GRPOShape
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import Machine, seconds
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.sft import SFTBatch, SFTState
+from touchr1_jax.training.train_sft import sft_program
 from touchr1_jax.types import TouchBatch
 
 
@@ -31,40 +32,40 @@ def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
     return _flops(jax.make_jaxpr(function)(*arguments).jaxpr)
 
 
-def sft_seconds(assembly: Assembly, config: SFTConfig, batch: SFTBatch, devices: int, machine: Machine) -> float:
+def sft_seconds(policy: TouchPolicy, config: StudySFT, batch: SFTBatch, devices: int, machine: Machine) -> float:
     """Least seconds of a step of SFT, W / (devices · peak · share), where W are the step's operations.
 
     Exchange between devices is not counted: it could only make the step longer, and so easier to feed.
 
     Args:
-      assembly, config: as in `run_sft`.
+      policy, config: as in `run_sft`.
       batch: one whole batch, or its shapes and dtypes.
       devices: that share it.
       machine: what each can do.
     """
-    optimizer, step = sft_program(assembly.fns, config, False)
+    optimizer, step = sft_program(policy.fns, config, False)
 
     def start(touch: TouchBatch) -> SFTState:
-        params = assembly.init(0, touch)
+        params = policy.init(0, touch)
         return SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
 
     state = jax.eval_shape(start, batch.touch)
     return count_flops(step, state, batch) / (devices * machine.flops * machine.flops_share)
 
 
-def grpo_seconds(assembly: Assembly, config: GRPOConfig, devices: int, machine: Machine) -> float:
+def grpo_seconds(policy: TouchPolicy, config: GRPOConfig, devices: int, machine: Machine) -> float:
     """Seconds of a step of GRPO as `touchr1_jax.distributed.work` predicts them, weights split over all devices.
 
     Args:
-      assembly, config: as in `run_grpo`.
+      policy, config: as in `run_grpo`.
       devices: that share a batch.
       machine: what each can do.
     """
     shape = GRPOShape(
-        decoder=assembly.fns.module.config.decoder,
+        decoder=policy.fns.module.config.decoder,
         grpo=config,
         mesh=MeshConfig(fsdp=devices),
-        prompt_tokens=assembly.layout.ids.shape[1],
+        prompt_tokens=policy.layout.ids.shape[1],
     )
     return math.fsum(seconds(shape, machine).values())
 

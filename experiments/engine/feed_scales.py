@@ -6,12 +6,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.study.assembly import Assembly
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import AnswerFeed, QuestionFeed
-from experiments.study.stages import encode_program
+from experiments.study.stages import answer_feed
 from experiments.study.study import StudyConfig
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.training.encoding import encode_program
+from touchr1_jax.training.feeds import AnswerFeed
+from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.types import TouchBatch
 
 
@@ -41,29 +43,21 @@ def memory_share(study: StudyConfig, data: Dataset, touch: TouchBatch) -> float:
     return min(1.0, study.clip_memory_gib * 2**30 / (contacts * clip_bytes(touch)))
 
 
-def answers(assembly: Assembly, data: Dataset, scale: FeedScale) -> AnswerFeed:
+def answers(policy: TouchPolicy, data: Dataset, scale: FeedScale) -> AnswerFeed:
     """Batches of SFT, those rows that the first device reads; the evidence is equal for all levels."""
     config = scale.study.sft
-    shape = (len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels))
-    return AnswerFeed(
-        assembly,
-        data,
-        np.zeros(shape, np.float32),
-        batch_size=config.batch_size,
-        questions=config.questions,
-        seed=0,
-        augment=config.augment,
-        own=np.arange(config.batch_size // scale.devices),
-    )
+    shape = (len(data.store), len(data.clip.sensors), len(policy.levels), max(policy.levels))
+    own = np.arange(config.batch_size // scale.devices)
+    return answer_feed(policy, data, np.zeros(shape, np.float32), config, seed=0, own=own)
 
 
-def questions(assembly: Assembly, touch: TouchBatch, data: Dataset, scale: FeedScale) -> QuestionFeed:
+def questions(policy: TouchPolicy, touch: TouchBatch, data: Dataset, scale: FeedScale) -> QuestionFeed:
     """Batches of GRPO, those rows that the first device reads, about encoded touch that is all zeros."""
-    params = jax.eval_shape(lambda touch: assembly.init(0, touch), touch)
-    one = jax.eval_shape(encode_program(assembly.fns, False), params, touch)
+    params = jax.eval_shape(lambda touch: policy.init(0, touch), touch)
+    one = jax.eval_shape(encode_program(policy.fns, False), params, touch)
     n = len(data.store)
     zeros: Features = jax.tree.map(lambda x: np.zeros((n, *x.shape[1:]), x.dtype), one)
     there: Any = np.ones(zeros.stream_mask.shape, bool)
     features = dataclasses.replace(zeros, stream_mask=there)
     drawn = scale.study.grpo.drawn
-    return QuestionFeed(assembly, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))
+    return QuestionFeed(policy, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))

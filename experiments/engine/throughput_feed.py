@@ -33,12 +33,12 @@ from experiments.engine.feed_demand import grpo_seconds, sft_seconds
 from experiments.engine.feed_scales import FeedScale, answers, clip_bytes, memory_share, questions
 from experiments.engine.feed_supply import BatchCost, idle_share, make_seconds
 from experiments.paper import presets
-from experiments.study.assembly import assemble
-from experiments.study.feeds import Feed
 from experiments.study.study import SMOKE as TINY_STUDY
 from experiments.study.study import open_study_data
 from sensors_io.pipeline import ClipMemory
 from touchr1_jax.distributed.work import Machine
+from touchr1_jax.models.touch_policy import build_policy
+from touchr1_jax.training.feeds import Feed
 
 MOST_IDLE = 0.02
 """Share of the time that a device may stand still for want of a batch."""
@@ -142,20 +142,20 @@ def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Contex
     )
     data = open_study_data(study, context)
     data = dataclasses.replace(data, parts={**data.parts, "sft": np.arange(len(data.store))})
-    assembly = assemble(study.model, data.clip.sensors)
-    sft = answers(assembly, data, scale)
-    batch = next(answers(assembly, data, scale))
+    policy = build_policy(study.model, data.clip.sensors)
+    sft = answers(policy, data, scale)
+    batch = next(answers(policy, data, scale))
     whole = jax.tree.map(lambda x: jax.ShapeDtypeStruct((study.sft.batch_size, *x.shape[1:]), x.dtype), batch)
-    step_s = sft_seconds(assembly, study.sft, whole, scale.devices, config.machine)
+    step_s = sft_seconds(policy, study.sft, whole, scale.devices, config.machine)
     kept = memory_share(scale.study, data, batch.touch)
     yield watch(config, f"{name}/sft/records", sft, step_s, context, configured=not kept)
     if kept:
         memory = ClipMemory(data.clip, round(kept * len(data.store)) * clip_bytes(batch.touch))
         remembering = dataclasses.replace(data, memory=memory)
-        feed = answers(assembly, remembering, scale)
+        feed = answers(policy, remembering, scale)
         yield watch(config, f"{name}/sft/memory", feed, step_s, context, configured=True, warm=len(data.store))
-    grpo_s = grpo_seconds(assembly, study.grpo, scale.devices, config.machine)
-    asked = questions(assembly, batch.touch, data, scale)
+    grpo_s = grpo_seconds(policy, study.grpo, scale.devices, config.machine)
+    asked = questions(policy, batch.touch, data, scale)
     yield watch(config, f"{name}/grpo/memory", asked, grpo_s, context, configured=True)
 
 

@@ -6,18 +6,20 @@ from collections.abc import Mapping
 from experiments.core.context import Context
 from experiments.core.loops import STEPPING, WAITING
 from experiments.encoder.pretrain import PretrainConfig, pretrain
-from experiments.study.assembly import assemble
-from experiments.study.reinforcement import Asked, make_arm, run_grpo
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import (
-    encode_contacts,
+    EncodedContacts,
+    encode_rows,
     gather_evidence,
+    make_arm,
     noise_bank,
     probe_features,
+    run_grpo,
     run_sft,
 )
 from experiments.study.study import StudyConfig, open_study_data
 from sensors_io.scenes.config import SceneConfig
+from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.loop import LoopConfig
 
 STAGES = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")
@@ -44,17 +46,17 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     """Train each stage for some steps from where it is; a stage that is done is not timed again."""
     study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
     data = open_study_data(study, context)
-    assembly = assemble(study.model, data.clip.sensors)
+    policy = build_policy(study.model, data.clip.sensors)
     evidence = gather_evidence(data, probe_features(data, context), study.probe, context)
     sft = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
-    params = run_sft(assembly, data, evidence, sft, context, seed=0, stage=STAGES[0])
-    features = encode_contacts(assembly, params, data, data.parts["grpo"], context)
-    noise = noise_bank(assembly.fns, params, data, seed=0)
-    asked = Asked(features=features, label=data.label[data.parts["grpo"]], noise=noise)
-    arm = make_arm(assembly, PUBLISHED, data.prior(), study.grpo, loop)
-    run_grpo(assembly, arm, asked, params, context, seed=0, stage=STAGES[1])
+    params = run_sft(policy, data, evidence, sft, context, seed=0, stage=STAGES[0])
+    features = encode_rows(policy, params, data, data.parts["grpo"], context)
+    noise = noise_bank(policy, params, data, seed=0)
+    contacts = EncodedContacts(features=features, label=data.label[data.parts["grpo"]], noise=noise)
+    arm = make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
+    run_grpo(policy, arm, contacts, params, context, seed=0, stage=STAGES[1])
     blind = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)
-    run_sft(assembly, data, evidence, blind, context, seed=0, stage=STAGES[2], blind=True)
+    run_sft(policy, data, evidence, blind, context, seed=0, stage=STAGES[2], blind=True)
     dynamics = dataclasses.replace(config.dynamics, steps=config.steps, probe_every=config.steps)
     pretrain(dynamics, data.store, data.parts["sft"], data.clip, context, stage=STAGES[3], seed=0)
     times = context.timing()

@@ -45,7 +45,7 @@ from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.validity import STRAIN_LIMIT
 from sensors_io.schema import SENSORS
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

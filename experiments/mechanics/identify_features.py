@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, UInt8
 from sensors_io.scenes import surface
 from sensors_io.selection import FIELD_MM_PER_COUNT
 from touchr1_jax.models.tactile_vit import force_features
-from touchr1_jax.training.evidence import stream_features
+from touchr1_jax.training.linear_probe import stream_features
 
 WORKERS = 2
 

@@ -13,7 +13,7 @@ from experiments.mechanics.identify_motions import MotionData
 from experiments.mechanics.identify_presses import ContactTier, PressData
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.training.evidence import ProbeConfig, group_folds, probe_log_probs
+from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_log_probs
 
 LEVELS = 3
 

@@ -36,7 +36,7 @@ from experiments.paper.components import BASE, COMPONENTS, published_steps, rein
 from experiments.paper.eval_variants import untrained
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.paper_numbers import differences_table
-from experiments.study.study import SFT, StudyConfig, Way
+from experiments.study.study import SFT, EvalVariant, StudyConfig
 
 UNTRAINED = "untrained"
 
@@ -54,7 +54,7 @@ ABLATION = Ablation(
     arms=WEIGHTS,
     algorithms=ALGORITHMS,
     pairs=tuple((arm, BELOW[arm]) for arm in WEIGHTS),
-    variants={UNTRAINED: Way(of=SFT, ask=untrained)},
+    variants={UNTRAINED: EvalVariant(of=SFT, evaluate=untrained)},
     curves=presets.GRPO_CURVES,
     example="grounding",
 )

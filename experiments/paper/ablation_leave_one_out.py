@@ -37,7 +37,7 @@ from experiments.paper.eval_variants import without_sft
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
-from experiments.study.study import SFT, StudyConfig, Way
+from experiments.study.study import SFT, EvalVariant, StudyConfig
 
 STEPS = tuple(
     ComponentStep(
@@ -58,7 +58,7 @@ ABLATION = Ablation(
     arms=WEIGHTS,
     algorithms=ALGORITHMS,
     pairs=tuple((FULL, arm.name) for arm in FROM_SFT),
-    variants={NO_SFT: Way(of=SFT, ask=functools.partial(without_sft, PUBLISHED, WITH_TACTILE_USE))},
+    variants={NO_SFT: EvalVariant(of=SFT, evaluate=functools.partial(without_sft, PUBLISHED, WITH_TACTILE_USE))},
     curves=presets.GRPO_CURVES,
     example=FULL,
 )

@@ -18,13 +18,13 @@ from experiments.bench.draw import Quota, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Estimate, Table, named_table
 from experiments.core.text import bounds, number
-from experiments.study.answers import Evaluated
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import estimate
 from experiments.study.paper_numbers import Row as PaperRow
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.averages import AVERAGED, WORST_OMAE, touch_average
 from touchr1_jax.bench.comparison import ORDERS
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM, Scores
 from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
@@ -55,7 +55,7 @@ class SingleTouchAnswers:
     alone: Int[np.ndarray, "n S A"]
 
     @staticmethod
-    def of(answers: Evaluated, contacts: int) -> "SingleTouchAnswers":
+    def of(answers: Evaluation, contacts: int) -> "SingleTouchAnswers":
         """From the answers to every question about `contacts` contacts, which `answers.contact` counts.
 
         A policy without touch gives the same answer whichever sensor is shown.
@@ -87,7 +87,7 @@ def bench_questions(data: Dataset, quota: Quota, context: Context) -> tuple[Ask,
     return draw(contacts, data.clip.sensors, quota, seed=0)
 
 
-def bench_answers(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluated]) -> list[dict[str, tuple[int, ...]]]:
+def bench_answers(data: Dataset, asks: Sequence[Ask], seeds: Sequence[Evaluation]) -> list[dict[str, tuple[int, ...]]]:
     """Answers to the bench's questions that follow from the answers about single touches, for every seed."""
     rows, contacts = touch_rows(data), len(data.parts["test"])
     each = (SingleTouchAnswers.of(answers, contacts) for answers in seeds)

@@ -196,8 +196,8 @@ def compare_components(
     study: Study, scored: Scored, steps: Sequence[ComponentStep], context: Context
 ) -> ComponentComparison:
     """Score all answers with `FOUR`, compare the steps, and diagnose the runs whose signs do not come out."""
-    answers = {**study.answers, **{name: [one] for name, one in baselines(study).items()}, **study.further}
-    plain = {**scored.rows, **{name: [score(study, one) for one in seeds] for name, seeds in study.further.items()}}
+    answers = {**study.answers, **{name: [one] for name, one in baselines(study).items()}, **study.variants}
+    plain = {**scored.rows, **{name: [score(study, one) for one in seeds] for name, seeds in study.variants.items()}}
     rows = {
         name: [
             {**scores, FOUR: mean_accuracy(np.asarray(one.parsed.conclude), one.label)}

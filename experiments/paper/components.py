@@ -7,8 +7,8 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 
 from experiments.study import paper_numbers as paper
-from experiments.study.assembly import Weights
 from experiments.study.scores import PUBLISHED
+from experiments.study.stages import Weights
 from experiments.study.study import SFT
 from touchr1_jax.rl.config import AnyAlgorithm, Paper, TactileUse
 

@@ -106,7 +106,7 @@ def run(config: StudyConfig, context: Context) -> Results:
         data=study.data.summary(),
         curves=presets.CURVES,
         examples=rollout_examples(
-            study, FULL, PUBLISHED, {c: study.further[control_name(FULL, c)][0] for c in CONTROLS}
+            study, FULL, PUBLISHED, {c: study.variants[control_name(FULL, c)][0] for c in CONTROLS}
         ),
     )
 

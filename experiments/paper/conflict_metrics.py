@@ -15,9 +15,9 @@ from experiments.core.results import Cell, Table, named_table
 from experiments.core.text import bounds, interval
 from experiments.paper.component_effects import pooled
 from experiments.paper.eval_variants import control_name
-from experiments.study.answers import Evaluated
 from experiments.study.study import Study
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE, LeastGain, least_tactile_use, revision_rate, tactile_use_gain
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL, Scores, accuracy, keep_scored
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, student_interval
@@ -45,7 +45,7 @@ class TouchQuestions:
         return self.attribute == ATTRIBUTES.index(attribute)
 
 
-def touch_questions(study: Study, answers: Evaluated) -> TouchQuestions:
+def touch_questions(study: Study, answers: Evaluation) -> TouchQuestions:
     """The questions that a study's policy answered about the test contacts."""
     test, n = study.data.parts["test"], np.arange(len(answers.contact))
     return TouchQuestions(
@@ -56,7 +56,7 @@ def touch_questions(study: Study, answers: Evaluated) -> TouchQuestions:
     )
 
 
-def concluded(answers: Evaluated) -> Int[np.ndarray, "N"]:
+def concluded(answers: Evaluation) -> Int[np.ndarray, "N"]:
     """The level that each answer concludes for the attribute in question, −1 for ⊥."""
     return np.asarray(answers.parsed.conclude)[np.arange(len(answers.contact)), answers.attribute]
 
@@ -146,8 +146,8 @@ class TouchGain:
 
 def touch_gain(
     questions: TouchQuestions,
-    real: Sequence[Evaluated],
-    controls: Mapping[str, Sequence[Evaluated]],
+    real: Sequence[Evaluation],
+    controls: Mapping[str, Sequence[Evaluation]],
     ordered: np.ndarray,
     mask: np.ndarray,
 ) -> TouchGain | None:
@@ -166,7 +166,7 @@ def touch_gain(
     if len(np.unique(questions.objects[mask & questions.ordinal])) < 2:
         return None
 
-    def score(answers: Evaluated) -> Scores:
+    def score(answers: Evaluation) -> Scores:
         levels, scored = concluded(answers), mask & questions.ordinal & (questions.label != BOTTOM)
         return keep_scored(100.0 * (levels == questions.label), scored, questions.attribute)
 
@@ -189,8 +189,8 @@ def study_touch_gain(study: Study, policy: str, mask: np.ndarray | None = None) 
       mask: bool [N], the questions to judge by; all labelled ones by default.
     """
     questions = touch_questions(study, study.answers[policy][0])
-    controls = {c: study.further[control_name(policy, c)] for c in CONTROLS}
-    ordered = study.assembly.ordered[questions.attribute]
+    controls = {c: study.variants[control_name(policy, c)] for c in CONTROLS}
+    ordered = study.policy.ordered[questions.attribute]
     return touch_gain(
         questions, study.answers[policy], controls, ordered, questions.label >= 0 if mask is None else mask
     )

@@ -17,22 +17,20 @@ from experiments.paper.feature_baselines import (
     together_and_alone,
 )
 from experiments.study import stages
-from experiments.study.answers import Evaluated, evaluate_policy
-from experiments.study.assembly import Weights
 from experiments.study.baselines import level_answers
-from experiments.study.reinforcement import Asked, make_arm, run_grpo
-from experiments.study.stages import encode_contacts, noise_bank
-from experiments.study.study import Trained, Way
+from experiments.study.stages import EncodedContacts, Weights, encode_rows, make_arm, noise_bank, run_grpo
+from experiments.study.study import EvalVariant, TrainedPolicy, ask_policy
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
 
 
-def control_variants(policy: str) -> dict[str, Way]:
+def control_variants(policy: str) -> dict[str, EvalVariant]:
     """For each of `CONTROLS` the policy evaluated without its touch, or with something else in its place."""
     return {
-        control_name(policy, control): Way(of=policy, ask=functools.partial(_under_control, control))
+        control_name(policy, control): EvalVariant(of=policy, evaluate=functools.partial(_under_control, control))
         for control in CONTROLS
     }
 
@@ -42,28 +40,28 @@ def control_name(policy: str, control: str) -> str:
     return f"{policy}-under-{control}"
 
 
-def untrained(trained: Trained) -> Evaluated:
+def untrained(trained: TrainedPolicy) -> Evaluation:
     """The policy as it is before SFT."""
-    params = stages.untrained(trained.assembly, trained.data, trained.seed)
-    test = encode_contacts(trained.assembly, params, trained.data, trained.data.parts["test"], trained.context)
-    return evaluate_policy(trained.assembly, params, test, trained.label, trained.context)
+    params = stages.untrained(trained.policy, trained.data, trained.seed)
+    test = encode_rows(trained.policy, params, trained.data, trained.data.parts["test"], trained.context)
+    return ask_policy(trained.policy, params, test, trained.label, trained.context)
 
 
-def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: Trained) -> Evaluated:
+def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: TrainedPolicy) -> Evaluation:
     """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
-    assembly, data, config = trained.assembly, trained.data, trained.config
-    params = stages.untrained(assembly, data, trained.seed)
-    encode = functools.partial(encode_contacts, assembly, params, data, context=trained.context)
+    policy, data, config = trained.policy, trained.data, trained.config
+    params = stages.untrained(policy, data, trained.seed)
+    encode = functools.partial(encode_rows, policy, params, data, context=trained.context)
     grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
-    arm = make_arm(assembly, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
-    noise = noise_bank(assembly.fns, params, data, seed=trained.seed)
-    asked = Asked(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
+    arm = make_arm(policy, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
+    noise = noise_bank(policy, params, data, seed=trained.seed)
+    contacts = EncodedContacts(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
     stage = f"grpo/no_sft/{trained.seed}"
-    tuned = run_grpo(assembly, arm, asked, params, trained.context, seed=trained.seed, stage=stage)
-    return evaluate_policy(assembly, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)
+    tuned = run_grpo(policy, arm, contacts, params, trained.context, seed=trained.seed, stage=stage)
+    return ask_policy(policy, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)
 
 
-def encoder_probe(swapped: bool, trained: Trained) -> Evaluated:
+def encoder_probe(swapped: bool, trained: TrainedPolicy) -> Evaluation:
     """Levels by a linear probe on the encoded touch, its mean over the tokens of each stream.
 
     Args:
@@ -72,14 +70,14 @@ def encoder_probe(swapped: bool, trained: Trained) -> Evaluated:
     """
     data = trained.data
     rows = np.concatenate([data.parts["sft"], data.parts["grpo"]])
-    known = mean_tokens(encode_contacts(trained.assembly, trained.params, data, rows, trained.context))
+    known = mean_tokens(encode_rows(trained.policy, trained.params, data, rows, trained.context))
     asked = mean_tokens(trained.test)
     if swapped:
         known = known.rows(other_objects(data.object_ids[rows], trained.seed))
         asked = asked.rows(other_objects(data.object_ids[data.parts["test"]], trained.seed))
-    probe = functools.partial(linear_probe, levels=trained.assembly.levels, config=trained.config.probe)
+    probe = functools.partial(linear_probe, levels=trained.policy.levels, config=trained.config.probe)
     levels = together_and_alone(probe, LabelledFeatures(features=known, label=data.label[rows]), asked)
-    return level_answers(trained.assembly, trained.said, levels.together, levels.alone)
+    return level_answers(trained.policy, trained.evaluation, levels.together, levels.alone)
 
 
 def mean_tokens(features: Features) -> ContactFeatures:
@@ -107,7 +105,7 @@ def swap_objects(features: Features, objects: np.ndarray, seed: int) -> Features
     )
 
 
-def _under_control(control: str, trained: Trained) -> Evaluated:
+def _under_control(control: str, trained: TrainedPolicy) -> Evaluation:
     test, key = jax.tree.map(jnp.asarray, trained.test), jax.random.key(trained.seed)
     objects = trained.data.object_ids[trained.data.parts["test"]]
     change: Mapping[str, Callable[[], Features]] = {
@@ -117,4 +115,4 @@ def _under_control(control: str, trained: Trained) -> Evaluated:
         "swapped": lambda: swap_objects(trained.test, objects, trained.seed),
     }
     changed = jax.device_get(change[control]())
-    return evaluate_policy(trained.assembly, trained.params, changed, trained.label, trained.context, alone=False)
+    return ask_policy(trained.policy, trained.params, changed, trained.label, trained.context, alone=False)

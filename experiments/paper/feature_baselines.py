@@ -15,7 +15,7 @@ from experiments.core.errors import DataError
 from sensors_io.records import RecordStore
 from sensors_io.schema import Sequence as Recording
 from touchr1_jax.bench.metrics import BOTTOM
-from touchr1_jax.training.evidence import ProbeConfig, probe_log_probs
+from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 
 NEIGHBOURS = 15
 """Contacts that vote; fixed beforehand, about the square root of a level's training contacts."""

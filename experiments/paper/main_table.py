@@ -47,14 +47,14 @@ from experiments.paper.feature_baselines import (
     together_and_alone,
 )
 from experiments.study import paper_numbers as paper
-from experiments.study.answers import Evaluated
 from experiments.study.baselines import baselines, level_answers
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
-from experiments.study.study import BLIND, SFT, SMOKE, Study, StudyConfig, Way, run_study
+from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.rl.config import Paper
 
 ENCODER_PROBE, SWAPPED = "encoder_probe", "shuffled_touch"
@@ -88,8 +88,8 @@ class MainConfig:
 def run(config: MainConfig, context: Context) -> Results:
     """Train, answer, score."""
     variants = {
-        ENCODER_PROBE: Way(of=SFT, ask=functools.partial(encoder_probe, False)),
-        SWAPPED: Way(of=SFT, ask=functools.partial(encoder_probe, True)),
+        ENCODER_PROBE: EvalVariant(of=SFT, evaluate=functools.partial(encoder_probe, False)),
+        SWAPPED: EvalVariant(of=SFT, evaluate=functools.partial(encoder_probe, True)),
     }
     study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)
     with context.timed("baselines"):
@@ -97,7 +97,7 @@ def run(config: MainConfig, context: Context) -> Results:
     with context.timed("score"):
         asks = bench_questions(study.data, config.quota, context)
         rows = {}
-        for name, seeds in context.each("scoring", {**study.answers, **study.further, **untrained}.items()):
+        for name, seeds in context.each("scoring", {**study.answers, **study.variants, **untrained}.items()):
             by_picture = bench_answers(study.data, asks, study.answers[BLIND][: len(seeds)])
             rows[name] = bench_row(asks, bench_answers(study.data, asks, seeds), by_picture)
     trained = {name: rows[name] for name in (SFT, FULL)}
@@ -130,9 +130,9 @@ def run(config: MainConfig, context: Context) -> Results:
     )
 
 
-def without_policy(study: Study, context: Context) -> dict[str, Evaluated]:
+def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
     """Answers of the baselines that need no policy, to the questions that policies were asked."""
-    data, levels = study.data, study.assembly.levels
+    data, levels = study.data, study.policy.levels
     train, test = np.concatenate([data.parts["sft"], data.parts["grpo"]]), data.parts["test"]
     with context.progress("reading fields", len(train) + len(test)) as advance:
         fields = [field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
@@ -157,7 +157,7 @@ def without_policy(study: Study, context: Context) -> dict[str, Evaluated]:
     answers = {}
     for name, predict in context.each("baselines", predictions.items()):
         found = predict()
-        answers[name] = level_answers(study.assembly, study.answers[SFT][0], found.together, found.alone)
+        answers[name] = level_answers(study.policy, study.answers[SFT][0], found.together, found.alone)
     return baselines(study) | answers
 
 

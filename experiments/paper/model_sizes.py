@@ -17,19 +17,22 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Estimate, Table, named_table
 from experiments.core.text import bounds, number
 from experiments.paper.components import FULL
-from experiments.study.answers import answer_program
-from experiments.study.assembly import ModelConfig
-from experiments.study.feeds import AnswerFeed, labelled, question_batch, touch_batch
 from experiments.study.scores import PUBLISHED
-from experiments.study.stages import ENCODE_BATCH, encode_program, sft_program
+from experiments.study.stages import ENCODE_BATCH, answer_feed
 from experiments.study.study import Study, StudyConfig, run_study
+from touchr1_jax.bench.evaluation import answer_program
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.bench.statistics import Interval, student_interval
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import Paper
+from touchr1_jax.training.encoding import encode_program
+from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.questions import labelled_questions, question_batch
 from touchr1_jax.training.sft import SFTState
+from touchr1_jax.training.train_sft import sft_program
 
 SMALL = ModelConfig(
     tactile=TactileViTConfig(sensors=0, width=60),
@@ -111,25 +114,25 @@ class TimedPrograms:
 
 def timed_programs(study: Study) -> TimedPrograms:
     """A step of SFT and a block of questions about some test contacts, ready to be timed."""
-    data, assembly = study.data, study.assembly
+    data, policy = study.data, study.policy
     rows = data.parts["test"][:ENCODE_BATCH]
     clips = data.batches(rows, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
     touch = touch_batch(next(iter(clips)))
-    params = assembly.init(0, touch)
+    params = policy.init(0, touch)
     label = data.label[rows]
-    contact, attribute = labelled(label)
-    encode, ask = encode_program(assembly.fns, False), answer_program(assembly)
+    contact, attribute = labelled_questions(label)
+    encode, ask = encode_program(policy.fns, False), answer_program(policy)
 
     def answer() -> Any:
         features = jax.device_get(encode(params, touch))
         present = features.stream_mask[contact]
-        batch = question_batch(assembly, features, label, contact, attribute, present)
+        batch = question_batch(policy, features, label, contact, attribute, present)
         return ask({"decoder": params["decoder"]}, batch)
 
     config = study.config.sft
-    evidence = np.zeros((len(data.store), len(data.clip.sensors), len(assembly.levels), max(assembly.levels)))
-    batch = next(AnswerFeed(assembly, data, evidence, batch_size=config.batch_size, questions=config.questions, seed=0))
-    optimizer, step = sft_program(assembly.fns, config, False)
+    evidence = np.zeros((len(data.store), len(data.clip.sensors), len(policy.levels), max(policy.levels)))
+    batch = next(answer_feed(policy, data, evidence, config, seed=0))
+    optimizer, step = sft_program(policy.fns, config, False)
     donated = jax.tree.map(jnp.array, params)  # a copy: the step gives its buffers away
     states = [SFTState(params=donated, opt_state=optimizer.init(donated), step=jnp.zeros((), jnp.int32))]
 

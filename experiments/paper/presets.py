@@ -21,18 +21,18 @@ from experiments.core.machine import Accelerators
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.study import paper_numbers as paper
-from experiments.study.assembly import ModelConfig
-from experiments.study.stages import SFTConfig
+from experiments.study.stages import StudySFT
 from experiments.study.study import SMOKE, StudyConfig
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.qwen.config import RELEASED
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 
-BENCH = StudyConfig(sft=SFTConfig(steps=1350), blind=SFTConfig(steps=1350, micro_contacts=16))
+BENCH = StudyConfig(sft=StudySFT(steps=1350), blind=StudySFT(steps=1350, micro_contacts=16))
 """The default: three times the SFT of `ablation_ordinal`, which still gained on validation objects when it stopped;
 policies that several studies share may cost more than a main job."""
 
@@ -46,10 +46,10 @@ NEEDS: Mapping[str, Accelerators] = {
 """An H100 or H200; sixteen H200, on which `scale_paper` counts 47 to 53 GB of a step on each."""
 
 
-def _sft(steps: int, contacts: int, lr_scale: float) -> SFTConfig:
+def _sft(steps: int, contacts: int, lr_scale: float) -> StudySFT:
     """SFT by whole batches: micro-batches serve a processor's cache."""
     optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale)
-    return SFTConfig(steps=steps, batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
+    return StudySFT(steps=steps, batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
 
 
 def _grpo(prompts: int, micro_prompts: int, lr_scale: float) -> GRPOConfig:

@@ -29,12 +29,12 @@ from experiments.paper.bench_scores import bench_answers, bench_questions, touch
 from experiments.paper.components import FULL
 from experiments.paper.conflict_metrics import TouchQuestions, concluded, touch_questions
 from experiments.paper.eval_variants import control_name, control_variants
-from experiments.study.answers import Evaluated
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM
@@ -114,7 +114,7 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     """Train one seed, evaluate every variant, choose, show."""
     study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, control_variants(FULL))
     scored = score_study(study)
-    first = {name: seeds[0] for name, seeds in {**study.answers, **study.further}.items()}
+    first = {name: seeds[0] for name, seeds in {**study.answers, **study.variants}.items()}
     full, questions = first[FULL], touch_questions(study, first[SFT])
     slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
     cases = answer_cases(
@@ -182,7 +182,7 @@ def first_of(rows: Bool[np.ndarray, "N"], objects: np.ndarray, count: int) -> li
 
 
 def item_examples(
-    asks: Sequence[Ask], answers: Mapping[str, tuple[int, ...]], places: Mapping[Touch, int], full: Evaluated
+    asks: Sequence[Ask], answers: Mapping[str, tuple[int, ...]], places: Mapping[Touch, int], full: Evaluation
 ) -> Iterator[tuple[str, list[int]]]:
     """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`.
 
@@ -237,7 +237,7 @@ def case_table(cases: Sequence[AnswerCase]) -> Table:
 
 def browser(study: Study, chosen: Sequence[tuple[str, Sequence[int]]]) -> Iterator[RolloutExample]:
     """The cards of each group of answers: its heading, and indices in the full model's answers."""
-    instead: dict[str, Evaluated] = {REPLACEMENTS[c]: study.further[control_name(FULL, c)][0] for c in CONTROLS}
+    instead: dict[str, Evaluation] = {REPLACEMENTS[c]: study.variants[control_name(FULL, c)][0] for c in CONTROLS}
     instead |= {title: study.answers[policy][0] for policy, title in OTHER_POLICIES.items()}
     for group, rows in chosen:
         yield from rollouts_of(study, FULL, PUBLISHED, rows, instead, group)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.results import Table, named_table
-from experiments.study.assembly import Assembly, TouchConfig, language_of
 from experiments.study.dataset import Dataset
 from experiments.study.training import TrainingConfig
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
@@ -20,6 +19,7 @@ from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.load import Checkpoint
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy, language_of
 from touchr1_jax.text.chat_layout import build_chat_layout
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.parser import compile_parser
@@ -49,8 +49,8 @@ class ReleasedModel(TouchConfig):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class ReleasedAssembly(Assembly):
-    """An assembly whose vision tower and decoder are a checkpoint's."""
+class ReleasedPolicy(TouchPolicy):
+    """An policy whose vision tower and decoder are a checkpoint's."""
 
     checkpoint: Checkpoint
 
@@ -80,7 +80,7 @@ def instruction(language: Language) -> str:
     )
 
 
-def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[str, ...]) -> ReleasedAssembly:
+def build_released_policy(model: ReleasedModel, found: Checkpoint, sensors: tuple[str, ...]) -> ReleasedPolicy:
     """Combine a checkpoint, prompts in its chat template and a tactile encoder for a set of sensors.
 
     Raises:
@@ -105,7 +105,7 @@ def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[st
         view_tokens=view.tokens,
         system=instruction(language),
     )
-    return ReleasedAssembly(
+    return ReleasedPolicy(
         model=model,
         language=language,
         tokenizer=found.tokenizer,
@@ -116,14 +116,14 @@ def assemble_released(model: ReleasedModel, found: Checkpoint, sensors: tuple[st
     )
 
 
-def prove_released(assembly: ReleasedAssembly, batch: TouchBatch) -> None:
+def check_released(policy: ReleasedPolicy, batch: TouchBatch) -> None:
     """Build the parameters of a batch's shapes abstractly, so that contradicting sizes show before data are made.
 
     Raises:
       SizeError: sizes contradict each other.
     """
     try:
-        jax.eval_shape(functools.partial(assembly.init, 0), batch)
+        jax.eval_shape(functools.partial(policy.init, 0), batch)
     except (ValueError, TypeError) as error:
         raise SizeError(f"no policy can be built of these sizes: {error}") from error
 
@@ -152,7 +152,7 @@ STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encode
 
 
 def memory_bytes(
-    config: TrainingConfig, assembly: ReleasedAssembly, data: Dataset, mesh: tuple[int, ...]
+    config: TrainingConfig, policy: ReleasedPolicy, data: Dataset, mesh: tuple[int, ...]
 ) -> dict[str, int]:
     """Bytes of training, counted from shapes: the first two on each device, or on the first one of each process.
 
@@ -161,27 +161,27 @@ def memory_bytes(
 
     Args:
       config: of the training.
-      assembly: the policy.
+      policy: the policy.
       data: its contacts are encoded once for GRPO, once for the test.
       mesh: devices along its axes.
 
     Raises:
       SizeError: as `grpo_shape`.
     """
-    released, layout, streams = assembly.checkpoint.config, assembly.layout, len(assembly.language.sensors)
+    released, layout, streams = policy.checkpoint.config, policy.layout, len(policy.language.sensors)
     touch, view = layout.touch.size // streams, len(layout.view)
-    shape = grpo_shape(config, assembly, mesh)
+    shape = grpo_shape(config, policy, mesh)
     text = layout.ids.shape[1] - streams * touch - view
     prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
     step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.grpo_lora)
     lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
     of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)
-    weights = sum(x.nbytes for x in jax.tree.leaves(assembly.checkpoint.params))
+    weights = sum(x.nbytes for x in jax.tree.leaves(policy.checkpoint.params))
     return {STEP: counted_peak(lines), WEIGHTS: weights, CONTACTS: contacts * of_contact}
 
 
-def grpo_shape(config: TrainingConfig, assembly: ReleasedAssembly, mesh: tuple[int, ...]) -> GRPOShape:
+def grpo_shape(config: TrainingConfig, policy: ReleasedPolicy, mesh: tuple[int, ...]) -> GRPOShape:
     """The sizes that the memory of a GRPO step depends on; needs no data.
 
     Raises:
@@ -190,10 +190,10 @@ def grpo_shape(config: TrainingConfig, assembly: ReleasedAssembly, mesh: tuple[i
     data, fsdp, tensor = mesh
     try:
         return GRPOShape(
-            decoder=assembly.checkpoint.config.decoder,
+            decoder=policy.checkpoint.config.decoder,
             grpo=config.grpo,
             mesh=MeshConfig(data=data, fsdp=fsdp, tensor=tensor),
-            prompt_tokens=assembly.layout.ids.shape[1],
+            prompt_tokens=policy.layout.ids.shape[1],
         )
     except ValueError as error:
         raise SizeError(f"GRPO cannot be shared by the devices of the mesh: {error}") from error

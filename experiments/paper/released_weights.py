@@ -12,15 +12,16 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
+from experiments.core.loops import KEPT
 from experiments.core.progress import in_megabytes
 from experiments.core.results import Requirement, Table, named_table
-from experiments.study.answers import Evaluated, evaluate_policy
-from experiments.study.arrays import flat, nested
-from experiments.study.stages import KEPT, encode_contacts, untrained
-from experiments.study.study import BLIND, SFT, Trained
+from experiments.study.stages import encode_rows, untrained
+from experiments.study.study import BLIND, SFT, TrainedPolicy, ask_policy
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.qwen.config import read_config
 from touchr1_jax.models.qwen.safetensors import Tell
@@ -84,7 +85,8 @@ def write_policy(
     released = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
     save_params(unfinished / SINGLE, released, read_config(source), progress)
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **flat({name: x for name, x in params.items() if name not in released}))
+    added = {name: x for name, x in params.items() if name not in released}
+    np.savez(buffer, allow_pickle=False, **traverse_util.flatten_dict(added, sep="/"))
     write_bytes(unfinished / TOUCH_FILE, buffer.getvalue())
     unfinished.rename(directory)
 
@@ -108,34 +110,34 @@ def read_policy(
         )
     released = load_params(directory, read_config(directory), dtype, progress=progress)
     with np.load(directory / TOUCH_FILE) as file:
-        touch = nested({name: file[name] for name in file.files})
+        touch = traverse_util.unflatten_dict({name: jnp.asarray(file[name]) for name in file.files}, sep="/")
     return {**touch, "vision": {"tower": released["vision"]}, "decoder": released["decoder"]}
 
 
-def zero_shot(trained: Trained) -> Evaluated:
+def zero_shot(trained: TrainedPolicy) -> Evaluation:
     """The released model before any training: it sees the object's picture and no touch, which it never learned to
     read; the system prompt describes the form of an answer."""
-    assembly, data = trained.assembly, trained.data
-    params = untrained(assembly, data, trained.seed)
-    test = encode_contacts(assembly, params, data, data.parts["test"], trained.context, blind=True)
-    return evaluate_policy(assembly, params, test, trained.label, trained.context)
+    policy, data = trained.policy, trained.data
+    params = untrained(policy, data, trained.seed)
+    test = encode_rows(policy, params, data, data.parts["test"], trained.context, blind=True)
+    return ask_policy(policy, params, test, trained.label, trained.context)
 
 
-def written(source: Path, trained: Trained) -> Evaluated:
+def written(source: Path, trained: TrainedPolicy) -> Evaluation:
     """The policy written to `weights/SEED` of the run, read from there, and evaluated again with all streams.
 
     Args:
       source: the released folder that it started from.
       trained: the policy.
     """
-    assembly, data, context = trained.assembly, trained.data, trained.context
+    policy, data, context = trained.policy, trained.data, trained.context
     folder = context.directory / "weights" / str(trained.seed)
     with context.progress_callback("writing weights, MB") as report:
         context.processes.write_once(lambda: write_policy(folder, source, trained.params, in_megabytes(report)))
     with context.progress_callback("reading weights, MB") as report:
-        params = read_policy(folder, assembly.fns.cache_dtype, in_megabytes(report))
-    test = encode_contacts(assembly, params, data, data.parts["test"], context)
-    return evaluate_policy(assembly, params, test, trained.label, context, alone=False)
+        params = read_policy(folder, policy.fns.cache_dtype, in_megabytes(report))
+    test = encode_rows(policy, params, data, data.parts["test"], context)
+    return ask_policy(policy, params, test, trained.label, context, alone=False)
 
 
 def merged_shares(arm: str, seeds: int, context: Context) -> dict[str, float]:

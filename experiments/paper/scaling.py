@@ -51,7 +51,6 @@ from experiments.paper.model_sizes import (
     trend_table,
 )
 from experiments.study import paper_numbers as paper
-from experiments.study.assembly import ModelConfig
 from experiments.study.examples import rollout_examples
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
@@ -60,6 +59,7 @@ from touchr1_jax.bench.items import Ask
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 
 POLICIES = {FULL: "full model", SFT: "SFT", BLIND: "without touch"}

@@ -20,9 +20,7 @@ import tokenizers
 from tokenizers import decoders, models, pre_tokenizers, trainers
 
 from experiments.core.context import Context
-from experiments.paper.released_policy import ReleasedAssembly, ReleasedModel, assemble_released, plain_answers
-from experiments.study.assembly import touch_shapes
-from experiments.study.feeds import random_streams
+from experiments.paper.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, plain_answers
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import TOKENIZER_FILE, load_checkpoint
@@ -31,9 +29,11 @@ from touchr1_jax.models.qwen.model import init_params
 from touchr1_jax.models.qwen.pictures import PREPROCESSOR_FILE
 from touchr1_jax.models.qwen.weights import SINGLE, save_params
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.text.chat import MARKS, SYSTEM
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import QUESTIONS, answer_text, encode_answer
+from touchr1_jax.training.feeds import random_streams
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import TouchBatch
@@ -210,29 +210,29 @@ def teach(directory: Path, config: TeachingConfig, context: Context, seed: int =
     if not config.steps:
         return
     found = load_checkpoint(directory, jnp.float32)
-    assembly = assemble_released(UNUSED_TOUCH, found, SENSORS)
+    policy = build_released_policy(UNUSED_TOUCH, found, SENSORS)
     shown = empty_touch(config.batch_size)
-    params = assembly.init(seed, shown)
+    params = policy.init(seed, shown)
     optimizer = make_optimizer(config.optimizer, config.steps)
-    step = make_sft_step(assembly.fns, optimizer)
+    step = make_sft_step(policy.fns, optimizer)
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     with context.timed(STAGE):
         for t in context.each(STAGE, range(config.steps)):
-            state, metrics = step(state, drawn_batch(assembly, shown, config, np.random.default_rng((seed, t))))
+            state, metrics = step(state, drawn_batch(policy, shown, config, np.random.default_rng((seed, t))))
             context.log(STAGE, t, **jax.device_get(metrics))
     taught = {"vision": state.params["vision"]["tower"], "decoder": state.params["decoder"]}
     save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), taught), found.config)
 
 
 def drawn_batch(
-    assembly: ReleasedAssembly, shown: TouchBatch, config: TeachingConfig, rng: np.random.Generator
+    policy: ReleasedPolicy, shown: TouchBatch, config: TeachingConfig, rng: np.random.Generator
 ) -> SFTBatch:
     """One question with a drawn answer for each contact of a batch without touch."""
-    layout, (p, s) = assembly.layout, shown.stream_mask.shape
+    layout, (p, s) = policy.layout, shown.stream_mask.shape
     asked = rng.integers(len(layout.asked), size=p)
     streams = random_streams(np.ones((p, s), bool), 0.5, rng)
     pairs = [
-        _answer(assembly, layout.asked[q], shown_by, config, rng) for q, shown_by in zip(asked, streams, strict=True)
+        _answer(policy, layout.asked[q], shown_by, config, rng) for q, shown_by in zip(asked, streams, strict=True)
     ]
     tokens, masks = (np.stack(x)[:, None] for x in zip(*pairs, strict=True))
     written: dict[str, Any] = {
@@ -246,19 +246,19 @@ def drawn_batch(
 
 
 def _answer(
-    assembly: ReleasedAssembly,
+    policy: ReleasedPolicy,
     asked: np.ndarray,
     streams: np.ndarray,
     config: TeachingConfig,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """An answer whose sensors mostly agree: it compares to what most of them perceive, and concludes the same."""
-    levels = np.array(assembly.levels)
+    levels = np.array(policy.levels)
     drawn_for, other = rng.integers(levels), rng.integers(levels, size=(len(streams), len(levels)))
     perceive = np.where(rng.random(other.shape) < config.agreement, drawn_for, other)
     most = np.array([np.bincount(perceive[streams, a]).argmax() for a in range(len(levels))])
-    text = answer_text(assembly.language, asked=asked, streams=streams, perceive=perceive, compare=most, conclude=most)
-    return encode_answer(assembly.tokenizer, text, assembly.model.completion_tokens)
+    text = answer_text(policy.language, asked=asked, streams=streams, perceive=perceive, compare=most, conclude=most)
+    return encode_answer(policy.tokenizer, text, policy.model.completion_tokens)
 
 
 def empty_touch(contacts: int) -> TouchBatch:

@@ -49,14 +49,14 @@ from experiments.paper.conflict_metrics import TouchGain, study_touch_gain, touc
 from experiments.paper.eval_variants import control_name, control_variants
 from experiments.paper.presets import CURVES
 from experiments.paper.released_policy import (
-    ReleasedAssembly,
     ReleasedModel,
-    assemble_released,
+    ReleasedPolicy,
+    build_released_policy,
+    check_released,
     grpo_shape,
     instruction,
     memory_bytes,
     memory_table,
-    prove_released,
 )
 from experiments.paper.released_weights import (
     least_merged,
@@ -67,14 +67,13 @@ from experiments.paper.released_weights import (
     zero_shot,
 )
 from experiments.paper.tiny_checkpoint import SMALLEST, TeachingConfig, teach, write_tiny
-from experiments.study.assembly import prove_rewards, touch_shapes
+from experiments.study.dataset import Dataset
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.pretrained import load_encoder
 from experiments.study.scores import PUBLISHED, score, score_study, study_settings
-from experiments.study.stages import SFTConfig
-from experiments.study.study import BLIND, SFT, Start, Study, Way, check_ways, train_study
+from experiments.study.stages import StudySFT
+from experiments.study.study import BLIND, SFT, EvalVariant, Study, check_arms, check_variants, train_study
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
@@ -82,10 +81,13 @@ from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import WeightsError, load_checkpoint
+from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.types import Params
 
 ARM, ZERO, WRITTEN = "touch_r1", "zero_shot", "written"
 
@@ -106,9 +108,9 @@ GRPO = dataclasses.replace(
 
 def adapted_sft(
     steps: int, *, micro_contacts: int, batch_size: int = 32, lora_rank: int = 16, lr_scale: float = 10.0
-) -> SFTConfig:
+) -> StudySFT:
     """SFT by adapters, by default at ten times the paper's learning rate, which is for whole weights."""
-    return SFTConfig(
+    return StudySFT(
         steps=steps,
         batch_size=batch_size,
         micro_contacts=micro_contacts,
@@ -140,8 +142,8 @@ class TouchR1Config(TrainingConfig):
     read_threads: int = 8
     noise_contacts: int = 16
     model: ReleasedModel = ReleasedModel()
-    sft: SFTConfig = adapted_sft(1_500, micro_contacts=4)
-    blind: SFTConfig = adapted_sft(1_500, micro_contacts=16)
+    sft: StudySFT = adapted_sft(1_500, micro_contacts=4)
+    blind: StudySFT = adapted_sft(1_500, micro_contacts=16)
     grpo: GRPOConfig = GRPO
     grpo_steps: int = 1_000
     grpo_lora_rank: int = 16
@@ -165,20 +167,20 @@ class TouchR1Config(TrainingConfig):
 def run(config: TouchR1Config, context: Context) -> Results:
     """Load, train, score, write."""
     arms = {ARM: PUBLISHED}
-    prove_rewards(arms)
+    check_arms(arms)
     source = released_folder(config, context)
-    ways = {
-        ZERO: Way(of=SFT, ask=zero_shot),
-        WRITTEN: Way(of=ARM, ask=functools.partial(written, source)),
+    variants = {
+        ZERO: EvalVariant(of=SFT, evaluate=zero_shot),
+        WRITTEN: EvalVariant(of=ARM, evaluate=functools.partial(written, source)),
         **control_variants(ARM),
     }
-    check_ways(ways, arms)
-    assembly, start = begin(config, source, context)
-    memory = memory_bytes(config, assembly, start.data, context.devices.shape)
+    check_variants(variants, arms)
+    policy, data, tactile = begin(config, source, context)
+    memory = memory_bytes(config, policy, data, context.devices.shape)
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
-    study = train_study(config, start, arms, context, ways=ways)
+    study = train_study(config, data, policy, arms, context, variants=variants, tactile=tactile)
     scored = score_study(study)
-    zero = [score(study, answers) for answers in study.further[ZERO]]
+    zero = [score(study, answers) for answers in study.variants[ZERO]]
     baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
     pictures, tables = level_report(study)
     gain, kept = study_touch_gain(study, ARM), merged_shares(ARM, config.seeds, context)
@@ -193,29 +195,32 @@ def run(config: TouchR1Config, context: Context) -> Results:
         pictures=pictures,
         data=study.data.summary(),
         curves=CURVES,
-        examples=rollout_examples(study, ARM, PUBLISHED, {c: study.further[control_name(ARM, c)][0] for c in CONTROLS}),
+        examples=rollout_examples(
+            study, ARM, PUBLISHED, {c: study.variants[control_name(ARM, c)][0] for c in CONTROLS}
+        ),
     )
 
 
-def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[ReleasedAssembly, Start]:
-    """The policy and its data; weights and sizes are looked at before data are made.
+def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[ReleasedPolicy, Dataset, Params | None]:
+    """The policy, its data, and its pretrained tactile encoder; weights and sizes are checked before data are made.
 
     Raises:
-      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `assemble_released`, `prove_released`, `grpo_shape`
+      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `build_released_policy`, `check_released` and
+        `grpo_shape`.
     """
     model = config.model
     with context.progress_callback("reading weights, MB") as tell:
         found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(tell))
     require_same(source, context)
-    ahead = assemble_released(model, found, SENSORS)
-    prove_released(ahead, touch_shapes(model, model.view_px, SENSORS))
+    ahead = build_released_policy(model, found, SENSORS)
+    check_released(ahead, touch_shapes(model, model.view_px, SENSORS))
     grpo_shape(config, ahead, context.devices.shape)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)
     model, tactile = starting_model(model, config.encoder, data.clip.sensors)
-    assembly = assemble_released(model, found, data.clip.sensors)
-    return assembly, Start(data=data, assembly=assembly, tactile=tactile)
+    policy = build_released_policy(model, found, data.clip.sensors)
+    return policy, data, tactile
 
 
 def released_folder(config: TouchR1Config, context: Context) -> Path:
@@ -275,7 +280,7 @@ def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.nda
 
 def differing(study: Study) -> Requirement:
     """Answers that the written folder gives and the trained policy does not."""
-    pairs = zip(study.answers[ARM], study.further[WRITTEN], strict=True)
+    pairs = zip(study.answers[ARM], study.variants[WRITTEN], strict=True)
     count = sum(int((a.tokens != b.tokens).any(-1).sum()) for a, b in pairs)
     name, note = "answers of the written weights that differ", f"of {len(study.answers[ARM][0].tokens)} a seed"
     return Requirement(name=name, measured=count, bound=0, better="lower", note=note)

@@ -9,14 +9,14 @@ from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
-from experiments.study.answers import Evaluated, reward_of
-from experiments.study.assembly import Weights
 from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import Scored, score_study, study_settings
-from experiments.study.study import BLIND, SFT, SMOKE, Study, StudyConfig, Way, run_study
+from experiments.study.stages import Weights
+from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.evaluation import Evaluation, rewards_of
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
@@ -41,7 +41,7 @@ class Ablation:
     arms: Mapping[str, Weights]
     pairs: tuple[tuple[str, str], ...]
     algorithms: Mapping[str, AnyAlgorithm] = dataclasses.field(default_factory=dict)
-    variants: Mapping[str, Way] = dataclasses.field(default_factory=dict)
+    variants: Mapping[str, EvalVariant] = dataclasses.field(default_factory=dict)
     curves: tuple[str, ...] = ("reward", "accuracy", "entropy", "kl", "grounding", "parse_rate", "length")
     example: str = ""
 
@@ -117,12 +117,12 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
     return found
 
 
-def own_reward(study: Study, seeds: Sequence[Evaluated], weights: Weights) -> Estimate:
+def own_reward(study: Study, seeds: Sequence[Evaluation], weights: Weights) -> Estimate:
     """Mean reward under an arm's own weights of greedy answers to what GRPO asks, of every seed; without interval."""
     asked = [i for i, name in enumerate(ATTRIBUTES) if name in study.config.grpo_attributes]
     each = []
     for answers in seeds:
-        reward = reward_of(study.assembly, answers, weights, study.prior)
+        reward = rewards_of(study.policy, answers, weights, study.prior)
         each.append(float(reward[np.isin(answers.attribute, asked)].mean()))
     mean = float(np.mean(each))
     return Estimate(mean=mean, ci95=(mean, mean), per_seed=tuple(each))

@@ -5,17 +5,17 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.study.answers import Evaluated
-from experiments.study.assembly import Assembly
 from experiments.study.stages import force_only
 from experiments.study.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.bench.evaluation import Evaluation
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Parsed
 
 ORDINAL = tuple(a for a in ATTRIBUTES if LEVELS[a] == 3)
 
 
-def baselines(study: Study) -> dict[str, Evaluated]:
+def baselines(study: Study) -> dict[str, Evaluation]:
     """Answers of every baseline to the questions that the policies were asked."""
     train = study.data.label[np.concatenate([study.data.parts["sft"], study.data.parts["grpo"]])]
     n = len(study.test_label)
@@ -45,29 +45,29 @@ def joint_mode(label: np.ndarray) -> np.ndarray:
     return out
 
 
-def constant_answers(study: Study, level: np.ndarray) -> Evaluated:
+def constant_answers(study: Study, level: np.ndarray) -> Evaluation:
     """Well-formatted answers that give contact i the levels `level[i]` [contact, A] in every slot."""
-    return level_answers(study.assembly, study.answers[SFT][0], level)
+    return level_answers(study.policy, study.answers[SFT][0], level)
 
 
 def level_answers(
-    assembly: Assembly, asked: Evaluated, level: np.ndarray, alone: np.ndarray | None = None
-) -> Evaluated:
+    policy: TouchPolicy, asked: Evaluation, level: np.ndarray, alone: np.ndarray | None = None
+) -> Evaluation:
     """Well-formatted answers with given levels to the questions that a policy was asked.
 
     Args:
-      assembly: of the study.
+      policy: of the study.
       asked: answers of any policy; its questions and labels are taken.
       level: int [contact, A], what `compare` and `conclude` say.
       alone: int [contact, S, A], what each sensor says in `perceive` and by itself; `level` where it is `None`.
     """
-    wanted = assembly.layout.asked[asked.attribute]
+    wanted = policy.layout.asked[asked.attribute]
     said = np.where(wanted, level[asked.contact], -1).astype(np.int32)
     n, sensors = asked.streams.shape
     single = np.repeat(level[:, None], sensors, 1) if alone is None else alone
     single = np.where(wanted[:, None], single[asked.contact], -1).astype(np.int32)
     perceive = np.where(asked.streams[:, :, None], single, -1)
-    return Evaluated(
+    return Evaluation(
         contact=asked.contact,
         attribute=asked.attribute,
         streams=asked.streams,

@@ -1,9 +1,9 @@
-"""Policies that experiments share: made once for a configuration, its data and the code behind it.
+"""Policies that experiments share, trained once for a configuration, its data and the code behind it.
 
-A policy lies in `CACHE/sft/HASH.npz` or `CACHE/grpo/HASH.npz` with the metrics that were logged while it was made, so
+A policy lies in `CACHE/sft/HASH.npz` or `CACHE/grpo/HASH.npz` with the metrics that were logged during its training, so
 that the report of an experiment that finds it shows the same curves.  The hash covers every value that training depends
-on and the source that it runs through.  For SFT the source of rewards and of reinforcement learning is not part of it,
-so that who works on those finds the checkpoints again.
+on and the source that it runs through.  For SFT it leaves out the source of rewards and of reinforcement learning: the
+checkpoints outlive changes there.
 """
 
 import dataclasses
@@ -16,23 +16,29 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context, read_metrics
 from experiments.core.runs import ROOT, versions
-from experiments.study.arrays import flat, nested
-from experiments.study.assembly import Assembly
 from experiments.study.dataset import Dataset
-from experiments.study.reinforcement import Arm, Asked, run_grpo
-from experiments.study.stages import SFTConfig, run_sft
+from experiments.study.stages import EncodedContacts, GRPOArm, StudySFT, run_grpo, run_sft
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Params
 
-NEVER = ("touchr1_jax/bench", "touchr1_jax/distributed", "sensors_io/commands", "sensors_io/viewer")
-"""Source that is never at work in training."""
+NEVER = ("touchr1_jax/bench/", "touchr1_jax/distributed/", "sensors_io/commands/", "sensors_io/viewer/")
+"""Source that training never runs."""
 
-LATER = ("touchr1_jax/rl", "touchr1_jax/rewards", *NEVER)
-"""Source that is at work only after SFT, or never."""
+LATER = (
+    "touchr1_jax/rl/",
+    "touchr1_jax/rewards/",
+    "touchr1_jax/training/questions.py",
+    "touchr1_jax/training/train_grpo.py",
+    *NEVER,
+)
+"""Source that runs only after SFT, or never."""
 
 USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
@@ -40,69 +46,71 @@ USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/losses.py")
 _LINES = "metrics"  # entry of the file that holds the logged lines as JSON; parameters are named by their path
 
 
-def shared_sft(
-    assembly: Assembly,
+def cached_sft(
+    policy: TouchPolicy,
     data: Dataset,
     evidence: np.ndarray,
-    config: SFTConfig,
+    config: StudySFT,
     context: Context,
     *,
     seed: int,
     stage: str,
     blind: bool = False,
     tactile: Params | None = None,
+    train: Callable[..., Params] = run_sft,
 ) -> Params:
-    """What `run_sft` gives for these arguments, from the cache where some experiment already made it.
-
-    Args:
-      assembly, data, evidence, config, context, seed, stage, blind, tactile: as in `run_sft`.
-    """
+    """The result of `train` for the same arguments, from the cache where an experiment already made it."""
     values = {
         "records": data.store.digest,
         "config": config,
-        "model": assembly.model,
+        "model": policy.model,
         "clip": data.clip,
         "seed": seed,
         "blind": blind,
         "mesh": context.devices.shape,
     }
-    felt = {} if tactile is None else {f"tactile/{name}": x for name, x in flat(tactile).items()}
-    arrays = {"evidence": evidence, "rows": data.parts["sft"], **felt}
-    return _shared(
+    arrays = {"evidence": evidence, "rows": data.parts["sft"], **_flat({} if tactile is None else {"tactile": tactile})}
+    return _cached(
         context.cache_dir / "sft" / f"{fingerprint(values, arrays, source_digest())}.npz",
-        lambda: run_sft(
-            assembly, data, evidence, config, context, seed=seed, stage=stage, blind=blind, tactile=tactile
-        ),
+        lambda: train(policy, data, evidence, config, context, seed=seed, stage=stage, blind=blind, tactile=tactile),
         context,
         stage,
     )
 
 
-def shared_grpo(
-    assembly: Assembly, arm: Arm, asked: Asked, params: Params, context: Context, *, seed: int, stage: str
+def cached_grpo(
+    policy: TouchPolicy,
+    arm: GRPOArm,
+    contacts: EncodedContacts,
+    params: Params,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+    train: Callable[..., Params] = run_grpo,
 ) -> Params:
-    """What `run_grpo` gives for these arguments, from the cache where some experiment already made it."""
+    """The result of `train` for the same arguments, from the cache where an experiment already made it."""
     values = {
         "weights": list(arm.weights.items()),
         "config": arm.config,
         "steps": arm.loop.steps,
         "lora": arm.lora,
-        "model": assembly.model,
+        "model": policy.model,
         "seed": seed,
         "mesh": context.devices.shape,
     }
-    named = dataclasses.asdict(asked.features) | {"label": asked.label, "noise": asked.noise, "prior": arm.prior}
-    arrays = flat(params) | {f"input/{name}": np.asarray(x) for name, x in named.items()}
-    return _shared(
+    named = dataclasses.asdict(contacts.features) | {"label": contacts.label, "noise": contacts.noise}
+    arrays = _flat(params) | {f"input/{name}": np.asarray(x) for name, x in named.items()} | {"input/prior": arm.prior}
+    return _cached(
         context.cache_dir / "grpo" / f"{fingerprint(values, arrays, source_digest(NEVER))}.npz",
-        lambda: run_grpo(assembly, arm, asked, params, context, seed=seed, stage=stage),
+        lambda: train(policy, arm, contacts, params, context, seed=seed, stage=stage),
         context,
         stage,
     )
 
 
-def _shared(path: Path, make: Callable[[], Params], context: Context, stage: str) -> Params:
-    """What lies at `path`; where nothing does, what `make` gives, published there."""
+def _cached(path: Path, make: Callable[[], Params], context: Context, stage: str) -> Params:
+    """The policy at `path`, made and published there first where there is none."""
     if path.exists():
         context.print(f"{stage}: made before, {path}")
         with context.timed(stage):
@@ -131,13 +139,18 @@ def source_digest(without: tuple[str, ...] = LATER, root: Path = ROOT) -> str:
     for folder in ("touchr1_jax", "sensors_io", "experiments/study"):
         for path in sorted((root / folder).rglob("*.py")):
             name = path.relative_to(root).as_posix()
-            if not name.startswith(tuple(f"{folder}/" for folder in without)) or name in USED:
+            if not name.startswith(without) or name in USED:
                 sum_.update(name.encode() + b"\0" + path.read_bytes() + b"\0")
     return sum_.hexdigest()
 
 
+def _flat(params: Params) -> dict[str, np.ndarray]:
+    """Arrays named by their path, joined by "/"."""
+    return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(params, sep="/").items()}
+
+
 def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
-    arrays: dict[str, Any] = {_LINES: np.frombuffer(json.dumps(lines).encode(), np.uint8), **flat(params)}
+    arrays: dict[str, Any] = {_LINES: np.frombuffer(json.dumps(lines).encode(), np.uint8), **_flat(params)}
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     write_bytes(path, buffer.getvalue())
@@ -146,7 +159,8 @@ def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
 def _found(path: Path, context: Context, stage: str) -> Params:
     with np.load(path) as file:
         lines = json.loads(file[_LINES].tobytes())
-        params = nested({name: file[name] for name in file.files if name != _LINES})
+        flat = {name: jnp.asarray(file[name]) for name in file.files if name != _LINES}
+        params = traverse_util.unflatten_dict(flat, sep="/")
     if _logged(context, stage) != lines:  # a resumed run has them already, and its log must not be reordered
         context.rewind(stage, 0)
         for line in lines:

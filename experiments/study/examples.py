@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 
 from experiments.core.results import RolloutExample, Slot, Trace
-from experiments.study.answers import Evaluated, reward_terms
-from experiments.study.assembly import Weights
+from experiments.study.stages import Weights
 from experiments.study.study import Study
 from sensors_io.pipeline import make_clip
 from sensors_io.schema import Sequence
+from touchr1_jax.bench.evaluation import Evaluation, reward_terms
 from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
 
@@ -26,7 +26,7 @@ ARROW_PX = 14.0
 
 
 def rollout_examples(
-    study: Study, arm: str, weights: Weights, instead: Mapping[str, Evaluated] | None = None
+    study: Study, arm: str, weights: Weights, instead: Mapping[str, Evaluation] | None = None
 ) -> tuple[RolloutExample, ...]:
     """For each attribute, the first test question that the arm's first seed got right and the first it got wrong.
 
@@ -40,7 +40,7 @@ def rollout_examples(
     asked = said.label[np.arange(len(said.attribute)), said.attribute]
     right = said.parsed.conclude[np.arange(len(said.attribute)), said.attribute] == asked
     rows = []
-    for a in range(len(study.assembly.language.attributes)):
+    for a in range(len(study.policy.language.attributes)):
         for outcome in (True, False):
             rows += np.flatnonzero((said.attribute == a) & (right == outcome))[:1].tolist()
     return rollouts_of(study, arm, weights, rows, instead)
@@ -51,7 +51,7 @@ def rollouts_of(
     arm: str,
     weights: Weights,
     rows: Iterable[int],
-    instead: Mapping[str, Evaluated] | None = None,
+    instead: Mapping[str, Evaluation] | None = None,
     group: str = "",
 ) -> tuple[RolloutExample, ...]:
     """Chosen answers of the arm's first seed.
@@ -62,7 +62,7 @@ def rollouts_of(
       group: heading under which they stand.
     """
     said = study.answers[arm][0]
-    terms = reward_terms(study.assembly, said, weights, study.prior)
+    terms = reward_terms(study.policy, said, weights, study.prior)
     return tuple(
         _example(study, arm, said, row, {name: float(v[row]) for name, v in terms.items()}, instead or {}, group)
         for row in rows
@@ -72,20 +72,20 @@ def rollouts_of(
 def _example(
     study: Study,
     arm: str,
-    said: Evaluated,
+    said: Evaluation,
     row: int,
     terms: dict[str, float],
-    instead: Mapping[str, Evaluated],
+    instead: Mapping[str, Evaluation],
     group: str,
 ) -> RolloutExample:
-    data, assembly = study.data, study.assembly
+    data, policy = study.data, study.policy
     contact = int(data.parts["test"][said.contact[row]])
     card = data.store.objects[data.store.contacts[contact].object_id]
     recorded = data.store.contact(contact, fields=True)
     clip = make_clip(recorded, card, data.clip)
-    attribute = assembly.language.attributes[said.attribute[row]]
+    attribute = policy.language.attributes[said.attribute[row]]
     felt = [(s, name) for s, name in enumerate(data.clip.sensors) if clip.stream_mask[s]]
-    trace = assembly.tokenizer.decode(said.tokens[row])
+    trace = policy.tokenizer.decode(said.tokens[row])
     return RolloutExample(
         arm=arm,
         object_id=card.object_id,
@@ -99,7 +99,7 @@ def _example(
         force_n={name: clip.force_n[s][clip.frame_mask[s]] for s, name in felt},
         view=card.view,
         fields={name: drawn for _, name in felt if (drawn := field_picture(recorded[name])) is not None},
-        instead={name: traced(assembly.tokenizer.decode(other.tokens[row])) for name, other in instead.items()},
+        instead={name: traced(policy.tokenizer.decode(other.tokens[row])) for name, other in instead.items()},
         group=group,
     )
 

@@ -10,9 +10,9 @@ from experiments.core.look import PALETTE
 from experiments.core.pictures import Heatmap, heatmaps
 from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.core.text import interval
-from experiments.study.answers import Evaluated
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 
@@ -47,7 +47,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     """Confusions of every policy, accuracy by agreement of its sensors, and the reliability of each level."""
     objects = study.data.object_ids[study.data.parts["test"]]
     rows = {name: _level_answers(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
-    language = study.assembly.language
+    language = study.policy.language
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
     with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
     if len(with_agreement) > len(PALETTE):  # more lines than colours: keep where training begins and where it ends
@@ -74,7 +74,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     return tuple(pictures), (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words),)
 
 
-def _level_answers(seeds: Sequence[Evaluated], objects: np.ndarray) -> LevelAnswers:
+def _level_answers(seeds: Sequence[Evaluation], objects: np.ndarray) -> LevelAnswers:
     agree = [_agree(answers) for answers in seeds]
     return LevelAnswers(
         answer=np.concatenate([np.asarray(answers.parsed.conclude)[:, _COLUMNS] for answers in seeds]),
@@ -84,7 +84,7 @@ def _level_answers(seeds: Sequence[Evaluated], objects: np.ndarray) -> LevelAnsw
     )
 
 
-def _agree(answers: Evaluated) -> np.ndarray | None:
+def _agree(answers: Evaluation) -> np.ndarray | None:
     if answers.alone is None:
         return None
     together = np.asarray(answers.parsed.conclude)

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from experiments.core.results import Estimate
-from experiments.study.answers import Evaluated, reward_of
-from experiments.study.assembly import Weights
 from experiments.study.baselines import baselines
 from experiments.study.estimates import estimate
+from experiments.study.stages import Weights
 from experiments.study.study import SFT, Study
 from experiments.study.training import TrainingConfig
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.evaluation import Evaluation, rewards_of
 from touchr1_jax.bench.metrics import Scores, evaluate
 from touchr1_jax.rl.config import preset_name
 
@@ -59,10 +59,10 @@ def score_study(study: Study) -> Scored:
     )
 
 
-def score(study: Study, said: Evaluated) -> dict[str, Scores]:
+def score(study: Study, said: Evaluation) -> dict[str, Scores]:
     """Every metric of one policy's answers."""
-    reward = reward_of(study.assembly, said, PUBLISHED, study.prior)
-    return evaluate(said.answers(reward), ATTRIBUTES, study.assembly.levels)
+    reward = rewards_of(study.policy, said, PUBLISHED, study.prior)
+    return evaluate(said.answers(reward), ATTRIBUTES, study.policy.levels)
 
 
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:

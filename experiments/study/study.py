@@ -1,45 +1,55 @@
 """A study: several arms of GRPO from one SFT checkpoint per seed, on the same data in the same order.
 
-What a finished policy said lies in `answers/NAME-SEED.npz` of the run, so a resumed run asks nothing twice.
+The answers of a finished policy are kept in `answers/NAME-SEED.npz` of the run, so a resumed run repeats no evaluation.
 """
 
 import dataclasses
 import functools
+import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Array
 
+from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.study.answers import Evaluated, evaluate_policy, load_answers, save_answers
-from experiments.study.assembly import Assembly, ModelConfig, Weights, assemble, prove_model, prove_rewards
-from experiments.study.cache import shared_grpo, shared_sft
+from experiments.study.cache import cached_grpo, cached_sft
 from experiments.study.dataset import Dataset
-from experiments.study.pretrained import load_encoder
-from experiments.study.reinforcement import Arm, Asked, make_arm, run_grpo
 from experiments.study.stages import (
-    Probed,
-    SFTConfig,
-    encode_contacts,
+    EncodedContacts,
+    GRPOArm,
+    ProbeFeatures,
+    StudySFT,
+    Weights,
+    encode_rows,
     gather_evidence,
+    make_arm,
     noise_bank,
     probe_features,
+    run_grpo,
     run_sft,
 )
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS, UNKNOWN
+from touchr1_jax.bench.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.pretrained import load_encoder
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
+from touchr1_jax.rewards import Reward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
-from touchr1_jax.types import Params
+from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.train_grpo import check_rewards
+from touchr1_jax.types import Params, Parsed
 
 SFT, BLIND = "sft", "tactile_blind"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudyConfig(TrainingConfig):
-    """Everything that a study depends on, whose towers start from drawn parameters."""
+    """All settings of a study whose towers start from fresh parameters."""
 
     model: ModelConfig = ModelConfig()
     share: bool = True
@@ -47,14 +57,14 @@ class StudyConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_told("decoder.vocab_size", self.model.decoder.vocab_size)
+        self.check_derived("decoder.vocab_size", self.model.decoder.vocab_size)
 
 
 SMOKE = StudyConfig(
     seeds=2,
     scenes=SceneConfig(objects=60, sites=1),
-    sft=SFTConfig(steps=12, batch_size=8),
-    blind=SFTConfig(steps=12, batch_size=8, micro_contacts=8),
+    sft=StudySFT(steps=12, batch_size=8),
+    blind=StudySFT(steps=12, batch_size=8, micro_contacts=8),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
     grpo_steps=4,
 )
@@ -62,18 +72,18 @@ SMOKE = StudyConfig(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Trained:
-    """A trained policy of one seed, and all that is needed to ask it in another way.
+class TrainedPolicy:
+    """A trained policy of one seed, and everything that another evaluation of it needs.
 
     Attributes:
-      assembly, data, config, context, seed: those of the study.
-      params: of the policy.
-      test: encoded test contacts; `noise` is the encoded noise bank of its encoder.
-      said: its answers about them.
+      policy, data, config, context, seed: those of the study.
+      params: its parameters.
+      test: encoded test contacts; `noise` is the noise bank of its encoder.
+      evaluation: its answers about them.
       grpo_label: labels that GRPO may ask about, int32 [contact of the GRPO part, A].
     """
 
-    assembly: Assembly
+    policy: TouchPolicy
     data: Dataset
     config: TrainingConfig
     context: Context
@@ -81,7 +91,7 @@ class Trained:
     params: Params
     test: Features
     noise: Array
-    said: Evaluated
+    evaluation: Evaluation
     grpo_label: np.ndarray
 
     @property
@@ -91,28 +101,28 @@ class Trained:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Way:
-    """Another way to ask the policy named `of`, SFT or an arm: `ask` answers about the test contacts."""
+class EvalVariant:
+    """Another evaluation, about the test contacts, of the policy named `of`, which is SFT or an arm."""
 
     of: str
-    ask: Callable[[Trained], Evaluated]
+    evaluate: Callable[[TrainedPolicy], Evaluation]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
-    """What a study knows when it is done; `answers[name][seed]` are the answers about the test contacts.
+    """The result of a study; `answers[name][seed]` are a policy's answers about the test contacts.
 
-    `further[name][seed]` are those that were got in another way.
+    `variants[name][seed]` are those of an `EvalVariant`.
     """
 
     config: TrainingConfig
     data: Dataset
-    assembly: Assembly
-    probed: Probed
+    policy: TouchPolicy
+    probed: ProbeFeatures
     prior: np.ndarray
     arms: Mapping[str, Weights]
-    answers: Mapping[str, Sequence[Evaluated]]
-    further: Mapping[str, Sequence[Evaluated]] = dataclasses.field(default_factory=dict)
+    answers: Mapping[str, Sequence[Evaluation]]
+    variants: Mapping[str, Sequence[Evaluation]] = dataclasses.field(default_factory=dict)
 
     @property
     def test_label(self) -> np.ndarray:
@@ -125,90 +135,60 @@ def run_study(
     arms: Mapping[str, Weights],
     context: Context,
     algorithms: Mapping[str, AnyAlgorithm] | None = None,
-    ways: Mapping[str, Way] | None = None,
+    variants: Mapping[str, EvalVariant] | None = None,
 ) -> Study:
-    """Make the data, train every arm of every seed, ask every policy.
+    """Make the data, train every arm of every seed, evaluate every policy.
 
     Args:
       config: sizes, data, algorithm.
       arms: reward weights of each arm.
       context: the run.
       algorithms: those of the arms that do not use the configured one.
-      ways: other ways to ask SFT and the arms, by the names of their answers.
+      variants: further evaluations of SFT and the arms, by the names of their answers.
 
     Raises:
-      ValueError: a way that asks a policy that is not there, or has the name of one.
-      RewardError, SizeError, EncoderError: as `prove_rewards`, `prove_model` and `load_encoder`.
+      ValueError, RewardError, SizeError, EncoderError: as `check_variants`, `check_arms`, `check_model` and
+        `load_encoder`.
     """
-    prove_rewards(arms)
-    prove_model(config.model, SENSORS)
+    check_arms(arms)
+    check_model(config.model, SENSORS)
     if config.encoder is not None:
-        load_encoder(config.encoder)  # what is no encoder is named before data are made
-    check_ways(ways or {}, arms)
+        load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
+    check_variants(variants or {}, arms)
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
-    start = Start(data=data, assembly=assemble(model, data.clip.sensors), tactile=tactile, share=config.share)
-    return train_study(config, start, arms, context, algorithms, ways)
+    policy = build_policy(model, data.clip.sensors)
+    return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Start:
-    """What a study begins with: data, policy, perhaps a tactile encoder, and whether policies are shared."""
-
-    data: Dataset
-    assembly: Assembly
-    tactile: Params | None = None
-    share: bool = False
-
-
-def train_study(
-    config: TrainingConfig,
-    start: Start,
-    arms: Mapping[str, Weights],
-    context: Context,
-    algorithms: Mapping[str, AnyAlgorithm] | None = None,
-    ways: Mapping[str, Way] | None = None,
-) -> Study:
-    """Train every arm of every seed, ask every policy; arguments as in `run_study`, which has checked them."""
-    data, assembly, ways = start.data, start.assembly, ways or {}
-    configs = {
-        arm: dataclasses.replace(config.grpo, algorithm=(algorithms or {}).get(arm, config.grpo.algorithm))
-        for arm in arms
-    }
-    probed = probe_features(data, context)
-    evidence = gather_evidence(data, probed, config.probe, context)
-    prior = data.prior()
-    make = functools.partial(make_arm, assembly, prior=prior, loop=config.grpo_loop, lora=config.grpo_lora)
-    made = {arm: make(weights, config=configs[arm]) for arm, weights in arms.items()}
-    answers: dict[str, list[Evaluated]] = {name: [] for name in (SFT, *arms, BLIND, *ways)}
-    for seed in context.each("seeds", range(config.seeds)):
-        one = _Seed(config, start, evidence, made, ways, context, seed)
-        for name, said in one.answers().items():
-            answers[name].append(said)
-    further = {name: answers.pop(name) for name in ways}
-    return Study(
-        config=config,
-        data=data,
-        assembly=assembly,
-        probed=probed,
-        prior=prior,
-        arms=arms,
-        answers=answers,
-        further=further,
-    )
-
-
-def check_ways(ways: Mapping[str, Way], arms: Mapping[str, Weights]) -> None:
-    """Refuse ways that no study with these arms has room for.
+def check_arms(arms: Mapping[str, Weights], rewards: Mapping[str, Reward] | None = None) -> None:
+    """Try every weighted reward of every arm, so that a misfit is reported before anything is made.
 
     Raises:
-      ValueError: a way that asks a policy that is not there, or has the name of one.
+      RewardError: as `check_rewards`; it names the arm.
     """
-    for name, way in ways.items():
-        if way.of not in (SFT, *arms):
-            raise ValueError(f"way {name!r} asks {way.of!r}: must be one of {', '.join((SFT, *arms))}; correct it")
-        if name in (SFT, BLIND, *arms):
-            raise ValueError(f"way {name!r} has the name of a policy: its answers would take their place; rename it")
+    known = rewards or make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
+    for arm, weights in arms.items():
+        try:
+            check_rewards(known, weights, TOUCH_LANGUAGE)
+        except RewardError as error:
+            raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
+
+
+def check_variants(variants: Mapping[str, EvalVariant], arms: Mapping[str, Weights]) -> None:
+    """Check the names of evaluation variants against the policies of a study.
+
+    Raises:
+      ValueError: a variant of a policy that is not there, or with the name of one.
+    """
+    policies = (SFT, *arms)
+    for name, variant in variants.items():
+        if variant.of not in policies:
+            raise ValueError(f"variant {name!r} is of {variant.of!r}: must be one of {', '.join(policies)}; correct it")
+        if name in (BLIND, *policies):
+            raise ValueError(
+                f"variant {name!r} has the name of a policy: its answers would take their place; rename it"
+            )
 
 
 def open_study_data(config: StudyConfig, context: Context) -> Dataset:
@@ -216,106 +196,163 @@ def open_study_data(config: StudyConfig, context: Context) -> Dataset:
     return open_data(config, config.model.vision.image_px, context)
 
 
+def train_study(
+    config: TrainingConfig,
+    data: Dataset,
+    policy: TouchPolicy,
+    arms: Mapping[str, Weights],
+    context: Context,
+    algorithms: Mapping[str, AnyAlgorithm] | None = None,
+    variants: Mapping[str, EvalVariant] | None = None,
+    *,
+    tactile: Params | None = None,
+    share: bool = False,
+) -> Study:
+    """Train every arm of every seed, evaluate every policy; arms and variants as in `run_study`, which checks them.
+
+    Args:
+      config, data, policy, arms, context, algorithms, variants: of the study.
+      tactile: parameters of the tactile encoder that SFT starts from; `None` starts from fresh ones.
+      share: take policies from the cache.
+    """
+    algorithms, variants = algorithms or {}, variants or {}
+    probed = probe_features(data, context)
+    evidence = gather_evidence(data, probed, config.probe, context)
+    prior = data.prior()
+    made = {}
+    for arm, weights in arms.items():
+        grpo = dataclasses.replace(config.grpo, algorithm=algorithms.get(arm, config.grpo.algorithm))
+        made[arm] = make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
+    answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, *arms, BLIND, *variants)}
+    for seed in context.each("seeds", range(config.seeds)):
+        of_seed = _Seed(config, data, policy, tactile, share, evidence, made, variants, context, seed)
+        for name, evaluation in of_seed.answers().items():
+            answers[name].append(evaluation)
+    further = {name: answers.pop(name) for name in variants}
+    return Study(
+        config=config,
+        data=data,
+        policy=policy,
+        probed=probed,
+        prior=prior,
+        arms=arms,
+        answers=answers,
+        variants=further,
+    )
+
+
 @dataclasses.dataclass(frozen=True)
 class _Seed:
     """One seed: its SFT checkpoint, the arms that start from it, and its blind baseline."""
 
     config: TrainingConfig
-    start: Start
+    data: Dataset
+    policy: TouchPolicy
+    tactile: Params | None
+    share: bool
     evidence: np.ndarray
-    arms: Mapping[str, Arm]
-    ways: Mapping[str, Way]
+    arms: Mapping[str, GRPOArm]
+    variants: Mapping[str, EvalVariant]
     context: Context
     seed: int
 
-    @property
-    def assembly(self) -> Assembly:
-        """The policy's."""
-        return self.start.assembly
-
-    @property
-    def data(self) -> Dataset:
-        """The study's."""
-        return self.start.data
-
-    def answers(self) -> dict[str, Evaluated]:
+    def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
-        names = (SFT, *self.arms, BLIND, *self.ways)
+        names = (SFT, *self.arms, BLIND, *self.variants)
         if not all(self._path(name).exists() for name in names):
             self._train()
-            self._ask(BLIND, self._blind)
+            self._evaluate(BLIND, self._blind)
         return {name: load_answers(self._path(name)) for name in names}
 
     def _train(self) -> None:
-        """Everything that feels."""
-        config, data, assembly, context, seed = self.config, self.data, self.assembly, self.context, self.seed
-        params = self._sft(config.sft, f"sft/{seed}", tactile=self.start.tactile)
-        encode = functools.partial(encode_contacts, assembly, params, data, context=context)
+        """SFT, and every arm from there."""
+        data, policy, context = self.data, self.policy, self.context
+        params = self._sft(self.config.sft, f"sft/{self.seed}", tactile=self.tactile)
+        encode = functools.partial(encode_rows, policy, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
-        noise = noise_bank(assembly.fns, params, data, seed=seed, probe=config.noise_contacts)
-        asked = Asked(features=train, label=self._grpo_label(), noise=noise)
-        self._ask(SFT, lambda: evaluate_policy(assembly, params, test, self._label("test"), context))
-        self._ask_further(SFT, params, test, noise)
-        for arm in self.arms:
-            tuned = self._grpo(arm, params, asked)
-            self._ask(arm, functools.partial(evaluate_policy, assembly, tuned, test, self._label("test"), context))
-            self._ask_further(arm, tuned, test, noise)
+        noise = noise_bank(policy, params, data, seed=self.seed, contacts=self.config.noise_contacts)
+        contacts = EncodedContacts(features=train, label=self._grpo_label(), noise=noise)
+        self._evaluate_all(SFT, params, test, noise)
+        make_grpo = cached_grpo if self.share else run_grpo
+        for name, arm in self.arms.items():
+            stage = f"grpo/{name}/{self.seed}"
+            tuned = make_grpo(policy, arm, contacts, params, context, seed=self.seed, stage=stage)
+            self._evaluate_all(name, tuned, test, noise)
 
-    def _blind(self) -> Evaluated:
+    def _blind(self) -> Evaluation:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
-        features = encode_contacts(self.assembly, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return evaluate_policy(self.assembly, params, features, self._label("test"), self.context)
+        features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
+        return ask_policy(self.policy, params, features, self._label("test"), self.context)
 
-    def _sft(self, sft: SFTConfig, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
-        make = shared_sft if self.start.share else run_sft
+    def _sft(self, config: StudySFT, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
+        make = cached_sft if self.share else run_sft
         return make(
-            self.assembly,
-            self.data,
-            self.evidence,
-            sft,
-            self.context,
-            seed=self.seed,
-            stage=stage,
-            blind=blind,
-            tactile=tactile,
-        )
+            self.policy, self.data, self.evidence, config, self.context,
+            seed=self.seed, stage=stage, blind=blind, tactile=tactile,
+        )  # fmt: skip
 
-    def _grpo(self, arm: str, params: Params, asked: Asked) -> Params:
-        make = shared_grpo if self.start.share else run_grpo
-        stage = f"grpo/{arm}/{self.seed}"
-        return make(self.assembly, self.arms[arm], asked, params, self.context, seed=self.seed, stage=stage)
-
-    def _ask(self, name: str, evaluate: Callable[[], Evaluated]) -> None:
-        if not self._path(name).exists():
-            with self.context.timed(f"ask/{name}/{self.seed}"):
-                said = evaluate()
-                self.context.processes.write_once(lambda: save_answers(self._path(name), said))
-
-    def _ask_further(self, name: str, params: Params, test: Features, noise: Array) -> None:
-        """Ask a policy in all other ways that are wanted of it."""
-        for title, way in self.ways.items():
-            if way.of == name:
-                trained = Trained(
-                    assembly=self.assembly,
+    def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
+        """Evaluate a policy, then all variants of it."""
+        policy, context = self.policy, self.context
+        self._evaluate(name, lambda: ask_policy(policy, params, test, self._label("test"), context))
+        for title, variant in self.variants.items():
+            if variant.of == name:
+                trained = TrainedPolicy(
+                    policy=policy,
                     data=self.data,
                     config=self.config,
-                    context=self.context,
+                    context=context,
                     seed=self.seed,
                     params=params,
                     test=test,
                     noise=noise,
-                    said=load_answers(self._path(name)),
+                    evaluation=load_answers(self._path(name)),
                     grpo_label=self._grpo_label(),
                 )
-                self._ask(title, functools.partial(way.ask, trained))
+                self._evaluate(title, functools.partial(variant.evaluate, trained))
+
+    def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:
+        if not self._path(name).exists():
+            with self.context.timed(f"ask/{name}/{self.seed}"):
+                evaluation = evaluate()
+                self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
 
     def _label(self, part: str) -> np.ndarray:
         return self.data.label[self.data.parts[part]]
 
     def _grpo_label(self) -> np.ndarray:
         """Labels of the GRPO contacts, with those of attributes that GRPO does not ask about hidden."""
-        names = [a.name for a in self.assembly.language.attributes]
+        names = [a.name for a in self.policy.language.attributes]
         return np.where(np.isin(names, self.config.grpo_attributes), self._label("grpo"), UNKNOWN)
 
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
+
+
+def ask_policy(
+    policy: TouchPolicy, params: Params, features: Features, label: np.ndarray, context: Context, *, alone: bool = True
+) -> Evaluation:
+    """`evaluate_policy` under a progress bar of the run."""
+    with context.progress_callback("asking") as progress:
+        return evaluate_policy(policy, params, features, label, alone=alone, progress=progress)
+
+
+def save_answers(path: Path, evaluation: Evaluation) -> None:
+    """Publish answers as one file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    flat: dict[str, Any] = {f: getattr(evaluation, f) for f in _FLAT if getattr(evaluation, f) is not None}
+    flat |= {f"parsed_{f}": getattr(evaluation.parsed, f) for f in _PARSED}
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **flat)
+    write_bytes(path, buffer.getvalue())
+
+
+def load_answers(path: Path) -> Evaluation:
+    """Answers that `save_answers` published."""
+    with np.load(path) as file:
+        flat: dict[str, Any] = {f: file.get(f) for f in _FLAT}
+        return Evaluation(**flat, parsed=Parsed(**{f: file[f"parsed_{f}"] for f in _PARSED}))
+
+
+_FLAT = tuple(f.name for f in dataclasses.fields(Evaluation) if f.name != "parsed")
+_PARSED = tuple(f.name for f in dataclasses.fields(Parsed))

@@ -1,23 +1,23 @@
-"""What every training of a policy depends on, whichever model it is: data, stages, seeds."""
+"""Settings of every study, whichever model it trains: data, stages, seeds."""
 
 import dataclasses
 from pathlib import Path
 from typing import TypeVar
 
 from experiments.core.context import Context
-from experiments.study.assembly import TouchConfig
 from experiments.study.dataset import Dataset, open_dataset
-from experiments.study.pretrained import load_encoder
 from experiments.study.sources import Source, SourceConfig, prepare_records
-from experiments.study.stages import SFTConfig
+from experiments.study.stages import StudySFT
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
 from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.models.pretrained import load_encoder
+from touchr1_jax.models.touch_policy import TouchConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
@@ -25,7 +25,7 @@ from touchr1_jax.validation import at_least
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """Data, what is felt of them, SFT and GRPO."""
+    """Data, their tactile input, SFT and GRPO."""
 
     seeds: int = 5
     """Training seeds, paired between arms."""
@@ -47,8 +47,8 @@ class TrainingConfig:
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
     probe: ProbeConfig = ProbeConfig()
-    sft: SFTConfig = SFTConfig()
-    blind: SFTConfig = SFTConfig(micro_contacts=16)
+    sft: StudySFT = StudySFT()
+    blind: StudySFT = StudySFT(micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
     grpo: GRPOConfig = GRPOConfig.paper()
     grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
@@ -88,7 +88,7 @@ class TrainingConfig:
             raise ValueError(
                 f"grpo_attributes is {self.grpo_attributes}: must be some of {', '.join(known)}; correct it"
             )
-        self.check_told("tactile.sensors", self.model.tactile.sensors)
+        self.check_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(
                 f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
@@ -104,14 +104,16 @@ class TrainingConfig:
         return SourceConfig(kind=self.data, directory=self.data_dir, scenes=self.scenes, physiclear=self.physiclear)
 
     @staticmethod
-    def check_told(field: str, value: int) -> None:
-        """Refuse a number of the model that something else tells.
+    def check_derived(field: str, value: int) -> None:
+        """Refuse a number of the model that the data or the language determine.
 
         Raises:
           ValueError: it is not 0.
         """
         if value:
-            raise ValueError(f"model.{field} is {value}: must be 0, the data and the language tell it; leave it out")
+            raise ValueError(
+                f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out"
+            )
 
 
 def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset:

@@ -6,12 +6,12 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context
-from experiments.study.assembly import assemble
 from experiments.study.dataset import open_dataset
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import config_hash
 from tests.experiments import tiny
+from touchr1_jax.models.touch_policy import build_policy
 
 
 @pytest.fixture(scope="session")
@@ -34,13 +34,13 @@ def data(records):
 
 
 @pytest.fixture(scope="session")
-def assembly(data):
-    return assemble(tiny.MODEL, data.clip.sensors)
+def policy(data):
+    return build_policy(tiny.MODEL, data.clip.sensors)
 
 
 @pytest.fixture(scope="session")
-def params(assembly, data):
-    return tiny.params(assembly, data)
+def params(policy, data):
+    return tiny.params(policy, data)
 
 
 @pytest.fixture

@@ -6,16 +6,16 @@ import jax
 import numpy as np
 
 from experiments.faults.trainings.small_study import MODEL, SCENES
-from experiments.study.assembly import Assembly
 from experiments.study.dataset import Dataset
-from experiments.study.feeds import touch_batch
-from experiments.study.stages import SFTConfig
+from experiments.study.stages import StudySFT
 from experiments.study.study import StudyConfig
 from sensors_io.pipeline import clip_batches
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Params, TouchBatch
 
 STUDY = StudyConfig(
@@ -23,8 +23,8 @@ STUDY = StudyConfig(
     scenes=SCENES,
     model=MODEL,
     probe=ProbeConfig(folds=2, iterations=4),
-    sft=SFTConfig(steps=3, batch_size=4),
-    blind=SFTConfig(steps=2, batch_size=4),
+    sft=StudySFT(steps=3, batch_size=4),
+    blind=StudySFT(steps=2, batch_size=4),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,
 )
@@ -37,9 +37,9 @@ def one_batch(data: Dataset) -> TouchBatch:
     return touch_batch(next(iter(clips)))
 
 
-def params(assembly: Assembly, data: Dataset, *, loud: float = 0.4, seed: int = 0) -> Params:
+def params(policy: TouchPolicy, data: Dataset, *, loud: float = 0.4, seed: int = 0) -> Params:
     """Loud parameters, so that answers depend on what is asked and felt."""
-    return draw_params(jax.eval_shape(lambda batch: assembly.init(0, batch), one_batch(data)), seed, loud=loud)
+    return draw_params(jax.eval_shape(lambda batch: policy.init(0, batch), one_batch(data)), seed, loud=loud)
 
 
 def features(n: int, seed: int = 0) -> Features:

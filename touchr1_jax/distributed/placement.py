@@ -17,14 +17,13 @@ from jax.sharding import Mesh, NamedSharding
 
 from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, state_shardings, whole
 from touchr1_jax.models.layers import RMSNorm
+from touchr1_jax.training.loop import Step
 
 LAYERS = (nn.Dense, nn.Embed, RMSNorm)
 """Layers whose results are constrained to a sharding; others follow from them."""
 
 OUTPUTS = ("__call__", "attend")
 """Their methods; by `attend` a table of embeddings computes logits."""
-
-Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
 
 
 def place_state(mesh: Mesh, state: Any) -> Any:

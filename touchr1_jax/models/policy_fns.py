@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.lm import LayerCache, PrefixCache
 from touchr1_jax.models.policy import Features, Policy, Row, Slots
+from touchr1_jax.text.template import PromptLayout
+from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -32,6 +34,20 @@ class PolicyFns:
     end_ids: tuple[int, ...]
     pad_id: int
     cache_dtype: jnp.dtype = jnp.dtype(jnp.float32)
+
+    @classmethod
+    def for_layout(
+        cls, module: Policy, layout: PromptLayout, tokenizer: Tokenizer, cache_dtype: jnp.dtype | type = jnp.float32
+    ) -> "PolicyFns":
+        """The functions of a module on the prompts of a layout."""
+        return cls(
+            module=module,
+            slots=Slots(layout.touch, layout.view, layout.stream_text),
+            banned=tokenizer.banned,
+            end_ids=tokenizer.end_ids,
+            pad_id=tokenizer.pad_id,
+            cache_dtype=jnp.dtype(cache_dtype),
+        )
 
     def encode(self, params: Params, batch: TouchBatch, *, blind: bool = False) -> Features:
         """Encode a batch of contacts, [P, …]; a blind policy has no streams."""

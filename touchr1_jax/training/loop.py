@@ -1,16 +1,24 @@
-"""The training loop of every stage: fetch, step, log one step late, checkpoint, resume, stop when asked."""
+"""The training loop of every stage: fetch, step, log one step late, checkpoint, resume, stop when asked.
+
+hooks = Hooks(log=print, checkpoints=Checkpoints(directory))
+state = fit(step, state, batches, LoopConfig(steps=100), hooks)
+"""
 
 import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
+import numpy as np
 
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import return_memory
 from touchr1_jax.training.optimizer import count_skipped
+
+Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
+"""(state, batch, *constants) → (state, metrics), jitted; it may donate its state."""
 
 Log = Callable[[int, dict[str, float]], None]
 """Receives (step, metrics) in order; steps count from 0."""
@@ -19,6 +27,7 @@ SKIPPED = "skipped"
 """Metric of a step that left its update out: how many did so far.  Other steps have none of this name."""
 
 
+@runtime_checkable
 class Batches(Protocol):
     """An iterator of batches that can say where it is and go back there; Grain's iterators are such."""
 
@@ -76,18 +85,73 @@ class LoopTime:
         return self.input_s / self.total_s if self.total_s else 0.0
 
 
+class SingleDevice:
+    """Training steps run on one device, as they are; a subclass splits them over a mesh."""
+
+    shape: tuple[int, ...] = (1, 1, 1)
+    """Devices along the axes of the mesh."""
+    gather_params: Callable[[Any], Any] = staticmethod(lambda params: params)
+    """All-gathers weights inside a traced step, as `make_grpo_step` takes it."""
+
+    def local_rows(self, batch_size: int) -> np.ndarray:
+        """Rows of a batch that this process must read, ascending."""
+        return np.arange(batch_size)
+
+    def shard(
+        self, step: Step, state: Any, batches: Batches, batch_size: int, *constants: Any
+    ) -> tuple[Step, Any, Batches]:
+        """Place a step (state, batch) → (state, metrics), its first state and its batches on the devices.
+
+        Args:
+          step: (state, batch, *constants) → (state, metrics).
+          state: the first one.
+          batches: of the rows that this process reads.
+          batch_size: rows of a whole batch.
+          constants: arguments that no step changes.
+        """
+        del batch_size
+        return lambda s, b: step(s, b, *constants), state, batches
+
+    def gather(self, tree: Any) -> Any:
+        """Arrays that every process holds completely."""
+        return tree
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hooks:
+    """Side effects of a training stage; by default it has none and runs on one device.
+
+    Attributes:
+      log: receives (step, metrics) in order, each one step late; of a step whose update was left out it receives the
+        finite metrics and `SKIPPED`.
+      checkpoints: where state and batches are saved and restored from; `None` saves nothing.
+      resumed: receives the first step that is computed, 0 or that of the checkpoint, before any step.
+      stopping: asked after every step; once it is true the state is saved and returned as it is.
+      merged: receives the share of its adapters that a stage's merged weights keep (`lora.kept_share`).
+      times: receives how long steps took and how long they waited for data.
+      devices: where the steps run.
+    """
+
+    log: Log = lambda step, metrics: None
+    checkpoints: Checkpoints | None = None
+    resumed: Callable[[int], None] = lambda step: None
+    stopping: Callable[[], bool] = lambda: False
+    merged: Callable[[float], None] = lambda kept: None
+    times: LoopTime | None = None
+    devices: SingleDevice = SingleDevice()
+
+
+SILENT = Hooks()
+
+
 def fit(
-    step: Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]],
+    step: Step,
     state: Any,
     batches: Batches,
     config: LoopConfig,
+    hooks: Hooks = SILENT,
     *,
-    checkpoints: Checkpoints,
-    log: Log,
-    start: int | None = None,
-    stopping: Callable[[], bool] = lambda: False,
     held_out: Callable[[Any], float] | None = None,
-    times: LoopTime | None = None,
 ) -> Any:
     """Run `step` to `config.steps`, continuing from the newest checkpoint where there is one.
 
@@ -96,24 +160,19 @@ def fit(
     and data iterator together: the result equals the uninterrupted run's bit for bit.
 
     Args:
-      step: jitted (state, batch) → (state, metrics); it may donate its state.
+      step: (state, batch) → (state, metrics).
       state: where a run without a checkpoint begins.
       batches: training data.
-      config: how long, how often to save, and when to give up.
-      checkpoints: where to save.
-      log: receives (step, metrics) in order; of a step whose update was left out the finite metrics and `SKIPPED`.
-      start: the step that `state` and `batches` stand at, from `resume`; `None` resumes here.
-      stopping: asked after every step; once it says yes the state is saved and returned as it is.
-      held_out: score of a state on held-out data, taken whenever a checkpoint is due; `checkpoints` keep the best.
-      times: receives where the time went.
+      config: number of steps, of steps between checkpoints, and of updates in a row that may be left out.
+      hooks: log, checkpoints, stop signal.
+      held_out: score of a state on held-out data, taken whenever a checkpoint is due; the checkpoints keep the best.
 
     Raises:
       NonFiniteGradientError: more than `config.most_skipped` updates in a row were left out.
     """
-    if start is None:
-        start, state = resume(state, batches, checkpoints)
-    times = LoopTime() if times is None else times
-    lines = _LateLines(log, config.most_skipped, _skipped_before(state))
+    start, state = resume(state, batches, hooks.checkpoints)
+    hooks.resumed(start)
+    lines = _LateLines(hooks.log, config.most_skipped, _skipped_before(state))
     batch = next(batches) if start < config.steps else None
     for t in range(start, config.steps):
         began = time.perf_counter()
@@ -126,21 +185,22 @@ def fit(
             return_memory()  # the step is compiled by now
         lines.put(_Line(t, metrics, count_skipped(state)))
         due = (t + 1) % config.save_every == 0 or t + 1 == config.steps
-        leaving = stopping()
+        leaving = hooks.stopping()
         if due or leaving:
             lines.flush()
             score = held_out(state) if due and held_out is not None else None
-            checkpoints.save(t + 1, state, place, score)
-        if t > start:
-            times.add(time.perf_counter() - began, waited_s)
+            if hooks.checkpoints is not None:
+                hooks.checkpoints.save(t + 1, state, place, score)
+        if t > start and hooks.times is not None:
+            hooks.times.add(time.perf_counter() - began, waited_s)
         if leaving:
             break
     return state
 
 
-def resume(state: Any, batches: Batches, checkpoints: Checkpoints) -> tuple[int, Any]:
+def resume(state: Any, batches: Batches, checkpoints: Checkpoints | None) -> tuple[int, Any]:
     """Step and state of the newest intact checkpoint, to which the batches are set; 0 and `state` without one."""
-    restored = checkpoints.restore(state)
+    restored = None if checkpoints is None else checkpoints.restore(state)
     if restored is None:
         return 0, state
     batches.set_state(restored.data)

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
@@ -23,19 +24,19 @@ from experiments.core.loops import run_loop
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.faults.trainings.small_study import ARM, MODEL
-from experiments.study.arrays import flat, nested
-from experiments.study.assembly import Assembly, assemble, touch_shapes
-from experiments.study.feeds import QuestionFeed
-from experiments.study.reinforcement import grpo_program
 from experiments.study.scores import PUBLISHED
-from experiments.study.watching import watched_log
+from experiments.study.stages import alarm_log
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
-from touchr1_jax.rewards import uniform_prior
+from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, touch_shapes
+from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.rl.scoring import make_score
 from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.questions import QuestionFeed
+from touchr1_jax.training.train_grpo import grpo_program
 from touchr1_jax.types import Params
 
 STAGE = f"grpo/{ARM}/0"
@@ -65,19 +66,19 @@ class ReinforcingConfig:
 
 def run(config: ReinforcingConfig, context: Context) -> Results:
     """Reinforce to the end."""
-    assembly = assemble(MODEL, SENSORS)
-    prior = uniform_prior(list(assembly.levels))
-    score, fns = assembly.score(PUBLISHED, prior), assembly.fns
+    policy = build_policy(MODEL, SENSORS)
+    prior = uniform_prior(list(policy.levels))
+    score, fns = make_score(policy.parser, make_rewards(prior), PUBLISHED), policy.fns
     optimizer, step = grpo_program(fns, score, config.grpo, config.steps, None)
-    decoder = {"decoder": _decoder(assembly, context.directory / "start.npz")}
+    decoder = {"decoder": _decoder(policy, context.directory / "start.npz")}
     rng = np.random.default_rng(1)
     noise = _features(rng, NOISE).touch
     frozen = FrozenInputs(reference=decoder, noise=jnp.asarray(noise))
-    feed = _questions(assembly, rng, CONTACTS, config.grpo.drawn)
-    held = next(_questions(assembly, rng, HELD_OUT, HELD_OUT))
+    feed = _questions(policy, rng, CONTACTS, config.grpo.drawn)
+    held = next(_questions(policy, rng, HELD_OUT, HELD_OUT))
     begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
     state = begin(decoder, jax.random.key(0))
-    judge = jax.jit(lambda params: _certainty(assembly, params, held))
+    judge = jax.jit(lambda params: _certainty(policy, params, held))
     run_loop(
         lambda s, batch: step(s, batch, frozen),
         state,
@@ -85,22 +86,22 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
         config.loop(),
         context,
         STAGE,
-        make_log=watched_log,
+        make_log=alarm_log,
         held_out=lambda s: float(judge(s.params)),
     )
     return Results(verdict=("It came to its end.",))
 
 
-def _certainty(assembly: Assembly, params: Params, held: GRPOBatch) -> jax.Array:
+def _certainty(policy: TouchPolicy, params: Params, held: GRPOBatch) -> jax.Array:
     """Mean largest log-probability of the first word about held-out contacts: cheap, and any score will do."""
-    first = jax.vmap(lambda f, i, m: assembly.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
+    first = jax.vmap(lambda f, i, m: policy.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
     return jnp.mean(jnp.max(jax.nn.log_softmax(first), -1))
 
 
-def _questions(assembly: Assembly, rng: np.random.Generator, contacts: int, batch_size: int) -> QuestionFeed:
+def _questions(policy: TouchPolicy, rng: np.random.Generator, contacts: int, batch_size: int) -> QuestionFeed:
     """Questions about contacts whose features and labels are drawn."""
-    label = np.stack([rng.integers(0, levels, contacts) for levels in assembly.levels], 1).astype(np.int32)
-    return QuestionFeed(assembly, _features(rng, contacts), label, batch_size=batch_size, seed=0)
+    label = np.stack([rng.integers(0, levels, contacts) for levels in policy.levels], 1).astype(np.int32)
+    return QuestionFeed(policy, _features(rng, contacts), label, batch_size=batch_size, seed=0)
 
 
 def _features(rng: np.random.Generator, contacts: int) -> Features:
@@ -118,21 +119,21 @@ def _features(rng: np.random.Generator, contacts: int) -> Features:
     return Features(**on_host)
 
 
-def _decoder(assembly: Assembly, path: Path) -> Params:
+def _decoder(policy: TouchPolicy, path: Path) -> Params:
     """A fresh policy's, drawn by the first session and found by the others, as GRPO finds what SFT left."""
     if not path.exists():
-        arrays: dict[str, Any] = flat(_drawn(assembly)["decoder"])
+        arrays: dict[str, Any] = traverse_util.flatten_dict(_drawn(policy)["decoder"], sep="/")
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)
         write_bytes(path, buffer.getvalue())
     with np.load(path) as file:
-        return nested(dict(file))
+        return jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(dict(file), sep="/"))
 
 
-def _drawn(assembly: Assembly) -> Params:
+def _drawn(policy: TouchPolicy) -> Params:
     """Parameters of a fresh policy."""
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, MODEL.vision.image_px, SENSORS))
-    return assembly.init(0, nothing)
+    return policy.init(0, nothing)
 
 
 EXPERIMENT = Experiment(name="small_grpo", config=ReinforcingConfig(), run=run)

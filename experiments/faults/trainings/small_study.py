@@ -12,16 +12,16 @@ import dataclasses
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
-from experiments.study.assembly import ModelConfig
 from experiments.study.scores import PUBLISHED
-from experiments.study.stages import SFTConfig
+from experiments.study.stages import StudySFT
 from experiments.study.study import StudyConfig, run_study
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 ARM = "paper"
 
@@ -61,8 +61,8 @@ STUDY = StudyConfig(
     scenes=SCENES,
     model=MODEL,
     probe=ProbeConfig(folds=2, iterations=4),
-    sft=SFTConfig(steps=60, batch_size=4, save_every=3),
-    blind=SFTConfig(steps=30, batch_size=4, save_every=3, micro_contacts=4),
+    sft=StudySFT(steps=60, batch_size=4, save_every=3),
+    blind=StudySFT(steps=30, batch_size=4, save_every=3, micro_contacts=4),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=60,
     grpo_save_every=3,

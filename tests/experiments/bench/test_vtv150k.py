@@ -22,7 +22,7 @@ from experiments.mechanics.identify_motions import MotionData
 from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.bench.averages import VTV, vtv_average
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 TINY = dataclasses.replace(vtv150k.EXPERIMENT.scales["smoke"], probe=ProbeConfig(folds=3, iterations=4), questions=24)
 N = 60

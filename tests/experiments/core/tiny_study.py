@@ -12,8 +12,8 @@ from experiments.core.commands import find
 from experiments.core.runner import run_experiment
 from experiments.paper.presets import SMALL_QUOTA
 from experiments.study.ablation import ablation_experiment
-from experiments.study.feeds import AnswerFeed
 from tests.experiments import tiny
+from touchr1_jax.training.feeds import AnswerFeed
 
 
 def strike(batch: int) -> None:

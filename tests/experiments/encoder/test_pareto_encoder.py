@@ -16,7 +16,7 @@ from sensors_io.pipeline import make_clip
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.predictor import PredictorConfig
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 VARIANTS = {v.name: v for v in variants(PretrainConfig(frames=8))}
 

@@ -13,14 +13,14 @@ from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain_encoder
 from experiments.encoder.data import StageOneDataConfig, held_out_contacts
 from experiments.encoder.pretrain import PretrainConfig, pretrain
-from experiments.study.assembly import assemble
-from experiments.study.pretrained import load_encoder
 from experiments.study.stages import run_sft
 from experiments.study.training import starting_model
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.predictor import PredictorConfig
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.models.pretrained import load_encoder
+from touchr1_jax.models.touch_policy import build_policy
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 PRETRAIN = PretrainConfig(
     encoder=dataclasses.replace(tiny.MODEL.tactile, causal=True),
@@ -101,7 +101,7 @@ def test_a_study_starts_from_it(directory, data, context):
     assert model.tactile.causal
     evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
     untouched = dataclasses.replace(tiny.STUDY.sft, steps=0)
-    assembly = assemble(model, data.clip.sensors)
-    params = run_sft(assembly, data, evidence, untouched, context, seed=0, stage="sft/0", tactile=tactile)
+    policy = build_policy(model, data.clip.sensors)
+    params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", tactile=tactile)
     jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
     assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)

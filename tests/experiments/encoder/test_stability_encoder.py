@@ -11,7 +11,7 @@ from experiments.encoder.data import StageOneDataConfig
 from experiments.encoder.stability_encoder import ARMS, CollapseOutcome
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 TINY = dataclasses.replace(
     stability_encoder.SMOKE,

@@ -26,7 +26,7 @@ from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import SENSORS, Phase
 from tests.experiments.shrunk import run_shrunk
-from touchr1_jax.training.evidence import ProbeConfig, cross_fit
+from touchr1_jax.training.linear_probe import ProbeConfig, cross_fit
 
 SCENES = SceneConfig(objects=8, sites=1, frames=3, min_force_n=0.3, max_force_n=3.0, image_px=24, contact_grid=24)
 TINY = dataclasses.replace(

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from experiments.paper.released_policy import ReleasedModel, assemble_released, instruction
+from experiments.paper.released_policy import ReleasedModel, build_released_policy, instruction
 from experiments.paper.tiny_checkpoint import write_tiny
 from experiments.study.dataset import open_dataset
 from sensors_io.pipeline import ClipConfig
@@ -44,4 +44,4 @@ def streamed(records):
 
 @pytest.fixture(scope="session")
 def policy(checkpoint, streamed):
-    return assemble_released(MODEL, checkpoint, streamed.clip.sensors)
+    return build_released_policy(MODEL, checkpoint, streamed.clip.sensors)

@@ -20,7 +20,7 @@ from experiments.paper.feature_baselines import (
     together_and_alone,
 )
 from tests.experiments import tiny
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 LEVELS = (3,)
 

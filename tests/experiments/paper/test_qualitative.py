@@ -4,7 +4,7 @@ import numpy as np
 
 from experiments.paper.conflict_metrics import TouchQuestions
 from experiments.paper.qualitative import Conclusions, answer_cases, first_of, item_examples
-from experiments.study.answers import Evaluated
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.items import Ask, Touch
 
 QUESTIONS = TouchQuestions(
@@ -45,7 +45,7 @@ def test_an_item_is_shown_by_the_answers_that_it_consists_of():
         id="compare-0000", kind="compare", attributes=("hardness",), touches=touches, sensors=("xense",), answer=(1,)
     )
     contact, attribute = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
-    full = Evaluated(
+    full = Evaluation(
         contact=contact, attribute=attribute, streams=None, tokens=None, parsed=None, label=None, alone=None
     )
     places = {touches[0]: 0, touches[1]: 1}

@@ -8,24 +8,25 @@ import numpy as np
 import pytest
 
 from experiments.paper.released_policy import (
-    assemble_released,
+    build_released_policy,
+    check_released,
     grpo_shape,
     instruction,
     longest_answer,
     plain_answers,
-    prove_released,
 )
 from experiments.paper.touch_r1 import SMOKE
-from experiments.study.assembly import touch_shapes
-from experiments.study.feeds import AnswerFeed
-from experiments.study.stages import SFTConfig, run_sft
+from experiments.study.stages import StudySFT, answer_feed, run_sft
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
 from tests.experiments.paper.conftest import MODEL
 from tests.touchr1_jax.text.vocabularies import character_level
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.text.oracle import read
+
+SFT = StudySFT(batch_size=3, questions=2, micro_contacts=1)
 
 
 def test_the_system_says_what_an_answer_looks_like(policy):
@@ -46,7 +47,7 @@ def test_no_answer_is_longer_than_the_longest(policy):
 def test_completions_must_have_room_for_an_answer(checkpoint):
     model = dataclasses.replace(MODEL, completion_tokens=20)
     with pytest.raises(SizeError, match=r"model\.completion_tokens is 20: the longest answer takes \d+ tokens"):
-        assemble_released(model, checkpoint, SENSORS)
+        build_released_policy(model, checkpoint, SENSORS)
 
 
 def test_sizes_that_contradict_each_other_are_named_before_there_is_data(checkpoint):
@@ -54,7 +55,7 @@ def test_sizes_that_contradict_each_other_are_named_before_there_is_data(checkpo
     tactile = TactileViTConfig(sensors=0, width=16, num_layers=0, num_heads=2, stem_width=4, frames_per_step=2)
     model = dataclasses.replace(MODEL, tactile=tactile, frames=3)
     with pytest.raises(SizeError, match="no policy can be built of these sizes"):
-        prove_released(assemble_released(model, checkpoint, SENSORS), touch_shapes(model, model.view_px, SENSORS))
+        check_released(build_released_policy(model, checkpoint, SENSORS), touch_shapes(model, model.view_px, SENSORS))
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_batches_of_sft_hold_the_prompts_and_answers_of_the_release(policy, stre
     """Read by two threads from disk; what is asked decodes to the answer that the parser reads as the label."""
     levels = max(policy.levels)
     evidence = np.zeros((len(streamed.store), len(SENSORS), len(policy.levels), levels), np.float32)
-    batch = next(AnswerFeed(policy, streamed, evidence, batch_size=3, questions=2, seed=0))
+    batch = next(answer_feed(policy, streamed, evidence, SFT, seed=0))
     p, q, s = 3, 2, len(SENSORS)
     length, clip = policy.layout.ids.shape[1], streamed.clip
     assert batch.ids.shape == batch.mask.shape == (p, q, length)
@@ -103,15 +104,14 @@ def test_batches_of_sft_hold_the_prompts_and_answers_of_the_release(policy, stre
 def test_reading_threads_change_nothing(policy, streamed):
     evidence = np.zeros((len(streamed.store), len(SENSORS), len(policy.levels), max(policy.levels)), np.float32)
     first, second = (
-        next(AnswerFeed(policy, dataclasses.replace(streamed, threads=n), evidence, batch_size=3, questions=1, seed=0))
-        for n in (1, 3)
+        next(answer_feed(policy, dataclasses.replace(streamed, threads=n), evidence, SFT, seed=0)) for n in (1, 3)
     )
     assert jax.tree.all(jax.tree.map(np.array_equal, first, second))
 
 
 def test_towers_that_stand_still_need_adapters(policy, streamed, context):
     with pytest.raises(SizeError, match=r"sft\.lora_rank is 0: must be at least 1 where vision and decoder stand"):
-        run_sft(policy, streamed, np.zeros(0), SFTConfig(), context, seed=0, stage="sft/0")
+        run_sft(policy, streamed, np.zeros(0), StudySFT(), context, seed=0, stage="sft/0")
 
 
 def test_the_cache_has_the_type_of_the_weights(policy, checkpoint):

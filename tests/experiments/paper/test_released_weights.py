@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.core.loops import KEPT
 from experiments.paper.released_weights import (
     TOUCH_FILE,
     file_fingerprint,
@@ -16,7 +17,6 @@ from experiments.paper.released_weights import (
 )
 from experiments.paper.tiny_checkpoint import published_config
 from experiments.paper.touch_r1 import ARM
-from experiments.study.stages import KEPT
 from experiments.study.study import BLIND, SFT
 from tests.experiments import tiny
 from touchr1_jax.models.load import Load, WeightsError, load_checkpoint

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.core.context import read_metrics
-from experiments.paper.released_policy import assemble_released, instruction
+from experiments.paper.released_policy import build_released_policy, instruction
 from experiments.paper.tiny_checkpoint import (
     STAGE,
     UNUSED_TOUCH,
@@ -28,7 +28,7 @@ from touchr1_jax.text.oracle import read
 
 @pytest.fixture(scope="module")
 def writer(checkpoint):
-    return assemble_released(UNUSED_TOUCH, checkpoint, SENSORS)
+    return build_released_policy(UNUSED_TOUCH, checkpoint, SENSORS)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from experiments.core.loops import STEPPING, WAITING
 from experiments.core.results import Estimate
 from experiments.core.runner import main
 from experiments.paper.touch_r1 import ARM, DEFAULT, DRAWN, SMALL, SMOKE, TAUGHT, WRITTEN, ZERO, verdict
-from experiments.study.stages import SFTConfig
+from experiments.study.stages import StudySFT
 from experiments.study.study import BLIND, SFT
 from tests.experiments.shrunk import only_run
 from touchr1_jax.bench.grounding import CONTROLS
@@ -25,8 +25,8 @@ from touchr1_jax.models.load import Load
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sft": SFTConfig()}, r"sft\.lora_rank is 0: must be at least 1"),
-        ({"blind": SFTConfig()}, r"blind\.lora_rank is 0: must be at least 1"),
+        ({"sft": StudySFT()}, r"sft\.lora_rank is 0: must be at least 1"),
+        ({"blind": StudySFT()}, r"blind\.lora_rank is 0: must be at least 1"),
         ({"grpo_lora_rank": 0}, "grpo_lora_rank is 0: must be at least 1, released towers stand still"),
         (
             {"model": dataclasses.replace(DEFAULT.model, dtype="float32")},

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.study import answers
-from experiments.study.answers import Evaluated, evaluate_policy, reward_of, reward_terms
 from tests.experiments import tiny
+from touchr1_jax.bench.evaluation import Evaluation, evaluate_policy, reward_terms, rewards_of
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.rollout import GreedyAnswers
 from touchr1_jax.types import Parsed
@@ -24,7 +23,7 @@ def said(data):
     contact, attribute = np.nonzero(data.label[data.parts["test"]] >= 0)
     n, asked = len(contact), np.arange(4) == attribute[:, None]
     level = lambda *shape: np.where(asked if len(shape) < 3 else asked[:, None], rng.integers(-1, 3, shape), -1)
-    return Evaluated(
+    return Evaluation(
         contact=contact,
         attribute=attribute,
         streams=rng.random((n, 4)) < 0.7,
@@ -42,19 +41,19 @@ def said(data):
     )
 
 
-def test_the_terms_of_a_reward_sum_to_the_total(assembly, data, said):
+def test_the_terms_of_a_reward_sum_to_the_total(policy, data, said):
     prior = data.prior()
-    terms = reward_terms(assembly, said, WEIGHTS, prior)
-    target = assembly.target(said.attribute, said.label, said.streams)
+    terms = reward_terms(policy, said, WEIGHTS, prior)
+    target = policy.target(said.attribute, said.label, said.streams)
     rewards = make_rewards(prior)
     total = jax.jit(jax.vmap(lambda p, t: total_reward(rewards, WEIGHTS, p, t)[0]))(said.parsed, target)
     assert set(terms) == set(WEIGHTS)
     np.testing.assert_allclose(np.sum(list(terms.values()), 0), total, atol=1e-6)
-    np.testing.assert_allclose(reward_of(assembly, said, WEIGHTS, prior), total, atol=1e-6)
+    np.testing.assert_allclose(rewards_of(policy, said, WEIGHTS, prior), total, atol=1e-6)
     assert np.ptp(np.asarray(total)) > 0.1
 
 
-def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(assembly, data, said):
+def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(policy, data, said):
     weights = {"exact": 0.6, "consistency": 0.3, "format": 0.1}
     n = len(said.contact)
     perfect = Parsed(
@@ -67,23 +66,22 @@ def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(a
     )
     silent = jax.tree.map(lambda x: x & False if x.dtype == bool else x * 0 - 1, perfect)
     felt = dataclasses.replace(said, streams=np.ones((n, 4), bool), parsed=perfect)
-    np.testing.assert_allclose(reward_of(assembly, felt, weights, data.prior()), 1.0, atol=1e-6)
-    mute = reward_terms(assembly, dataclasses.replace(felt, parsed=silent), weights, data.prior())
+    np.testing.assert_allclose(rewards_of(policy, felt, weights, data.prior()), 1.0, atol=1e-6)
+    mute = reward_terms(policy, dataclasses.replace(felt, parsed=silent), weights, data.prior())
     material = said.attribute == 3  # consistency does not apply: the other weights grow from 0.7 to 1
     np.testing.assert_allclose(mute["exact"], np.where(material, -0.06 / 0.7, -0.06), atol=1e-6)
 
 
 @pytest.fixture
-def ask(assembly, params, context, monkeypatch):
+def ask(policy, params):
     """Evaluate some contacts in blocks of eight questions, two contacts each."""
-    monkeypatch.setattr(answers, "EVAL_BATCH", 8)
-    return lambda features, label: evaluate_policy(assembly, params, features, label, context)
+    return lambda features, label: evaluate_policy(policy, params, features, label, batch_size=8)
 
 
 LABEL = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, 1, 1, 4]], np.int32)
 
 
-def test_padding_the_last_block_changes_nothing(assembly, ask):
+def test_padding_the_last_block_changes_nothing(policy, ask):
     features = tiny.features(3)
     whole, padded = (ask(jax.tree.map(lambda x, n=n: x[:n], features), LABEL[:n]) for n in (2, 3))
     assert (len(whole.tokens), len(padded.tokens)) == (8, 12)
@@ -112,27 +110,28 @@ def felt_sum(decoder, batch):
     return GreedyAnswers(tokens=batch.ids, parsed=parsed)
 
 
-def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(assembly, context, monkeypatch):
-    monkeypatch.setattr(answers, "answer_program", lambda assembly: felt_sum)
+def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(policy):
+    done = []
     present = np.array([[True] * 4, [True, False, True, False]])
     features = dataclasses.replace(tiny.features(2), stream_mask=present)
     label = LABEL[:2].copy()
     label[0, 1] = -1
-    said = evaluate_policy(assembly, {"decoder": {}}, features, label, context)
+    said = evaluate_policy(
+        policy, {"decoder": {}}, features, label, answer=felt_sum, progress=lambda n, total: done.append((n, total))
+    )
     assert list(zip(said.contact, said.attribute, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
-    assert np.array_equal(said.tokens, assembly.layout.ids[said.attribute])
+    assert np.array_equal(said.tokens, policy.layout.ids[said.attribute])
     assert np.array_equal(said.streams, present[said.contact])
     assert np.array_equal(said.label >= 0, np.arange(4) == said.attribute[:, None])
     assert np.array_equal(said.label.max(1), label[said.contact, said.attribute])
     assert said.parsed.conclude[:, 0].tolist() == [15] * 3 + [5] * 4
     assert said.alone[:, :, 0].tolist() == [[1, 2, 4, 8]] * 3 + [[1, 0, 4, 0]] * 4
-    assert "asking: 35/35" in context.console.file.getvalue()  # seven questions, by all streams and each of four
+    assert (done[0], done[-1]) == ((0, 35), (35, 35))  # seven questions, by all streams and each of four
 
 
-def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(assembly, context, monkeypatch):
-    monkeypatch.setattr(answers, "answer_program", lambda assembly: felt_sum)
+def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(policy):
     features = dataclasses.replace(tiny.features(1), stream_mask=np.zeros((1, 4), bool))
-    assert evaluate_policy(assembly, {"decoder": {}}, features, LABEL[:1], context).alone is None
+    assert evaluate_policy(policy, {"decoder": {}}, features, LABEL[:1], answer=felt_sum).alone is None
 
 
 def test_the_answers_are_what_the_metrics_read(said):

@@ -4,16 +4,16 @@ import dataclasses
 
 import pytest
 
-from experiments.study import assembly
-from experiments.study.assembly import ModelConfig, prove_model, prove_rewards
 from experiments.study.scores import PUBLISHED
+from experiments.study.study import check_arms
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.layers import SizeError
+from touchr1_jax.models.touch_policy import ModelConfig, check_model
 from touchr1_jax.rewards import Reward, RewardError
 
 
 def test_the_published_rewards_pass():
-    prove_rewards({"published": PUBLISHED})
+    check_arms({"published": PUBLISHED})
 
 
 @pytest.mark.parametrize(
@@ -23,10 +23,9 @@ def test_the_published_rewards_pass():
         (Reward(lambda p, t: 1.0 / p.length), r"reward 'mine' is inf .*must be finite everywhere"),
     ],
 )
-def test_a_reward_that_does_not_fit_is_named_with_its_arm(monkeypatch, reward, message):
-    monkeypatch.setattr(assembly, "make_rewards", lambda prior: {"mine": reward})
+def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
     with pytest.raises(RewardError, match=rf"{message}.* \(in the weights of arm 'good', {{'mine': 0.5}}\)"):
-        prove_rewards({"good": {"mine": 0.5}})
+        check_arms({"good": {"mine": 0.5}}, {"mine": reward})
 
 
 @pytest.mark.parametrize(
@@ -41,13 +40,13 @@ def test_sizes_that_contradict_each_other_are_named_without_data(part, changes, 
     model = ModelConfig()
     changed = dataclasses.replace(model, **{part: dataclasses.replace(getattr(model, part), **changes)})
     with pytest.raises(SizeError, match=message):
-        prove_model(changed, SENSORS)
+        check_model(changed, SENSORS)
 
 
 def test_sizes_that_fit_are_built():
-    prove_model(dataclasses.replace(ModelConfig(), frames=3), SENSORS)
+    check_model(dataclasses.replace(ModelConfig(), frames=3), SENSORS)
 
 
 def test_an_unknown_reward_is_answered_with_the_known_ones():
     with pytest.raises(RewardError, match=r"no reward is called 'brevty'; choose from accuracy.* of arm 'mine'"):
-        prove_rewards({"published": PUBLISHED, "mine": {"brevty": 1.0}})
+        check_arms({"published": PUBLISHED, "mine": {"brevty": 1.0}})

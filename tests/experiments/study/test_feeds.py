@@ -9,22 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.study.feeds import (
-    AnswerFeed,
-    Feed,
-    QuestionFeed,
-    each,
-    falling_share,
-    question_batch,
-    random_streams,
-    take,
-)
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
+from touchr1_jax.training.feeds import AnswerFeed, Feed, falling_share, random_streams
 from touchr1_jax.training.packing import Packing
+from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch, take
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +38,13 @@ def clips(data):
 
 
 @pytest.fixture
-def answers(assembly, data, evidence):
-    return lambda **changes: AnswerFeed(
-        assembly, data, evidence, **{"batch_size": 3, "questions": 3, "seed": 1, **changes}
-    )
+def answers(policy, data, evidence):
+    def feed(augment=None, **changes):
+        order = {"batch_size": 3, "seed": 1} | {k: v for k, v in changes.items() if k in ("batch_size", "seed", "own")}
+        clips = data.batches(data.parts["sft"], felt=not changes.get("blind"), augment=augment, **order)
+        return AnswerFeed(policy, clips, evidence, **{"questions": 3, **order, **changes})
+
+    return feed
 
 
 @pytest.fixture
@@ -70,32 +65,32 @@ def features(data):
 
 
 @pytest.fixture
-def questions(assembly, data, features):
+def questions(policy, data, features):
     label = data.label[data.parts["grpo"]]
-    return lambda **changes: QuestionFeed(assembly, features, label, **{"batch_size": 4, "seed": 1, **changes})
+    return lambda **changes: QuestionFeed(policy, features, label, **{"batch_size": 4, "seed": 1, **changes})
 
 
-def attribute_of(assembly, ids: np.ndarray) -> int:
+def attribute_of(policy, ids: np.ndarray) -> int:
     """The attribute that a prompt asks for."""
-    return int(np.flatnonzero((assembly.layout.ids == ids).all(-1))[0])
+    return int(np.flatnonzero((policy.layout.ids == ids).all(-1))[0])
 
 
-def readings(assembly, batch):
+def readings(policy, batch):
     """Contact, attribute, streams and text of every question, read by the slow and obvious parser."""
-    tokenizer, p, q = assembly.tokenizer, *batch.ids.shape[:2]
+    tokenizer, p, q = policy.tokenizer, *batch.ids.shape[:2]
     for i in range(p):
         for j in range(q):
             tokens = np.asarray(batch.tokens[i, j])[np.asarray(batch.token_mask[i, j])]
             assert tokens[-1] == tokenizer.end_ids[0]
-            said = read(assembly.language, tokenizer.decode(tokens[:-1]))
-            yield i, attribute_of(assembly, batch.ids[i, j]), np.asarray(batch.streams[i, j]), said
+            said = read(policy.language, tokenizer.decode(tokens[:-1]))
+            yield i, attribute_of(policy, batch.ids[i, j]), np.asarray(batch.streams[i, j]), said
 
 
-def test_answers_say_what_the_evidence_and_the_labels_say(assembly, answers, clips, evidence):
+def test_answers_say_what_the_evidence_and_the_labels_say(policy, answers, clips, evidence):
     seen = 0
     for draw in range(8):
         batch = answers().make(clips, np.random.default_rng(draw))
-        for i, a, streams, said in readings(assembly, batch):
+        for i, a, streams, said in readings(policy, batch):
             of_contact = evidence[clips["contact"][i], :, a]
             assert said.formatted
             for s in range(4):
@@ -107,10 +102,10 @@ def test_answers_say_what_the_evidence_and_the_labels_say(assembly, answers, cli
     assert seen, "evidence that always agrees with the label tests nothing"
 
 
-def test_the_questions_of_a_contact_are_about_different_attributes(assembly, answers, clips):
+def test_the_questions_of_a_contact_are_about_different_attributes(policy, answers, clips):
     batch = answers(questions=4).make(clips, np.random.default_rng(0))
     for i in range(3):
-        assert sorted(attribute_of(assembly, ids) for ids in batch.ids[i]) == [0, 1, 2, 3]
+        assert sorted(attribute_of(policy, ids) for ids in batch.ids[i]) == [0, 1, 2, 3]
 
 
 def test_absent_streams_are_never_asked_about(answers, clips):
@@ -120,20 +115,20 @@ def test_absent_streams_are_never_asked_about(answers, clips):
         assert streams.any(-1).all()
 
 
-def test_an_attribute_that_nobody_annotated_has_no_answer_and_no_loss(assembly, answers, clips):
+def test_an_attribute_that_nobody_annotated_has_no_answer_and_no_loss(policy, answers, clips):
     hidden = clips | {"label": np.where(np.arange(4) == 1, -1, clips["label"])}
     batch = answers(questions=4).make(hidden, np.random.default_rng(0))
     for i in range(3):
         for j in range(4):
-            asked = attribute_of(assembly, batch.ids[i, j])
+            asked = attribute_of(policy, batch.ids[i, j])
             assert bool(batch.token_mask[i, j].any()) == (asked != 1)
-            assert (asked != 1) or (batch.tokens[i, j] == assembly.tokenizer.pad_id).all()
+            assert (asked != 1) or (batch.tokens[i, j] == policy.tokenizer.pad_id).all()
 
 
-def test_a_blind_policy_perceives_nothing_and_is_told_the_label(assembly, answers, clips):
+def test_a_blind_policy_perceives_nothing_and_is_told_the_label(policy, answers, clips):
     batch = answers(blind=True).make(clips, np.random.default_rng(0))
     assert not batch.streams.any()
-    for i, a, _, said in readings(assembly, batch):
+    for i, a, _, said in readings(policy, batch):
         assert said.perceive == [[-1] * 4] * 4
         assert said.compare[a] == said.conclude[a] == clips["label"][i, a]
 
@@ -158,7 +153,7 @@ def test_what_is_felt_can_be_changed_at_random(answers):
         np.testing.assert_array_equal(getattr(plain, name), getattr(changed, name))
 
 
-def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(assembly, answers):
+def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(policy, answers):
     plain, packed = (next(answers(packing=packing)) for packing in (None, Packing(width=128, contacts=3)))
     assert equal([leaves(plain)], [leaves(packed.replace(rows=None))])
     n = packed.ids.shape[-1] + packed.tokens.shape[-1]
@@ -166,13 +161,13 @@ def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(assembly, 
     said = [tokens[row[at[at >= 0] + 1]] for row, at in rows_of(packed.rows)]
     assert sorted(np.concatenate(said)) == sorted(packed.tokens[packed.token_mask])
     felt = np.concatenate([row for row, _ in rows_of(packed.rows)])
-    touch = np.isin(felt % n, assembly.layout.touch.ravel())
+    touch = np.isin(felt % n, policy.layout.touch.ravel())
     steps = packed.streams[..., None] & packed.touch.frame_mask[:, None]  # a step is a frame here
-    assert touch.sum() == steps.sum() * assembly.model.tactile.tokens_per_step
+    assert touch.sum() == steps.sum() * policy.model.tactile.tokens_per_step
 
 
 def rows_of(rows):
-    """Source and predicting places of each row of one group."""
+    """Source and predicting places of equal_blocks row of one group."""
     for row, at in zip(rows.source.reshape(-1, 128), rows.predicts.reshape(-1, rows.predicts.shape[-1]), strict=True):
         yield row[row >= 0], at
 
@@ -218,12 +213,12 @@ def equal(a, b) -> bool:
     return all(np.array_equal(x, y) for m, n in zip(a, b, strict=True) for x, y in zip(m, n, strict=True))
 
 
-def test_a_feed_that_makes_nothing_says_so(questions):
-    with pytest.raises(TypeError, match="Feed must say how it makes a batch"):
+def test_a_feed_must_make_batches(questions):
+    with pytest.raises(TypeError, match=r"Feed\.make is not defined"):
         Feed.make(questions(), None, np.random.default_rng(0))
 
 
-def test_targets_hide_the_labels_that_are_not_asked(assembly, questions, data):
+def test_targets_hide_the_labels_that_are_not_asked(policy, questions, data):
     label = data.label[data.parts["grpo"]]
     for _, batch in zip(range(5), questions(), strict=False):
         target = jax.tree.map(np.asarray, batch.target)
@@ -233,26 +228,26 @@ def test_targets_hide_the_labels_that_are_not_asked(assembly, questions, data):
         assert (target.levels == [3, 3, 3, 9]).all()
         assert (target.ordinal == [True, True, True, False]).all()
         for ids, mask, asked, row in zip(batch.ids, batch.mask, target.asked, target.label, strict=True):
-            a = attribute_of(assembly, ids)
+            a = attribute_of(policy, ids)
             assert asked[a]
             assert row[a] in label[:, a]
-            assert np.array_equal(mask, assembly.layout.mask[a])
+            assert np.array_equal(mask, policy.layout.mask[a])
 
 
-def test_every_question_comes_once_an_epoch_and_none_without_a_label(assembly, features, data):
+def test_every_question_comes_once_an_epoch_and_none_without_a_label(policy, features, data):
     label = np.where(np.arange(4) == 3, -1, data.label[data.parts["grpo"]])
     total = int((label >= 0).sum())
-    batch = next(QuestionFeed(assembly, features, label, batch_size=total, seed=0))
+    batch = next(QuestionFeed(policy, features, label, batch_size=total, seed=0))
     asked = np.asarray(batch.target.asked).argmax(1)
     contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
     assert sorted(zip(contact, asked, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
     assert (np.asarray(batch.target.label).max(1) == label[contact, asked]).all()
 
 
-def test_a_question_is_felt_by_the_streams_that_it_says(assembly, features, data):
+def test_a_question_is_felt_by_the_streams_that_it_says(policy, features, data):
     label, rows, attribute = data.label[data.parts["grpo"]], np.array([2, 0]), np.array([1, 3])
     streams = np.array([[True, False, False, True], [False, True, True, False]])
-    batch = question_batch(assembly, features, label, rows, attribute, streams)
+    batch = question_batch(policy, features, label, rows, attribute, streams)
     assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
     assert np.array_equal(batch.target.streams, streams)
     assert not batch.ordered.any()  # a press shows its peak in whatever order
@@ -294,11 +289,11 @@ def test_a_curriculum_begins_with_all_sensors(answers, data):
 
 
 def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
-    blocks = [(rows.tolist(), real) for rows, real in each(7, 3)]
+    blocks = [(rows.tolist(), real) for rows, real in equal_blocks(7, 3)]
     assert blocks == [([0, 1, 2], 3), ([3, 4, 5], 3), ([6, 6, 6], 1)]
-    assert [(rows.tolist(), real) for rows, real in each(2, 4)] == [([0, 1, 1, 1], 2)]
-    assert [real for _, real in each(6, 3)] == [3, 3]
-    assert list(each(0, 3)) == []
+    assert [(rows.tolist(), real) for rows, real in equal_blocks(2, 4)] == [([0, 1, 1, 1], 2)]
+    assert [real for _, real in equal_blocks(6, 3)] == [3, 3]
+    assert list(equal_blocks(0, 3)) == []
 
 
 def test_the_order_of_questions_is_not_made_ahead(questions):

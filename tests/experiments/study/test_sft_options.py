@@ -8,10 +8,10 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
-from experiments.study.stages import SFTConfig, run_sft
+from experiments.study.stages import StudySFT, run_sft
 from tests.experiments import tiny
 
-CONFIG = SFTConfig(steps=3, batch_size=4)
+CONFIG = StudySFT(steps=3, batch_size=4)
 WIDTH = 128
 
 
@@ -22,14 +22,14 @@ def evidence(data):
 
 
 @pytest.fixture(scope="module")
-def train(assembly, data, evidence, tmp_path_factory):
+def train(policy, data, evidence, tmp_path_factory):
     """Parameters after SFT with some settings changed, and its losses."""
 
     def run(**changes):
         context = Context(tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("cache"), Console(quiet=True))
         try:
             config = dataclasses.replace(CONFIG, **changes)
-            params = run_sft(assembly, data, evidence, config, context, seed=0, stage="sft/0")
+            params = run_sft(policy, data, evidence, config, context, seed=0, stage="sft/0")
             return params, [line["loss"] for line in read_metrics(context.directory)]
         finally:
             context.close()
@@ -38,9 +38,9 @@ def train(assembly, data, evidence, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def first(assembly, data):
+def first(policy, data):
     """Parameters before it."""
-    return assembly.init(0, tiny.one_batch(data))
+    return policy.init(0, tiny.one_batch(data))
 
 
 @pytest.fixture(scope="module")
@@ -81,20 +81,20 @@ def test_adapters_learn_from_rows_too(train):
 @pytest.mark.parametrize("field", ["pack", "lora_rank"])
 def test_numbers_must_not_be_negative(field):
     with pytest.raises(ValueError, match=f"{field} is -1: must be at least 0"):
-        SFTConfig(**{field: -1})
+        StudySFT(**{field: -1})
 
 
 def test_a_curriculum_is_a_share_of_the_steps(train, padded):
     """Here of all of them: it learns from other questions."""
     assert train(curriculum=1.0)[1][0] != padded[1][0]
     with pytest.raises(ValueError, match=r"curriculum is 1\.5: must lie in 0 … 1"):
-        SFTConfig(curriculum=1.5)
+        StudySFT(curriculum=1.5)
 
 
 def test_devices_share_a_micro_batch():
-    config = SFTConfig(batch_size=16, micro_contacts=8, pack=WIDTH)
+    config = StudySFT(batch_size=16, micro_contacts=8, pack=WIDTH)
     packing = config.packing(4)
     assert (packing.width, packing.contacts, packing.micro_batches) == (WIDTH, 2, 2)
-    assert SFTConfig().packing(3) is None
+    assert StudySFT().packing(3) is None
     with pytest.raises(ValueError, match="micro_contacts is 8: must be a multiple of the 3 devices"):
         config.packing(3)

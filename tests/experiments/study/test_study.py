@@ -6,32 +6,32 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.study.answers import Evaluated, load_answers, save_answers
-from experiments.study.assembly import ModelConfig
 from experiments.study.baselines import baselines, constant_answers, joint_mode, level_answers
 from experiments.study.scores import score, score_study
-from experiments.study.stages import Probed
-from experiments.study.study import SFT, Study, StudyConfig, Way, run_study
+from experiments.study.stages import ProbeFeatures
+from experiments.study.study import SFT, EvalVariant, Study, StudyConfig, load_answers, run_study, save_answers
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
+from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.metrics import evaluate
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.training.evidence import ProbeConfig
+from touchr1_jax.models.touch_policy import ModelConfig
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Parsed
 
 TEST = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, -1, 1, 4], [1, 0, 0, 8], [1, 2, 2, 0]], np.int32)
 """Labels of the five test contacts; nobody annotated the roughness of the third."""
 
 
-def answers_about(label: np.ndarray, alone: bool = True) -> Evaluated:
+def answers_about(label: np.ndarray, alone: bool = True) -> Evaluation:
     """Random answers to every labelled question, felt by all four sensors but the last contact's by two."""
     rng = np.random.default_rng(0)
     contact, attribute = np.nonzero(label >= 0)
     n, asked = len(contact), np.arange(4) == attribute[:, None]
     streams = np.ones((len(label), 4), bool)
     streams[-1, 2:] = False
-    return Evaluated(
+    return Evaluation(
         contact=contact,
         attribute=attribute,
         streams=streams[contact],
@@ -50,7 +50,7 @@ def answers_about(label: np.ndarray, alone: bool = True) -> Evaluated:
 
 
 @pytest.fixture(scope="module")
-def study(data, assembly):
+def study(data, policy):
     """A study whose policies were asked about `TEST`, whose measured force is the label of hardness."""
     label = data.label.copy()
     label[data.parts["test"]] = TEST
@@ -60,16 +60,16 @@ def study(data, assembly):
     return Study(
         config=dataclasses.replace(tiny.STUDY, probe=ProbeConfig(iterations=30)),
         data=data,
-        assembly=assembly,
-        probed=Probed(streams=streams, present=np.ones((len(label), 4), bool), force=force.astype(np.float32)),
+        policy=policy,
+        probed=ProbeFeatures(streams=streams, present=np.ones((len(label), 4), bool), force=force.astype(np.float32)),
         prior=data.prior(),
         arms={},
         answers={SFT: [answers_about(TEST)]},
     )
 
 
-def table(study: Study, said: Evaluated) -> dict[str, float]:
-    scores = evaluate(said.answers(np.zeros(len(said.contact))), ATTRIBUTES, study.assembly.levels)
+def table(study: Study, said: Evaluation) -> dict[str, float]:
+    scores = evaluate(said.answers(np.zeros(len(said.contact))), ATTRIBUTES, study.policy.levels)
     return {name: value.mean() for name, value in scores.items()}
 
 
@@ -160,18 +160,18 @@ def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
 
 
 @pytest.mark.parametrize(
-    ("name", "of", "message"), [("more", "ordinal", "asks 'ordinal'"), ("sft", "sft", "has the name of a policy")]
+    ("name", "of", "message"), [("more", "ordinal", "is of 'ordinal'"), ("sft", "sft", "has the name of a policy")]
 )
-def test_another_way_asks_a_policy_that_is_there_under_a_name_of_its_own(context, name, of, message):
-    way = Way(of=of, ask=lambda trained: trained.said)
+def test_a_variant_evaluates_a_policy_that_is_there_under_a_name_of_its_own(context, name, of, message):
+    variant = EvalVariant(of=of, evaluate=lambda trained: trained.evaluation)
     with pytest.raises(ValueError, match=message):
-        run_study(tiny.STUDY, {}, context, ways={name: way})
+        run_study(tiny.STUDY, {}, context, variants={name: variant})
 
 
 def test_answers_by_single_sensors_are_their_own(study):
     alone = np.tile([0, 1, 2, 0], (5, 4, 1))
     alone[:, 0] = TEST
-    said = level_answers(study.assembly, study.answers[SFT][0], TEST, alone)
+    said = level_answers(study.policy, study.answers[SFT][0], TEST, alone)
     scores = table(study, said)
     assert scores["acc"] == 100
     assert np.array_equal(said.alone[:, 0].max(1), said.label.max(1))

@@ -11,7 +11,7 @@ from tests.touchr1_jax.distributed.problems import PROBLEMS, ROWS, STEPS, Traini
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.placement import local_rows, place_batch, place_state, shard_step
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import LoopConfig, fit
+from touchr1_jax.training.loop import Hooks, LoopConfig, fit
 
 SAVE_AT = 10
 
@@ -54,8 +54,7 @@ def train(name: str, config: MeshConfig, directory: Path, devices: list[jax.Devi
             place_state(mesh, problem.state),
             batches,
             LoopConfig(steps=STEPS, save_every=SAVE_AT),
-            checkpoints=checkpoints,
-            log=lambda _, metrics: found.append(metrics),
+            Hooks(checkpoints=checkpoints, log=lambda _, metrics: found.append(metrics)),
         )
     held = sum(x.addressable_shards[0].data.nbytes for x in jax.tree.leaves(end.params))
     whole = sum(x.nbytes for x in jax.tree.leaves(end.params))

@@ -8,7 +8,7 @@ import pytest
 
 from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import SKIPPED, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
+from touchr1_jax.training.loop import SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
 
 STEPS = 10
 CONFIG = LoopConfig(steps=STEPS, save_every=3)
@@ -44,7 +44,9 @@ def run(directory, batches, config: LoopConfig = CONFIG):
     """State at the end and the lines that were logged."""
     lines = []
     with Checkpoints(directory) as checkpoints:
-        state = fit(step, start(), batches, config, checkpoints=checkpoints, log=lambda t, m: lines.append((t, m)))
+        state = fit(
+            step, start(), batches, config, Hooks(checkpoints=checkpoints, log=lambda t, m: lines.append((t, m)))
+        )
     return state, lines
 
 
@@ -116,6 +118,11 @@ def test_a_longer_run_goes_on_from_a_shorter_one(tmp_path):
     assert [t for t, _ in lines] == list(range(4, STEPS))
 
 
+def test_without_hooks_it_trains_from_the_beginning(whole):
+    for a, b in zip(arrays(fit(step, start(), feed(), CONFIG)), arrays(whole[0]), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_metrics_become_floats():
     assert fetch({"a": jax.numpy.float32(0.5), "b": jax.numpy.int32(3)}) == {"a": 0.5, "b": 3.0}
 
@@ -128,7 +135,9 @@ class TestSkipping:
         config = LoopConfig(steps=steps, save_every=3, most_skipped=most_skipped)
         with Checkpoints(directory) as checkpoints:
             log = lambda t, m: lines.append((t, m))
-            state = fit(guarded_step, guarded_start(), Poisoned(poisoned), config, checkpoints=checkpoints, log=log)
+            state = fit(
+                guarded_step, guarded_start(), Poisoned(poisoned), config, Hooks(checkpoints=checkpoints, log=log)
+            )
         return state, lines
 
     def test_a_bad_update_is_left_out_and_counted(self, tmp_path):
@@ -179,7 +188,7 @@ def test_a_request_to_stop_saves_where_it_is(whole, tmp_path):
     log = lambda t, m: lines.append((t, m))
     with Checkpoints(tmp_path) as checkpoints:
         stopping = lambda: len(lines) >= 4
-        stopped = fit(step, start(), feed(), CONFIG, checkpoints=checkpoints, log=log, stopping=stopping)
+        stopped = fit(step, start(), feed(), CONFIG, Hooks(checkpoints=checkpoints, log=log, stopping=stopping))
         assert checkpoints.latest() == int(stopped.step) == 5
     state, more = run(tmp_path, feed())
     assert lines + more == whole[1]
@@ -192,7 +201,7 @@ def test_the_best_held_out_state_is_kept(tmp_path):
     scores = iter([1.0, 4.0, 2.0, 3.0])
     with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
         held_out = lambda state: next(scores)
-        fit(step, start(), feed(), CONFIG, checkpoints=checkpoints, log=lambda t, m: None, held_out=held_out)
+        fit(step, start(), feed(), CONFIG, Hooks(checkpoints=checkpoints), held_out=held_out)
         assert int(checkpoints.best(start()).state.step) == 6
         assert int(checkpoints.restore(start()).state.step) == STEPS
 
@@ -215,11 +224,10 @@ def test_each_batch_is_made_once_and_none_beyond_the_last(whole, tmp_path):
         next(batches)
 
 
-def test_time_without_a_batch_counts_as_waiting(tmp_path):
+def test_time_without_a_batch_counts_as_waiting():
     slow, quick = LoopTime(), LoopTime()
-    for name, batches, times in (("slow", Slow(1000), slow), ("quick", feed(), quick)):
-        with Checkpoints(tmp_path / name) as checkpoints:
-            fit(step, start(), batches, CONFIG, checkpoints=checkpoints, log=lambda t, m: None, times=times)
+    for batches, times in ((Slow(1000), slow), (feed(), quick)):
+        fit(step, start(), batches, CONFIG, Hooks(times=times))
     assert slow.steps == quick.steps == STEPS - 1  # all but the first, which compiles
     assert slow.input_s >= 0.05 * (slow.steps - 1)  # the last step needs no further batch
     assert slow.input_s <= slow.total_s

@@ -7,25 +7,25 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
-from experiments.core.artifacts import jsonable, write_bytes
-from experiments.study.arrays import flat, nested
-from sensors_io.errors import UserError
+from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params
 
 _ABOUT = "about"  # entry of the file that holds its JSON; parameters are named by their path, joined by "/"
 
 
-class EncoderError(UserError, ValueError):
+class EncoderError(WeightsError):
     """A file that is no encoder to start from; the message names it and the fix."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PretrainedEncoder:
-    """An encoder and the names of its sensors, in the order of its embedding; `notes` say how it was made."""
+    """An encoder and the names of its sensors, in the order of its embedding; `notes` describe its training."""
 
     config: TactileViTConfig
     sensors: tuple[str, ...]
@@ -33,26 +33,25 @@ class PretrainedEncoder:
     notes: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def for_sensors(self, sensors: tuple[str, ...]) -> "PretrainedEncoder":
-        """The same encoder for other sensors, in another order; one that it never saw gets the mean embedding."""
+        """The same encoder for other sensors, in another order; an unknown one gets the mean embedding."""
         table = self.params["sensor"]["embedding"]
         rows = [table[self.sensors.index(s)] if s in self.sensors else table.mean(0) for s in sensors]
         params = {**self.params, "sensor": {"embedding": jnp.stack(rows)}}
         config = dataclasses.replace(self.config, sensors=len(sensors))
         return dataclasses.replace(self, config=config, sensors=sensors, params=params)
 
-
-def save_encoder(path: Path, encoder: PretrainedEncoder) -> None:
-    """Publish an encoder atomically, as an `.npz` file."""
-    about = {"config": encoder.config, "sensors": encoder.sensors, "notes": encoder.notes}
-    arrays: dict[str, Any] = {_ABOUT: np.frombuffer(json.dumps(jsonable(about)).encode(), np.uint8)}
-    arrays |= flat(encoder.params)
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
+    def to_bytes(self) -> bytes:
+        """Content of an `.npz` file that `load_encoder` reads."""
+        about = {"config": dataclasses.asdict(self.config), "sensors": self.sensors, "notes": self.notes}
+        arrays: dict[str, Any] = {_ABOUT: np.frombuffer(json.dumps(about).encode(), np.uint8)}
+        arrays |= traverse_util.flatten_dict(self.params, sep="/")
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        return buffer.getvalue()
 
 
 def load_encoder(path: Path) -> PretrainedEncoder:
-    """Read an encoder that `save_encoder` wrote; a run's directory stands for its `encoder.npz`.
+    """Read an encoder from its file; a run's directory stands for its `encoder.npz`.
 
     Raises:
       EncoderError: there is no such file, it is no encoder, or one of another version of its config.
@@ -69,10 +68,13 @@ def load_encoder(path: Path) -> PretrainedEncoder:
     if _ABOUT not in entries:
         raise EncoderError(f"encoder is {path}: it has no entry {_ABOUT!r}; {fix}")
     about = json.loads(entries.pop(_ABOUT).tobytes())
-    params = nested(entries)
     known = {f.name for f in dataclasses.fields(TactileViTConfig)}
     if set(about["config"]) != known:
         odd = sorted(set(about["config"]) ^ known)
         raise EncoderError(f"encoder is {path}: its config differs in {odd}, it is of another version; train it again")
-    config = TactileViTConfig(**about["config"])
-    return PretrainedEncoder(config=config, sensors=tuple(about["sensors"]), params=params, notes=about["notes"])
+    return PretrainedEncoder(
+        config=TactileViTConfig(**about["config"]),
+        sensors=tuple(about["sensors"]),
+        params=jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(entries, sep="/")),
+        notes=about["notes"],
+    )

@@ -1,18 +1,21 @@
-"""What each sensor's own evidence says: the targets of the `perceive` and `compare` slots in supervised fine-tuning.
+"""Linear probes, and the targets that they give the `perceive` and `compare` slots in supervised fine-tuning.
 
-The slots must not repeat the object's label: then cross-sensor consistency would start at 1 and could teach nothing.  A
-multinomial probe on fixed features of one stream is fitted on the other folds of objects and read on the held-out fold,
-so that its answers are as fallible as that sensor is.
+These slots must not repeat the object's label: cross-sensor consistency would start at 1 and could teach nothing.
+Instead a multinomial probe on fixed features of one stream is fitted on the other folds of objects and evaluated on the
+held-out fold, so that its levels are as fallible as that sensor is.
 """
 
 import dataclasses
 import functools
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, Shaped, UInt8
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 
 from touchr1_jax.models.tactile_vit import force_features
 from touchr1_jax.validation import above, at_least
@@ -112,6 +115,40 @@ def cross_fit(
     fold = group_folds(groups, config)
     weights = np.stack([(fold != k) & (labels >= 0) for k in range(config.folds)])
     return probe_log_probs(features, labels, weights, levels, config)[fold, np.arange(len(fold))]
+
+
+def sensor_evidence(
+    features: Float[np.ndarray, "n S D"],
+    present: Bool[np.ndarray, "n S"],
+    label: Int[np.ndarray, "n A"],
+    groups: np.ndarray,
+    levels: Sequence[int],
+    config: ProbeConfig,
+    track: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+) -> Float[np.ndarray, "n S A K"]:
+    """Out-of-fold log-probabilities of each sensor's own probe for every attribute.
+
+    Levels that an attribute lacks have −∞.  A stream that was not recorded gives 0 for every level, and so does every
+    stream about an attribute that too few groups are annotated for.
+
+    Args:
+      features: of every contact's streams.
+      present: whether the stream was recorded.
+      label: −1 for unknown.
+      groups: identity whose rows stay together in a fold, such as the object.
+      levels: K of each attribute.
+      config: folds and fit.
+      track: passes the (attribute, sensor) pairs through, for example under a progress bar.
+    """
+    n, sensors = present.shape
+    out = np.full((n, sensors, len(levels), max(levels)), -np.inf, np.float32)
+    for a, s in track(itertools.product(range(len(levels)), range(sensors))):
+        out[:, s, a, : levels[a]] = 0.0
+        known = np.flatnonzero(present[:, s] & (label[:, a] >= 0))
+        if len(np.unique(groups[known])) >= config.folds:
+            found = cross_fit(features[known, s], label[known, a], groups[known], levels[a], config)
+            out[known, s, a, : levels[a]] = found
+    return out
 
 
 def group_folds(groups: np.ndarray, config: ProbeConfig, field: str = "groups") -> Int[np.ndarray, "n"]:

@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 import scipy.special
 
-from touchr1_jax.training.evidence import ProbeConfig, cross_fit, probe_log_probs, stream_features
+from touchr1_jax.training.linear_probe import ProbeConfig, cross_fit, probe_log_probs, stream_features
 
 CONFIG = ProbeConfig()
 K = 3

@@ -1,7 +1,7 @@
-"""What latents hold, told by linear probes and by their rank, and the alarms of stage 1.
+"""Linear probes and effective rank of latents, and the alarms of stage 1.
 
-A probe is multinomial logistic regression on frozen features (`evidence.probe_log_probs`), fitted on some objects and
-read on others; the same probe on an encoder that was never trained says what training brought.
+A probe is multinomial logistic regression on frozen features (`linear_probe`), fitted on some objects and evaluated on
+others; the same probe on an untrained encoder shows the effect of training.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from touchr1_jax import masked
 from touchr1_jax.masked import AnyArray
 from touchr1_jax.rl.alarms import Alarm
 from touchr1_jax.training.dynamics import residuals
-from touchr1_jax.training.evidence import ProbeConfig, probe_log_probs
+from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 
 ORDINAL_LEVELS = 3
 

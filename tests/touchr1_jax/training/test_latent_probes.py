@@ -4,8 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from touchr1_jax.training.evidence import ProbeConfig
-from touchr1_jax.training.probes import BOUNDS, collapse_alarms, contact_features, probe_right, rank_me, told_apart
+from touchr1_jax.training.latent_probes import (
+    BOUNDS,
+    collapse_alarms,
+    contact_features,
+    probe_right,
+    rank_me,
+    told_apart,
+)
+from touchr1_jax.training.linear_probe import ProbeConfig
 
 
 def test_features_are_means_over_the_steps_that_exist():

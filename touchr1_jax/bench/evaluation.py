@@ -1,0 +1,142 @@
+"""Greedy answers of a policy to every question about some contacts, and the reward that each answer earns."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from touchr1_jax.bench.metrics import Answers
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, make_answer
+from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
+from touchr1_jax.types import Params, Parsed
+
+EVAL_BATCH = 64
+"""Questions that are answered at once."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Greedy answers to every labelled question about some contacts; question n is about contact `contact[n]`.
+
+    Attributes:
+      contact, attribute, streams: the question, and the streams that were shown.
+      tokens, parsed: the answer.
+      label: −1 where not asked.
+      alone: conclusions of the policy that is shown each stream alone; `None` where it was not asked so.
+    """
+
+    contact: Int[np.ndarray, "N"]
+    attribute: Int[np.ndarray, "N"]
+    streams: Bool[np.ndarray, "N S"]
+    tokens: Int[np.ndarray, "N T"]
+    parsed: Parsed
+    label: Int[np.ndarray, "N A"]
+    alone: Int[np.ndarray, "N S A"] | None
+
+    def answers(self, reward: np.ndarray) -> Answers:
+        """The input of `metrics.evaluate`."""
+        return Answers(
+            conclude=np.asarray(self.parsed.conclude),
+            label=self.label,
+            formatted=np.asarray(self.parsed.formatted),
+            reward=reward,
+            streams=self.streams,
+            perceive=np.asarray(self.parsed.perceive),
+            alone=self.alone,
+        )
+
+
+def evaluate_policy(
+    policy: TouchPolicy,
+    params: Params,
+    features: Features,
+    label: Int[np.ndarray, "n A"],
+    *,
+    alone: bool = True,
+    batch_size: int = EVAL_BATCH,
+    answer: Callable[[Params, GRPOBatch], GreedyAnswers] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Evaluation:
+    """Ask every labelled question about every contact with all streams, and with each stream alone.
+
+    Args:
+      policy, params: of whom is asked.
+      features: of the contacts, from `encoding.encode_contacts`.
+      label: −1 for unknown, which is not asked about.
+      alone: ask with each stream alone too, where there are several.
+      batch_size: questions that are answered at once.
+      answer: from (decoder, questions) to answers; by default the policy's own (`answer_program`).
+      progress: receives how many of how many answers are done.
+    """
+    contact, attribute = labelled_questions(label)
+    present = np.asarray(features.stream_mask)[contact]
+    s = present.shape[1]
+    shown = [present]
+    if alone and present.any() and s > 1:
+        shown += [present & (np.arange(s) == i) for i in range(s)]
+    answer, decoder = answer or answer_program(policy), {"decoder": params["decoder"]}
+    found, done = [], 0
+    progress(0, len(shown) * len(contact))
+    for streams in shown:
+        blocks = []
+        for rows, real in equal_blocks(len(contact), batch_size):
+            batch = question_batch(policy, features, label, contact[rows], attribute[rows], streams[rows])
+            blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], answer(decoder, batch)))
+            done += real
+            progress(done, len(shown) * len(contact))
+        found.append(jax.tree.map(lambda *x: np.concatenate(x), *blocks))
+    together, *each_alone = found
+    return Evaluation(
+        contact=contact,
+        attribute=attribute,
+        streams=present,
+        tokens=together.tokens,
+        parsed=together.parsed,
+        label=np.where(policy.layout.asked[attribute], label[contact], -1),
+        alone=np.stack([x.parsed.conclude for x in each_alone], 1) if each_alone else None,
+    )
+
+
+@functools.cache
+def answer_program(policy: TouchPolicy) -> Any:
+    """Compiled greedy decoder and parser, made once."""
+    return make_answer(policy.fns, policy.parser, policy.model.completion_tokens)
+
+
+def reward_terms(
+    policy: TouchPolicy, evaluation: Evaluation, weights: Mapping[str, float], prior: Float[np.ndarray, "A K"]
+) -> dict[str, Float[np.ndarray, "N"]]:
+    """The part of each weighted reward in the total of each answer.
+
+    Args:
+      policy: who answered.
+      evaluation: the answers.
+      weights: of the rewards.
+      prior: share of each level among the training labels.
+    """
+    target = policy.target(evaluation.attribute, evaluation.label, evaluation.streams)
+    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
+    return jax.device_get(score(jax.tree.map(jnp.asarray, evaluation.parsed), target))
+
+
+@functools.cache
+def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
+    """Compiled reward terms of many answers, made once for each set of weights."""
+    rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
+    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
+
+
+def rewards_of(
+    policy: TouchPolicy, evaluation: Evaluation, weights: Mapping[str, float], prior: Float[np.ndarray, "A K"]
+) -> Float[np.ndarray, "N"]:
+    """Total reward of each answer; arguments as in `reward_terms`."""
+    terms = reward_terms(policy, evaluation, weights, prior)
+    return sum(terms.values(), start=np.zeros(len(evaluation.contact), np.float32))

@@ -1,0 +1,77 @@
+"""Contacts encoded once by a frozen encoder: the input of GRPO and of evaluation."""
+
+import functools
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.types import Params, TouchBatch
+
+
+def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch], *, blind: bool = False) -> Features:
+    """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams."""
+    encode = encode_program(fns, blind)
+    parts = [jax.device_get(encode(params, batch)) for batch in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+@functools.cache
+def encode_program(fns: PolicyFns, blind: bool) -> Any:
+    """Compiled encoder, made once."""
+    return jax.jit(lambda params, batch: fns.encode(params, batch, blind=blind))
+
+
+def noise_bank(
+    fns: PolicyFns, params: Params, batch: TouchBatch, *, seed: int, draws: int = 64
+) -> Float[Array, "K S N D"]:
+    """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
+
+    The statistics are those of the batch's recorded frames; frame times are those of its contacts, so that nothing but
+    the touch itself is out of the ordinary.
+
+    Args:
+      fns, params: of the encoder.
+      batch: contacts, arrays on the host.
+      seed: of the draws.
+      draws: K.
+    """
+    recorded = np.where(batch.frame_mask, 1.0, np.nan).astype(np.float32)
+    frames, force_n = np.asarray(batch.frames), np.asarray(batch.force_n)
+    pixel = _statistics(frames.astype(np.float32) * recorded[..., None, None, None], (0, 2, 3, 4))
+    force = _statistics(force_n * recorded[..., None], (0, 2))
+    rows = np.arange(draws) % len(batch.frame_index)
+    keys = jax.random.split(jax.random.key(seed), draws)
+    times = jnp.asarray(batch.frame_index[rows]), jnp.asarray(batch.frame_mask[rows])
+    return noise_program(fns, frames.shape[3:5])(params, pixel, force, (keys, *times))
+
+
+@functools.cache
+def noise_program(fns: PolicyFns, size: tuple[int, int]) -> Any:
+    """Compiled encoder of noise, (params, pixel statistics, force statistics, (key, index, mask)) → features."""
+
+    def draw(params: Params, pixel: Any, force: Any, x: tuple[Array, Array, Array]) -> Float[Array, "S N D"]:
+        key, index, mask = x
+        pixel_key, force_key = jax.random.split(key)
+        (pixel_mean, pixel_std), (force_mean, force_std), shape = pixel, force, index.shape
+        noise = jax.random.normal(pixel_key, (*shape, *size, 3)) * pixel_std[:, None, None, None]
+        frames = jnp.clip(noise + pixel_mean[:, None, None, None], 0, 255)
+        push = jax.random.normal(force_key, (*shape, 3)) * force_std[:, None] + force_mean[:, None]
+        return fns.encode_streams(params, frames, push, index, mask, jnp.arange(shape[0]))
+
+    return jax.jit(lambda params, pixel, force, x: jax.lax.map(functools.partial(draw, params, pixel, force), x))
+
+
+def _statistics(x: np.ndarray, axes: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of the numbers that are not NaN; 0 where there is none."""
+    known = ~np.isnan(x)
+    n = np.maximum(known.sum(axes), 1)
+    mean = np.where(known, x, 0.0).sum(axes) / n
+    shape = [1 if i in axes else size for i, size in enumerate(x.shape)]
+    square = np.where(known, (x - mean.reshape(shape)) ** 2, 0.0).sum(axes)
+    return mean.astype(np.float32), np.sqrt(square / n).astype(np.float32)

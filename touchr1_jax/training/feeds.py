@@ -1,0 +1,176 @@
+"""Batches of SFT: clips with questions and verified answers.  Batches of GRPO are in `questions`.
+
+A feed wraps a Grain iterator and counts the batches that it made; its own randomness is a function of (seed, count), so
+that `set_state` resumes it exactly.  Batches are NumPy arrays: the step that takes one puts it on its devices, and a
+mesh splits it without fetching it back.  Put there array by array, each would wait while the threads that write a
+checkpoint hold Python's lock.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
+
+import jax
+import numpy as np
+
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.text.template import answer_text, encode_answer
+from touchr1_jax.training.packing import PackedRows, Packing, existing_tokens, pack_rows
+from touchr1_jax.training.sft import SFTBatch
+from touchr1_jax.types import TouchBatch
+
+
+class Feed:
+    """A Grain iterator with a count; subclasses turn its elements into batches."""
+
+    def __init__(self, elements: Iterable[Any], seed: int) -> None:
+        self._elements: Any = iter(elements)
+        self._seed = seed
+        self._count = 0
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Any:
+        element = next(self._elements)
+        rng = np.random.default_rng((self._seed, self._count))
+        self._count += 1
+        return self.make(element, rng)
+
+    def make(self, element: Any, rng: np.random.Generator) -> Any:
+        """One batch from one element."""
+        raise TypeError(f"{type(self).__name__}.make is not defined: a feed must make batches; define it")
+
+    def get_state(self) -> dict[str, Any]:
+        """Position of the feed, as JSON."""
+        return {"count": self._count, "elements": self._elements.get_state()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go back to a state that `get_state` gave."""
+        self._count = state["count"]
+        self._elements.set_state(state["elements"])
+
+
+def host_touch(clip: Mapping[str, Any]) -> TouchBatch:
+    """The arrays of a clip batch as the JAX batch type, on the host; they must not be written to any more."""
+    return TouchBatch(**{field.name: clip[field.name] for field in dataclasses.fields(TouchBatch)})
+
+
+def touch_batch(clip: Mapping[str, Any]) -> TouchBatch:
+    """The same on the device, to compute with it outside of a compiled program."""
+    return jax.device_put(host_touch(clip))
+
+
+def random_streams(present: np.ndarray, full_share: float, rng: np.random.Generator) -> np.ndarray:
+    """Sensors whose touch a question shows: all present ones with probability `full_share`, else a random subset ≠ ∅.
+
+    Args:
+      present: bool [n, S].
+      full_share: probability of all.
+      rng: source of randomness.
+    """
+    n, s = present.shape
+    size = rng.integers(1, s + 1, (n, 1))
+    rank = np.argsort(np.argsort(rng.random((n, s)), 1), 1)
+    subset = present & (rank < size)
+    use = (rng.random((n, 1)) >= full_share) & subset.any(1, keepdims=True)
+    return np.where(use, subset, present)
+
+
+FULL_SHARE = 0.5
+"""Share of the questions of SFT that show all present sensors."""
+
+
+def falling_share(step: int, steps: int) -> float:
+    """Curriculum: the share falls from 1 within some steps, 1 − (1 − `FULL_SHARE`) min(step / steps, 1)."""
+    return 1 - (1 - FULL_SHARE) * min(step / steps, 1) if steps else FULL_SHARE
+
+
+class AnswerFeed(Feed):
+    """SFT batches: each contact with Q questions about different attributes at random, and the verified answers.
+
+    Args:
+      policy: prompts and vocabulary.
+      clips: batches of clips, mappings with the arrays of `TouchBatch` and the number `contact` of each.
+      evidence: [contact, S, A, K], out-of-fold log-probabilities of each sensor's probe.  `perceive` gives the level
+        most likely to each sensor alone, `compare` the one most likely to the shown sensors together, `conclude` the
+        label.
+      batch_size: contacts of a whole batch.
+      questions: Q.
+      seed: of the questions.
+      blind: show no touch.
+      easy_steps: batches within which the share of questions that show all sensors falls to `FULL_SHARE`.
+      packing: put tokens into rows; `None` pads.
+      own: rows of a batch that this process reads; all by default.
+    """
+
+    def __init__(
+        self,
+        policy: TouchPolicy,
+        clips: Iterable[Any],
+        evidence: np.ndarray,
+        *,
+        batch_size: int,
+        questions: int,
+        seed: int,
+        blind: bool = False,
+        easy_steps: int = 0,
+        packing: Packing | None = None,
+        own: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(clips, seed)
+        self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own
+        self._policy, self._evidence, self._blind = policy, evidence, blind
+        self._questions, self._packing, self._easy_steps = questions, packing, easy_steps
+
+    def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> SFTBatch:
+        """Write the answers of one batch of clips; random numbers are drawn for the whole batch, not for `own`."""
+        layout, (p, a), q = self._policy.layout, element["label"].shape, self._questions
+        chosen = np.argsort(rng.random((self._batch_size, a)), 1)[self._own, :q]
+        present = np.ones((self._batch_size, element["stream_mask"].shape[1]), bool)
+        present[self._own] = element["stream_mask"]
+        present = np.repeat(present, q, 0)
+        full_share = falling_share(self._count - 1, self._easy_steps)
+        streams = np.zeros_like(present) if self._blind else random_streams(present, full_share, rng)
+        streams = streams.reshape(self._batch_size, q, -1)[self._own]
+        pairs = [
+            self._answer(element["contact"][i], chosen[i, j], element["label"][i], streams[i, j])
+            for i in range(p)
+            for j in range(q)
+        ]
+        tokens, masks = (np.stack(x).reshape(p, q, -1) for x in zip(*pairs, strict=True))
+        written: dict[str, Any] = {
+            "ids": layout.ids[chosen],
+            "mask": layout.mask[chosen],
+            "streams": streams,
+            "tokens": tokens,
+            "token_mask": masks,
+        }
+        touch = host_touch(element)
+        return SFTBatch(touch=touch, rows=self._rows(touch, written), **written)
+
+    def _rows(self, touch: TouchBatch, written: dict[str, np.ndarray]) -> PackedRows | None:
+        if self._packing is None:
+            return None
+        fns, token_mask = self._policy.fns, written["token_mask"]
+        exists = existing_tokens(fns.module, fns.slots, touch, written["mask"], written["streams"], token_mask)
+        return pack_rows(exists, token_mask, self._packing)
+
+    def _answer(
+        self, contact: int, question: int, label: np.ndarray, streams: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        policy, asked = self._policy, self._policy.layout.asked[question]
+        length = policy.model.completion_tokens
+        if np.any(label[asked] < 0):  # not annotated: the question has no answer and no loss
+            return np.full(length, policy.tokenizer.pad_id, np.int32), np.zeros(length, bool)
+        log_prob = self._evidence[contact]
+        together = label if not streams.any() else log_prob[streams].sum(0).argmax(-1)
+        text = answer_text(
+            policy.language,
+            asked=asked,
+            streams=streams,
+            perceive=log_prob.argmax(-1),
+            compare=together,
+            conclude=label,
+        )
+        return encode_answer(policy.tokenizer, text, length)

@@ -1,0 +1,100 @@
+"""Batches of GRPO and of evaluation: encoded contacts, each with the question for one attribute."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import grain
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.training.feeds import Feed, random_streams
+
+ONE_AT_A_TIME = grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)
+"""Reading options of a feed of row numbers: by default Grain shuffles 500 batches ahead, seconds of a core."""
+
+
+class NoLabelsError(ValueError):
+    """Contacts of which no label is known, so that nothing can be asked about them."""
+
+
+class QuestionFeed(Feed):
+    """GRPO batches: encoded contacts in random order, each with the question for one attribute.
+
+    Where several processes share a batch, each makes the rows `own` of it.
+    """
+
+    def __init__(
+        self,
+        policy: TouchPolicy,
+        features: Features,
+        label: np.ndarray,
+        *,
+        batch_size: int,
+        seed: int,
+        full_share: float = 0.75,
+        own: np.ndarray | None = None,
+    ) -> None:
+        contact, attribute = labelled_questions(label)
+        order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
+        super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
+        self._policy, self._features, self._label = policy, features, label
+        self._contact, self._attribute, self._full_share = contact, attribute, full_share
+        self._own = np.arange(batch_size) if own is None else own
+
+    def make(self, element: np.ndarray, rng: np.random.Generator) -> GRPOBatch:
+        """Gather the features of one batch of questions."""
+        contact, attribute = self._contact[element], self._attribute[element]
+        streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
+        own = self._own
+        return question_batch(self._policy, self._features, self._label, contact[own], attribute[own], streams[own])
+
+
+def labelled_questions(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:
+    """Contact and attribute of every question that has an answer.
+
+    Raises:
+      NoLabelsError: no label is known.
+    """
+    contact, attribute = np.nonzero(label >= 0)
+    if not len(contact):
+        raise NoLabelsError(f"label has {len(label)} rows and none is known (≥ 0): annotate some contacts of this part")
+    return contact, attribute
+
+
+def question_batch(
+    policy: TouchPolicy,
+    features: Features,
+    label: np.ndarray,
+    contact: np.ndarray,
+    attribute: np.ndarray,
+    streams: np.ndarray,
+) -> GRPOBatch:
+    """One question per row: row i asks attribute[i] about contact[i], shown streams[i]."""
+    chosen = take(features, contact)
+    asked: dict[str, Any] = {
+        "ids": policy.layout.ids[attribute],
+        "mask": policy.layout.mask[attribute],
+        "ordered": policy.ordered[attribute],
+    }
+    return GRPOBatch(
+        features=dataclasses.replace(chosen, stream_mask=chosen.stream_mask & streams),
+        target=policy.target(attribute, label[contact], streams),
+        **asked,
+    )
+
+
+def take(features: Features, rows: np.ndarray) -> Features:
+    """Rows of encoded contacts, on the host as these are."""
+    return jax.tree.map(lambda x: x[rows], features)
+
+
+def equal_blocks(total: int, size: int) -> Iterator[tuple[np.ndarray, int]]:
+    """Index blocks of one fixed size over 0 … total − 1, the last padded by repeats, with the number of real rows."""
+    for start in range(0, total, size):
+        rows = np.arange(start, start + size)
+        yield np.minimum(rows, total - 1), min(size, total - start)

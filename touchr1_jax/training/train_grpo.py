@@ -1,0 +1,139 @@
+"""Stage 3 from parameters to parameters: GRPO of the decoder on encoded touch."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float
+
+from touchr1_jax.models.lora import LoraConfig, adapt
+from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rewards import Reward, check_weights, total_reward
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.grpo import LEAN, FrozenInputs, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.rl.scoring import ScoreFn, check_finite
+from touchr1_jax.rl.stream_check import check_streams, stream_influence
+from touchr1_jax.text.constraint import Constraint
+from touchr1_jax.text.language import Language
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
+from touchr1_jax.training.optimizer import falling_adamw
+from touchr1_jax.training.train_sft import fresh_adapters, merge_adapters
+from touchr1_jax.types import Params, Parsed, Target
+
+
+def train_grpo(
+    policy: TouchPolicy,
+    params: Params,
+    batches: Batches,
+    score: ScoreFn,
+    config: GRPOConfig,
+    loop: LoopConfig,
+    hooks: Hooks = SILENT,
+    *,
+    noise: Float[Array, "K S N D"],
+    lora: LoraConfig | None = None,
+    seed: int = 0,
+) -> Params:
+    """Reinforce the decoder of a policy by GRPO; both encoders stay as they are, and the reference is where it starts.
+
+    Fresh adapters change nothing, so that the policy without them is the reference; they are merged in the end.
+
+    Args:
+      policy: its prompts and forward passes.
+      params: of the policy after SFT.
+      batches: `GRPOBatch`es of `config.drawn` prompts, for example of a `QuestionFeed`.
+      score: reward of one rollout (see `rl.scoring.make_score`); programs are compiled once for each such object.
+      config: sizes of a step and algorithm.
+      loop: number of steps.
+      hooks: log, checkpoints, devices.
+      noise: encoded noise streams of the policy's encoder (`encoding.noise_bank`).
+      lora: adapters that are trained instead of the decoder's weights; `None` trains those.
+      seed: of rollouts and fresh adapters.
+
+    Raises:
+      ValueError: a stream whose touch does not reach the policy.
+    """
+    constraint = policy.constraint if config.algorithm.constrained else None
+    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, lora, hooks.devices.gather_params)
+    decoder = {"decoder": params["decoder"]}
+    influence = influence_program(policy.fns, config.length)
+    check_streams(*jax.device_get(influence(decoder, _peek(batches), noise, jax.random.key(seed))))
+    trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
+    state = start_state(trained, optimizer, jax.random.key(seed), config)
+    constants = (FrozenInputs(reference=trained, noise=noise), *(() if lora is None else (decoder,)))
+    step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)
+    found = hooks.devices.gather(fit(step, state, batches, loop, hooks).params)
+    return {**params, **(found if lora is None else merge_adapters(decoder, found, lora, hooks))}
+
+
+def check_rewards(rewards: Mapping[str, Reward], weights: Mapping[str, float], language: Language) -> None:
+    """Try every weighted reward on an empty answer, so that a misfit is reported before anything is made.
+
+    Raises:
+      RewardError: an unknown reward, a weight that is negative or not finite, a reward that is no floating scalar,
+        cannot be traced, or can be NaN or infinite.
+    """
+    attributes, sensors = len(language.attributes), len(language.sensors)
+    level, flag = jnp.zeros(attributes, jnp.int32), jnp.array(False)
+    parsed = Parsed(
+        perceive=jnp.zeros((sensors, attributes), jnp.int32),
+        compare=level,
+        conclude=level,
+        formatted=flag,
+        truncated=flag,
+        length=jnp.int32(0),
+    )
+    target = Target(asked=level > 0, label=level, levels=level, ordinal=level > 0, streams=jnp.zeros(sensors, bool))
+    check_weights(rewards, weights)
+    jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
+    for name in weights:
+        check_finite(name, rewards[name], sensors, attributes)
+
+
+@functools.cache
+def grpo_program(
+    fns: PolicyFns,
+    score: ScoreFn,
+    config: GRPOConfig,
+    steps: int,
+    constraint: Constraint | None = None,
+    lora: LoraConfig | None = None,
+    gather: Callable[[Params], Params] = lambda params: params,
+) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds; with adapters the frozen decoder is the last argument."""
+    learning_rate = config.learning_rate * config.lr_scale
+    updates = steps * config.algorithm.updates
+    optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
+    plain = make_grpo_step(fns, score, optimizer, config, constraint, gather=gather)
+    if lora is None:
+        return optimizer, plain
+    # a jitted step inside another takes no options of the compiler: the outer one gets them
+    inner = dataclasses.replace(config, lean_compilation=False)
+
+    def step(
+        state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params
+    ) -> tuple[GRPOState, dict[str, Array]]:
+        adapted = adapt(fns, base, lora)
+        return make_grpo_step(adapted, score, optimizer, inner, constraint, gather=gather)(state, batch, frozen)
+
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
+
+
+@functools.cache
+def influence_program(fns: PolicyFns, length: int) -> Any:
+    """Compiled `stream_influence`, made once for all rewards and seeds."""
+    return jax.jit(lambda p, batch, noise, key: stream_influence(fns, p, batch, noise, key, length))
+
+
+def _peek(batches: Batches) -> Any:
+    """The next batch, which is made again when it is asked for."""
+    place = batches.get_state()
+    first = next(batches)
+    batches.set_state(place)
+    return first

@@ -1,0 +1,157 @@
+"""Stage 2 from parameters to parameters: the settings of supervised fine-tuning, and the stage itself."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array
+
+from touchr1_jax.models.chunked_logits import MAX_LOGITS
+from touchr1_jax.models.layers import SizeError
+from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
+from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.packing import Packing
+from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
+from touchr1_jax.types import Params
+from touchr1_jax.validation import above, at_least, within
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SFTConfig:
+    """Stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 450
+    batch_size: int = 16
+    questions: int = 2
+    """Questions per contact and step; the contact is encoded once for all of them."""
+    save_every: int = 100
+    micro_contacts: int = 2
+    """Contacts of a micro-batch of the gradient; two stay in cache, which on a CPU is a third faster than sixteen."""
+    max_logits: int = MAX_LOGITS
+    """Logits that may exist at once; more tokens than that are scored in blocks."""
+    pack: int = 0
+    """Tokens of a row that several questions with their answers share; 0 pads each to the longest instead."""
+    lora_rank: int = 0
+    """Rank of adapters that are trained instead of the decoder's weights; 0 trains the weights."""
+    lora_alpha: float = 32.0
+    """The adapters' change is multiplied by lora_alpha / lora_rank."""
+    remat: bool = False
+    """Keep only matrix products of the decoder for the backward pass and compute the rest again: less memory."""
+    curriculum: float = 0.0
+    """Share of the steps within which the share of questions that show all sensors falls from 1 to a half."""
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "steps", "pack", "lora_rank")
+        at_least(self, 1, "batch_size", "questions", "save_every", "micro_contacts", "max_logits")
+        above(self, 0, "lora_alpha")
+        within(self, 0, 1, "curriculum")
+        if self.batch_size % self.micro_contacts:
+            raise ValueError(
+                f"micro_contacts is {self.micro_contacts}: must divide batch_size = {self.batch_size}; change either"
+            )
+
+    @property
+    def lora(self) -> LoraConfig | None:
+        """Adapters of the decoder, or none."""
+        return LoraConfig(rank=self.lora_rank, alpha=self.lora_alpha) if self.lora_rank else None
+
+    def packing(self, devices: int) -> Packing | None:
+        """Rows that the contacts of a micro-batch share on each of the devices; `None` pads.
+
+        Raises:
+          ValueError: a micro-batch that the devices cannot share.
+        """
+        if not self.pack:
+            return None
+        if self.micro_contacts % devices:
+            raise ValueError(
+                f"micro_contacts is {self.micro_contacts}: must be a multiple of the {devices} devices that share a "
+                "micro-batch, for none reads the rows of another; raise it, or leave pack at 0"
+            )
+        micro_batches = self.batch_size // self.micro_contacts
+        return Packing(width=self.pack, contacts=self.micro_contacts // devices, micro_batches=micro_batches)
+
+
+def train_sft(
+    policy: TouchPolicy,
+    params: Params,
+    batches: Batches,
+    config: SFTConfig,
+    hooks: Hooks = SILENT,
+    *,
+    seed: int = 0,
+    blind: bool = False,
+) -> Params:
+    """Train a policy on verified answers; adapters are merged into the weights in the end.
+
+    Args:
+      policy: its prompts, forward passes, and towers that no stage trains.
+      params: where it begins.
+      batches: `SFTBatch`es, for example of an `AnswerFeed`.
+      config: steps, optimizer, memory.
+      hooks: log, checkpoints, devices.
+      seed: of fresh adapters.
+      blind: train without touch.
+
+    Raises:
+      SizeError: a policy with frozen towers, and no adapters.
+    """
+    lora = config.lora
+    if policy.frozen and lora is None:
+        raise SizeError(
+            f"sft.lora_rank is 0: must be at least 1 where {' and '.join(policy.frozen)} stand still; raise it"
+        )
+    optimizer, step = sft_program(policy.fns, config, blind)
+    frozen_towers = () if lora is None else {*policy.frozen, *lora.towers}
+    frozen = {name: tree for name, tree in params.items() if name in frozen_towers}
+    towers = {name: tree for name, tree in params.items() if name not in frozen_towers}
+    trained = towers if lora is None else fresh_adapters(frozen, towers, lora, seed)
+    trained = jax.tree.map(jnp.copy, trained)  # a step takes over the buffers of its state
+    state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
+    loop = LoopConfig(steps=config.steps, save_every=config.save_every)
+    constants = () if lora is None else (frozen,)
+    step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, *constants)
+    found = hooks.devices.gather(fit(step, state, batches, loop, hooks).params)
+    return found if lora is None else {**merge_adapters(frozen, found, lora, hooks), **found.towers}
+
+
+def fresh_adapters(frozen: Params, towers: Params, lora: LoraConfig, seed: int) -> Trainable:
+    """Trained parameters where some towers are frozen: the adapters of those, and the other towers."""
+    adapters = init_adapters(jax.random.fold_in(jax.random.key(seed), 1), frozen, lora)
+    return Trainable(adapters=adapters, towers=towers)
+
+
+def merge_adapters(frozen: Params, trained: Trainable, lora: LoraConfig, hooks: Hooks) -> Params:
+    """The frozen towers with their adapters merged into them."""
+    merged = merge(frozen, trained.adapters, lora)
+    hooks.merged(kept_share(frozen, merged, trained.adapters, lora))
+    return merged
+
+
+@functools.cache
+def sft_program(fns: PolicyFns, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all seeds; with adapters, (state, batch, frozen towers) → …"""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    fns = dataclasses.replace(fns, module=fns.module.clone(remat=True)) if config.remat else fns
+    make = functools.partial(
+        make_sft_step,
+        optimizer=optimizer,
+        blind=blind,
+        max_logits=config.max_logits,
+        micro_contacts=config.micro_contacts,
+    )
+    if config.lora is None:
+        return optimizer, make(fns)
+    lora = config.lora
+
+    def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, Array]]:
+        return make(adapt(fns, frozen, lora))(state, batch)
+
+    return optimizer, jax.jit(step, donate_argnums=0)
