@@ -7,7 +7,6 @@ hard, rough and protruding they are, in about two minutes on two cores.  Every s
 `EXP=ablation_ordinal` adds controls, baselines, checkpoints, five seeds and a report.
 """
 
-import itertools
 import tempfile
 from pathlib import Path
 
@@ -20,76 +19,48 @@ from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import CLIP_ARRAYS
+from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import clustered_bootstrap
-from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
-from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.models.touch_policy import ModelConfig, build_policy
 from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.advantages import group_advantage
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.counterfactual import drop_touch
 from touchr1_jax.rl.losses import grpo_loss, token_terms
-from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, make_answer, sample_group
+from touchr1_jax.rl.rollout import SampleConfig, make_answer, sample_group
 from touchr1_jax.rl.scoring import make_score
-from touchr1_jax.text.language import TOUCH_LANGUAGE as LANGUAGE
-from touchr1_jax.text.parser import compile_parser
-from touchr1_jax.text.template import answer_text, build_layout, encode_answer, prompt_words
-from touchr1_jax.text.tokenizer import word_level
-from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
-from touchr1_jax.types import Target, TouchBatch
+from touchr1_jax.training.encoding import encode_contacts
+from touchr1_jax.training.feeds import AnswerFeed, touch_batch
+from touchr1_jax.training.questions import QuestionFeed, question_batch
+from touchr1_jax.training.sft import SFTState, make_sft_step
 
-CONTACTS, FRAMES, TOKENS, SFT_STEPS, GRPO_STEPS = 8, 2, 20, 400, 100  # contacts of a batch, tokens of an answer
-GRPO = GRPOConfig(prompts=CONTACTS, length=TOKENS)
-SCENES = SceneConfig(objects=1200, sites=1, frames=FRAMES, min_force_n=2.0, image_px=56, contact_grid=48)
-ASKED = np.arange(3)  # hardness, roughness, protrusion: each on three levels
+CONTACTS, FRAMES, IMAGE_PX, SFT_STEPS, GRPO_STEPS = 8, 2, 56, 400, 100  # contacts of a batch, frames of a clip
+SCENES = SceneConfig(objects=1200, sites=1, frames=FRAMES, min_force_n=2.0, image_px=IMAGE_PX, contact_grid=48)
+REWARD = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
 
-# the answer language, the prompts and the policy; parameters are always an argument
-TOKENIZER, ENCODER, VISION = word_level(LANGUAGE, prompt_words()), TactileViTConfig(sensors=4), VisionConfig()
-LAYOUT = build_layout(TOKENIZER, LANGUAGE, tactile_tokens=FRAMES * ENCODER.tokens_per_step, view_tokens=VISION.grid**2)
-POLICY = Policy(PolicyConfig(tactile=ENCODER, vision=VISION, decoder=DecoderConfig(vocab_size=TOKENIZER.vocab_size)))
-SLOTS, END, PAD = Slots(LAYOUT.touch, LAYOUT.view, LAYOUT.stream_text), TOKENIZER.end_ids, TOKENIZER.pad_id
-FNS = PolicyFns(module=POLICY, slots=SLOTS, banned=TOKENIZER.banned, end_ids=END, pad_id=PAD)
-LEVELS, ORDINAL = np.array([[len(a.levels), a.ordinal] for a in LANGUAGE.attributes]).T
-PARSER, GRPO_OPTIMIZER = compile_parser(LANGUAGE, TOKENIZER), optax.adam(2e-5)
-WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
-SCORE = make_score(PARSER, make_rewards(uniform_prior(LEVELS.tolist())), WEIGHTS)
+# language, tokenizer, prompts and forward passes; parameters are always an argument
+POLICY = build_policy(ModelConfig(frames=FRAMES, image_px=IMAGE_PX), SENSORS)
+FNS, GRPO = POLICY.fns, GRPOConfig(prompts=CONTACTS, length=POLICY.model.completion_tokens)
+SCORE = make_score(POLICY.parser, make_rewards(uniform_prior(POLICY.levels)), REWARD)
+GRPO_OPTIMIZER = optax.adam(2e-5)
 
 
-def touch_batches(store, rows, train=True):
+def read_clips(store, rows, train=True):
     """Grain batches of clips: training contacts in random order for ever, others once."""
-    clip = ClipConfig(frames=FRAMES, image_px=56)
-    for arrays in clip_batches(store, rows, clip, batch_size=CONTACTS, seed=0, shuffle=train, repeat=train):
-        yield TouchBatch(**{name: arrays[name] for name in CLIP_ARRAYS}), arrays["contact"]
+    clip = ClipConfig(frames=FRAMES, image_px=IMAGE_PX)
+    return clip_batches(store, rows, clip, batch_size=CONTACTS, seed=0, shuffle=train, repeat=train)
 
 
-def sft_batch(touch):
-    """Every contact with all questions and the true answers to them; every sensor is taken to perceive the label."""
-    asked, answers = np.tile(ASKED, (CONTACTS, 1)), []
-    for label, q in itertools.product(touch.label, ASKED):
-        levels = {"perceive": np.tile(label, (4, 1)), "compare": label, "conclude": label}
-        text = answer_text(LANGUAGE, asked=LAYOUT.asked[q], streams=np.ones(4, bool), **levels)
-        answers.append(encode_answer(TOKENIZER, text, TOKENS))
-    tokens, mask = (jnp.reshape(np.array(x), (*asked.shape, TOKENS)) for x in zip(*answers, strict=True))
-    ids, exists, streams = map(jnp.asarray, (LAYOUT.ids[asked], LAYOUT.mask[asked], np.ones((*asked.shape, 4), bool)))
-    return SFTBatch(touch, ids, exists, streams, tokens, mask)
-
-
-@jax.jit
-def ask(params, touch, question):
-    """Encoded contacts with one question each, and what the rewards compare the answers with."""
-    asked, ids, mask = (jnp.asarray(x)[question] for x in (LAYOUT.asked, LAYOUT.ids, LAYOUT.mask))
-    levels, ordinal = jnp.broadcast_to(LEVELS, asked.shape), jnp.broadcast_to(ORDINAL > 0, asked.shape)
-    target = Target(asked, jnp.where(asked, touch.label, -1), levels, ordinal, touch.stream_mask)
-    return GRPOBatch(features=FNS.encode(params, touch), ids=ids, mask=mask, target=target)
+def encode(store, params, rows):
+    """Contacts as the decoder reads them, and their labels: GRPO and evaluation encode each contact once."""
+    features = encode_contacts(FNS, params, map(touch_batch, read_clips(store, rows, train=False)))
+    return features, np.stack([store.objects[store.contacts[i].object_id].label_row() for i in rows])
 
 
 @jax.jit
 def grpo_step(params, opt_state, reference, batch, key):
     """One GRPO step as one program: rollouts, rewards, advantages, loss, update."""
-    draw = SampleConfig(group=GRPO.group, length=TOKENS, end_ids=END, pad_id=PAD)
+    draw = SampleConfig(group=GRPO.group, length=GRPO.length, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
     rollout = sample_group(FNS, params, batch, key, draw)
     reward, _, _ = jax.vmap(jax.vmap(SCORE, (0, None)))(rollout.tokens, batch.target)
     advantage = group_advantage(reward)  # (R − mean R) / σ_R over the answers to one question
@@ -109,39 +80,46 @@ def grpo_step(params, opt_state, reference, batch, key):
 
 def score_unseen(store, params):
     """Share of the levels of unseen objects that are right, and its lead over the best constant, objects resampled."""
-    answer, rows, found, true = make_answer(FNS, PARSER, TOKENS), store.contacts_of_split("test"), [], []
-    for touch, contact in touch_batches(store, rows, train=False):
-        questions = [ask(params, touch, np.full(len(contact), q)) for q in ASKED]
-        found.append(np.stack([answer(params, x).parsed.conclude[:, q] for q, x in enumerate(questions)], -1))
-        true.append(touch.label[:, ASKED])
-    label = np.concatenate(true)
-    right, constant = np.concatenate(found) == label, label == [np.bincount(x).argmax() for x in label.T]
+    rows, answer = store.contacts_of_split("test"), make_answer(FNS, POLICY.parser, GRPO.length)
+    (features, label), everyone, right, constant = encode(store, params, rows), np.arange(len(rows)), [], []
+    for question in range(3):  # hardness, roughness, protrusion: each low, middle or high
+        attribute = np.full(len(rows), question)
+        batch = question_batch(POLICY, features, label, everyone, attribute, features.stream_mask)
+        right.append(answer(params, batch).parsed.conclude[:, question] == label[:, question])
+        constant.append(label[:, question] == np.bincount(label[:, question]).argmax())
     objects = np.array([store.contacts[i].object_id for i in rows])
-    lead = clustered_bootstrap(100.0 * (right.astype(float) - constant).mean(1), objects)
-    return f"{right.mean():.1%} right, {lead.mean:+.1f} [{lead.low:.1f}, {lead.high:.1f}] points over a constant"
+    lead = clustered_bootstrap(100.0 * (np.mean(right, 0) - np.mean(constant, 0)), objects)
+    return f"{np.mean(right):.1%} right, {lead.mean:+.1f} [{lead.low:.1f}, {lead.high:.1f}] points over a constant"
 
 
 def main(log):
     """Generate records, train by SFT and GRPO, score after each."""
-    folder, key, rng = tempfile.TemporaryDirectory(), jax.random.key(0), np.random.default_rng(0)
+    folder, key = tempfile.TemporaryDirectory(), jax.random.key(0)
     generate_records(SCENES, Path(folder.name))
     store = RecordStore(folder.name)
     imitated, reinforced = np.split(store.contacts_of_split("train"), [640])
-    batches = touch_batches(store, imitated)
-    params = init_policy(POLICY, key, next(batches)[0], LAYOUT.ids[0], LAYOUT.mask[0], SLOTS)
+    log(f"{len(imitated)} contacts to imitate, {len(reinforced)} to reinforce, one object in five to test")
+
+    # SFT: imitate answers in which every sensor perceives the true level (probes say what it perceives in the studies)
+    truth = np.stack([store.objects[contact.object_id].label_row() for contact in store.contacts])
+    perceived = np.log(np.eye(max(POLICY.levels))[truth] + 1e-9)[:, None].repeat(len(SENSORS), 1)
+    answers = AnswerFeed(POLICY, read_clips(store, imitated), perceived, batch_size=CONTACTS, questions=3, seed=0)
+    params = POLICY.init(0, next(answers).touch)
     optimizer = optax.adam(optax.cosine_decay_schedule(2e-3, SFT_STEPS))
     sft_step = make_sft_step(FNS, optimizer, micro_contacts=2)
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     for i in range(SFT_STEPS):
-        state, metrics = sft_step(state, sft_batch(next(batches)[0]))
+        state, metrics = sft_step(state, next(answers))
         if i % 100 == 99:
             log(f"SFT step {i + 1}: loss {metrics['loss']:.3f}")
     log(f"after SFT: {score_unseen(store, state.params)}")
 
-    batches, params, opt_state = touch_batches(store, reinforced), state.params, GRPO_OPTIMIZER.init(state.params)
+    # GRPO: sample answers about other objects and raise the probability of those that earn more than their group
+    questions = QuestionFeed(POLICY, *encode(store, state.params, reinforced), batch_size=CONTACTS, seed=0)
+    params, opt_state = state.params, GRPO_OPTIMIZER.init(state.params)
     for i in range(GRPO_STEPS):
-        batch = ask(params, next(batches)[0], rng.choice(ASKED, CONTACTS))
-        params, opt_state, reward = grpo_step(params, opt_state, state.params, batch, jax.random.fold_in(key, i))
+        step_key = jax.random.fold_in(key, i)
+        params, opt_state, reward = grpo_step(params, opt_state, state.params, next(questions), step_key)
         if i % 20 == 19:
             log(f"GRPO step {i + 1}: mean reward {reward:.3f}")
     log(f"after GRPO: {score_unseen(store, params)}")

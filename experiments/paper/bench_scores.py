@@ -24,7 +24,6 @@ from experiments.study.paper_numbers import Row as PaperRow
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.averages import AVERAGED, WORST_OMAE, touch_average
 from touchr1_jax.bench.comparison import ORDERS
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM, Scores
 from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
@@ -34,6 +33,7 @@ from touchr1_jax.bench.statistics import (
     improvement_interval,
     stratified_bootstrap_iqm,
 )
+from touchr1_jax.training.evaluation import Evaluation
 
 ORDINAL_LEVELS = 3
 """K of ordinal levels: means of levels over K stay below one level."""

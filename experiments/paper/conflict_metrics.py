@@ -17,10 +17,10 @@ from experiments.paper.component_effects import pooled
 from experiments.paper.eval_variants import control_name
 from experiments.study.study import Study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE, LeastGain, least_tactile_use, revision_rate, tactile_use_gain
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL, Scores, accuracy, keep_scored
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, student_interval
+from touchr1_jax.training.evaluation import Evaluation
 
 RESAMPLES = 2_000
 """Of each interval over objects: its ends are then good to a tenth of its width."""

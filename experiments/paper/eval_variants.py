@@ -20,11 +20,11 @@ from experiments.study import stages
 from experiments.study.baselines import level_answers
 from experiments.study.stages import EncodedContacts, Weights, encode_rows, make_arm, noise_bank, run_grpo
 from experiments.study.study import EvalVariant, TrainedPolicy, ask_policy
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.rl.counterfactual import drop_touch, noise_touch, shuffle_touch
+from touchr1_jax.training.evaluation import Evaluation
 
 
 def control_variants(policy: str) -> dict[str, EvalVariant]:

@@ -54,8 +54,8 @@ from experiments.study.levels import level_report
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.rl.config import Paper
+from touchr1_jax.training.evaluation import Evaluation
 
 ENCODER_PROBE, SWAPPED = "encoder_probe", "shuffled_touch"
 PICTURE, NEAREST = "vision_only", "nearest_fields"

@@ -20,7 +20,6 @@ from experiments.paper.components import FULL
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import ENCODE_BATCH, answer_feed
 from experiments.study.study import Study, StudyConfig, run_study
-from touchr1_jax.bench.evaluation import answer_program
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.bench.statistics import Interval, student_interval
 from touchr1_jax.models.lm import DecoderConfig
@@ -29,6 +28,7 @@ from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import Paper
 from touchr1_jax.training.encoding import encode_program
+from touchr1_jax.training.evaluation import answer_program
 from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.questions import labelled_questions, question_batch
 from touchr1_jax.training.sft import SFTState

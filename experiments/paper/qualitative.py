@@ -34,11 +34,11 @@ from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM
 from touchr1_jax.rl.config import Paper
+from touchr1_jax.training.evaluation import Evaluation
 
 SWAPPED = "swapped"
 """The control with another object's touch."""

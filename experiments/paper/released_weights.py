@@ -21,11 +21,11 @@ from experiments.core.progress import in_megabytes
 from experiments.core.results import Requirement, Table, named_table
 from experiments.study.stages import encode_rows, untrained
 from experiments.study.study import BLIND, SFT, TrainedPolicy, ask_policy
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.qwen.config import read_config
 from touchr1_jax.models.qwen.safetensors import Tell
 from touchr1_jax.models.qwen.weights import INDEX, SINGLE, load_params, save_params
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.types import Params
 
 TOUCH_FILE = "touch.npz"

@@ -16,8 +16,8 @@ from experiments.study.scores import Scored, score_study, study_settings
 from experiments.study.stages import Weights
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.evaluation import Evaluation, rewards_of
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
+from touchr1_jax.training.evaluation import Evaluation, rewards_of
 
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
 

@@ -8,8 +8,8 @@ import numpy as np
 from experiments.study.stages import force_only
 from experiments.study.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.types import Parsed
 
 ORDINAL = tuple(a for a in ATTRIBUTES if LEVELS[a] == 3)

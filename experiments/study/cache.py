@@ -34,6 +34,7 @@ NEVER = ("touchr1_jax/bench/", "touchr1_jax/distributed/", "sensors_io/commands/
 LATER = (
     "touchr1_jax/rl/",
     "touchr1_jax/rewards/",
+    "touchr1_jax/training/evaluation.py",
     "touchr1_jax/training/questions.py",
     "touchr1_jax/training/train_grpo.py",
     *NEVER,

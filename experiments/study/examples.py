@@ -11,9 +11,9 @@ from experiments.study.stages import Weights
 from experiments.study.study import Study
 from sensors_io.pipeline import make_clip
 from sensors_io.schema import Sequence
-from touchr1_jax.bench.evaluation import Evaluation, reward_terms
 from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
+from touchr1_jax.training.evaluation import Evaluation, reward_terms
 
 FIELD_PX = 192
 """Side of a drawn field."""

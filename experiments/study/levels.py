@@ -12,9 +12,9 @@ from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.core.text import interval
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+from touchr1_jax.training.evaluation import Evaluation
 
 RESAMPLES = 1_000
 """Of each interval over objects; its ends are then accurate to a tenth of its width."""

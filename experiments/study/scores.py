@@ -12,9 +12,9 @@ from experiments.study.stages import Weights
 from experiments.study.study import SFT, Study
 from experiments.study.training import TrainingConfig
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.evaluation import Evaluation, rewards_of
-from touchr1_jax.bench.metrics import Scores, evaluate
+from touchr1_jax.bench.metrics import Answers, Scores, evaluate
 from touchr1_jax.rl.config import preset_name
+from touchr1_jax.training.evaluation import Evaluation, rewards_of
 
 PUBLISHED: Weights = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
 """The reward of the paper, by which `reward` is reported for every row, whatever an arm was trained on."""
@@ -62,7 +62,7 @@ def score_study(study: Study) -> Scored:
 def score(study: Study, said: Evaluation) -> dict[str, Scores]:
     """Every metric of one policy's answers."""
     reward = rewards_of(study.policy, said, PUBLISHED, study.prior)
-    return evaluate(said.answers(reward), ATTRIBUTES, study.policy.levels)
+    return evaluate(bench_answers(said, reward), ATTRIBUTES, study.policy.levels)
 
 
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:
@@ -72,3 +72,16 @@ def study_settings(config: TrainingConfig) -> dict[str, str | float]:
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,
     }
+
+
+def bench_answers(evaluation: Evaluation, reward: np.ndarray) -> Answers:
+    """The input of `bench.metrics.evaluate`: answers with the reward of each."""
+    return Answers(
+        conclude=np.asarray(evaluation.parsed.conclude),
+        label=evaluation.label,
+        formatted=np.asarray(evaluation.parsed.formatted),
+        reward=reward,
+        streams=evaluation.streams,
+        perceive=np.asarray(evaluation.parsed.perceive),
+        alone=evaluation.alone,
+    )

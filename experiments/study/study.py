@@ -34,13 +34,13 @@ from experiments.study.stages import (
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS, UNKNOWN
-from touchr1_jax.bench.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
 from touchr1_jax.rewards import Reward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.train_grpo import check_rewards
 from touchr1_jax.types import Params, Parsed
 

@@ -13,8 +13,7 @@
     config, loop = GRPOConfig.paper(), LoopConfig(steps=900)                                       rl.config, loop
     params = train_grpo(policy, params, questions, score, config, loop, hooks, noise=noise, seed=0)   train_grpo
 
-    evaluation = evaluate_policy(policy, params, test_features, test_label)                        bench.evaluation
-    scores = evaluate(evaluation.answers(reward), attributes, policy.levels)                       bench.metrics
+    evaluation = evaluate_policy(policy, params, test_features, test_label)                              evaluation
 
 `clips` is a Grain dataset, or any iterable whose iterator has `get_state` and `set_state`, of mappings with the arrays
 of `TouchBatch` and the number `contact` of each row; `touch_batches` are any `TouchBatch`es.

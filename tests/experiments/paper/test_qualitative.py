@@ -4,8 +4,8 @@ import numpy as np
 
 from experiments.paper.conflict_metrics import TouchQuestions
 from experiments.paper.qualitative import Conclusions, answer_cases, first_of, item_examples
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.items import Ask, Touch
+from touchr1_jax.training.evaluation import Evaluation
 
 QUESTIONS = TouchQuestions(
     attribute=np.array([0, 0, 1, 3, 3]),

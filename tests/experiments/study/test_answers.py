@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.study.scores import bench_answers
 from tests.experiments import tiny
-from touchr1_jax.bench.evaluation import Evaluation, evaluate_policy, reward_terms, rewards_of
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.rollout import GreedyAnswers
+from touchr1_jax.training.evaluation import Evaluation, evaluate_policy, reward_terms, rewards_of
 from touchr1_jax.types import Parsed
 
 WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
@@ -136,7 +137,7 @@ def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(policy):
 
 def test_the_answers_are_what_the_metrics_read(said):
     reward = np.arange(len(said.contact), dtype=float)
-    read = said.answers(reward)
+    read = bench_answers(said, reward)
     assert read.reward is reward
     assert np.array_equal(read.conclude, said.parsed.conclude)
     assert np.array_equal(read.perceive, said.parsed.perceive)

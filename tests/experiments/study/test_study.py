@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from experiments.study.baselines import baselines, constant_answers, joint_mode, level_answers
-from experiments.study.scores import score, score_study
+from experiments.study.scores import bench_answers, score, score_study
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import SFT, EvalVariant, Study, StudyConfig, load_answers, run_study, save_answers
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
-from touchr1_jax.bench.evaluation import Evaluation
 from touchr1_jax.bench.metrics import evaluate
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Parsed
 
@@ -69,7 +69,7 @@ def study(data, policy):
 
 
 def table(study: Study, said: Evaluation) -> dict[str, float]:
-    scores = evaluate(said.answers(np.zeros(len(said.contact))), ATTRIBUTES, study.policy.levels)
+    scores = evaluate(bench_answers(said, np.zeros(len(said.contact))), ATTRIBUTES, study.policy.levels)
     return {name: value.mean() for name, value in scores.items()}
 
 

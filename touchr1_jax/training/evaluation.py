@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from touchr1_jax.bench.metrics import Answers
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
@@ -40,18 +39,6 @@ class Evaluation:
     parsed: Parsed
     label: Int[np.ndarray, "N A"]
     alone: Int[np.ndarray, "N S A"] | None
-
-    def answers(self, reward: np.ndarray) -> Answers:
-        """The input of `metrics.evaluate`."""
-        return Answers(
-            conclude=np.asarray(self.parsed.conclude),
-            label=self.label,
-            formatted=np.asarray(self.parsed.formatted),
-            reward=reward,
-            streams=self.streams,
-            perceive=np.asarray(self.parsed.perceive),
-            alone=self.alone,
-        )
 
 
 def evaluate_policy(
