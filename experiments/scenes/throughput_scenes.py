@@ -262,20 +262,20 @@ def _rate_table(config: ThroughputConfig, feed: RecordRate, large: RecordRate, w
 def _picture(
     config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: WrittenSet, stages: Stages
 ) -> Picture:
-    measured = {
-        f"feed {config.image_px}²": (feed.per_second, FEED_RATE),
-        f"feed {config.large_px}²": (large.per_second, LARGE_RATE),
-        f"written {config.image_px}²": (written.rate.per_second, PAPER_RECORDS / WRITTEN_HOURS / 3600),
-    }
-    rates, required = zip(*measured.values(), strict=True)
+    measured: tuple[tuple[Any, ...], ...] = (
+        (f"feed {config.image_px}²", feed.per_second, FEED_RATE),
+        (f"feed {config.large_px}²", large.per_second, LARGE_RATE),
+        (f"written {config.image_px}²", written.rate.per_second, PAPER_RECORDS / WRITTEN_HOURS / 3600),
+    )
+    names, rates, required = ([row[i] for row in measured] for i in range(3))
     parts = next(iter(stages.values()))
     panels = [
         Panel(
             [
                 Series(x=rates, bar=True),
-                Series("required", x=required, line="", marker="|", size=300, colour=SHARED),
+                Series("required", x=required, line="", marker="|", size=300, colour=SHARED, hollow=True),
             ],
-            rows=list(measured),
+            rows=names,
             x_label="records/s by the clock",
             written=".0f",
         ),
