@@ -318,8 +318,9 @@ def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
     if series.line and not panel.rows:
         axes.plot(series.x, series.y, series.line, color=series.colour, lw=series.width, alpha=series.alpha)
     if series.marker:
-        outline = {"facecolors": "none", "edgecolors": series.colour}
-        look = outline if series.hollow else {"color": series.colour, "linewidths": 0}
+        look = {"color": series.colour, "linewidths": 1.5 if series.marker in "|_x+" else 0}  # strokes have no area
+        if series.hollow:
+            look = {"facecolors": "none", "edgecolors": series.colour}
         axes.scatter(series.x, series.y, series.size, marker=series.marker, alpha=series.alpha, zorder=3, **look)
 
 

@@ -63,8 +63,7 @@ def run(config: PretrainEncoderConfig, context: Context) -> Results:
         seed=SEED,
         held_out=held_out_contacts(data, "val", config.touch, config.watch_fit),
     )
-    notes = {"steps": config.pretrain.steps, "source": data.store.meta.source}
-    encoder = encoder_of(config.pretrain, state, sensors, **notes)
+    encoder = encoder_of(config.pretrain, state, sensors, steps=config.pretrain.steps, source=data.store.meta.source)
     write_bytes(context.directory / "encoder.npz", encoder.to_bytes())
     with context.timed("assess"):
         test, networks = held_out_contacts(data, "test", config.touch), config.pretrain.dynamics(len(sensors))

@@ -273,7 +273,7 @@ def _picture(
         Panel(
             [
                 Series(x=rates, bar=True),
-                Series("required", x=required, line="", marker="|", size=300, colour=SHARED, hollow=True),
+                Series("required", x=required, line="", marker="|", size=300, colour=SHARED),
             ],
             rows=names,
             x_label="records/s by the clock",

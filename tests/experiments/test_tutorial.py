@@ -60,7 +60,7 @@ def test_every_step_does_what_it_says(checkout):
     assert RUN in TUTORIAL.read_text(encoding="utf-8")
     assert follow(checkout, (RUN,)) == ["experiments", "pytest", "touchr1_jax.rewards", "experiments"]
     proof = (
-        "from experiments.paper.brevity import ABLATION, EXPERIMENT as E; from experiments.study import policy as a; "
+        "from experiments.paper.brevity import ABLATION, EXPERIMENT as E; from experiments.study import study as s; "
     )
     assert run(checkout, "-c", proof + "s.check_arms(ABLATION.arms); print(E.name)") == "brevity\n"
 
