@@ -3,8 +3,8 @@
     python -m experiments.minimal
 
 Objects are generated and pressed by four sensors; a policy of half a million parameters learns from scratch to say how
-hard, rough and protruding they are, in a minute and a half on two cores.  Every step of the method is a plain call below;
-`EXP=ablation_ordinal` adds controls, baselines, checkpoints, five seeds and a report.
+hard, rough and protruding they are, in a minute and a half on two cores.  Every step of the method is a plain call
+below; `EXP=ablation_ordinal` adds controls, baselines, checkpoints, five seeds and a report.
 """
 
 import tempfile
