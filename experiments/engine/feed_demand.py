@@ -1,4 +1,4 @@
-"""How long a step of training keeps accelerators busy at least, counted from shapes."""
+"""Least time that a step of training occupies accelerators, counted from shapes."""
 
 import math
 from collections.abc import Callable, Iterator

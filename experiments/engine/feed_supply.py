@@ -1,4 +1,4 @@
-"""What cores deliver to a step of training: seconds of a batch, and a device that stands still when it comes late."""
+"""Supply of batches by CPU cores: seconds per batch, and the idle time of a device when batches arrive late."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -14,7 +14,7 @@ from touchr1_jax.training.loop import Batches, LoopConfig
 
 
 class BatchCost(NamedTuple):
-    """What one batch takes: seconds of one core, and bytes that go to the device."""
+    """Cost of one batch: seconds of one core, and bytes sent to the device."""
 
     cpu_s: float
     size_bytes: int

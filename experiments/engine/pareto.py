@@ -101,7 +101,7 @@ class ParetoPoint:
     at: tuple[float, ...]
 
     def beats(self, other: "ParetoPoint") -> bool:
-        """Whether it is better on one axis and worse on none."""
+        """True if it is better on one axis and worse on none."""
         return all(a <= b for a, b in zip(self.at, other.at, strict=True)) and self.at != other.at
 
 

@@ -101,7 +101,7 @@ class LearningCurves:
         return float(np.median(reached)) * self.step_s if len(reached) else np.nan
 
     def all_reach(self, target: float) -> bool:
-        """Whether every seed reaches the target."""
+        """True if every seed reaches the target."""
         return bool(np.isfinite(self.steps_to(target)).all())
 
 

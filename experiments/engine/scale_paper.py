@@ -93,7 +93,7 @@ class ScaleConfig:
 
     @property
     def training(self) -> Training:
-        """What is trained."""
+        """Trained parameters."""
         return Training(
             model=model_of(self.size),
             prompt=TINY_PROMPT if self.size == "tiny" else PAPER_PROMPT,

@@ -110,7 +110,7 @@ def matrix_gflops(rounds: int = 10) -> float:
 def options(
     size: JobSize, prefix: int, micro_prompts: int, buckets: tuple[int, ...], names: Sequence[Option]
 ) -> dict[str, Callable[[], Job]]:
-    """How to make the engine as it is, and with one thing changed; short answers are ones that end."""
+    """Makers of the default engine and of variants with one change; short answers are ones that end early."""
     plain = config_of(size, micro_prompts)
     change = lambda **changes: lambda: Job(size, prefix, dataclasses.replace(plain, **changes))
     short = lambda config: lambda: Job(size, prefix, config, end_share=SHORT, learning_rate=0.0)
@@ -131,7 +131,7 @@ def options(
 
 
 def repeated(size: JobSize, prefix: int, micro_prompts: int) -> dict[str, Callable[[], Job]]:
-    """How to make the engine as it is, and one that encodes the prefix for every rollout."""
+    """Makers of the default engine and of one that encodes the prefix for every rollout."""
     plain = config_of(size, micro_prompts)
     return {
         "this": lambda: Job(size, prefix, plain),

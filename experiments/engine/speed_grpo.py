@@ -249,7 +249,7 @@ def said(ratios: Mapping[str, float]) -> str:
 def verdict(
     alone: Mapping[int, ProcessTiming], twice: Mapping[int, Mapping[str, float]], peers: Peers
 ) -> tuple[str, ...]:
-    """What an iteration takes, what once-encoded prefixes gain, and how the others fare."""
+    """Verdict: time of an iteration, gain of prefixes that are encoded once, comparison with other engines."""
     times = ", ".join(f"{median(a.seconds):.3g} s at {prefix}" for prefix, a in alone.items())
     gains = ", ".join(f"{ratios['repeated prefix']:.1f} × at {prefix}" for prefix, ratios in twice.items())
     spoken = [f"One iteration takes {times}.", f"Repeating the prefix for every rollout takes {gains} as long."]

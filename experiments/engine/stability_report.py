@@ -61,11 +61,11 @@ class ScenarioOutcome:
 
     @property
     def compared(self) -> np.ndarray:
-        """Whether each run of `stable` failed, at the values where any run of the failing variant did, bool [n]."""
+        """Failures of each run of `stable` at the values where any run of the failing variant failed, bool [n]."""
         return self.stable.failed[np.any(self.failing.failed, axis=1)].ravel()
 
     def noticed(self, *, failed: bool) -> np.ndarray:
-        """Whether the scenario's alarm fired, of the runs of both variants that failed (or did not), bool [n]."""
+        """Alarms of the scenario in the runs of both variants that failed (or did not), bool [n]."""
         codes = self.scenario.alarms
         return np.concatenate([one.fired(codes)[one.failed == failed] for one in (self.failing, self.stable)])
 
@@ -210,7 +210,7 @@ def criterion_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
 
 
 def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
-    """How often and when each failure's alarm fired, in failed runs and in others."""
+    """Share and time of each failure's alarm, in failed runs and in others."""
     rows: list[dict[str, Cell]] = []
     for o in outcomes:
         failed, others, firsts = o.noticed(failed=True), o.noticed(failed=False), o.firsts()

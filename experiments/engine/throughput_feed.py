@@ -194,12 +194,12 @@ def watch(
 
 
 def stretch(config: FeedingConfig, needed: float) -> float:
-    """How many times longer a stand-in's steps last: until half of the cores here are enough, if so many are there."""
+    """Factor that slows the stand-in's steps until half of the cores here suffice, if so many are there."""
     return min(max(1.0, 2 * needed / cores_here()), max(1.0, config.cores / cores_here()))
 
 
 def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
-    """What every feed delivers, and what the device asks."""
+    """Rates that every feed delivers, and rates that the device needs."""
     return Table(
         title="What a batch takes, and what a device asks",
         columns=(

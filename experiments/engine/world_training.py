@@ -127,7 +127,7 @@ class VariantRun:
         return self.after[name] - self.before[name]
 
     def streams_pass(self) -> bool:
-        """Whether every seed passes the check of the streams that each study makes before it trains."""
+        """True if every seed passes the stream check that each study makes before it trains."""
         influence = np.stack([self.before[f"grounding_{s}"] for s in range(S)], 1)
         try:
             for row in influence:

@@ -14,7 +14,7 @@ from touchr1_jax.bench.statistics import Interval
 
 
 def confusions(answer: np.ndarray, label: np.ndarray, titles: tuple[str, ...]) -> bytes:
-    """How often each level is answered for each label: one panel per attribute, rows sum to 100 %.
+    """Frequency of each answered level for each label: one panel per attribute, rows sum to 100 %.
 
     Args:
       answer, label: int [n, A].

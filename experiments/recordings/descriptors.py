@@ -77,7 +77,7 @@ def _parts(picture: np.ndarray) -> Iterator[_Part]:
 
 
 def _octave(size: np.ndarray, smooth: np.ndarray, local: np.ndarray) -> Iterator[_Part]:
-    """What one octave says: |band| and what is coarser [h, w, 3], local energies."""
+    """Descriptors of one octave from |band|, the coarser picture [h, w, 3] and local energies."""
     yield "spread", np.log(size.mean((0, 1)) + FLOOR)
     yield "patches", np.log(np.percentile(local, QUANTILES) + FLOOR)
     yield "edges", _edges(smooth)

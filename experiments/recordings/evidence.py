@@ -1,4 +1,4 @@
-"""What a touch says of its levels: kernel ridge regression on the labels of real objects, read out of fold.
+"""Level probabilities from a touch: kernel ridge regression on the labels of real objects, read out of fold.
 
 With 60 objects to learn from, what is learned must be little; in closed form, with targets Y,
 

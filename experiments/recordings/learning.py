@@ -44,7 +44,7 @@ ROWS = 64
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LearnConfig:
-    """What a policy is made of and how it is trained.
+    """Architecture and training of a policy.
 
     Args:
       evidence: probes whose log-probabilities the encoder reads, and whose verdict `perceive` repeats.
@@ -70,7 +70,7 @@ class LearnConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Background:
-    """What is known without labels of real objects: scenes, and descriptions of unlabelled videos [m, D]."""
+    """Data without labels of real objects: scenes, and descriptions of unlabelled videos [m, D]."""
 
     scenes: Scenes
     unlabelled: Float[np.ndarray, "m D"]
@@ -160,7 +160,7 @@ def say(learned: Learned, videos: Described) -> Said:
 def evidence_alone(
     config: LearnConfig, training: Described, background: Background, videos: Described
 ) -> Int[np.ndarray, "n A"]:
-    """What the probes answer without a policy: the most likely level of each attribute, families averaged."""
+    """Answers of the probes without a policy: the most likely level of each attribute, families averaged."""
     return _Felt(training, background, videos, config).evidence.mean(1).argmax(-1)
 
 
@@ -185,7 +185,7 @@ class _Felt:
 
     @functools.cached_property
     def evidence(self) -> Float[np.ndarray, "n M A K"]:
-        """What probes that were fitted on all training videos say of the others."""
+        """Predictions for other videos by probes that were fitted on all training videos."""
         n = len(self._x)
         label = np.zeros((n + len(self._other), self._training.label.shape[1]), np.int32)
         label[:n] = self._training.label
@@ -194,12 +194,12 @@ class _Felt:
         return probe(x, label, weight, self._family, self._config.evidence)[n:]
 
     def crossed(self, seed: int) -> Float[np.ndarray, "n M A K"]:
-        """What probes say of the training videos, each fitted without the object that it reads."""
+        """Predictions for the training videos by probes that were fitted without the object in question."""
         t = self._training
         return cross_probe(self._x, t.label, self._weight, t.objects, self._family, self._config.evidence, seed)
 
     def inputs(self, seed: int | None) -> tuple[Float[np.ndarray, "n D"], Int[np.ndarray, "n A"]]:
-        """What the encoder reads, and what the evidence says.
+        """Input of the encoder, and the probes' probabilities.
 
         With a seed, of the training videos by out-of-fold evidence, else of the others.
         """

@@ -1,4 +1,4 @@
-"""What limits the answers: how they grow with the number of objects, and how far the labels can be told at all."""
+"""Limits of the answers: growth with the number of objects, and agreement of the labels themselves."""
 
 import math
 from collections.abc import Mapping

@@ -58,7 +58,7 @@ _LIMITS = "Probes alone, on another partition.  To vote, and to have touched the
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysiclearStudy:
-    """What is trained, validated and left out."""
+    """Training, validation, and objects left out."""
 
     data_dir: Path | None = None
     """Folder with labels.json and videos/; needed to train."""
@@ -204,7 +204,7 @@ def background_of(config: PhysiclearStudy, everything: Described, context: Conte
 
 
 def requirements(main: Mapping[str, Interval], spent: Mapping[str, float]) -> tuple[Requirement, ...]:
-    """What is asked for, against what was measured; `spent` are the seconds of the stages that are counted."""
+    """Requirements and measured figures; `spent` are the seconds of the stages that are counted."""
     side: Mapping[str, Literal["lower", "higher"]] = {"all right": "higher", "mean": "higher", "OMAE": "lower"}
     kept = [
         Requirement(

@@ -83,7 +83,7 @@ class TouchPolicy:
         return {"encoder": encoder, "decoder": decoder}
 
     def features(self, params: Params, x: Float[Array, "*n D"]) -> Features:
-        """What the decoder reads of touches: one stream, all of whose tokens share one time; no view."""
+        """Decoder input from touches: one stream, all of whose tokens share one time; no view."""
         lead, tokens, hidden = x.shape[:-1], self.shape.tokens, self.shape.decoder.hidden_size
         touch = jnp.asarray(DescriptionEncoder(self.shape).apply({"params": params["encoder"]}, x))
         return Features(

@@ -1,4 +1,4 @@
-"""What generated scenes teach about touch: probes of their known properties, read on real videos.
+"""Knowledge from generated scenes: probes of their known properties, applied to real videos.
 
 A scene's hardness, roughness and relief are known exactly and cost nothing, while people judged only 67 real objects.
 So a probe learns the properties of scenes from the same description, and what it says of a real video, few numbers that
@@ -73,7 +73,7 @@ def _one_hot(levels: np.ndarray) -> np.ndarray:
 def sense(
     scenes: Scenes, world: Float[np.ndarray, "m D"], x: Float[np.ndarray, "n D"], config: EvidenceConfig
 ) -> Float[np.ndarray, "n T"]:
-    """What a probe of scenes says of videos: each level of hardness, roughness and protrusion, and each material.
+    """Predictions of scene probes for videos: each level of hardness, roughness and protrusion, and each material.
 
     Args:
       scenes: what they learn from.

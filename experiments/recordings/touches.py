@@ -27,7 +27,7 @@ CONTACT_SHARE = 0.4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Touch:
-    """What a video shows of a contact.
+    """Contact data of a video.
 
     Args:
       rest: float32 [H, W, 3], the gel that nothing touches, RGB counts.

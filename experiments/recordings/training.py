@@ -60,7 +60,7 @@ class ReinforceConfig:
 
 @struct.dataclass
 class Lesson:
-    """What a policy learns from: n videos, of which those of weight 0 are never drawn.
+    """Training data of a policy: n videos; those of weight 0 are never drawn.
 
     `percept` is what out-of-fold evidence says of a video, `label` what the annotators said of its object.
     """

@@ -38,7 +38,7 @@ class Dataset:
         return clip_batches(self.store, rows, self.clip, memory=self.memory, threads=self.threads, **order)
 
     def prior(self) -> np.ndarray:
-        """How often each level is the label of a training contact, float32 [A, K]; padding levels have 0.
+        """Frequency of each level among the labels of training contacts, float32 [A, K]; padding levels have 0.
 
         An attribute that nobody annotated has equal shares: no question asks for it.
         """

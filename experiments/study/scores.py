@@ -1,4 +1,4 @@
-"""What the answers of a study score: every policy beside every baseline, with intervals over objects."""
+"""Scores of a study's answers: every policy and every baseline, with intervals over objects."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -40,7 +40,7 @@ class WeightsError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
-    """What a directory holds; `params` is the tree of `QwenVL`, `budget` the pixels that a picture may have."""
+    """Contents of a directory; `params` is the tree of `QwenVL`, `budget` the pixels that a picture may have."""
 
     config: QwenConfig
     params: Params

@@ -118,7 +118,7 @@ def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
 
 
 def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraConfig) -> float:
-    """How much of the adapters' change Δ is in merged weights, ⟨W' − W, Δ⟩ / ⟨Δ, Δ⟩ over all layers.
+    """Share of the adapters' change Δ that merged weights keep, ⟨W' − W, Δ⟩ / ⟨Δ, Δ⟩ over all layers.
 
     1 where nothing is lost; near 0 where the weights' type is too coarse: a weight that the change moves by less than
     half the distance to its neighbour in that type stays where it is.  No change at all is kept whole.
@@ -138,7 +138,7 @@ def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraCon
 
 
 def _change(adapter: Adapter, config: LoraConfig) -> Array:
-    """What an adapter adds to its kernel, (α/r) A B, in float32."""
+    """Change that an adapter adds to its kernel, (α/r) A B, in float32."""
     return config.scale * adapter.a @ adapter.b
 
 

@@ -27,7 +27,7 @@ from touchr1_jax.types import Params, TouchBatch
 
 @struct.dataclass
 class Features:
-    """What the decoder reads of one contact: tactile tokens with their frame indices, and view tokens.
+    """Decoder input of one contact: tactile tokens with their frame indices, and view tokens.
 
     `touch_time` is the integer frame index of each tactile token, never seconds: a cast of seconds per step to integers
     would zero it and make a temporal control vacuous.  It is −1 where a time step has no frame: no such token exists.
@@ -63,7 +63,7 @@ class Row(NamedTuple):
 
 
 class ViewConfig(Protocol):
-    """What a policy must know of its vision tower: how many tokens stand in a row, and how it is built."""
+    """Interface of a vision tower: number of tokens, and how it is built."""
 
     @property
     def grid(self) -> int: ...

@@ -58,7 +58,7 @@ class TactileViTConfig:
 
 
 class Encoded(NamedTuple):
-    """What a stream becomes: the tokens of all its patches, and those few that they are pooled to."""
+    """Encoding of a stream: the tokens of all its patches, and the few that they are pooled to."""
 
     patches: Float[Array, "*n step patch D"]
     pooled: Float[Array, "*n step token D"]

@@ -85,7 +85,7 @@ class TouchPolicy:
 
     @property
     def ordered(self) -> np.ndarray:
-        """Whether the answer to each question depends on the order of frames, bool [Q]."""
+        """True where the answer to a question depends on the order of frames, bool [Q]."""
         return self.layout.asked @ np.array([a.ordered for a in self.language.attributes])
 
     @functools.cached_property

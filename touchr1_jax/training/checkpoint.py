@@ -39,7 +39,7 @@ class DamagedCheckpointError(CheckpointError):
 
 
 class Restored(NamedTuple):
-    """What a checkpoint held."""
+    """Contents of a checkpoint."""
 
     step: int
     state: Any
@@ -194,7 +194,7 @@ class Checkpoints:
         return self._manager.restore(step, args=args)
 
     def _readable(self, step: int) -> bool:
-        """Whether it can be read as whatever it is."""
+        """True if the checkpoint is readable, whatever its structure."""
         try:
             self._restored(step)
         except _FAILURES:

@@ -34,7 +34,7 @@ SPREAD_FLOOR = 1e-4
 
 @struct.dataclass
 class Guards:
-    """What keeps the latents from collapsing; numbers, so that a compiled step serves them all.
+    """Terms that keep the latents from collapsing; numbers, so that one compiled step serves them all.
 
     Args:
       variance, covariance: weights w_v, w_c of the two terms.
@@ -69,7 +69,7 @@ class DynamicsConfig:
 
 @struct.dataclass
 class DynamicsState:
-    """What a step changes; `params` holds "encoder" and "predictor", `target` the averaged encoder."""
+    """State of training; `params` holds "encoder" and "predictor", `target` the averaged encoder."""
 
     params: Params
     target: Params
@@ -80,7 +80,7 @@ class DynamicsState:
 
 @struct.dataclass
 class Steps:
-    """What is said of every time step: [P, S, T] frame index, force of its last frame, whether it exists."""
+    """Time steps, [P, S, T]: frame index, force of the last frame, existence."""
 
     index: Int[Array, "P S T"]
     force_n: Float[Array, "P S T 3"]

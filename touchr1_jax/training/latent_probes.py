@@ -20,7 +20,7 @@ ORDINAL_LEVELS = 3
 
 
 def contact_features(latent: Float[AnyArray, "P S T N D"], exists: Bool[AnyArray, "P S T"]) -> Float[Array, "P S*N*D"]:
-    """What a linear probe reads of a contact: each stream's tokens, mean over its steps; zeros for an absent stream."""
+    """Input of a linear probe for a contact: each stream's tokens, mean over its steps; zeros for an absent stream."""
     mean = masked.mean(latent, exists[..., None, None], 2)
     return mean.reshape(len(mean), -1)
 
@@ -31,7 +31,7 @@ def probe_right(
     train: Bool[np.ndarray, "n"],
     config: ProbeConfig,
 ) -> Bool[np.ndarray, "test A"]:
-    """Whether the probe of each ordinal attribute is right about each contact that it was not fitted on.
+    """Correctness of the probe of each ordinal attribute on each contact that it was not fitted on.
 
     Args:
       features: one row per contact.
@@ -62,7 +62,7 @@ def rank_me(rows: Float[Array, "n D"]) -> Float[Array, ""]:
 
 
 def told_apart(latent: Float[AnyArray, "P S T N D"], exists: Bool[AnyArray, "P S T"]) -> Float[Array, ""]:
-    """What contacts differ by over the size of the latents, √(Σ (z − z̄)² / Σ z²), z̄ of one sensor, step and token.
+    """Variation between contacts relative to the latents, √(Σ (z − z̄)² / Σ z²), z̄ of one sensor, step and token.
 
     The share that is left for a decoder that normalises what it reads: the scale of the latents does not enter.
     """

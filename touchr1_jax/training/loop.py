@@ -255,7 +255,7 @@ class _LateLines:
 
 
 def _computed(metrics: dict[str, Any]) -> bool:
-    """Whether the device is done with the step of these metrics."""
+    """True if the device has finished the step of these metrics."""
     return all(array.is_ready() for array in metrics.values())
 
 

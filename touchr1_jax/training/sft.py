@@ -41,7 +41,7 @@ class SFTBatch:
 
 @struct.dataclass
 class SFTState:
-    """What a step changes."""
+    """Training state."""
 
     params: Params
     opt_state: optax.OptState
@@ -87,7 +87,7 @@ def sft_gradient(
     max_logits: int = MAX_LOGITS,
     micro_contacts: int | None = None,
 ) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], Params]:
-    """What `sft_loss` says of the batch, and the gradient of the loss, summed over micro-batches.
+    """Result of `sft_loss` for the batch, and the gradient of the loss, summed over micro-batches.
 
     Neighbours are in different micro-batches: where devices share the contacts, each then has some of every one.  Of a
     packed batch the rows are computed, group beside group and one row of each after the other.

@@ -124,7 +124,7 @@ def every_question(frames: int, skips: tuple[int, ...]) -> list[tuple[int, int]]
 
 @struct.dataclass
 class VideoState:
-    """What a step changes."""
+    """Training state."""
 
     params: Params
     opt_state: optax.OptState

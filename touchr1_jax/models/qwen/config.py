@@ -245,7 +245,7 @@ def _vision(vision: _Fields) -> QwenVisionConfig:
 
 
 def _is_tied(found: Mapping[str, Any]) -> bool:
-    """Whether the head is the embedding table; a flag in either place says so, and none says no, as in transformers."""
+    """True if the head is the embedding table; a flag in either place counts, absence means no, as in transformers."""
     parts = [found, found.get("text_config", {})]
     return any(part.get("tie_word_embeddings", False) for part in parts)
 

@@ -33,12 +33,12 @@ class Groups(NamedTuple):
 
     @property
     def even(self) -> bool:
-        """Whether all runs are equally long, so that grouping is a reshape."""
+        """True if all runs are equally long, so that grouping is a reshape."""
         return bool(np.all(self.length == self.patch.shape[1]))
 
 
 class Geometry(NamedTuple):
-    """How the n patches of a few grids are reordered, placed and grouped; `row` … `frames` are in window order."""
+    """Order, positions and groups of the n patches of a few grids; `row` … `frames` are in window order."""
 
     order: np.ndarray  # int [n], patch that comes at each place of the window order
     token_order: np.ndarray  # int [n / merge²], place in window order of each token of the given order

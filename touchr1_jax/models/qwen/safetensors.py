@@ -50,7 +50,7 @@ class Entry(NamedTuple):
 
 
 def read_header(path: Path) -> dict[str, Entry]:
-    """What tensors a file holds.
+    """Tensors of a file.
 
     Raises:
       ValueError: not this format, not fetched, cut off, or an entry that contradicts itself.

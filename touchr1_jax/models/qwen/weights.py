@@ -88,7 +88,7 @@ def find_tensors(directory: Path) -> dict[str, safetensors.Entry]:
 
 
 def compare(entries: Mapping[str, safetensors.Entry], wanted: Mapping[str, tuple[int, ...]]) -> list[str]:
-    """What does not fit, one line each, by published keys: missing, extra, shape, type."""
+    """Mismatches, one line each, by published keys: missing, extra, shape, type."""
     missing = [f"missing: {published(key)} {shape}" for key, shape in wanted.items() if key not in entries]
     strangers = [(published(key), entry) for key, entry in entries.items() if key not in wanted]
     extra = [f"extra: {key} {entry.shape} in {entry.path.name}" for key, entry in strangers]
