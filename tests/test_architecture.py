@@ -183,6 +183,18 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
         yield from ((module, n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
+def test_docstrings_open_with_a_noun_or_a_verb():
+    """Only the question of an experiment may open with What, Whether or How."""
+    wrong = []
+    for module, tree in TREES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                first = (ast.get_docstring(node) or "").partition("\n")[0]
+                if re.match(r"(What|Whether|How)\b", first) and not first.endswith("?"):
+                    wrong.append(f"{module}: {first}")
+    assert not wrong
+
+
 def test_every_folder_serves_several_modules():
     """A folder that one module alone imports is a part of that module; families and commands are found by name."""
     assert len([p for p in (ROOT / "experiments").iterdir() if p.name not in NO_CODE]) <= MAX_ENTRIES
