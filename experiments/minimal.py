@@ -94,9 +94,13 @@ def score_unseen(store, params):
 
 def main(log):
     """Generate records, train by SFT and GRPO, score after each."""
-    folder, key = tempfile.TemporaryDirectory(), jax.random.key(0)
-    generate_records(SCENES, Path(folder.name))
-    store = RecordStore(folder.name)
+    with tempfile.TemporaryDirectory() as folder:
+        generate_records(SCENES, Path(folder))
+        train(RecordStore(folder), jax.random.key(0), log)
+
+
+def train(store, key, log):
+    """SFT on some objects, GRPO on others, scores on unseen ones."""
     imitated, reinforced = np.split(store.contacts_of_split("train"), [640])
     log(f"{len(imitated)} contacts to imitate, {len(reinforced)} to reinforce, one object in five to test")
 
