@@ -95,14 +95,7 @@ def qwen_fns(
     policy: Policy, layout: PromptLayout, tokenizer: Tokenizer, cache_dtype: jnp.dtype | type = jnp.bfloat16
 ) -> PolicyFns:
     """The functions that SFT and GRPO train; `cache_dtype` is the type of the decoder's parameters."""
-    return PolicyFns(
-        module=policy,
-        slots=Slots(layout.touch, layout.view, layout.stream_text),
-        banned=tokenizer.banned,
-        end_ids=tokenizer.end_ids,
-        pad_id=tokenizer.pad_id,
-        cache_dtype=jnp.dtype(cache_dtype),
-    )
+    return PolicyFns.for_layout(policy, layout, tokenizer, cache_dtype)
 
 
 def init_on_pretrained(
