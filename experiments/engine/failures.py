@@ -14,30 +14,35 @@ from experiments.engine.world_training import GrpoVariant, Setting, VariantRun, 
 from touchr1_jax.rl.config import GRPOConfig, Paper, Stable, TactileUse
 from touchr1_jax.rl.stream_check import ROUNDING_NAT
 
+WATCHING = Paper(tactile_use=TactileUse.RECOMMENDED, tactile_weight=0.0)
 PAPER = GrpoVariant(name="paper", algorithm=Paper())
 STABLE = GrpoVariant(name="stable", algorithm=Stable(), accuracy="accuracy_debiased", consistency="consistency_gated")
-WATCHED = GrpoVariant(
-    name="paper, controls watched",
-    algorithm=Paper(tactile_use=TactileUse.RECOMMENDED, tactile_weight=0.0),
-)
+WATCHED = GrpoVariant(name="paper, controls watched", algorithm=WATCHING)
 LITERAL = GrpoVariant(name="paper, literal bonus", algorithm=Paper(tactile_use=TactileUse.LITERAL), accuracy="exact")
 SCORE_FUNCTION = GrpoVariant(name="paper, k1", algorithm=Paper(kl="k1"))
 
 PLAIN = World()
+NO_TOUCH = World(noise=4.0, sight=0.9)
+"""Touch with next to no information, and a picture that is nearly always right."""
+ANCHORED = World(anchored=0.8)
+"""A supervised policy that concludes what it sees although touch is more often right."""
+
+Knob = Callable[[GrpoVariant, float], Setting]
+"""(variant, value) → setting of the world and the hyperparameters."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class FailureScenario:
     """A failure, the knob that drives it, and the criterion of a failed seed.
 
     Attributes:
       code: that of its alarm.
       title: what fails.
-      knob: what `values` mean.
+      knob: meaning of `values`.
       values: of the knob, from the mildest on.
       criterion: `failed` in words.
       failing: variant that is compared with the `stable` preset.
-      setting: (variant, value) → setting of the world and the hyperparameters.
+      setting: applies the knob.
       failed: run → whether each seed has failed.
       others: codes of other alarms that notice the same failure.
     """
@@ -48,7 +53,7 @@ class FailureScenario:
     values: tuple[float, ...]
     criterion: str
     failing: GrpoVariant
-    setting: Callable[[GrpoVariant, float], Setting]
+    setting: Knob
     failed: Callable[[VariantRun], np.ndarray]
     others: tuple[str, ...] = ()
 
@@ -63,29 +68,12 @@ class FailureScenario:
         return (self.code, *self.others)
 
 
-def _hyperparameter(name: str, world: World = PLAIN) -> Callable[[GrpoVariant, float], Setting]:
-    """The knob is a hyperparameter, in a fixed world."""
+def _hyperparameter(name: str, world: World = PLAIN) -> Knob:
     return lambda variant, value: (world, hyperparameters_of(variant)._replace(**{name: value}))
 
 
-def _world(field: str, world: World = PLAIN) -> Callable[[GrpoVariant, float], Setting]:
-    """The knob is a property of the world."""
+def _world(field: str, world: World = PLAIN) -> Knob:
     return lambda variant, value: (world._replace(**{field: value}), hyperparameters_of(variant))
-
-
-def _unlearns(run: VariantRun) -> np.ndarray:
-    return run.gain("accuracy") < -0.1
-
-
-def _bonus_cancels(run: VariantRun) -> np.ndarray:
-    telling = run.late("bonus_telling_share")
-    return (telling > 0.02) & (run.late("bonus_cancelled_share") > 0.5 * telling)
-
-
-NO_TOUCH = World(noise=4.0, sight=0.9)
-"""Touch with next to no information, and a picture that is nearly always right."""
-ANCHORED = World(anchored=0.8)
-"""A supervised policy that concludes what it sees although touch is more often right."""
 
 
 def _time_ids(variant: GrpoVariant, fps: float) -> Setting:
@@ -104,141 +92,87 @@ def _lenience(variant: GrpoVariant, value: float) -> Setting:
     return PLAIN, hyperparameters_of(variant)._replace(lenient=0.0 if variant is STABLE else value)
 
 
+def _unlearns(run: VariantRun) -> np.ndarray:
+    return run.gain("accuracy") < -0.1
+
+
+def _bonus_cancels(run: VariantRun) -> np.ndarray:
+    telling = run.late("bonus_telling_share")
+    return (telling > 0.02) & (run.late("bonus_cancelled_share") > 0.5 * telling)
+
+
+def _noise_is_detected(run: VariantRun) -> np.ndarray:
+    return (run.after["grounding"] > 0.3) & (run.after["accuracy"] - run.after["accuracy_swap"] < 0.05)
+
+
 GAMMAS = (0.01, 0.16, 0.64, 2.56)
 
 SCENARIOS = (
     FailureScenario(
-        code="F1",
-        title="answers drift to the middle level",
-        knob="noise of touch σ, levels",
-        values=(0.4, 1.0, 1.5, 2.5),
-        criterion="middle answers exceed middle labels by more than .25",
-        failing=PAPER,
-        setting=_world("noise"),
-        failed=lambda run: run.after["middle"] - 1 / K > 0.25,
+        "F1", "answers drift to the middle level", "noise of touch σ, levels", (0.4, 1.0, 1.5, 2.5),
+        "middle answers exceed middle labels by more than .25",
+        PAPER, _world("noise"), lambda run: run.after["middle"] - 1 / K > 0.25,
     ),
     FailureScenario(
-        code="F2",
-        title="slots echo each other",
-        knob="weight of consistency",
-        values=(0.3, 0.7, 0.85, 0.9),
-        criterion="all slots agree in more than 90 % and are right 10 points less often than before",
-        failing=PAPER,
-        setting=_hyperparameter("consistency"),
-        failed=lambda run: (run.after["echo_share"] > 0.9) & (run.gain("slots_right") < -0.1),
+        "F2", "slots echo each other", "weight of consistency", (0.3, 0.7, 0.85, 0.9),
+        "all slots agree in more than 90 % and are right 10 points less often than before",
+        PAPER, _hyperparameter("consistency"),
+        lambda run: (run.after["echo_share"] > 0.9) & (run.gain("slots_right") < -0.1),
     ),
     FailureScenario(
-        code="F3",
-        title="grounding without bound",
-        knob="weight of grounding γ",
-        values=GAMMAS,
-        criterion="accuracy more than 10 points below the start",
-        failing=PAPER,
-        setting=_hyperparameter("gamma"),
-        failed=_unlearns,
+        "F3", "grounding without bound", "weight of grounding γ", GAMMAS,
+        "accuracy more than 10 points below the start", PAPER, _hyperparameter("gamma"), _unlearns,
     ),
     FailureScenario(
-        code="F4",
-        title="noise is detected, touch is not read",
-        knob="weight of grounding γ, useless touch",
-        values=GAMMAS,
-        criterion="grounding above .3 nat a token, another object's touch costs less than 5 points",
-        failing=WATCHED,
-        setting=_hyperparameter("gamma", NO_TOUCH),
-        failed=lambda run: (run.after["grounding"] > 0.3) & (run.after["accuracy"] - run.after["accuracy_swap"] < 0.05),
-        others=("F3",),
+        "F4", "noise is detected, touch is not read", "weight of grounding γ, useless touch", GAMMAS,
+        "grounding above .3 nat a token, another object's touch costs less than 5 points",
+        WATCHED, _hyperparameter("gamma", NO_TOUCH), _noise_is_detected, ("F3",),
     ),
     FailureScenario(
-        code="F5",
-        title="the tactile bonus cancels",
-        knob="weight of consistency, 0/1 accuracy",
-        values=(0.8, 0.3, 0.0),
-        criterion="of the groups that the bonus tells apart, more than half have the advantages of before",
-        failing=LITERAL,
-        setting=_hyperparameter("consistency"),
-        failed=_bonus_cancels,
+        "F5", "the tactile bonus cancels", "weight of consistency, 0/1 accuracy", (0.8, 0.3, 0.0),
+        "of the groups that the bonus tells apart, more than half have the advantages of before",
+        LITERAL, _hyperparameter("consistency"), _bonus_cancels,
     ),
     FailureScenario(
-        code="F6",
-        title="tactile credit by chance",
-        knob="share of right pictures, useless touch",
-        values=(1.0, 0.6, 0.0),
-        # the rate that R_tu is designed for, and two standard errors of all groups, those of 80 steps of 8
-        criterion="more than 14.6 % of the groups of a policy that stands still earn credit: 12 %, and two standard "
-        "errors of 640 groups",
-        failing=LITERAL,
-        setting=_standing_still,
-        failed=lambda run: run.metrics["tactile_credit_share"].mean(1) > 0.146,
+        "F6", "tactile credit by chance", "share of right pictures, useless touch", (1.0, 0.6, 0.0),
+        "more than 14.6 % of the groups of a policy that stands still earn credit: 12 %, and two standard errors of "
+        "640 groups",
+        LITERAL, _standing_still, lambda run: run.metrics["tactile_credit_share"].mean(1) > 0.146,
     ),
     FailureScenario(
-        code="F7",
-        title="groups that teach nothing",
-        knob="sharpness of the start (factor on logits)",
-        values=(1.0, 2.0, 4.0, 16.0),
-        criterion="more than half of the groups are constant and accuracy is more than 5 points below the start",
-        failing=PAPER,
-        setting=_world("sharp", ANCHORED),
-        failed=lambda run: (run.late("degenerate_share") > 0.5) & (run.gain("accuracy") < -0.05),
+        "F7", "groups that teach nothing", "sharpness of the start (factor on logits)", (1.0, 2.0, 4.0, 16.0),
+        "more than half of the groups are constant and accuracy is more than 5 points below the start",
+        PAPER, _world("sharp", ANCHORED),
+        lambda run: (run.late("degenerate_share") > 0.5) & (run.gain("accuracy") < -0.05),
     ),
     FailureScenario(
-        code="F8",
-        title="the KL estimate does not hold",
-        knob="weight of the reference KL β",
-        values=(1e-3, 1.0, 10.0, 100.0),
-        criterion="exact KL to the reference above 1 nat a token",
-        failing=SCORE_FUNCTION,
-        setting=_hyperparameter("beta"),
-        failed=lambda run: run.after["kl"] > 1.0,
+        "F8", "the KL estimate does not hold", "weight of the reference KL β", (1e-3, 1.0, 10.0, 100.0),
+        "exact KL to the reference above 1 nat a token",
+        SCORE_FUNCTION, _hyperparameter("beta"), lambda run: run.after["kl"] > 1.0,
     ),
     FailureScenario(
-        code="F9",
-        title="entropy blows up",
-        knob="weight of the entropy bonus",
-        values=(0.03, 0.1, 0.3, 1.0),
-        criterion="entropy more than .2 nat a token above the start, accuracy more than 10 points below",
-        failing=PAPER,
-        setting=_hyperparameter("entropy_weight"),
-        failed=lambda run: (run.gain("entropy") > 0.2) & _unlearns(run),
+        "F9", "entropy blows up", "weight of the entropy bonus", (0.03, 0.1, 0.3, 1.0),
+        "entropy more than .2 nat a token above the start, accuracy more than 10 points below",
+        PAPER, _hyperparameter("entropy_weight"), lambda run: (run.gain("entropy") > 0.2) & _unlearns(run),
     ),
     FailureScenario(
-        code="F9",
-        title="long steps end in one answer",
-        knob="learning rate",
-        values=(0.003, 0.01, 0.03, 0.1),
-        criterion="accuracy more than 10 points below the start",
-        failing=PAPER,
-        setting=_hyperparameter("learning_rate"),
-        failed=_unlearns,
-        others=("F7",),
+        "F9", "long steps end in one answer", "learning rate", (0.003, 0.01, 0.03, 0.1),
+        "accuracy more than 10 points below the start", PAPER, _hyperparameter("learning_rate"), _unlearns, ("F7",),
     ),
     FailureScenario(
-        code="F10",
-        title="a stream that never arrives",
-        knob="share of the second sensor's touch that arrives",
-        values=(1.0, 0.3, 0.1, 0.0),
-        criterion="noise in it moves no answer, and training goes on",
-        failing=PAPER,
-        setting=_world("kept"),
-        failed=lambda run: (run.after[f"grounding_{S - 1}"] <= ROUNDING_NAT) & (not run.refused),
+        "F10", "a stream that never arrives", "share of the second sensor's touch that arrives", (1.0, 0.3, 0.1, 0.0),
+        "noise in it moves no answer, and training goes on",
+        PAPER, _world("kept"),
+        lambda run: (run.after[f"grounding_{S - 1}"] <= ROUNDING_NAT) & (not run.refused),
     ),
     FailureScenario(
-        code="F12",
-        title="time ids stand still",
-        knob="frames a second",
-        values=(1.0, 2.0, 4.0, 8.0),
-        criterion="the shuffle of steps can change less than half of the prompts",
-        failing=LITERAL,
-        setting=_time_ids,
-        failed=lambda run: run.after["shuffled"] < 0.5,
+        "F12", "time ids stand still", "frames a second", (1.0, 2.0, 4.0, 8.0),
+        "the shuffle of steps can change less than half of the prompts",
+        LITERAL, _time_ids, lambda run: run.after["shuffled"] < 0.5,
     ),
     FailureScenario(
-        code="F13",
-        title="the parser is gamed",
-        knob="credit for naming the answer among others",
-        values=(0.0, 0.5, 0.75, 1.0),
-        criterion="more than half of the answers name levels where they cannot be read",
-        failing=PAPER,
-        setting=_lenience,
-        failed=lambda run: run.after["gamed_share"] > 0.5,
+        "F13", "the parser is gamed", "credit for naming the answer among others", (0.0, 0.5, 0.75, 1.0),
+        "more than half of the answers name levels where they cannot be read",
+        PAPER, _lenience, lambda run: run.after["gamed_share"] > 0.5,
     ),
-)
+)  # fmt: skip

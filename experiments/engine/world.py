@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy import Features, Policy, PolicyConfig
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
@@ -46,19 +46,9 @@ DECODER = DecoderConfig(
     intermediate_size=48,
     mrope_section=(1, 1, 2),
 )
-FNS = PolicyFns(
-    module=Policy(
-        PolicyConfig(
-            tactile=TactileViTConfig(sensors=S, width=8, num_layers=0, num_heads=1),
-            vision=VisionConfig(image_px=32),
-            decoder=DECODER,
-        )
-    ),
-    slots=Slots(LAYOUT.touch, LAYOUT.view, LAYOUT.stream_text),
-    banned=TOKENIZER.banned,
-    end_ids=TOKENIZER.end_ids,
-    pad_id=TOKENIZER.pad_id,
-)
+TACTILE = TactileViTConfig(sensors=S, width=8, num_layers=0, num_heads=1)
+MODULE = Policy(PolicyConfig(tactile=TACTILE, vision=VisionConfig(image_px=32), decoder=DECODER))
+FNS = PolicyFns.for_layout(MODULE, LAYOUT, TOKENIZER)
 
 _BASIS = np.linalg.qr(np.random.default_rng(0).normal(size=(DECODER.hidden_size,) * 2))[0].astype(np.float32)
 LEVEL, RAMP, SENSOR, SIGHT, HOLE = np.split(_BASIS[: 2 * K + S + 2], [K, K + 1, K + 1 + S, 2 * K + 1 + S])
@@ -122,12 +112,18 @@ def draw(world: World, key: Array, p: int) -> WorldBatch:
         view=2 * jnp.asarray(SIGHT)[seen][:, None],
         view_mask=jnp.ones(p, bool),
     )
+    chosen = jnp.broadcast_to(jnp.arange(A) == asked, (p, A))
+    target = Target(
+        asked=chosen,
+        label=jnp.where(chosen, y[:, None], -1),
+        levels=jnp.full((p, A), K),
+        ordinal=jnp.ones((p, A), bool),
+        streams=jnp.ones((p, S), bool),
+    )
+    of_question = lambda x: jnp.broadcast_to(jnp.asarray(x)[asked], (p, *np.shape(x)[1:]))
+    ordered = of_question([a.ordered for a in LANGUAGE.attributes])
     batch = GRPOBatch(
-        features=features,
-        ids=jnp.broadcast_to(jnp.asarray(LAYOUT.ids)[asked], (p, LAYOUT.ids.shape[1])),
-        mask=jnp.broadcast_to(jnp.asarray(LAYOUT.mask)[asked], (p, LAYOUT.mask.shape[1])),
-        target=target_of(asked, y),
-        ordered=jnp.broadcast_to(jnp.array([a.ordered for a in LANGUAGE.attributes])[asked], (p,)),
+        features=features, ids=of_question(LAYOUT.ids), mask=of_question(LAYOUT.mask), target=target, ordered=ordered
     )
     return WorldBatch(batch, y, evidence[..., asked], seen)
 
@@ -158,26 +154,9 @@ def noise_bank(world: World, key: Array, draws: int = 32, probe: int = 256) -> F
     return broken(world, mean[:, None] + std[:, None] * noise)
 
 
-def target_of(asked: Int[Array, ""], level: Int[Array, "P"]) -> Target:
-    """Targets of questions for one attribute."""
-    p = level.shape[0]
-    chosen = jnp.broadcast_to(jnp.arange(A) == asked, (p, A))
-    return Target(
-        asked=chosen,
-        label=jnp.where(chosen, level[:, None], -1),
-        levels=jnp.full((p, A), K),
-        ordinal=jnp.ones((p, A), bool),
-        streams=jnp.ones((p, S), bool),
-    )
-
-
-def _ids(text: str) -> list[int]:
-    return TOKENIZER.encode(text)
-
-
-WORDS = np.array([[_ids(words[0])[0] for words in a.levels] for a in LANGUAGE.attributes])
+WORDS = np.array([[TOKENIZER.encode(words[0])[0] for words in a.levels] for a in LANGUAGE.attributes])
 """Token of each level of each attribute, [A, K]."""
-(CONCLUDE,) = _ids("<conclude>")
+(CONCLUDE,) = TOKENIZER.encode("<conclude>")
 
 
 def verified_answers(world: World, scene: WorldBatch, key: Array) -> tuple[Int[Array, "P T"], Array]:
@@ -194,7 +173,7 @@ def verified_answers(world: World, scene: WorldBatch, key: Array) -> tuple[Int[A
     level = jnp.where(anchored, scene.seen, scene.level)
     sloppy = jax.random.uniform(slop_key, (p,)) < world.sloppy
     first, second = words[level], words[(level + 1) % K]
-    fixed = lambda text: [jnp.full(p, i) for i in _ids(text)]
+    fixed = lambda text: [jnp.full(p, i) for i in TOKENIZER.encode(text)]
     perceive = [x for s, slot in zip(LANGUAGE.sensors, slots, strict=True) for x in (*fixed(s.phrases[0]), slot)]
     compare = nearest(jnp.mean(scene.evidence, 1))
     head = [*fixed("<perceive>"), *perceive, *fixed("</perceive> <compare>"), compare, *fixed("</compare> <conclude>")]

@@ -7,7 +7,7 @@ program serves every value of a knob; `vmap` runs the seeds.
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,6 +99,8 @@ class Hyperparameters(NamedTuple):
 Setting = tuple[World, Hyperparameters]
 """Values of all knobs."""
 
+Program = Callable[..., Any]
+
 
 def hyperparameters_of(variant: GrpoVariant) -> Hyperparameters:
     """The preset's own weights."""
@@ -177,18 +179,19 @@ class VariantRuns:
     def _train(self, variant: GrpoVariant, setting: Setting) -> VariantRun:
         world, hyperparameters = setting
         start = self._supervised(world)
-        evaluate = evaluate_program(self._budget)
+        evaluator = seeds_program(evaluate, (self._budget,), 1, 3)
         if world not in self._before:
-            self._before[world] = evaluate(world, start, start, self._keys)
-        end, metrics = reinforce_program(self._budget, variant)(world, hyperparameters, start, self._keys)
-        after = evaluate(world, end, start, self._keys)
+            self._before[world] = evaluator(world, start, start, self._keys)
+        training = seeds_program(reinforce, (self._budget, variant), 2, 2)
+        end, metrics = training(world, hyperparameters, start, self._keys)
+        after = evaluator(world, end, start, self._keys)
         return VariantRun(**jax.device_get({"before": self._before[world], "after": after, "metrics": metrics}))
 
     def _supervised(self, world: World) -> Params:
         """The policies that supervised training makes of a world, with their logits scaled."""
         plain = world._replace(sharp=1.0)
         if plain not in self._pretrained:
-            self._pretrained[plain] = pretrain_program(self._budget)(plain, self._keys)
+            self._pretrained[plain] = seeds_program(pretrain, (self._budget,), 1, 1)(plain, self._keys)
         decoder = self._pretrained[plain]["decoder"]
         norm = {"scale": decoder["norm"]["scale"] * world.sharp}
         return {"decoder": {**decoder, "norm": norm}}
@@ -344,18 +347,8 @@ def divergences(
 
 
 @functools.cache
-def pretrain_program(budget: TrainingBudget) -> Callable[..., Params]:
-    """Jitted `pretrain` of many seeds of one world."""
-    return jax.jit(jax.vmap(functools.partial(pretrain, budget), in_axes=(None, 0)))
-
-
-@functools.cache
-def reinforce_program(budget: TrainingBudget, variant: GrpoVariant) -> Callable[..., tuple[Params, dict[str, Array]]]:
-    """Jitted `reinforce` of many seeds."""
-    return jax.jit(jax.vmap(functools.partial(reinforce, budget, variant), in_axes=(None, None, 0, 0)))
-
-
-@functools.cache
-def evaluate_program(budget: TrainingBudget) -> Callable[..., dict[str, Array]]:
-    """Jitted `evaluate` of many seeds of one world."""
-    return jax.jit(jax.vmap(functools.partial(evaluate, budget), in_axes=(None, 0, 0, 0)))
+def seeds_program(
+    function: Callable[..., Any], static: tuple[Any, ...], shared: int, mapped: int
+) -> Callable[..., Any]:
+    """Jitted function of many seeds: after its static arguments `shared` ones are equal for all, `mapped` are not."""
+    return jax.jit(jax.vmap(functools.partial(function, *static), in_axes=(None,) * shared + (0,) * mapped))

@@ -8,8 +8,8 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.engine import stability_grpo
 from experiments.engine.failures import PAPER, SCENARIOS, STABLE
-from experiments.engine.stability_grpo import SMOKE
-from experiments.engine.stability_report import (
+from experiments.engine.stability_grpo import (
+    SMOKE,
     ScenarioOutcome,
     VariantOutcome,
     alarm_table,
@@ -17,7 +17,6 @@ from experiments.engine.stability_report import (
     odds_table,
     requirements,
     summary_table,
-    verdict,
 )
 from experiments.engine.world_training import FirstAlarm, VariantRun
 from tests.experiments.shrunk import run_shrunk
@@ -45,25 +44,12 @@ def test_the_odds_of_the_tactile_reward():
 
 
 HEALTHY_FIGURES = {
-    "accuracy": 0.8,
-    "middle": 0.33,
-    "echo_share": 0.7,
-    "slots_right": 0.75,
-    "grounding": 0.2,
-    "grounding_0": 0.2,
-    "grounding_1": 0.2,
-    "entropy": 0.1,
-    "kl": 0.1,
-    "gamed_share": 0.05,
-    "accuracy_swap": 0.4,
-    "shuffled": 1.0,
-}
+    "accuracy": 0.8, "middle": 0.33, "echo_share": 0.7, "slots_right": 0.75, "grounding": 0.2, "grounding_0": 0.2,
+    "grounding_1": 0.2, "entropy": 0.1, "kl": 0.1, "gamed_share": 0.05, "accuracy_swap": 0.4, "shuffled": 1.0,
+}  # fmt: skip
 HEALTHY_METRICS = {
-    "degenerate_share": 0.3,
-    "tactile_credit_share": 0.05,
-    "bonus_cancelled_share": 0.0,
-    "bonus_telling_share": 0.3,
-}
+    "degenerate_share": 0.3, "tactile_credit_share": 0.05, "bonus_cancelled_share": 0.0, "bonus_telling_share": 0.3,
+}  # fmt: skip
 
 
 def evaluation(**figures: float) -> dict[str, np.ndarray]:
@@ -127,27 +113,16 @@ OUTCOME = ScenarioOutcome(
 )
 
 
-def test_tables_count_failures_and_alarms():
+def test_failures_and_alarms_are_counted():
     """Of 8 failed runs 6 raised the alarm, of 52 others 1; `stable` failed once of 20 where the other variant does."""
     assert summary_table([OUTCOME]).rows[0][2:] == (2.0, 3.0, 3.0, 1, 20, 0.75, pytest.approx(1 / 52))
     listed = [cell.replace("\N{NO-BREAK SPACE}", "") for cell in criterion_table([OUTCOME]).rows[0][2:]]
     assert listed == ["1:0 · 2:1 · 3:6", "1:0 · 2:0 · 3:1"]
     assert alarm_table([OUTCOME]).rows[0][1:] == ("F1 > 0.25", 8, 6, 0.4, 30.0, 52, 1)
     assert OUTCOME.stable.breaks_at(OUTCOME.values, 0.5) is None
-
-
-def test_requirements_and_verdict_count_the_same():
     harmed, noticed, false, *_ = requirements([OUTCOME])
-    assert (harmed.measured, harmed.met) == (1, False)
-    assert (noticed.measured, noticed.met) == (0.75, False)
+    assert [(r.measured, r.met) for r in (harmed, noticed)] == [(1, False), (0.75, False)]
     assert (false.measured, false.met) == (pytest.approx(1 / 52), True)
-    undriven = {"paper": [{}] * 10, "stable": [{"F7": FirstAlarm(20, 0.9)}, {}]}
-    provoked, failed, alarms, missed, plain = verdict([OUTCOME], undriven)
-    assert provoked.startswith("1 of 1 failures")
-    assert "1 of 20 runs" in failed
-    assert "75% of 8" in alarms
-    assert "(2)" in missed
-    assert "F7 in 1 of 2 seeds" in plain
 
 
 def test_alarms_are_those_of_the_training_log():
