@@ -148,8 +148,8 @@ def drive(
             raised = [[{} if run.refused else run.alarms(seed) for seed in range(config.seeds)] for run in trained]
             context.save_stage(stage, {"failed": [scenario.failed(run).tolist() for run in trained], "raised": raised})
         saved = context.load_stage(stage)
-        raised = [[_alarms(alarms) for alarms in seeds] for seeds in saved["raised"]]
-        found.append(VariantOutcome(failed=np.array(saved["failed"], bool), raised=raised))
+        alarms = [[_alarms(alarms) for alarms in seeds] for seeds in saved["raised"]]
+        found.append(VariantOutcome(failed=np.array(saved["failed"], bool), raised=alarms))
     return ScenarioOutcome(scenario=scenario, values=values, failing=found[0], stable=found[1])
 
 
