@@ -20,7 +20,7 @@ from touchr1_jax.models.load import Checkpoint
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy, language_of
-from touchr1_jax.text.chat_layout import build_chat_layout
+from touchr1_jax.text.chat import build_chat_layout
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import answer_text

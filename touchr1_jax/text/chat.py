@@ -1,130 +1,46 @@
-"""Conversations in the text format that Qwen2.5-VL was trained on.
+"""The prompt of a policy on a pretrained Qwen2.5-VL, in the chat template that the model was trained on.
 
     <|im_start|>system
     You are a helpful assistant.<|im_end|>
     <|im_start|>user
-    <|vision_start|><|image_pad|><|vision_end|>How hard is it?<|im_end|>
+    <view>, for each sensor its name and its touch, the question<|im_end|>
     <|im_start|>assistant
 
-A picture or video is one pad between two marks here; `expand` repeats the pad once per token.  The published template
-is a Jinja program; its result is written directly, so that no template engine is needed, and `check_template` rejects a
+View and touch stand between the two marks of vision: touch takes the place of a video, one pad per tactile token.
+Questions are padded on their left, as in `template`, so that all prompts have one length and end where the completion
+starts.  The published template is a Jinja program; its result is written directly, and `check_template` rejects a
 checkpoint with another template.
 """
 
-import dataclasses
-import enum
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
-Role = Literal["system", "user", "assistant"]
+import numpy as np
+
+from touchr1_jax.text.language import Language
+from touchr1_jax.text.template import QUESTIONS, PromptLayout, question_ids
+from touchr1_jax.text.tokenizer import Tokenizer
 
 TURN, TURN_END = "<|im_start|>", "<|im_end|>"
 VISION, VISION_END = "<|vision_start|>", "<|vision_end|>"
 MARKS = (TURN, TURN_END, VISION, VISION_END, "<|image_pad|>", "<|video_pad|>", "<|endoftext|>")
-"""Special tokens, which no text may contain."""
+"""Special tokens of the template."""
 
 SYSTEM = "You are a helpful assistant."
-"""System message of a conversation that does not begin with one."""
+"""System message of the published template where a conversation gives none."""
 
 TEMPLATE_SHA256 = "a0bc6f6fc7a29a80017a433e8f03a1cc1236e838a944a2d034295a60c4f2fddb"
 """Digest of the published template without surrounding white space, the same for all released sizes."""
 
 
-class Media(enum.Enum):
-    """Picture or video in a message."""
-
-    PICTURE = "image"
-    VIDEO = "video"
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ChatMessage:
-    """A turn of a conversation: texts, pictures and videos in order.
-
-    Raises:
-      ValueError: a text that contains a special token.
-    """
-
-    role: Role
-    parts: tuple[str | Media, ...]
-
-    def __post_init__(self) -> None:
-        for part in self.parts:
-            spelled = [mark for mark in MARKS if isinstance(part, str) and mark in part]
-            if spelled:
-                raise ValueError(
-                    f"a message of the {self.role} spells {spelled[0]!r}: special tokens are not for texts"
-                )
-
-
-def render(messages: Sequence[ChatMessage], *, reply: bool = True, numbered: bool = False) -> str:
-    """The text of a conversation, by the published template of Qwen2.5-VL.
-
-    Args:
-      messages: the turns; a system message may only be the first one, and is `SYSTEM` by default.
-      reply: open the assistant's turn.
-      numbered: name pictures and videos "Picture 1: ", "Video 1: " and so on.
-
-    Raises:
-      ValueError: no message.
-    """
-    if not messages:
-        raise ValueError("messages is empty: a conversation has at least one turn; add it")
-    count = dict.fromkeys(Media, 0)
-    text = "" if messages[0].role == "system" else turn("system", SYSTEM)
-    for message in messages:
-        body = ""
-        for part in message.parts:
-            if isinstance(part, Media):
-                count[part] += 1
-                body += _number(part, count[part]) if numbered else ""
-                body += f"{VISION}<|{part.value}_pad|>{VISION_END}"
-            else:
-                body += part
-        text += turn(message.role, body)
-    return text + (opening("assistant") if reply else "")
-
-
-def turn(role: Role, body: str) -> str:
-    """A complete turn."""
-    return f"{opening(role)}{body}{TURN_END}\n"
-
-
-def opening(role: Role) -> str:
-    """The beginning of a turn."""
-    return f"{TURN}{role}\n"
-
-
-def expand(ids: Sequence[int], sizes: Mapping[int, Sequence[int]]) -> list[int]:
-    """Repeat the n-th occurrence of a pad as often as the n-th picture or video has tokens.
-
-    Args:
-      ids: tokens of a rendered conversation.
-      sizes: for each pad's id the numbers of tokens, in order.
-
-    Raises:
-      ValueError: more or fewer sizes than pads.
-    """
-    left = {pad: list(numbers) for pad, numbers in sizes.items()}
-    expanded: list[int] = []
-    for i in ids:
-        if i in left and not left[i]:
-            raise ValueError(f"sizes of pad {i} are {list(sizes[i])}: the text has more of them; give each its size")
-        expanded += [i] * left[i].pop(0) if i in left else [i]
-    if any(left.values()):
-        raise ValueError(f"sizes {left} are left over: the text has fewer pads; show every picture and video in it")
-    return expanded
-
-
 def check_template(directory: Path) -> Path:
-    """File with the chat template of a checkpoint, which must be the published one.
+    """Find the chat template of a checkpoint, which must be the published one; return its file.
 
     Raises:
       FileNotFoundError: the checkpoint has none.
-      ValueError: it is another one, so that `render` would write other texts.
+      ValueError: it is another one, so that prompts would not be what the model was trained on.
     """
     for name in ("chat_template.jinja", "chat_template.json", "tokenizer_config.json"):
         path = directory / name
@@ -138,11 +54,79 @@ def check_template(directory: Path) -> Path:
         if digest != TEMPLATE_SHA256:
             raise ValueError(
                 f"{path} holds another chat template (SHA-256 {digest[:12]}…, published {TEMPLATE_SHA256[:12]}…): "
-                "render would not write what the model was trained on; use a released Qwen2.5-VL Instruct checkpoint"
+                "prompts would not be what the model was trained on; use a released Qwen2.5-VL Instruct checkpoint"
             )
         return path
     raise FileNotFoundError(f"{directory} has no chat template: fetch chat_template.json or tokenizer_config.json")
 
 
-def _number(media: Media, n: int) -> str:
-    return f"{'Picture' if media is Media.PICTURE else 'Video'} {n}: "
+def build_chat_layout(
+    tokenizer: Tokenizer, language: Language, *, tactile_tokens: int, view_tokens: int, system: str = SYSTEM
+) -> PromptLayout:
+    """Lay out one prompt per attribute of the language, in its order.
+
+    A stream's name and marks belong to the stream (`stream_text` s), the marks of the view to the view (S, the number
+    of streams): they are masked with it.
+
+    Args:
+      tokenizer: must know the special tokens of the chat template.
+      language: gives the sensors, stream s being sensor s, and the attributes.
+      tactile_tokens: n, embeddings per stream.
+      view_tokens: n_view, embeddings of the RGB view; 0 for none.
+      system: the system message.
+
+    Raises:
+      ValueError: a tokenizer that splits a mark, or as `question_ids`.
+    """
+    questions = [question_ids(tokenizer, language, (a.name,), QUESTIONS) for a in language.attributes]
+    head, owner, touch, view = _head(tokenizer, language, tactile_tokens, view_tokens, system)
+    tail = tokenizer.encode(f"{TURN_END}\n{_opening('assistant')}")
+    width = max(map(len, questions))
+    padding = [width - len(ids) for ids in questions]
+    ids = [[*head, *[tokenizer.pad_id] * m, *q, *tail] for m, q in zip(padding, questions, strict=True)]
+    return PromptLayout(
+        asked=np.eye(len(questions), dtype=bool),
+        ids=np.array(ids, np.int32),
+        mask=np.array([[*[True] * len(head), *[False] * m, *[True] * (width - m + len(tail))] for m in padding]),
+        touch=np.array(touch, np.int32),
+        view=np.array(view, np.int32),
+        stream_text=np.array(owner + [-1] * (width + len(tail)), np.int32),
+    )
+
+
+def _head(
+    tokenizer: Tokenizer, language: Language, tactile_tokens: int, view_tokens: int, system: str
+) -> tuple[list[int], list[int], list[list[int]], list[int]]:
+    """Ids before the question, the stream whose text each is, and the places of touch and view."""
+    begin, end = (_mark(tokenizer, mark) for mark in (VISION, VISION_END))
+    ids = tokenizer.encode(f"{_opening('system')}{system}{TURN_END}\n{_opening('user')}")
+    owner = [-1] * len(ids)
+
+    def show(pad: int, count: int, whose: int) -> list[int]:
+        places = list(range(len(ids) + 1, len(ids) + 1 + count))
+        ids.extend([begin, *[pad] * count, end])
+        owner.extend([whose, *[-1] * count, whose])
+        return places
+
+    view = show(tokenizer.view_id, view_tokens, len(language.sensors)) if view_tokens else []
+    touch = []
+    for s, sensor in enumerate(language.sensors):
+        name = tokenizer.encode(sensor.phrases[0])
+        ids.extend(name)
+        owner.extend([s] * len(name))
+        touch.append(show(tokenizer.tactile_id, tactile_tokens, s))
+    return ids, owner, touch, view
+
+
+def _opening(role: Literal["system", "user", "assistant"]) -> str:
+    return f"{TURN}{role}\n"
+
+
+def _mark(tokenizer: Tokenizer, mark: str) -> int:
+    ids = tokenizer.encode(mark)
+    if len(ids) != 1:
+        raise ValueError(
+            f"tokenizer splits {mark} into {len(ids)} tokens: must have it as a special token; use the tokenizer.json "
+            "of a Qwen2.5-VL checkpoint"
+        )
+    return ids[0]

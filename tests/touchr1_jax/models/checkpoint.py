@@ -4,7 +4,8 @@ import json
 import shutil
 from pathlib import Path
 
-from tests.touchr1_jax.models.qwen import cases, chats, tiny, words
+from experiments.paper.tiny_checkpoint import TEMPLATE
+from tests.touchr1_jax.models.qwen import cases, tiny, words
 from touchr1_jax.models.qwen.config import parse_config
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 
@@ -25,4 +26,4 @@ def write_checkpoint(directory: Path) -> None:
     tiny.write_weights(directory, parse_config(config))
     (directory / "config.json").write_text(json.dumps(config))
     (directory / "preprocessor_config.json").write_text(json.dumps(PICTURES))
-    shutil.copy(chats.TEMPLATE, directory)
+    shutil.copy(TEMPLATE, directory)

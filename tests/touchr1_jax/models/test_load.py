@@ -10,11 +10,8 @@ import pytest
 from tests.touchr1_jax.models.checkpoint import PICTURES, write_checkpoint
 from tests.touchr1_jax.models.qwen import cases
 from touchr1_jax.models.load import Load, load_checkpoint
-from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget
-from touchr1_jax.models.qwen.prompts import Film, prepare
 from touchr1_jax.models.qwen.safetensors import read_header
-from touchr1_jax.text.chat import ChatMessage, Media
 
 
 @pytest.fixture
@@ -101,36 +98,3 @@ def test_newer_picture_settings_are_read(directory):
     settings = {"size": {"shortest_edge": 100, "longest_edge": 200}, "min_pixels": None, "patch_size": None}
     (directory / "preprocessor_config.json").write_text(json.dumps(settings))
     assert load_checkpoint(directory).budget == PixelBudget(least=100, most=200)
-
-
-def test_conversation_runs_through_the_loaded_model(directory):
-    """A picture and a video of three frames: their tokens stand between their marks, and both reach the logits."""
-    found, rng = load_checkpoint(directory, jnp.float32), np.random.default_rng(0)
-    message = ChatMessage(role="user", parts=(Media.PICTURE, "soft", Media.VIDEO, "hard"))
-    picture = rng.integers(0, 256, (17, 25, 3), dtype=np.uint8)
-    film = Film(rng.integers(0, 256, (3, 16, 16, 3), dtype=np.uint8), 4.0)
-
-    forward = jax.jit(lambda p, x, grids: QwenVL(found.config).apply({"params": p}, x, grids), static_argnums=2)
-
-    def logits(picture, film):
-        inputs, grids = prepare(
-            [message],
-            found.tokenizer,
-            found.config,
-            pictures=[picture],
-            videos=[film],
-            picture_budget=found.budget,
-            video_budget=found.budget,
-        )
-        return inputs, grids, forward(found.params, inputs, grids)
-
-    inputs, grids, before = logits(picture, film)
-    assert grids == ((1, 4, 6), (2, 4, 4))
-    kinds = np.asarray(inputs.ids)[np.asarray(inputs.slots)]
-    np.testing.assert_array_equal(kinds, [found.config.image_id] * 6 + [found.config.video_id] * 8)
-    video = np.asarray(inputs.positions)[:, np.asarray(inputs.slots)[6:]]
-    np.testing.assert_array_equal(video[0] - video[0, 0], [0] * 4 + [1] * 4)  # half a second, two ids a second
-    assert jnp.abs(logits(255 - picture, film)[2] - before)[-1].max() > 1e-3
-    assert jnp.abs(logits(picture, film._replace(frames=255 - film.frames))[2] - before)[-1].max() > 1e-3
-    with pytest.raises(ValueError, match="the text has more of them"):
-        prepare([message], found.tokenizer, found.config, pictures=[picture])

@@ -14,7 +14,7 @@ from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, merge, over_base
 from touchr1_jax.models.qwen.policy import init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.text.chat_layout import build_chat_layout
+from touchr1_jax.text.chat import build_chat_layout
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import TouchBatch

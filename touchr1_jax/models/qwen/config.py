@@ -18,8 +18,7 @@ class QwenVisionConfig:
     """Shape of the vision tower; the defaults are the published one, which differs between sizes in its exit alone.
 
     A patch is `patch_px`² pixels of `patch_frames` frames; `merge`² patches become one token of `out_size` channels.
-    Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.  A second of
-    video is `tokens_per_second` steps of the time id.
+    Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.
 
     Raises:
       ValueError: heads that do not divide the width or cannot turn in two axes, or a window that is no whole number of
@@ -36,7 +35,6 @@ class QwenVisionConfig:
     merge: int = 2
     window_px: int = 112
     full_layers: tuple[int, ...] = (7, 15, 23, 31)
-    tokens_per_second: int = 2
 
     def __post_init__(self) -> None:
         if self.hidden_size % (4 * self.num_heads):
@@ -240,7 +238,6 @@ def _vision(vision: _Fields) -> QwenVisionConfig:
         merge=vision.count("spatial_merge_size"),
         window_px=vision.count("window_size"),
         full_layers=tuple(vision["fullatt_block_indexes"]),
-        tokens_per_second=vision["tokens_per_second"],
     )
 
 

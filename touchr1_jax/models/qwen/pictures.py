@@ -31,8 +31,7 @@ class PixelBudget:
 
 
 PICTURE_BUDGET = PixelBudget(least=28 * 28 * 4, most=28 * 28 * 1280)
-VIDEO_BUDGET = PixelBudget(least=28 * 28 * 128, most=28 * 28 * 768)
-"""Budgets of a picture and of one frame of a video, those of transformers' processors; a checkpoint may name others."""
+"""Budget of transformers' processor; a checkpoint may name another."""
 
 
 def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:

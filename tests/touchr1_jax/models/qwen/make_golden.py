@@ -2,12 +2,11 @@
 
     python -m tests.touchr1_jax.models.qwen.make_golden [--check]
 
-For each case: logits [L, V] and position ids [3, L]; besides, a picture's patches and rendered conversations.
+For each case: logits [L, V] and position ids [3, L]; also a picture's patches.
 `--check` compares with the committed arrays and writes nothing.
 """
 
 import argparse
-import json
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import transformers
 from transformers.models.qwen2_5_vl import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
-from tests.touchr1_jax.models.qwen import cases, chats
+from tests.touchr1_jax.models.qwen import cases
 from tests.touchr1_jax.models.qwen.cases import CASES, Case, Picture, Video
 
 ROUNDING = 2e-5
@@ -135,14 +134,11 @@ def main() -> None:
     arrays = picture_levels()
     for name, case in CASES.items():
         arrays |= golden(name, case)
-    rendered = chats.reference_renderings()
     if check:
         compare(arrays)
-        assert rendered == json.loads(chats.GOLDEN.read_text(encoding="utf-8"))
         return
     cases.GOLDEN.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(cases.GOLDEN, transformers=np.array(transformers.__version__), **arrays)
-    chats.GOLDEN.write_text(json.dumps(rendered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def compare(arrays: dict[str, np.ndarray]) -> None:

@@ -13,7 +13,7 @@ from touchr1_jax.models.policy import Slots, init_policy
 from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.pictures import PixelBudget
 from touchr1_jax.models.qwen.policy import qwen_fns, qwen_policy
-from touchr1_jax.text.chat_layout import build_chat_layout
+from touchr1_jax.text.chat import build_chat_layout
 from touchr1_jax.types import Params
 
 TOKENIZER = words.tokenizer(tiny.LANGUAGE, vocab_size=448)

@@ -11,13 +11,13 @@ import pytest
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.models.qwen import small_policy
 from tests.touchr1_jax.models.qwen.small_policy import CONFIG, FNS, LAYOUT, POLICY, SLOTS, TOKENIZER, VIEW_TOKENS
+from tests.touchr1_jax.models.qwen.tiny import Block, position_ids
 from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, init_adapters, over_base
 from touchr1_jax.models.policy import init_policy, prompt_mask, prompt_positions
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.model import Inputs, QwenVL
 from touchr1_jax.models.qwen.pictures import PixelBudget, patchify, resize
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns
-from touchr1_jax.models.qwen.positions import picture, position_ids, tactile
 from touchr1_jax.rl.config import Algorithm, GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -62,9 +62,9 @@ def test_positions_are_those_of_the_model(batch):
     before, streams = LAYOUT.view[0], []
     for s, name in enumerate(names):
         steps = np.unique(features.touch_time[s])
-        streams += [1 + name + 1, tactile(steps, tiny.N // len(steps))]
+        streams += [1 + name + 1, Block(steps, 1, tiny.N // len(steps))]
     question = mask[LAYOUT.touch[-1, -1] + 1 :].sum()
-    runs = [int(before), picture(Grid(1, 4, 4), 2), *streams, int(question)]
+    runs = [int(before), Block([0], 2, 2), *streams, int(question)]
     np.testing.assert_array_equal(ours[:, mask], position_ids(runs))
 
 
@@ -80,7 +80,7 @@ def test_untouched_policy_is_the_model(batch):
     view = resize(tiny.touch_batch(0, P).view[1], 16, 16)
     inputs = Inputs(
         ids=jnp.asarray(ids),
-        positions=jnp.asarray(position_ids([int(LAYOUT.view[0]), picture(Grid(1, 4, 4), 2), int(after)])),
+        positions=jnp.asarray(position_ids([int(LAYOUT.view[0]), Block([0], 2, 2), int(after)])),
         slots=jnp.asarray(LAYOUT.view),
         patches=patchify(view[None], CONFIG.vision),
     )

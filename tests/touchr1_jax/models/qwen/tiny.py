@@ -1,7 +1,9 @@
-"""The golden model on this side: config, checkpoint files, parameters and inputs."""
+"""The golden model on this side: config, checkpoint files, parameters, position ids and inputs."""
 
 import functools
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,6 @@ from touchr1_jax.models.qwen.config import QwenConfig, parse_config
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.model import Inputs
 from touchr1_jax.models.qwen.names import published, sources
-from touchr1_jax.models.qwen.positions import Seen, picture, position_ids, video
 from touchr1_jax.models.qwen.weights import load_params
 from touchr1_jax.types import Params
 
@@ -43,19 +44,41 @@ def grids_of(case: Case) -> tuple[Grid, ...]:
     return tuple(Grid(cases.steps(part), part.rows, part.columns) for part in case.seen())
 
 
-def runs_of(case: Case) -> list[int | Seen]:
-    """The prompt as `position_ids` reads it."""
-    config, runs = config_of(case), []
+class Block(NamedTuple):
+    """Tokens of one picture, video or tactile stream: the time id of each step, and rows × columns of a step."""
+
+    times: Sequence[int]
+    rows: int
+    columns: int
+
+
+def position_ids(runs: Sequence[int | Block]) -> np.ndarray:
+    """(time, row, column) ids [3, L] of a prompt of text tokens (their number) and blocks.
+
+    A block starts one after the largest id before it (Qwen2-VL, arXiv 2409.12191, §2.1).
+    """
+    start, columns = 0, []
+    for run in runs:
+        text = isinstance(run, int)
+        ids = (
+            [(i, i, i) for i in range(run)]
+            if text
+            else [(t, y, x) for t in run.times for y in range(run.rows) for x in range(run.columns)]
+        )
+        columns.append(start + np.array(ids).T)
+        start = int(columns[-1].max()) + 1
+    return np.concatenate(columns, 1)
+
+
+def runs_of(case: Case) -> list[int | Block]:
+    """A case as `position_ids` reads it; step t of a video has the time id ⌊t · seconds per step · 2⌋."""
+    runs: list[int | Block] = []
     for part in case.parts:
         if isinstance(part, int):
             runs.append(part)
             continue
-        grid = Grid(cases.steps(part), part.rows, part.columns)
-        if isinstance(part, Video):
-            seen = video(grid, cases.MERGE, part.seconds_per_step, config.vision.tokens_per_second)
-        else:
-            seen = picture(grid, cases.MERGE)
-        runs += [1, seen, 1]
+        times = [int(2 * t * part.seconds_per_step) for t in range(part.steps)] if isinstance(part, Video) else [0]
+        runs += [1, Block(times, part.rows // cases.MERGE, part.columns // cases.MERGE), 1]
     return runs
 
 
