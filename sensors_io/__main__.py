@@ -25,7 +25,7 @@ COMMANDS: Mapping[str, str] = {
     "view": "view.View",
     "record": "record.Record",
     "calibrate": "calibrate.Calibrate",
-    "geometry": "geometry.Geometry",
+    "geometry": "geometry.MeasureGeometry",
     "extract": "extract.Extract",
     "zero": "zero.Zero",
     "force-zero": "force_zero.ForceZeroing",

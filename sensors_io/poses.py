@@ -40,7 +40,7 @@ class PoseConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pose:
+class PoseReading:
     """Mean reading of one pose: force [3], moment [3], and the largest standard deviation of a force component."""
 
     force_n: np.ndarray
@@ -58,9 +58,9 @@ class PoseFinder:
     def __init__(self, config: PoseConfig | None = None):
         self._config = config or PoseConfig()
         self._recent: collections.deque[tuple[int, np.ndarray]] = collections.deque()
-        self.poses: list[Pose] = []
+        self.poses: list[PoseReading] = []
 
-    def offer(self, time_ns: int, force_n: np.ndarray, moment_nmm: np.ndarray) -> Pose | None:
+    def offer(self, time_ns: int, force_n: np.ndarray, moment_nmm: np.ndarray) -> PoseReading | None:
         """Take one reading into account; the pose that it completes.
 
         Args:
@@ -78,7 +78,7 @@ class PoseFinder:
             self._forget_half()
             return None
         recent.clear()
-        pose = Pose(force_n=mean[:3], moment_nmm=mean[3:], spread_n=spread_n)
+        pose = PoseReading(force_n=mean[:3], moment_nmm=mean[3:], spread_n=spread_n)
         self.poses.append(pose)
         return pose
 
@@ -123,7 +123,7 @@ class ForceZero:
             raise ForceError(f"{path} holds no gravity model ({error!r}); make one with `force-zero`") from error
 
 
-def fit_poses(poses: list[Pose]) -> ForceZero:
+def fit_poses(poses: list[PoseReading]) -> ForceZero:
     """Bias, weight and centre of mass from poses that nobody measured, by least squares.
 
     The directions of gravity follow from the sphere that the forces lie on, see `gravity_directions`.  The residual of

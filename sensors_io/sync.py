@@ -52,7 +52,7 @@ class ClockMap:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Step:
+class CounterStep:
     """Relation of one sample to those before it.
 
     Args:
@@ -68,7 +68,7 @@ class Step:
     restarted: bool = False
 
 
-_NEXT = Step()
+_NEXT = CounterStep()
 
 
 class IndexGaps:
@@ -86,7 +86,7 @@ class IndexGaps:
         self._last: int | None = None
         self._missing: collections.OrderedDict[int, None] = collections.OrderedDict()
 
-    def step(self, index: int, *, reopened: bool = False) -> Step:
+    def step(self, index: int, *, reopened: bool = False) -> CounterStep:
         """Take the counter of the next sample into account.
 
         Args:
@@ -100,15 +100,15 @@ class IndexGaps:
         if ahead >= 1:
             self._remember(self._last + 1, ahead - 1)
             self._last = index
-            return _NEXT if ahead == 1 else Step(missing=ahead - 1)
+            return _NEXT if ahead == 1 else CounterStep(missing=ahead - 1)
         if ahead and (reopened or -ahead >= self.REMEMBERED):
             self._missing.clear()
             self._last = index
-            return Step(restarted=True)
+            return CounterStep(restarted=True)
         if index in self._missing:
             del self._missing[index]
-            return Step(late=True)
-        return Step(duplicate=True)
+            return CounterStep(late=True)
+        return CounterStep(duplicate=True)
 
     def _ahead(self, index: int, last: int) -> int:
         if self._modulus is None:
@@ -146,7 +146,7 @@ class PeriodGaps:
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
 
-    def step(self, time_ns: int) -> Step:
+    def step(self, time_ns: int) -> CounterStep:
         """Take the stamp of the next sample into account."""
         if self._phase_ns is None:
             self._phase_ns = float(time_ns)
@@ -160,4 +160,4 @@ class PeriodGaps:
                 max(period, self._nominal_ns * (1 - self._DRIFT)), self._nominal_ns * (1 + self._DRIFT)
             )
             return _NEXT
-        return Step(missing=max(count - 1, -1))
+        return CounterStep(missing=max(count - 1, -1))

@@ -92,7 +92,7 @@ def check(path: pathlib.Path) -> RecordingCheck:
     )
 
 
-def _lateness_s(recording: tac3d_messages.Recording) -> np.ndarray:
+def _lateness_s(recording: tac3d_messages.Tac3dArrays) -> np.ndarray:
     """Time of arrival after the stamp by running minimum, median and largest."""
     if recording.receive_time_s is None:
         return np.full(2, np.nan)
@@ -130,13 +130,13 @@ def message(path: pathlib.Path | None) -> list[bytes]:
 def decode_ms(packets: list[bytes], rounds: Iterable[object]) -> dict[str, np.ndarray]:
     """Milliseconds to decode one message by every method, [rounds]."""
     layout, data = _joined(packets)
-    decoder = tac3d_messages.Decoder()
+    decoder = tac3d_messages.Tac3dDecoder()
     calls: dict[str, Callable[[], Any]] = {
         CACHED: lambda: decoder.decode(layout, data),
         f"{CACHED}, packets joined, schema's arrays": lambda: tac3d_messages.to_schema(
             decoder.decode(*_joined(packets)).matrices
         ),
-        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(layout, data),
+        "layout parsed each time": lambda: tac3d_messages.Tac3dDecoder().decode(layout, data),
     }
     if YAML:
         calls[BY_YAML] = functools.partial(_decode_by_yaml, layout, data)

@@ -90,7 +90,9 @@ def _solve(kernels: scenes.FrictionKernels, motion: scenes.FrictionSequence) -> 
     series = in_series(kernels.gel, kernels.body, 1.0, motion.modulus_mpa)
     bodies = drag.Bodies(compliance=series, coupling=None, response=kernels.markers)
 
-    def advance(history: drag.History, at: tuple[jax.Array, drag.Step]) -> tuple[drag.History, dict[str, jax.Array]]:
+    def advance(
+        history: drag.History, at: tuple[jax.Array, drag.RigidMotion]
+    ) -> tuple[drag.History, dict[str, jax.Array]]:
         pressure, step = at
         history, frame = drag.advance(history, pressure, motion.friction, step, bodies, kernels.x_mm)
         traction = frame.traction_mpa

@@ -101,6 +101,6 @@ def draw(
 
 
 @functools.partial(jax.jit, static_argnames="sides")
-def _gaps(skin: surface.Skin, pose: surface.Pose, x_mm: Array, sides: tuple[int, ...]) -> dict[int, Array]:
+def _gaps(skin: surface.Skin, pose: surface.SensorPose, x_mm: Array, sides: tuple[int, ...]) -> dict[int, Array]:
     gap = surface.gap(skin, pose, x_mm)
     return {n: nested.coarsen(gap, gap.shape[0] // n) for n in sides}

@@ -20,7 +20,7 @@ from experiments.mechanics.chooser_draw import SceneBatch
 from sensors_io import layer
 from sensors_io.scenes import chooser, contact, nested
 from sensors_io.scenes.batching import chunks, gather, map_live
-from sensors_io.scenes.chooser import Stage
+from sensors_io.scenes.chooser import ContactScene
 from sensors_io.scenes.chooser_law import Setting, Survey
 from sensors_io.scenes.sensors import BODY, SensorModel
 
@@ -68,9 +68,9 @@ def join(parts: Sequence[Mapping[str, Any]]) -> MenuMeasurements:
     return MenuMeasurements(family=tuple(f for p in parts for f in p["family"]), **arrays)
 
 
-def stage_of(sensor: SensorModel) -> Stage:
+def stage_of(sensor: SensorModel) -> ContactScene:
     """Where a sensor's contacts take place."""
-    return Stage(gel=sensor.gel, body=BODY, window_mm=sensor.window_mm)
+    return ContactScene(gel=sensor.gel, body=BODY, window_mm=sensor.window_mm)
 
 
 def measure(batch: SceneBatch, menu: Iterable[Setting], true: Array) -> MenuMeasurements:

@@ -19,7 +19,7 @@ from sensors_io import layer
 from sensors_io.scenes import contact, effort, nested, protocol
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import Draw, draw
-from sensors_io.scenes.press import Grid, Kernels, Path, Press, Scene, make_kernels
+from sensors_io.scenes.press import GridSizes, Kernels, Path, Press, Scene, make_kernels
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
 
@@ -71,7 +71,7 @@ def _kept(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: Arra
     efforts = [effort.choose(asked, d.press, d.unit.modulus_factor, d.sensor) for d in drawn]
     errors = []
     for k, (each, path, how) in enumerate(zip(drawn, paths, efforts, strict=True)):
-        grid = Grid(contact_grid=how.grid, image_px=how.grid)
+        grid = GridSizes(contact_grid=how.grid, image_px=how.grid)
         found = _solve(each.press, path, each.unit, make_kernels(each.sensor, grid), how.tolerance, each.sensor, grid)
         errors.append(measured.errors_of(found, true[k * FRAMES : (k + 1) * FRAMES]))
     return SequenceTrial(
@@ -85,7 +85,7 @@ def _kept(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: Arra
 
 def _reference(drawn: Draw, path: Path, grid: int) -> Array:
     """Displacement on half the reference's grid, [FRAMES, K, K]."""
-    sides = Grid(contact_grid=grid, image_px=grid)
+    sides = GridSizes(contact_grid=grid, image_px=grid)
     kernels = _widely_padded(drawn.sensor, grid)
     found = _solve(drawn.press, path, drawn.unit, kernels, measured.REFERENCE_TOLERANCE, drawn.sensor, sides)
     return jax.vmap(lambda u: nested.coarsen(u, 2))(found)
@@ -96,13 +96,13 @@ def _widely_padded(sensor: SensorModel, grid: int) -> Kernels:
     """Kernels of the normal contact alone, with the padding of the reference solution."""
     q = np.hypot(*layer.wave_numbers(round(grid * measured.REFERENCE_PADDING), sensor.window_mm / grid))
     gel, body = (jnp.asarray(layer.normal_compliance(q, each), jnp.float32) for each in (sensor.gel, BODY))
-    coarse = make_kernels(sensor, Grid(contact_grid=effort.GRIDS[0], image_px=effort.GRIDS[0]))
+    coarse = make_kernels(sensor, GridSizes(contact_grid=effort.GRIDS[0], image_px=effort.GRIDS[0]))
     return dataclasses.replace(coarse, gel=gel, body=body)
 
 
 @functools.partial(jax.jit, static_argnames=("sensor", "grid"))
 def _solve(
-    press: Press, path: Path, unit: Unit, kernels: Kernels, tolerance: float, sensor: SensorModel, grid: Grid
+    press: Press, path: Path, unit: Unit, kernels: Kernels, tolerance: float, sensor: SensorModel, grid: GridSizes
 ) -> Array:
     """Displacement of every frame of a path, [F, n, n]."""
     scene = Scene(press, unit, kernels, sensor, grid, (tolerance, contact.MAX_ITERATIONS))

@@ -66,10 +66,10 @@ def gel_kernels(sensor: SensorModel, grid: int) -> GelKernels:
     return GelKernels(gel=gel, body=body, spacing_mm=spacing, thickness_mm=sensor.gel.thickness_mm)
 
 
-def draw_press(rng: np.random.Generator, solid: objects.Solid) -> tuple[surface.Skin, surface.Pose, float]:
+def draw_press(rng: np.random.Generator, solid: objects.Solid) -> tuple[surface.Skin, surface.SensorPose, float]:
     """Skin of the object, a pose near its apex and a log-uniform force, N."""
     skin = surface.make_skin(solid, rng.uniform(-2, 2, 2), 1.0)
-    pose = surface.Pose(
+    pose = surface.SensorPose(
         offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
         turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
         tilt=jnp.asarray(rng.normal(0, 0.01, 2), jnp.float32),

@@ -86,7 +86,7 @@ def statistics(skins: Seq[surface.Skin]) -> np.ndarray:
 def _gaps(skins: Seq[surface.Skin], x: np.ndarray) -> np.ndarray:
     """Gaps of all skins under a level sensor over the site, [n, N, N] mm."""
     zero = jnp.zeros(())
-    level = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=zero, tilt=jnp.zeros(2))
+    level = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=zero, tilt=jnp.zeros(2))
     stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *jax.device_get(list(skins)))
     gap_of = lambda skin: surface.gap(skin, level, jnp.asarray(x, jnp.float32))
     return np.asarray(jax.jit(lambda s: jax.lax.map(gap_of, s))(stacked), np.float64)

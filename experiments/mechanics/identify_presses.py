@@ -19,8 +19,8 @@ from experiments.mechanics.identify_features import features_of, field_counts, f
 from sensors_io.scenes import contact, draws, noise, readout, schedule, surface, traction
 from sensors_io.scenes.cards import shortest_wave_mm, solid_of
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels
-from sensors_io.scenes.readout import Fields, Gel, Unit
+from sensors_io.scenes.press import GridSizes, Kernels, Press, make_kernels
+from sensors_io.scenes.readout import FrameFields, Gel, Unit
 from sensors_io.scenes.sensors import MODELS, SensorModel
 from sensors_io.schema import SENSORS
 
@@ -93,7 +93,7 @@ class PressReadings:
     """A press of F frames at L levels of noise: pictures (`None` without a camera), fields, strain and convergence."""
 
     pictures: UInt8[Array, "F L H W 3"] | None
-    fields: Fields
+    fields: FrameFields
     strain: Float[Array, "F"]
     converged: Bool[Array, "F"]
 
@@ -112,7 +112,7 @@ class PressSetup:
     """One sensor at L levels of noise, its grids, the iteration limit of the solver, springs or not."""
 
     sensors: tuple[SensorModel, ...]
-    grid: Grid
+    grid: GridSizes
     max_iterations: int
     springs: bool
 
@@ -126,7 +126,7 @@ def press_setup(config: SceneConfig, tier: ContactTier, order: int, factors: tup
     """Sensor number `order` with its noise multiplied by each factor, and the tier's grid."""
     return PressSetup(
         sensors=tuple(noisier(MODELS[order], factor) for factor in factors),
-        grid=Grid(contact_grid=tier.grid, image_px=config.image_px),
+        grid=GridSizes(contact_grid=tier.grid, image_px=config.image_px),
         max_iterations=config.solver_max_iterations,
         springs=tier.springs,
     )

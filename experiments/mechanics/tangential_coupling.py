@@ -126,7 +126,7 @@ def _frames(motion: FrictionSequence, kernels: FrictionKernels, coupling: Array 
     series = in_series(kernels.gel, kernels.body, 1.0, motion.modulus_mpa)
     bodies = drag.Bodies(compliance=series, coupling=coupling, response=kernels.markers)
 
-    def go_on(history: drag.History, frame: tuple[Array, drag.Step]) -> tuple[drag.History, drag.Frame]:
+    def go_on(history: drag.History, frame: tuple[Array, drag.RigidMotion]) -> tuple[drag.History, drag.Frame]:
         pressure, step = frame
         return drag.advance(history, pressure, motion.friction, step, bodies, kernels.x_mm)
 

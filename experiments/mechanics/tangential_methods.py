@@ -180,7 +180,7 @@ def spg_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Ar
     """A sequence as the generator makes it."""
     bodies = drag.Bodies(compliance=_series(motion, kernels), coupling=None, response=kernels.markers)
 
-    def go_on(history: drag.History, frame: tuple[Array, drag.Step]) -> tuple[drag.History, tuple[Array, Array]]:
+    def go_on(history: drag.History, frame: tuple[Array, drag.RigidMotion]) -> tuple[drag.History, tuple[Array, Array]]:
         pressure, step = frame
         history, seen = drag.advance(
             history, pressure, motion.friction, step, bodies, kernels.x_mm, tolerance, MOST_ITERATIONS
@@ -200,7 +200,7 @@ def plain_frames(motion: FrictionSequence, kernels: FrictionKernels, iterations:
 def full_slip_frames(motion: FrictionSequence, kernels: FrictionKernels, _: Array) -> tuple[Array, Any]:
     """A sequence that slips everywhere against the motion of each frame."""
 
-    def one(frame: tuple[Array, drag.Step]) -> tuple[Array, Any]:
+    def one(frame: tuple[Array, drag.RigidMotion]) -> tuple[Array, Any]:
         pressure, step = frame
         moved = rigid_field(kernels.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
         found = motion.friction * pressure * moved / jnp.maximum(jnp.abs(moved), _TINY)
@@ -222,7 +222,7 @@ def _frames(motion: FrictionSequence, kernels: FrictionKernels, solve: FrameSolv
     """Regions that stick keep their displacement: the target of a frame is that of the last frame plus the motion."""
     compliance = _series(motion, kernels)
 
-    def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.Step]) -> tuple[tuple[Array, Array], Any]:
+    def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.RigidMotion]) -> tuple[tuple[Array, Array], Any]:
         (before, carried), (pressure, step) = state, frame
         target = carried + rigid_field(kernels.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
         found, more = solve(motion.friction * pressure, target, compliance, before)

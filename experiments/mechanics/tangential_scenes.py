@@ -80,7 +80,7 @@ class FrictionSequence:
     """A sequence of F frames: the pressure of each and the motion since the frame before."""
 
     pressure_mpa: Float[Array, "F N N"]
-    step: drag.Step
+    step: drag.RigidMotion
     modulus_mpa: Float[Array, ""]
     friction: Float[Array, ""]
 
@@ -163,7 +163,7 @@ def make_motion(kernels: FrictionKernels, body: FrictionBody, name: str, frames:
 
     return FrictionSequence(
         pressure_mpa=_pressures(kernels, body.skin, modulus, force, slide, twist),
-        step=drag.Step(slide_mm=since(slide), twist_rad=since(twist), centre_mm=still + slide),
+        step=drag.RigidMotion(slide_mm=since(slide), twist_rad=since(twist), centre_mm=still + slide),
         modulus_mpa=modulus,
         friction=jnp.float32(body.friction),
     )
@@ -175,7 +175,7 @@ def contact_radius_mm(pressure_mpa: np.ndarray, spacing_mm: float) -> float:
 
 
 def _case(kernels: FrictionKernels, body: FrictionBody, rng: np.random.Generator) -> FrictionContact:
-    pose = surface.Pose(
+    pose = surface.SensorPose(
         offset_mm=jnp.asarray(rng.uniform(-1, 1, 2), jnp.float32),
         turn_rad=jnp.float32(rng.uniform(0, 2 * np.pi)),
         tilt=jnp.zeros(2),
@@ -204,7 +204,7 @@ def _case(kernels: FrictionKernels, body: FrictionBody, rng: np.random.Generator
 def _press(
     kernels: FrictionKernels,
     skin: surface.Skin,
-    pose: surface.Pose,
+    pose: surface.SensorPose,
     modulus_mpa: Array,
     forces_n: Array,
     direction: Array,
@@ -221,7 +221,7 @@ def _pressures(
     kernels: FrictionKernels, skin: surface.Skin, modulus_mpa: Array, force_n: Array, slide_mm: Array, twist_rad: Array
 ) -> Array:
     """Pressure of every frame, [F, N, N]; zeros without force."""
-    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
+    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
 
     def frame(at: tuple[Array, Array, Array]) -> Array:
         force, slide, twist = at

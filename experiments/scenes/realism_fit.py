@@ -12,7 +12,7 @@ from experiments.core.errors import ResultsError, require
 from sensors_io.calibration import circles
 from sensors_io.calibration.presses import BallPresses as Recorded
 from sensors_io.scenes import fitting, mini_optics, optics, photometric
-from sensors_io.scenes.fitting import BallPresses, Noise, Profiles
+from sensors_io.scenes.fitting import BallPictures, Noise, Profiles
 from sensors_io.scenes.optics import DeformedGel, Lamp, Light
 from sensors_io.scenes.photometric import PhotometricOptics
 from sensors_io.scenes.sensors import GELSIGHT_MINI, Renderer
@@ -40,7 +40,7 @@ class RenderCandidate:
 class PressFit:
     """The held-out presses and what was fitted to the others."""
 
-    presses: BallPresses
+    presses: BallPictures
     profiles: Profiles
     touches: np.ndarray
     held_out: np.ndarray
@@ -48,7 +48,7 @@ class PressFit:
     noise: Noise
 
 
-def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: float, image_px: int) -> BallPresses:
+def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: float, image_px: int) -> BallPictures:
     """The square middles of the recordings, shrunk by area.
 
     Args:
@@ -69,7 +69,7 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
     require(len(paths) >= 16, f"data_dir {data_dir}", found, "must hold at least 16", fix)
     pictures = [_square(path, image_px) for path in [data_dir / "background.png", *paths]]
     height = _read(paths[0]).shape[0]
-    return BallPresses(
+    return BallPictures(
         pictures=np.stack(pictures[1:]),
         background=pictures[0],
         radius_mm=diameter_mm / 2,
@@ -77,7 +77,7 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
     )
 
 
-def fit(presses: BallPresses, context: Context) -> PressFit:
+def fit(presses: BallPictures, context: Context) -> PressFit:
     """Fit to the even presses, align the odd ones."""
     with context.progress("fitting", 2 + fitting.ROUNDS + 1) as advance:
         profiles = fitting.ball_profiles(GELSIGHT_MINI.gel, presses.radius_mm)
@@ -97,7 +97,7 @@ def fit(presses: BallPresses, context: Context) -> PressFit:
     )
 
 
-def located(presses: BallPresses, train: np.ndarray) -> np.ndarray:
+def located(presses: BallPictures, train: np.ndarray) -> np.ndarray:
     """Touches (x, y, contact radius), mm, [P, 3], by calibration's finder; held-out ones by the others' optics."""
     whole = Recorded(
         pictures=np.round(255 * presses.pictures).astype(np.uint8),
@@ -168,7 +168,7 @@ def clean(study: PressFit, model: PhotometricOptics) -> np.ndarray:
     return np.stack([photometric.shade(gel(study, t), light, model) for t in study.touches[study.held_out]])
 
 
-def source(fitted: PhotometricOptics, noise: Noise, presses: BallPresses) -> str:
+def source(fitted: PhotometricOptics, noise: Noise, presses: BallPictures) -> str:
     """The constants as a Python module."""
     scalars: dict[str, object] = {
         "HALF_WINDOW_MM": round(fitted.half_window_mm, 4),
@@ -258,7 +258,7 @@ def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:
     }
 
 
-def _shadows(presses: BallPresses, profiles: Profiles, touch: np.ndarray) -> np.ndarray:
+def _shadows(presses: BallPictures, profiles: Profiles, touch: np.ndarray) -> np.ndarray:
     """s at the pixels near a touch, [n, directions × elevations]."""
     x, y = fitting.points(presses.axis_mm, touch)
     here = profiles.field(touch, x, y)[0]
@@ -272,7 +272,7 @@ def _shadows(presses: BallPresses, profiles: Profiles, touch: np.ndarray) -> np.
 
 
 def _residual(
-    presses: BallPresses, profiles: Profiles, touch: np.ndarray, picture: np.ndarray, optics: PhotometricOptics
+    presses: BallPictures, profiles: Profiles, touch: np.ndarray, picture: np.ndarray, optics: PhotometricOptics
 ) -> np.ndarray:
     """Change near a touch that the optics do not explain, [n, 3]."""
     near = fitting.near(presses.axis_mm, touch)

@@ -136,7 +136,7 @@ def motions(config: GalleryConfig) -> Picture:
 def varied(config: GalleryConfig) -> Picture:
     """Height maps of objects that change over their surface, with the level of hardness where a press would land."""
     x = jnp.linspace(-12, 12, 320)
-    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
+    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
     rows = {}
     for kind, shares in (("two parts", (1.0, 0.0)), ("graded", (0.0, 1.0))):
         cells = []

@@ -17,7 +17,7 @@ from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.scenes import contact, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw
-from sensors_io.scenes.press import Grid, Kernels, Press, make_kernels, record
+from sensors_io.scenes.press import GridSizes, Kernels, Press, make_kernels, record
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.schedule import Slot
 from sensors_io.scenes.sensors import MODELS, SensorModel
@@ -158,7 +158,7 @@ def _scene(config: SceneConfig, index: int, order: int, motion: str) -> _Scene:
 
 
 def _cpu_ms(config: SceneConfig, sensor: SensorModel, scenes: list[_Scene], run: Callable[..., Any]) -> float:
-    grid = Grid(contact_grid=config.contact_grid, image_px=config.image_px)
+    grid = GridSizes(contact_grid=config.contact_grid, image_px=config.image_px)
     kernels = make_kernels(sensor, grid)
     jax.block_until_ready(run(*scenes[0], kernels, sensor, grid))
     watch = Stopwatch()
@@ -168,14 +168,20 @@ def _cpu_ms(config: SceneConfig, sensor: SensorModel, scenes: list[_Scene], run:
 
 
 def _record(
-    press: Press, unit: Any, key: np.ndarray, kernels: Kernels, sensor: SensorModel, grid: Grid, moving: bool = False
+    press: Press,
+    unit: Any,
+    key: np.ndarray,
+    kernels: Kernels,
+    sensor: SensorModel,
+    grid: GridSizes,
+    moving: bool = False,
 ) -> Any:
     return record(press, unit, kernels, key, sensor, grid, moving=moving)
 
 
 @functools.partial(jax.jit, static_argnames=("sensor", "grid"))
 def _pressures(
-    press: Press, unit: Any, key: np.ndarray, kernels: Kernels, sensor: SensorModel, grid: Grid
+    press: Press, unit: Any, key: np.ndarray, kernels: Kernels, sensor: SensorModel, grid: GridSizes
 ) -> tuple[jax.Array, jax.Array]:
     """Pressure and displacement of every frame with load, one of force 1 N in place of the others."""
     spacing = sensor.window_mm / grid.contact_grid

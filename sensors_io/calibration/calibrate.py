@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sensors_io.calibration.circles import Circles, find_circles
-from sensors_io.calibration.fit import Choice, fit_map
+from sensors_io.calibration.fit import ColourMapSettings, fit_map
 from sensors_io.calibration.presses import BallPresses, Touches
 from sensors_io.calibration.validate import BallErrors, cross_validate
 from sensors_io.fields.contact import ContactConfig, steepest_change
@@ -42,7 +42,7 @@ class CalibrateConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LeftOut:
+class UnusedPress:
     """A press that was not used, and why."""
 
     name: str
@@ -54,10 +54,10 @@ class CalibrationReport:
     """Origin of a calibration: presses used and left out, their contacts, chosen settings, errors on unseen presses."""
 
     kept: tuple[str, ...]
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[UnusedPress, ...]
     touches: Touches
     misfit: np.ndarray
-    choice: Choice
+    choice: ColourMapSettings
     errors: BallErrors
 
 
@@ -98,7 +98,7 @@ def calibrate(
     _check_errors(errors, config)
     report = CalibrationReport(
         kept=tuple(names[i] for i in remaining),
-        left_out=tuple(LeftOut(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
+        left_out=tuple(UnusedPress(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
         touches=touches,
         misfit=circles.misfit,
         choice=choice,

@@ -57,7 +57,7 @@ class Samples:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Choice:
+class ColourMapSettings:
     """Degrees and ridge, and the held-out rms error of the normal that they were chosen by."""
 
     degree: int
@@ -68,7 +68,7 @@ class Choice:
 
 def fit_map(
     presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5
-) -> tuple[ColourMap, Touches, Choice]:
+) -> tuple[ColourMap, Touches, ColourMapSettings]:
     """Fit the map, move each centre to where the map sees it, fit again.
 
     Args:
@@ -102,7 +102,7 @@ def recentre(presses: BallPresses, touches: Touches, colours: ColourMap) -> Touc
 
 def _fit_once(
     presses: BallPresses, touches: Touches, before: ColourMap | None, rng: np.random.Generator, folds: int
-) -> tuple[Choice, ColourMap]:
+) -> tuple[ColourMapSettings, ColourMap]:
     """Gather pixels, choose degrees and ridge over folds, solve with all presses."""
     top = tuple(max(d) for d in zip(*DEGREES, strict=True))
     places = legendre(*presses.shape, top[1])
@@ -170,12 +170,12 @@ def _kept(degree: int, position_degree: int) -> np.ndarray:
     return grid[: len(position_terms(position_degree)), : len(colour_terms(degree))].ravel()
 
 
-def _choose(grams: list[Gram], order: np.ndarray, folds: int) -> Choice:
+def _choose(grams: list[Gram], order: np.ndarray, folds: int) -> ColourMapSettings:
     """Fewest constants whose held-out error is within a standard error over the folds of the least (Breiman's rule)."""
     tried = []
     for degree, position_degree in DEGREES:
         for ridge in RIDGES:
-            trial = Choice(degree=degree, position_degree=position_degree, ridge=ridge, error=0.0)
+            trial = ColourMapSettings(degree=degree, position_degree=position_degree, ridge=ridge, error=0.0)
             by_fold = np.array([_fold_error(grams, order, k, folds, trial) for k in range(folds)])
             tried.append((dataclasses.replace(trial, error=float(by_fold.mean())), by_fold))
     best, by_fold = min(tried, key=lambda pair: pair[0].error)
@@ -184,7 +184,7 @@ def _choose(grams: list[Gram], order: np.ndarray, folds: int) -> Choice:
     return min(close, key=lambda c: (len(_kept(c.degree, c.position_degree)), c.error))
 
 
-def _fold_error(grams: list[Gram], order: np.ndarray, fold: int, folds: int, trial: Choice) -> float:
+def _fold_error(grams: list[Gram], order: np.ndarray, fold: int, folds: int, trial: ColourMapSettings) -> float:
     """Root mean square of the normal's error on left-out presses, √(Σ nᵀWn − 2 wᵀAᵀWn + wᵀAᵀWA w over Σ W)."""
     out = set(order[fold::folds].tolist())
     terms = _kept(trial.degree, trial.position_degree)
@@ -198,7 +198,7 @@ def _fold_error(grams: list[Gram], order: np.ndarray, fold: int, folds: int, tri
     return float(np.sqrt(max(total, 0.0) / count))
 
 
-def _solve(grams: list[Gram], choice: Choice) -> np.ndarray:
+def _solve(grams: list[Gram], choice: ColourMapSettings) -> np.ndarray:
     terms = _kept(choice.degree, choice.position_degree)
     left = sum((gram[0] for gram in grams), start=np.zeros_like(grams[0][0]))
     right = sum((gram[1] for gram in grams), start=np.zeros_like(grams[0][1]))

@@ -38,7 +38,7 @@ class GeometryError(UserError, ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Geometry:
+class CameraGeometry:
     """Map from each pixel to a place on the gel.
 
     Args:
@@ -81,7 +81,7 @@ class Geometry:
         edges = (corners[1:] - corners[0]) / 2
         return float(np.sqrt(abs(np.linalg.det(edges))))
 
-    def view(self, *, mm_per_px: float, size_px: tuple[int, int]) -> "View":
+    def view(self, *, mm_per_px: float, size_px: tuple[int, int]) -> "Rectifier":
         """An undistorted view straight from above, about the same middle.
 
         Args:
@@ -92,7 +92,7 @@ class Geometry:
         middle = self.to_mm(np.array([self.size_px[1] - 1, self.size_px[0] - 1]) / 2)
         x, y = np.meshgrid(np.arange(columns) - (columns - 1) / 2, np.arange(rows) - (rows - 1) / 2)
         at = self.to_px(middle + mm_per_px * np.stack([x, y], -1)).astype(np.float32)
-        return View(size_px=self.size_px, mm_per_px=mm_per_px, at=at)
+        return Rectifier(size_px=self.size_px, mm_per_px=mm_per_px, at=at)
 
     @property
     def hash(self) -> str:
@@ -131,7 +131,7 @@ class Geometry:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class View:
+class Rectifier:
     """Straightens pictures of one camera; where each pixel comes from is told once.
 
     Args:
@@ -197,7 +197,7 @@ def find_pins(picture: np.ndarray, background: np.ndarray, *, rows: int, columns
     return _in_grid(found, rows, columns)
 
 
-def fit_geometry(pins_px: np.ndarray, *, pitch_mm: float, size_px: tuple[int, int]) -> Geometry:
+def fit_geometry(pins_px: np.ndarray, *, pitch_mm: float, size_px: tuple[int, int]) -> CameraGeometry:
     """Fit the geometry to the pins of a board, and test it on pins left out.
 
     Args:
@@ -223,17 +223,17 @@ def fit_geometry(pins_px: np.ndarray, *, pitch_mm: float, size_px: tuple[int, in
     return dataclasses.replace(whole, held_out_mm=held_out)
 
 
-def _fit(seen: np.ndarray, true: np.ndarray, size_px: tuple[int, int]) -> Geometry:
+def _fit(seen: np.ndarray, true: np.ndarray, size_px: tuple[int, int]) -> CameraGeometry:
     start = cv2.findHomography(seen, true)[0]
     if start is None:
         raise GeometryError("the pins lie on a line: press the board flat, all pins in the picture")
     middle = np.array([size_px[1], size_px[0]]) / 2
     half = _half_diagonal(size_px)
 
-    def unpack(v: np.ndarray) -> Geometry:
+    def unpack(v: np.ndarray) -> CameraGeometry:
         scale = start / start[2, 2]
         homography = scale * (1 + np.append(v[4:], 0.0).reshape(3, 3))
-        return Geometry(
+        return CameraGeometry(
             size_px=size_px,
             centre_px=middle + half * v[:2],
             radial=v[2:4],

@@ -13,7 +13,7 @@ from sensors_io.calibration.presses import BallPresses
 from sensors_io.calibration.scale import measure_scale
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.commands.straightening import Straightening
-from sensors_io.fields.sources import Pictures, read_picture, read_pictures
+from sensors_io.fields.sources import PictureSequence, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError
 from sensors_io.layer import Layer
 
@@ -68,7 +68,7 @@ class Calibrate:
         OUT.print(f"wrote {self.out}, hash {made.hash}", highlight=False)
         return 0
 
-    def _measured_mm_per_px(self, pictures: Pictures, background: np.ndarray) -> float:
+    def _measured_mm_per_px(self, pictures: PictureSequence, background: np.ndarray) -> float:
         """The pitch by which the contacts are as large as the ball makes them at the known depths."""
         if self.mm_per_px is not None or self.geometry is not None:
             raise CalibrationError(
@@ -109,7 +109,7 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
     return table
 
 
-def _without(pictures: Pictures, background: np.ndarray) -> Pictures:
+def _without(pictures: PictureSequence, background: np.ndarray) -> PictureSequence:
     """The pictures that are not the background itself, which often lies in the same folder."""
     kept = [i for i, frame in enumerate(pictures.frames) if not np.array_equal(frame, background)]
     return pictures.chosen(np.array(kept, np.int64))

@@ -12,7 +12,7 @@ from sensors_io.commands.console import OUT, live_display
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.devices.reader import Reader
 from sensors_io.force import ForceError
-from sensors_io.poses import ForceZero, Pose, PoseConfig, PoseFinder, fit_poses
+from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, PoseReading, fit_poses
 
 _LOOK_S = 0.02  # between two looks at the readings
 
@@ -83,7 +83,7 @@ def _board(finder: PoseFinder, wanted: int, force_n: np.ndarray) -> Table:
     return table
 
 
-def report(zero: ForceZero, poses: list[Pose]) -> Table:
+def report(zero: ForceZero, poses: list[PoseReading]) -> Table:
     """Report of the fit and its residuals."""
     model = zero.model
     table = Table("what", "figure", title="force sensor without contact")

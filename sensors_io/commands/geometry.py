@@ -11,7 +11,7 @@ from sensors_io.importers.pictures import read_picture
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Geometry:
+class MeasureGeometry:
     """Measure lens distortion and mm/px from one picture of a pin board pressed into the gel."""
 
     board: tyro.conf.Positional[pathlib.Path]

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from sensors_io.calibration.geometry import Geometry, View
+from sensors_io.calibration.geometry import CameraGeometry, Rectifier
 from sensors_io.fields.types import Calibration, CalibrationError
 
 _MADE_FROM = "geometry"  # entry of a calibration's `made_from` that names the geometry of its pictures
@@ -22,7 +22,7 @@ class Straightening:
       mm_per_px: pitch of the pixels afterwards.
     """
 
-    view: View | None
+    view: Rectifier | None
     geometry: str
     mm_per_px: float
 
@@ -44,7 +44,7 @@ class Straightening:
                     "mm_per_px is not given: must be known without a geometry or a calibration; set --mm-per-px"
                 )
             return cls(view=None, geometry="", mm_per_px=mm_per_px)
-        geometry = Geometry.load(path)
+        geometry = CameraGeometry.load(path)
         pitch = geometry.mm_per_px if mm_per_px is None else mm_per_px
         return cls(view=geometry.view(mm_per_px=pitch, size_px=size_px), geometry=geometry.hash, mm_per_px=pitch)
 

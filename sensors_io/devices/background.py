@@ -22,7 +22,7 @@ class Drift:
     rms: float
 
 
-class Background:
+class GelBackground:
     """Running mean of untouched frames:  b ← b + (frame − b) / min(n, memory).
 
     Args:

@@ -21,7 +21,7 @@ import numpy as np
 from sensors_io.clock import NS_PER_S, Clock
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceError, DeviceTimeoutError, OverloadWarning, StaleFrameError
-from sensors_io.sync import ClockMap, IndexGaps, PeriodGaps, Step
+from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -249,13 +249,13 @@ class Intake:
             self._away = False
         return False
 
-    def _step(self, sample: Sample) -> Step:
+    def _step(self, sample: Sample) -> CounterStep:
         """By the counter; by the period where there is none, or where it restarted."""
-        by_index = Step(restarted=True)
+        by_index = CounterStep(restarted=True)
         if sample.index is not None:
             by_index = self._index_gaps.step(sample.index, reopened=self._away)
         if self._period_gaps is None or by_index.duplicate or by_index.late:
-            return by_index if sample.index is not None else Step()
+            return by_index if sample.index is not None else CounterStep()
         stamp = sample.host_time_ns if sample.device_time_ns is None else sample.device_time_ns
         by_period = self._period_gaps.step(stamp)
         if not by_index.restarted:

@@ -61,7 +61,7 @@ class Command(enum.IntEnum):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Calibration:
+class NetFtScale:
     """Counts per newton and per newton millimetre."""
 
     counts_per_n: float
@@ -96,7 +96,7 @@ class NetFtConfig:
         return NetFt(self)
 
 
-def parse_calibration(answer: bytes) -> Calibration:
+def parse_calibration(answer: bytes) -> NetFtScale:
     """Counts per SI unit from the sensor's answer.
 
     Raises:
@@ -111,7 +111,7 @@ def parse_calibration(answer: bytes) -> Calibration:
         raise DeviceDataError(
             f"NetFT calibration {answer.hex()} gives no counts per unit; choose a calibration on its page"
         )
-    return Calibration(
+    return NetFtScale(
         counts_per_n=per_force / _FORCE_UNIT_N[force_unit], counts_per_nmm=per_torque / _TORQUE_UNIT_NMM[torque_unit]
     )
 
@@ -124,7 +124,7 @@ class NetFt:
     def __init__(self, config: NetFtConfig):
         self._config = config
         self._socket: socket.socket | None = None
-        self._calibration: Calibration | None = None
+        self._calibration: NetFtScale | None = None
         self._records: deque[tuple[int, bytes]] = deque()
 
     @property

@@ -19,7 +19,7 @@ from sensors_io.devices.errors import (
     DeviceTimeoutError,
     StreamEndedError,
 )
-from sensors_io.devices.sources import Recorded, Source, source_of
+from sensors_io.devices.sources import Recorded, SampleSource, source_of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,12 @@ class Replay:
     _CLOCK_AHEAD_NS = 987_654_321  # of the device's clock: nobody may take it for the host's
 
     def __init__(
-        self, source: Source, *, seconds: float | None = None, faults: Faults | None = None, clock: Clock | None = None
+        self,
+        source: SampleSource,
+        *,
+        seconds: float | None = None,
+        faults: Faults | None = None,
+        clock: Clock | None = None,
     ):
         self._source = source
         self._end_ns = None if seconds is None else round(seconds * NS_PER_S)

@@ -29,7 +29,7 @@ class Recorded:
     arrays: Mapping[str, np.ndarray]
 
 
-class Source(Protocol):
+class SampleSource(Protocol):
     """A recording that can be read from its beginning any number of times."""
 
     @property
@@ -79,7 +79,7 @@ class PictureFolder:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Video:
+class VideoFile:
     """The frames of a video file, at its own rate."""
 
     path: pathlib.Path
@@ -202,7 +202,9 @@ def _require_rate(rate_hz: float) -> None:
         raise ValueError(f"rate_hz is {rate_hz}: must be > 0; give the rate of the recording")
 
 
-def source_of(path: pathlib.Path, *, sensor: str = "gelsight_mini", rate_hz: float = 25.0, contact: int = 0) -> Source:
+def source_of(
+    path: pathlib.Path, *, sensor: str = "gelsight_mini", rate_hz: float = 25.0, contact: int = 0
+) -> SampleSource:
     """The recording at a path: records, what the Tac3D software saves, a video, or a folder of pictures.
 
     Args:
@@ -221,5 +223,5 @@ def source_of(path: pathlib.Path, *, sensor: str = "gelsight_mini", rate_hz: flo
     if path.suffix == ".npz" or (path / "index.npy").is_file():
         return Tac3dRecording(path=path)
     if path.is_file():
-        return Video(path=path, sensor=sensor)
+        return VideoFile(path=path, sensor=sensor)
     return PictureFolder(path=path, rate_hz=rate_hz, sensor=sensor)

@@ -9,7 +9,7 @@ from typing import Self
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
-from sensors_io.devices.tac3d_messages import Assembler, Decoder, to_schema
+from sensors_io.devices.tac3d_messages import Assembler, Tac3dDecoder, to_schema
 
 PORT = 9988
 PERIOD_S = 0.0327
@@ -34,12 +34,12 @@ class Tac3dConfig:
     address: str = "127.0.0.1"
     wait_s: float = 3.0
 
-    def open(self) -> "Tac3d":
+    def open(self) -> "Tac3dSensor":
         """The device, not open yet."""
-        return Tac3d(self)
+        return Tac3dSensor(self)
 
 
-class Tac3d:
+class Tac3dSensor:
     """A Tac3D sensor, heard over UDP; messages of other sensors on the same port are passed over."""
 
     _RECEIVE_BUFFER = 4 * 1024 * 1024  # bytes: a second of messages, so that a busy host loses none
@@ -47,7 +47,7 @@ class Tac3d:
     def __init__(self, config: Tac3dConfig):
         self._config = config
         self._socket: socket.socket | None = None
-        self._decoder, self._assembler = Decoder(), Assembler()
+        self._decoder, self._assembler = Tac3dDecoder(), Assembler()
         self._sender: tuple[str, int] | None = None
         self._serial = config.serial
         self._first: Sample | None = None

@@ -65,7 +65,7 @@ class _Item:
     end: int
 
 
-class Decoder:
+class Tac3dDecoder:
     """Decodes messages; layouts that were seen before are not parsed again."""
 
     def __init__(self) -> None:
@@ -206,7 +206,7 @@ def to_schema(matrices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Recording:
+class Tac3dArrays:
     """A recording as the vendor saves it, N messages.
 
     Args:
@@ -222,7 +222,7 @@ class Recording:
     matrices: Mapping[str, np.ndarray]
 
 
-def load_recording(path: pathlib.Path) -> Recording:
+def load_recording(path: pathlib.Path) -> Tac3dArrays:
     """Read a folder of .npy files or one .npz.
 
     Raises:
@@ -245,4 +245,4 @@ def load_recording(path: pathlib.Path) -> Recording:
         len(a) != len(index) for a in (times, received if received is not None else times, *matrices.values())
     ) or not len(index):
         raise DeviceDataError(f"{path}: its arrays must be of one length > 0; copy the recording again")
-    return Recording(index=index, send_time_s=times, receive_time_s=received, matrices=matrices)
+    return Tac3dArrays(index=index, send_time_s=times, receive_time_s=received, matrices=matrices)

@@ -46,7 +46,7 @@ class ContactConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Contacts:
+class ContactRegions:
     """The mask bool [H, W], the number of its separate contacts, whether one meets the border of the picture."""
 
     mask: np.ndarray
@@ -54,7 +54,7 @@ class Contacts:
     at_border: bool
 
 
-def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig | None = None) -> Contacts:
+def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig | None = None) -> ContactRegions:
     """Contact by hysteresis: in each connected region deeper than `low_mm` that reaches `high_mm` and slopes by `rim`,
 
         the pixels with u ≥ max(low_mm, ½ max u)
@@ -84,7 +84,7 @@ def find_contacts(depth_mm: np.ndarray, mm_per_px: float, config: ContactConfig 
         mask[box] |= touched
         kept += 1
         border |= _meets_border(touched, (x, y), depth_mm.shape)
-    return Contacts(mask=mask, count=kept, at_border=border)
+    return ContactRegions(mask=mask, count=kept, at_border=border)
 
 
 def _slope(depth_mm: np.ndarray, mm_per_px: float) -> np.ndarray:
@@ -99,7 +99,7 @@ def _slope(depth_mm: np.ndarray, mm_per_px: float) -> np.ndarray:
 
 def changed_contacts(
     picture: np.ndarray, background: np.ndarray, mm_per_px: float, config: ContactConfig | None = None
-) -> Contacts:
+) -> ContactRegions:
     """Contact where no depth is known: regions about a steep change of colour, by hysteresis on its gradient.
 
     The gradient of the smoothed change reaches `steepness` somewhere in a region and half of it throughout; holes, such
@@ -125,7 +125,7 @@ def changed_contacts(
             mask[box] |= inside
             kept += 1
             border |= _meets_border(inside, (x, y), steep.shape)
-    return Contacts(mask=mask, count=kept, at_border=border)
+    return ContactRegions(mask=mask, count=kept, at_border=border)
 
 
 def steepest_change(picture: np.ndarray, background: np.ndarray, mm_per_px: float, smoothing_mm: float = 0.3) -> float:

@@ -6,7 +6,7 @@ import functools
 import cv2
 import numpy as np
 
-from sensors_io.fields.contact import STEEP, ContactConfig, Contacts, find_contacts
+from sensors_io.fields.contact import STEEP, ContactConfig, ContactRegions, find_contacts
 from sensors_io.fields.poisson import neumann
 from sensors_io.fields.slopes import SlopeReader
 from sensors_io.fields.types import Calibration
@@ -44,7 +44,7 @@ class Surface:
     """
 
     depth_mm: np.ndarray
-    contacts: Contacts
+    contacts: ContactRegions
     untouched: float
     zero_known: bool
 
@@ -65,7 +65,7 @@ class DepthReader:
         self._zero = zero or ZeroConfig()
         self._contact = contact or ContactConfig()
 
-    def __call__(self, picture: np.ndarray) -> tuple[np.ndarray, Contacts]:
+    def __call__(self, picture: np.ndarray) -> tuple[np.ndarray, ContactRegions]:
         """Indentation, float32 [H, W] mm, and its contacts, of one picture, uint8 [H, W, 3] RGB."""
         surface = self.read(picture)
         return surface.depth_mm, surface.contacts

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sensors_io.fields.compliance import NodeGrid
-from sensors_io.fields.contact import ContactConfig, Contacts, changed_contacts, steepest_change
+from sensors_io.fields.contact import ContactConfig, ContactRegions, changed_contacts, steepest_change
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.depth import DepthReader, ZeroConfig
 from sensors_io.fields.evidence import Pattern, examine
@@ -160,11 +160,11 @@ class Extractor:
         late = time_gap(host_time_ns, self.config.quality).tolist()
         return joined([self.read(frame, gap=gap) for frame, gap in zip(frames, late, strict=True)])
 
-    def _contacts(self, picture: np.ndarray) -> Contacts:
+    def _contacts(self, picture: np.ndarray) -> ContactRegions:
         """Contacts by colour, where no depth tells them."""
         return changed_contacts(picture, self.background, self.mm_per_px, self.config.contact)
 
-    def _flags(self, picture: np.ndarray, contacts: Contacts) -> Flag:
+    def _flags(self, picture: np.ndarray, contacts: ContactRegions) -> Flag:
         contact = self.config.contact
         flags = Flag.REFUSED if self.refused else Flag.NONE
         steep = steepest_change(picture, self.background, self.mm_per_px, contact.smoothing_mm)
@@ -205,7 +205,7 @@ class Extractor:
             self._shear = ShearReader(self.config.gel, grid, self.config.inverse)
 
     def _split(
-        self, moved: np.ndarray, depth: np.ndarray, contacts: Contacts, valid: np.ndarray
+        self, moved: np.ndarray, depth: np.ndarray, contacts: ContactRegions, valid: np.ndarray
     ) -> dict[str, np.ndarray]:
         """Shear, traction and force of one frame."""
         if self._shear is None:

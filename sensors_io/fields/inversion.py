@@ -60,7 +60,7 @@ class InverseConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Load:
+class GelLoad:
     """Load on the gel in one frame, and the displacement due to each part of it.
 
     Args:
@@ -103,7 +103,7 @@ class LayerInverse:
         self._penalty = _covariance(grid, config.smooth_mm)
         self._decompose()
 
-    def linear(self, displacement_mm: np.ndarray, depth_mm: np.ndarray) -> Load:
+    def linear(self, displacement_mm: np.ndarray, depth_mm: np.ndarray) -> GelLoad:
         """The linear solution.
 
         Args:
@@ -116,7 +116,7 @@ class LayerInverse:
         load, weight = self._linear(self._observed(displacement_mm, depth_mm))
         return self._describe(load, weight)
 
-    def contact(self, displacement_mm: np.ndarray, depth_mm: np.ndarray, touching: np.ndarray | None = None) -> Load:
+    def contact(self, displacement_mm: np.ndarray, depth_mm: np.ndarray, touching: np.ndarray | None = None) -> GelLoad:
         """The solution in which only pressing nodes carry a load: arguments as for `linear`.
 
         Args:
@@ -170,10 +170,10 @@ class LayerInverse:
         load[2 * self._nodes :] = np.maximum(load[2 * self._nodes :], 0)
         return load
 
-    def _describe(self, load: np.ndarray, weight: float) -> Load:
+    def _describe(self, load: np.ndarray, weight: float) -> GelLoad:
         half = 2 * self._nodes
         load = load.astype(np.float32)
-        return Load(
+        return GelLoad(
             traction_mpa=self._fields(np.concatenate([load[:half], -load[half:]])),
             by_pressure_mm=self._fields(self._lateral[:, half:] @ load[half:]),
             by_traction_mm=self._fields(self._lateral[:, :half] @ load[:half]),

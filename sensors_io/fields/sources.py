@@ -24,7 +24,7 @@ class SourceError(UserError, ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pictures:
+class PictureSequence:
     """N pictures, one after the other.
 
     Args:
@@ -42,15 +42,15 @@ class Pictures:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def chosen(self, index: np.ndarray) -> "Pictures":
+    def chosen(self, index: np.ndarray) -> "PictureSequence":
         """Some of the pictures."""
         names = tuple(self.names[i] for i in index)
-        return Pictures(frames=self.frames[index], names=names, gap=self.gap[index], apart=self.apart[index])
+        return PictureSequence(frames=self.frames[index], names=names, gap=self.gap[index], apart=self.apart[index])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Shot:
-    """One picture, uint8 [H, W, 3], its name and what is known of the time before it, as in `Pictures`."""
+    """One picture, uint8 [H, W, 3], its name and what is known of the time before it, as in `PictureSequence`."""
 
     name: str
     frame: np.ndarray
@@ -70,7 +70,7 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
         raise SourceError(f"{path} {error}: must be a whole picture; replace it") from error
 
 
-def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> Pictures:
+def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> PictureSequence:
     """All pictures of files, folders, videos and records, in the order given; files of a folder by name.
 
     Args:
@@ -87,7 +87,7 @@ def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> Pictures:
     if len(shapes) > 1:
         sizes = "; ".join(f"{name} is {shape[1]} × {shape[0]}" for shape, name in shapes.items())
         raise SourceError(f"pictures have different sizes ({sizes}): must be equal; extract them apart")
-    return Pictures(
+    return PictureSequence(
         frames=np.stack([shot.frame for shot in shots]),
         names=tuple(shot.name for shot in shots),
         gap=np.array([shot.gap for shot in shots]),

@@ -47,7 +47,7 @@ class FeelAnyForceConfig(ImportConfig):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Row:
+class _Reading:
     """One picture and its reading."""
 
     indenter: str
@@ -109,7 +109,7 @@ def pressing_sign(fz_n: list[float], pressing: str) -> float:
     return -1.0 if largest >= LEAST_PUSH_N else 1.0
 
 
-def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Row], list[Skip]]:
+def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Reading], list[Skip]]:
     rows, skipped = [], []
     for table in tables:
         for line, cells in enumerate(read_table(table, COLUMNS), start=2):
@@ -127,7 +127,7 @@ def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Row],
                 reason = NO_FORCE if path.is_file() else f"{NO_FORCE}, and its picture is absent"
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=reason))
             if force_n is not None or path.is_file():
-                row = _Row(
+                row = _Reading(
                     indenter=name.parts[-3], path=path, time_ms=int(name.stem), force_n=force_n, table=table.name
                 )
                 rows.append(row)
@@ -143,7 +143,7 @@ def _force(cell: str) -> tuple[float, ...] | None:
     return tuple(reading[:3]) if len(reading) == 6 and np.isfinite(reading).all() else None
 
 
-def _read(key: ContactKey, rows: list[_Row], sign: float, config: FeelAnyForceConfig) -> Taken:
+def _read(key: ContactKey, rows: list[_Reading], sign: float, config: FeelAnyForceConfig) -> Taken:
     pictures = read_pictures([row.path for row in rows], np.arange(len(rows)), config)
     kept = [rows[i] for i in pictures.index]
     camera = {"table": kept[0].table, "clock": "Unix time in the names, ms", "size_px": pictures.size_px}

@@ -23,7 +23,7 @@ class PictureError(UnreadableError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pictures:
+class ReadPictures:
     """The pictures that could be read.
 
     Args:
@@ -68,7 +68,7 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
     return image
 
 
-def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -> Pictures:
+def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -> ReadPictures:
     """The pictures at some positions of a list, at `keep.height` rows.
 
     Args:
@@ -98,7 +98,7 @@ def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -
     if not frames:
         first = f"; the first: {lost[0][1].name} {lost[0][1].reason}" if lost else ""
         raise PictureError(f"holds no picture that can be read{first}")
-    return Pictures(frames=np.stack(frames), index=np.array(index), lost=tuple(lost), size_px=size_px)
+    return ReadPictures(frames=np.stack(frames), index=np.array(index), lost=tuple(lost), size_px=size_px)
 
 
 def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg", ".png")) -> list[pathlib.Path]:

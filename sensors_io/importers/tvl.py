@@ -32,7 +32,7 @@ _DIGIT_PX = (240, 320)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Row:
+class _Pair:
     """One pair: its pictures, its caption, and the table that names it."""
 
     tactile: pathlib.Path
@@ -72,8 +72,8 @@ def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
     )
 
 
-def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dict[str, list[_Row]], list[Skip]]:
-    found: dict[str, list[_Row]] = collections.defaultdict(list)
+def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dict[str, list[_Pair]], list[Skip]]:
+    found: dict[str, list[_Pair]] = collections.defaultdict(list)
     skipped = []
     for table in tables:
         for row in read_table(table, COLUMNS):
@@ -84,7 +84,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
                 skipped.append(Skip(name=f"{table.parent.name}/{table.name}: {row['tactile']}", reason=reason))
                 continue
             part = "" if table.parent == source else f"{table.parent.name}-"
-            pair = _Row(
+            pair = _Pair(
                 tactile=table.parent / tactile, vision=table.parent / vision, caption=row["caption"], table=table.name
             )
             found[part + tactile.parts[0]].append(pair)
@@ -93,7 +93,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
     return found, skipped
 
 
-def _read(key: ContactKey, rows: list[_Row], config: ImportConfig) -> Taken:
+def _read(key: ContactKey, rows: list[_Pair], config: ImportConfig) -> Taken:
     positions = config.positions(len(rows))
     turned = {i for i in positions.tolist() if _swapped(rows[i])}
     paths = [row.vision if i in turned else row.tactile for i, row in enumerate(rows)]
@@ -117,12 +117,12 @@ def _read(key: ContactKey, rows: list[_Row], config: ImportConfig) -> Taken:
     return Taken(sequences=(sequence,), left_out=pictures.left_out)
 
 
-def _swapped(row: _Row) -> bool:
+def _swapped(row: _Pair) -> bool:
     """True if the picture called vision is the DIGIT's."""
     return not _of_digit(row.tactile) and _of_digit(row.vision)
 
 
-def _vision(row: _Row) -> pathlib.Path:
+def _vision(row: _Pair) -> pathlib.Path:
     return row.tactile if _swapped(row) else row.vision
 
 

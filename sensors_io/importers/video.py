@@ -16,7 +16,7 @@ class VideoError(UnreadableError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Video:
+class VideoFrames:
     """Frames kept of a video.
 
     Args:
@@ -38,7 +38,7 @@ class Video:
         return {"file": path.name, "rate_hz": self.rate_hz, "size_px": self.size_px, "frames": self.total}
 
 
-def read_video(path: pathlib.Path, keep: Keep) -> Video:
+def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
     """Decode a video and keep what `keep` says of it.
 
     Args:
@@ -65,7 +65,7 @@ def read_video(path: pathlib.Path, keep: Keep) -> Video:
         raise VideoError(f"is cut off: {total} of {stated} frames can be decoded")
     kept = keep.positions(total)
     images = np.stack([image for n in kept if (image := frames[n]) is not None])
-    return Video(frames=images, index=kept, rate_hz=rate_hz, size_px=size_px, total=total)
+    return VideoFrames(frames=images, index=kept, rate_hz=rate_hz, size_px=size_px, total=total)
 
 
 def _decode(capture: cv2.VideoCapture, keep: Keep) -> tuple[list[np.ndarray | None], tuple[int, int]]:

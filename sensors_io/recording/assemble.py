@@ -13,7 +13,7 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.force import ForceError, at_frames
-from sensors_io.recording.journal import Entry, JournalError, read_journal
+from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
@@ -79,7 +79,7 @@ def background_name(key: ContactKey, sensor: str) -> pathlib.Path:
     return pathlib.Path("backgrounds", f"{key.object_id}-{key.site}-{key.motion}-{key.trial}-{sensor}.png")
 
 
-def _backgrounds(start: Mapping[str, Any], entries: Seq[Entry]) -> dict[str, np.ndarray]:
+def _backgrounds(start: Mapping[str, Any], entries: Seq[JournalEntry]) -> dict[str, np.ndarray]:
     """The first picture that the entries hold of each stream."""
     found: dict[str, np.ndarray] = {}
     for i, stream in enumerate(start["streams"]):
@@ -95,11 +95,11 @@ class _Shared:
 
     start: Mapping[str, Any]
     end: Mapping[str, Any] | None
-    entries: Seq[Entry]
+    entries: Seq[JournalEntry]
     backgrounds: Mapping[str, np.ndarray]
     absent: tuple[str, ...]
 
-    def sequence(self, number: int, frames: Seq[Entry]) -> Sequence:
+    def sequence(self, number: int, frames: Seq[JournalEntry]) -> Sequence:
         """That of one stream."""
         start, stream = self.start, self.start["streams"][number]
         identity, key = stream["identity"], ContactKey(**start["key"])
@@ -147,7 +147,7 @@ class _Shared:
         }
 
 
-def _own_arrays(frames: Seq[Entry]) -> dict[str, np.ndarray]:
+def _own_arrays(frames: Seq[JournalEntry]) -> dict[str, np.ndarray]:
     """Arrays that the sensor itself gives besides pictures, stacked."""
     names = [n for n in frames[0].arrays if n in FRAME_ARRAYS and n not in _MADE_HERE]
     return {n: np.stack([e.arrays[n] for e in frames]).astype(FRAME_ARRAYS[n].dtype) for n in names}
@@ -163,7 +163,7 @@ class _Force:
     residual_n: float | None
 
     @classmethod
-    def at(cls, time_ns: np.ndarray, entries: Seq[Entry]) -> "_Force":
+    def at(cls, time_ns: np.ndarray, entries: Seq[JournalEntry]) -> "_Force":
         """Force and moment, frames that no reading covers or a reading out of range, the residual of interpolation."""
         batches = [e.arrays for e in entries if e.kind == "force"]
         nowhere = np.zeros(len(time_ns), bool)
@@ -197,7 +197,7 @@ def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -
     return np.diff(time_ns, prepend=time_ns[0]) > _GAP_PERIODS * period_s * NS_PER_S
 
 
-def _phases(entries: Seq[Entry], time_ns: np.ndarray) -> np.ndarray:
+def _phases(entries: Seq[JournalEntry], time_ns: np.ndarray) -> np.ndarray:
     """Phase under way at each frame."""
     changes = [(e.plain["time_ns"], e.plain["phase"]) for e in entries if e.kind == "phase"]
     if not changes:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sensors_io.recording.assemble import assemble, background_name
-from sensors_io.recording.coach import Stage
+from sensors_io.recording.coach import ContactStage
 from sensors_io.records import RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard
 
@@ -74,7 +74,7 @@ class Book:
         for path in sorted(self._journals.glob("*.journal")):
             self._report.recovered += self.store(path) is not None
 
-    def wanted(self, object_id: str, site: int, stage: Stage) -> ContactKey | None:
+    def wanted(self, object_id: str, site: int, stage: ContactStage) -> ContactKey | None:
         """Identity of the next attempt at a stage; `None` once it is complete or has been tried `ATTEMPTS` times."""
         for attempt in range(ATTEMPTS):
             trial = stage.level * ATTEMPTS + attempt

@@ -21,7 +21,7 @@ _MOVING = {
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Stage:
+class ContactStage:
     """One contact of the protocol: its motion, the normal force it is made at, and which force level that is."""
 
     motion: str
@@ -82,10 +82,10 @@ class Advice:
     target_n: float
 
 
-def protocol() -> tuple[Stage, ...]:
+def protocol() -> tuple[ContactStage, ...]:
     """All contacts at one site: the press, then every motion at every force, gentlest first."""
-    moves = [Stage(motion=m, force_n=f, level=k) for k, f in enumerate(FORCES_N) for m in EXPLORATORY]
-    return (Stage(motion="press", force_n=PRESS_FORCE_N), *moves)
+    moves = [ContactStage(motion=m, force_n=f, level=k) for k, f in enumerate(FORCES_N) for m in EXPLORATORY]
+    return (ContactStage(motion="press", force_n=PRESS_FORCE_N), *moves)
 
 
 class Coach:
@@ -96,7 +96,7 @@ class Coach:
       config: thresholds.
     """
 
-    def __init__(self, stage: Stage, config: CoachConfig | None = None):
+    def __init__(self, stage: ContactStage, config: CoachConfig | None = None):
         self._stage = stage
         self._config = config or CoachConfig()
         self._clear_since_ns: int | None = None

@@ -33,7 +33,7 @@ class JournalError(UserError, ValueError):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Entry:
+class JournalEntry:
     """One entry: its kind, plain values and arrays."""
 
     kind: str
@@ -94,7 +94,7 @@ class JournalWriter:
                 rest = rest[os.write(self._file, rest) :]
 
 
-def read_journal(path: pathlib.Path) -> tuple[list[Entry], int]:
+def read_journal(path: pathlib.Path) -> tuple[list[JournalEntry], int]:
     """All whole entries, and the number of bytes of a last one that was cut off.
 
     Raises:
@@ -106,7 +106,7 @@ def read_journal(path: pathlib.Path) -> tuple[list[Entry], int]:
     return [entry for entry, _ in whole], len(data) - end
 
 
-def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[Entry, int]]:
+def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntry, int]]:
     start = 0
     while start + _PREFIX.size <= len(data):
         magic, size, checksum = _PREFIX.unpack_from(data, start)
@@ -120,7 +120,7 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[Entry, int]
         start = end
 
 
-def _decode(body: memoryview) -> Entry:
+def _decode(body: memoryview) -> JournalEntry:
     (length,) = _HEADER_SIZE.unpack_from(body)
     start = _HEADER_SIZE.size + length
     header = json.loads(bytes(body[_HEADER_SIZE.size : start]))
@@ -129,4 +129,4 @@ def _decode(body: memoryview) -> Entry:
         dtype, count = np.dtype(kind), int(np.prod(shape))
         arrays[name] = np.frombuffer(body, dtype, count, start).reshape(shape) if count else np.zeros(shape, dtype)
         start += count * dtype.itemsize
-    return Entry(kind=header["kind"], plain=header["plain"], arrays=arrays)
+    return JournalEntry(kind=header["kind"], plain=header["plain"], arrays=arrays)

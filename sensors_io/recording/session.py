@@ -20,9 +20,9 @@ from sensors_io.devices.errors import DeviceError, StreamEndedError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.recording.book import Book, ObjectView, Report
-from sensors_io.recording.coach import Advice, Coach, CoachConfig, FreeCoach, Stage, protocol
+from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
-from sensors_io.recording.streams import Feed, Stream, StreamStatus
+from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, Phase, SchemaError
 
@@ -51,7 +51,7 @@ class SessionConfig:
     object_id: str
     site: int = 0
     licence: str = "all rights reserved"
-    stages: tuple[Stage, ...] = dataclasses.field(default_factory=protocol)
+    stages: tuple[ContactStage, ...] = dataclasses.field(default_factory=protocol)
     free_s: float = 0.0
     coach: CoachConfig = dataclasses.field(default_factory=CoachConfig)
     gravity: GravityModel | None = None
@@ -72,7 +72,7 @@ class Status:
       alarm: what is wrong now; empty if nothing is.
     """
 
-    stage: Stage
+    stage: ContactStage
     advice: Advice
     streams: tuple[StreamStatus, ...]
     force: Counts | None
@@ -82,8 +82,8 @@ class Status:
 def record_session(
     out: pathlib.Path,
     config: SessionConfig,
-    tactile: Seq[Feed],
-    force: Feed | None,
+    tactile: Seq[SampleReader],
+    force: SampleReader | None,
     *,
     show: Callable[[Status], None],
     view: ObjectView | None = None,
@@ -126,8 +126,8 @@ def record_session(
     return report
 
 
-def _stages(config: SessionConfig) -> tuple[Stage, ...]:
-    return (Stage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
+def _stages(config: SessionConfig) -> tuple[ContactStage, ...]:
+    return (ContactStage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
 
 
 def _meta(config: SessionConfig, streams: Seq[Stream]) -> RecordsMeta:
@@ -149,7 +149,7 @@ class _Session:
         self,
         config: SessionConfig,
         streams: Seq[Stream],
-        force: Feed | None,
+        force: SampleReader | None,
         show: Callable[[Status], None],
         stop: Callable[[], bool],
         book: Book,
@@ -160,7 +160,7 @@ class _Session:
         self._leads: Stream | None = None
         self._alarm = ""
 
-    def contact(self, stage: Stage, key: ContactKey) -> None:
+    def contact(self, stage: ContactStage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
         c = self._config
         coach = FreeCoach(c.free_s) if c.free_s > 0 else Coach(stage, c.coach)
@@ -179,7 +179,7 @@ class _Session:
         if failure is not None:
             raise failure
 
-    def _run(self, stage: Stage, coach: Coach | FreeCoach, journal: JournalWriter) -> bool:
+    def _run(self, stage: ContactStage, coach: Coach | FreeCoach, journal: JournalWriter) -> bool:
         """Read until the coach says done; whether the contact is complete."""
         phase: Phase | None = None
         advice: Advice | None = None
@@ -245,7 +245,7 @@ class _Session:
             self._alarm = "the force sensor is out of its range: release" if beyond[-1] else ""
         return times, force
 
-    def _start(self, key: ContactKey, stage: Stage) -> dict[str, Any]:
+    def _start(self, key: ContactKey, stage: ContactStage) -> dict[str, Any]:
         return {
             "key": dataclasses.asdict(key),
             "streams": [stream.begin() for stream in self._streams],
@@ -262,7 +262,7 @@ class _Session:
         force = {} if self._force is None else {"force": dataclasses.asdict(self._force.counts)}
         return {stream.sensor: dataclasses.asdict(stream.feed.counts) for stream in self._streams} | force
 
-    def _status(self, stage: Stage, advice: Advice) -> Status:
+    def _status(self, stage: ContactStage, advice: Advice) -> Status:
         return Status(
             stage=stage,
             advice=advice,

@@ -8,7 +8,7 @@ import numpy as np
 from sensors_io.devices.base import Sample
 from sensors_io.force import ForceError, estimate_lag
 from sensors_io.offsets import Offset, Offsets, OffsetsError
-from sensors_io.recording.streams import Feed
+from sensors_io.recording.streams import SampleReader
 from sensors_io.taps import Signal, TapError, tap_offset
 
 _STRIDE = 4  # of the pixels that tell how much a picture has changed
@@ -26,7 +26,7 @@ class Listener:
       feed: an open device.
     """
 
-    def __init__(self, feed: Feed):
+    def __init__(self, feed: SampleReader):
         self.feed = feed
         self._first: np.ndarray | None = None
         self._times: list[int] = []

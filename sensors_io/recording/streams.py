@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.background import Background, Drift
+from sensors_io.devices.background import Drift, GelBackground
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.intake import Counts
 from sensors_io.recording.journal import JournalWriter
@@ -16,7 +16,7 @@ _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
 _DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
 
 
-class Feed(Protocol):
+class SampleReader(Protocol):
     """Source of a session's samples; `Reader` is one."""
 
     @property
@@ -54,12 +54,12 @@ class Stream:
       late_s: by which its stamps lie behind those of the force sensor, or of the first stream.
     """
 
-    def __init__(self, number: int, feed: Feed, late_s: float):
+    def __init__(self, number: int, feed: SampleReader, late_s: float):
         self.feed, self.late_s = feed, late_s
         self.frames = 0
         self._number = number
         self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
-        self._background = Background()
+        self._background = GelBackground()
         self._drift: Drift | None = None
         self._newest: Sample | None = None
 

@@ -60,7 +60,7 @@ Texture = Callable[[int, np.random.Generator], np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Look:
+class MaterialLook:
     """Appearance of a material: ranges of hue, saturation and value (0..1), gloss, texture and its share in the value.
 
     `clear` is the share of the background that shines through.
@@ -118,17 +118,23 @@ def _turned_pixels(px: int, rng: np.random.Generator) -> tuple[np.ndarray, np.nd
 
 
 LOOKS = (
-    Look(hue=(0, 1), saturation=(0.6, 0.95), value=(0.6, 0.95), gloss=0.5, texture=_plain, contrast=0.02),
-    Look(hue=(0.52, 0.66), saturation=(0, 0.1), value=(0.5, 0.75), gloss=0.9, texture=_brushed, contrast=0.12),
-    Look(hue=(0, 1), saturation=(0.25, 0.65), value=(0.35, 0.8), gloss=0.0, texture=_weave, contrast=0.3),
-    Look(hue=(0, 0.28), saturation=(0.55, 0.9), value=(0.55, 0.9), gloss=0.25, texture=_mottle, contrast=0.3),
-    Look(hue=(0.08, 0.16), saturation=(0.02, 0.2), value=(0.85, 0.98), gloss=0.03, texture=_mottle, contrast=0.05),
-    Look(
+    MaterialLook(hue=(0, 1), saturation=(0.6, 0.95), value=(0.6, 0.95), gloss=0.5, texture=_plain, contrast=0.02),
+    MaterialLook(hue=(0.52, 0.66), saturation=(0, 0.1), value=(0.5, 0.75), gloss=0.9, texture=_brushed, contrast=0.12),
+    MaterialLook(hue=(0, 1), saturation=(0.25, 0.65), value=(0.35, 0.8), gloss=0.0, texture=_weave, contrast=0.3),
+    MaterialLook(hue=(0, 0.28), saturation=(0.55, 0.9), value=(0.55, 0.9), gloss=0.25, texture=_mottle, contrast=0.3),
+    MaterialLook(
+        hue=(0.08, 0.16), saturation=(0.02, 0.2), value=(0.85, 0.98), gloss=0.03, texture=_mottle, contrast=0.05
+    ),
+    MaterialLook(
         hue=(0.42, 0.58), saturation=(0.1, 0.3), value=(0.75, 0.95), gloss=1, texture=_plain, contrast=0.01, clear=0.6
     ),
-    Look(hue=(0.02, 0.08), saturation=(0.4, 0.7), value=(0.15, 0.45), gloss=0.2, texture=_pebble, contrast=0.35),
-    Look(hue=(0.06, 0.11), saturation=(0.4, 0.65), value=(0.45, 0.75), gloss=0.08, texture=_grain, contrast=0.35),
-    Look(hue=(0, 1), saturation=(0, 0.5), value=(0.2, 0.9), gloss=0.2, texture=_mottle, contrast=0.18),
+    MaterialLook(
+        hue=(0.02, 0.08), saturation=(0.4, 0.7), value=(0.15, 0.45), gloss=0.2, texture=_pebble, contrast=0.35
+    ),
+    MaterialLook(
+        hue=(0.06, 0.11), saturation=(0.4, 0.65), value=(0.45, 0.75), gloss=0.08, texture=_grain, contrast=0.35
+    ),
+    MaterialLook(hue=(0, 1), saturation=(0, 0.5), value=(0.2, 0.9), gloss=0.2, texture=_mottle, contrast=0.18),
 )
 """In the order of `MATERIALS`: plastic, metal, fabric, food, paper, glass, leather, wood, other."""
 
@@ -176,7 +182,7 @@ def _shape(material: int, x: np.ndarray, y: np.ndarray, rng: np.random.Generator
     return inside * height, inside
 
 
-def _albedo(look: Look, px: int, rng: np.random.Generator) -> np.ndarray:
+def _albedo(look: MaterialLook, px: int, rng: np.random.Generator) -> np.ndarray:
     """Colour without light, [px, px, 3]."""
     colour = _hsv(rng.uniform(*look.hue), rng.uniform(*look.saturation), rng.uniform(*look.value))
     return colour * (1 + look.contrast * look.texture(px, rng))[..., None]

@@ -35,7 +35,7 @@ Gap = Callable[[int], Array] | Array
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Stage:
+class ContactScene:
     """Surroundings of contacts: the gel, its square window, and the object as a layer of 1 MPa, `None` if rigid."""
 
     gel: Layer
@@ -47,7 +47,7 @@ class Stage:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Choice:
+class ContactSettings:
     """Settings for solving a contact, and the predicted error and cost.
 
     `promised_error` is the law's bound of the error.  Where `met` is false the setting is the one of least error, and
@@ -76,12 +76,12 @@ class Bucket:
 class Solved:
     """S scenes: the choice of each, and their contacts by grid."""
 
-    choices: tuple[Choice, ...]
+    choices: tuple[ContactSettings, ...]
     buckets: tuple[Bucket, ...]
 
 
 @struct.dataclass
-class Look:
+class CoarseSolve:
     """One look: the coarse contact, what it tells, and what follows for the error asked for."""
 
     contact: contact.Contact
@@ -91,7 +91,7 @@ class Look:
     met: Bool[Array, "..."]
 
 
-def choose(error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float) -> Choice:
+def choose(error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float) -> ContactSettings:
     """Choose as `solve` does, for who solves by other means."""
     stage, gaps, modulus = _alone(gap, gel, body, window_mm)
     seen = look(error, gaps, np.array([force_n]), modulus, stage)
@@ -100,7 +100,7 @@ def choose(error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | Non
 
 def solve(
     error: float, gap: Gap, force_n: float, gel: Layer, body: Layer | None, window_mm: float
-) -> tuple[Choice, contact.Contact]:
+) -> tuple[ContactSettings, contact.Contact]:
     """Solve one contact on the cheapest setting whose promised error is at most 1.5 times the error asked for.
 
     Args:
@@ -120,7 +120,7 @@ def solve(
     return solved.choices[0], jax.tree.map(lambda leaf: leaf[0], bucket.contacts)
 
 
-def solve_many(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: Stage) -> Solved:
+def solve_many(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: ContactScene) -> Solved:
     """Solve S contacts on one gel, each as `solve` does; the host sorts them by grid between look and solution.
 
     Compiles one program for the look and one for every grid and padding that is ever chosen.
@@ -151,7 +151,9 @@ def solve_many(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.nd
     return Solved(choices=_choices(seen), buckets=tuple(buckets))
 
 
-def look(error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: Stage, law: Law = LAW) -> Look:
+def look(
+    error: float, gaps: Gaps, force_n: np.ndarray, modulus_mpa: np.ndarray, stage: ContactScene, law: Law = LAW
+) -> CoarseSolve:
     """Solve S contacts on the coarsest grid and choose for each; arguments as for `solve_many`."""
     require(0 < error <= 1, "error", error, "must lie in (0, 1]")
     for name, values in (("force_n", force_n), ("modulus_mpa", modulus_mpa)):
@@ -178,27 +180,28 @@ def gap_on(gap: Gap, grid: int) -> Float[Array, "N N"]:
     return nested.coarsen(gap, gap.shape[0] // grid)
 
 
-def _alone(gap: Gap, gel: Layer, body: Layer | None, window_mm: float) -> tuple[Stage, Gaps, np.ndarray]:
+def _alone(gap: Gap, gel: Layer, body: Layer | None, window_mm: float) -> tuple[ContactScene, Gaps, np.ndarray]:
     """One scene as many."""
     soft = None if body is None else dataclasses.replace(body, modulus_mpa=1.0)
     modulus = np.array([1.0 if body is None else body.modulus_mpa])
-    return Stage(gel=gel, body=soft, window_mm=window_mm), lambda n, rows: gap_on(gap, n)[None], modulus
+    return ContactScene(gel=gel, body=soft, window_mm=window_mm), lambda n, rows: gap_on(gap, n)[None], modulus
 
 
-def _choices(seen: Look) -> tuple[Choice, ...]:
+def _choices(seen: CoarseSolve) -> tuple[ContactSettings, ...]:
     fields = zip(seen.index.tolist(), seen.promised.tolist(), seen.met.tolist(), strict=True)
     return tuple(
-        Choice(**dataclasses.asdict(MENU[i]), tier=contact.Tier.SPG, promised_error=e, met=m) for i, e, m in fields
+        ContactSettings(**dataclasses.asdict(MENU[i]), tier=contact.Tier.SPG, promised_error=e, met=m)
+        for i, e, m in fields
     )
 
 
 def _go_on(
-    seen: Look,
+    seen: CoarseSolve,
     gaps: Gaps,
     rows: np.ndarray,
     force_n: np.ndarray,
     modulus_mpa: np.ndarray,
-    stage: Stage,
+    stage: ContactScene,
     program: tuple[int, int],
 ) -> contact.Contact:
     """Contacts of some scenes on one grid, from where the look left them."""
@@ -217,7 +220,7 @@ def _go_on(
 @jax.jit
 def _look(
     live: Array, given: tuple, gel: Array, body: Array, sizes: tuple[float, float], error: float, law: Law
-) -> Look:
+) -> CoarseSolve:
     window, thickness = sizes
 
     def one(scene: tuple[Array, Array, Array]) -> contact.Contact:
@@ -225,11 +228,11 @@ def _look(
         spacing = window / LOOK.grid
         return contact.solve(gap, force, gel, body / modulus, spacing, LOOK.tolerance, thickness_mm=thickness)
 
-    def tell(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> Look:
+    def tell(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> CoarseSolve:
         share = gel_share(gel, body / modulus)
         told = survey(found.pressure_mpa, found.displacement_mm, gaps, share, window, thickness)
         index, promised, met = pick(error, log_error(told, law, MENU), law)
-        return Look(contact=found, survey=told, index=index, promised=promised, met=met)
+        return CoarseSolve(contact=found, survey=told, index=index, promised=promised, met=met)
 
     gaps, force, modulus = given
     found = map_live(one, live, (gaps[0], force, modulus))
@@ -247,7 +250,7 @@ def _resume(
     return map_live(one, live, given)
 
 
-def _spectra(stage: Stage, padded: int, spacing_mm: float) -> tuple[Array, Array]:
+def _spectra(stage: ContactScene, padded: int, spacing_mm: float) -> tuple[Array, Array]:
     """Compliance of the gel and of the object of 1 MPa."""
     gel = _compliance(stage.gel, padded, spacing_mm)
     return gel, jnp.zeros_like(gel) if stage.body is None else _compliance(stage.body, padded, spacing_mm)

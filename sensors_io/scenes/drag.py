@@ -30,7 +30,7 @@ class History:
 
 
 @struct.dataclass
-class Step:
+class RigidMotion:
     """Rigid motion of the object since the frame before: slide, and twist about `centre_mm`, which moves along."""
 
     slide_mm: Float[Array, "2"]
@@ -77,7 +77,7 @@ def advance(
     history: History,
     pressure_mpa: Float[Array, "N N"],
     friction: Array | float,
-    step: Step,
+    step: RigidMotion,
     bodies: Bodies,
     x_mm: Float[Array, "N"],
     tolerance: Array | float = tangential.TOLERANCE,

@@ -33,7 +33,7 @@ _NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation of a n
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class BallPresses:
+class BallPictures:
     """Pictures of presses [P, N, N, 3] and of the gel at rest [N, N, 3], RGB in 0..1; the ball's radius; the scale."""
 
     pictures: np.ndarray
@@ -120,7 +120,7 @@ def ball_profiles(gel: layer.Layer, radius_mm: float, presses: int = 24, side_mm
     return Profiles(contact_mm=np.array(contacts), ratio=ratio, depth_mm=np.array(depths))
 
 
-def fit(presses: BallPresses, profiles: Profiles, touches: np.ndarray) -> PhotometricOptics:
+def fit(presses: BallPictures, profiles: Profiles, touches: np.ndarray) -> PhotometricOptics:
     """Optics by linear least squares: the flat field from the background, slope and depth from the presses' changes."""
     half, axis = presses.window_mm / 2, presses.axis_mm
     x = axis / half
@@ -140,7 +140,7 @@ def fit(presses: BallPresses, profiles: Profiles, touches: np.ndarray) -> Photom
     )
 
 
-def align(presses: BallPresses, profiles: Profiles, touches: np.ndarray, optics: PhotometricOptics) -> np.ndarray:
+def align(presses: BallPictures, profiles: Profiles, touches: np.ndarray, optics: PhotometricOptics) -> np.ndarray:
     """Touches that explain each picture best, given the optics; [P, 3]."""
     return np.array(
         [
@@ -151,7 +151,7 @@ def align(presses: BallPresses, profiles: Profiles, touches: np.ndarray, optics:
 
 
 def fit_jointly(
-    presses: BallPresses,
+    presses: BallPictures,
     profiles: Profiles,
     begun: np.ndarray,
     train: np.ndarray,
@@ -199,7 +199,7 @@ def points(axis_mm: np.ndarray, touch: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return axis_mm[column], axis_mm[row]
 
 
-def measure_noise(presses: BallPresses, touches: np.ndarray, optics: PhotometricOptics) -> Noise:
+def measure_noise(presses: BallPictures, touches: np.ndarray, optics: PhotometricOptics) -> Noise:
     """Noise and grain, high-passed, away from the press, of what the flat field leaves.
 
     The median over the presses is the fixed part; what is left of each picture is noise, its standard deviation taken
@@ -226,7 +226,7 @@ def measure_noise(presses: BallPresses, touches: np.ndarray, optics: Photometric
 
 
 def _align_one(
-    presses: BallPresses, profiles: Profiles, picture: np.ndarray, touch: np.ndarray, optics: PhotometricOptics
+    presses: BallPictures, profiles: Profiles, picture: np.ndarray, touch: np.ndarray, optics: PhotometricOptics
 ) -> np.ndarray:
     axis = presses.axis_mm
     close, at = near(axis, touch), points(axis, touch)

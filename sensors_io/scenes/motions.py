@@ -98,8 +98,8 @@ def plan(motion: str, force_n: float, pace: Pace | None = None) -> Plan:
 
 
 def moved(
-    pose: surface.Pose, slide_mm: Float[Array, "2"], twist_rad: Float[Array, ""], tilt_rad: Float[Array, "2"]
-) -> surface.Pose:
+    pose: surface.SensorPose, slide_mm: Float[Array, "2"], twist_rad: Float[Array, ""], tilt_rad: Float[Array, "2"]
+) -> surface.SensorPose:
     """Pose of the object after a rigid motion in the gel's frame: its skin, relief and texture go with it.
 
     `surface.gap(skin, moved(pose, ...), x)` is the gap that the normal contact of that frame needs.  The twist turns

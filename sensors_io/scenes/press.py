@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int, UInt8, UInt32
 
 from sensors_io import layer
 from sensors_io.scenes import contact, drag, failures, motions, noise, readout, surface, traction
-from sensors_io.scenes.readout import Fields, Gel, Resampling, Unit
+from sensors_io.scenes.readout import FrameFields, Gel, Resampling, Unit
 from sensors_io.scenes.sensors import BODY, SensorModel
 
 
@@ -33,7 +33,7 @@ class Press:
     """Touched object: skin, pose, effective modulus and friction, path, drift of exposure over it."""
 
     skin: surface.Skin
-    pose: surface.Pose
+    pose: surface.SensorPose
     modulus_mpa: Float[Array, ""]
     friction: Float[Array, ""]
     path: Path
@@ -41,7 +41,7 @@ class Press:
 
 
 @struct.dataclass
-class Recording:
+class SensorRecording:
     """Result of F frames: pictures, fields on the 20 × 20 grid, load, and the solver's report on every frame.
 
     Force and moment act on the gel, about the window's centre.  `strain` is the greatest indentation over the gel's
@@ -49,7 +49,7 @@ class Recording:
     """
 
     frames: UInt8[Array, "F H W 3"] | None
-    fields: Fields
+    fields: FrameFields
     force_n: Float[Array, "F 3"]
     moment_nmm: Float[Array, "F 3"]
     strain: Float[Array, "F"]
@@ -60,7 +60,7 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Grid:
+class GridSizes:
     """Sides of the contact grid and of the picture, in pixels."""
 
     contact_grid: int
@@ -94,7 +94,7 @@ def padded_size(grid: int, window_mm: float, thickness_mm: float) -> int:
 
 
 @functools.lru_cache(maxsize=16)
-def make_kernels(sensor: SensorModel, grid: Grid, *, coupled: bool = False) -> Kernels:
+def make_kernels(sensor: SensorModel, grid: GridSizes, *, coupled: bool = False) -> Kernels:
     """Kernels of a sensor, made in float64 on the host and kept in float32; `coupled` as in `SceneConfig`."""
     spacing = sensor.window_mm / grid.contact_grid
     size = padded_size(grid.contact_grid, sensor.window_mm, sensor.gel.thickness_mm)
@@ -118,12 +118,12 @@ def record(
     kernels: Kernels,
     key: UInt32[Array, "2"],
     sensor: SensorModel,
-    grid: Grid,
+    grid: GridSizes,
     tolerance: float = contact.TOLERANCE,
     max_iterations: int = contact.MAX_ITERATIONS,
     *,
     moving: bool = False,
-) -> Recording:
+) -> SensorRecording:
     """Touch, measure and photograph.
 
     Args:
@@ -145,13 +145,15 @@ def record(
     if not moving:
         gap = scene.gap(jax.tree.map(lambda leaf: leaf[0], press.path))
 
-        def press_on(frame: tuple[Path, Array, Array]) -> Recording:
+        def press_on(frame: tuple[Path, Array, Array]) -> SensorRecording:
             path, exposure, key = frame
             return scene.see(scene.solve(gap, path.force_n), None, exposure, key)
 
         return jax.lax.map(press_on, (press.path, exposure, keys))
 
-    def move_on(history: drag.History, frame: tuple[Path, Array, Array, drag.Step]) -> tuple[drag.History, Recording]:
+    def move_on(
+        history: drag.History, frame: tuple[Path, Array, Array, drag.RigidMotion]
+    ) -> tuple[drag.History, SensorRecording]:
         path, exposure, key, step = frame
         solved = scene.solve(scene.gap(path), path.force_n)
         history, dragged = scene.drag(history, solved, step)
@@ -170,7 +172,7 @@ class Scene:
     unit: Unit
     kernels: Kernels
     sensor: SensorModel
-    grid: Grid
+    grid: GridSizes
     limits: tuple[float, int]
 
     @property
@@ -203,7 +205,9 @@ class Scene:
             strain=jnp.where(touches, solved.strain, 0),
         )
 
-    def drag(self, history: drag.History, solved: contact.Contact, step: drag.Step) -> tuple[drag.History, drag.Frame]:
+    def drag(
+        self, history: drag.History, solved: contact.Contact, step: drag.RigidMotion
+    ) -> tuple[drag.History, drag.Frame]:
         """The traction of this frame."""
         series = traction.in_series(
             self.kernels.gel_shear, self.kernels.body_shear, self.unit.modulus_factor, self.press.modulus_mpa
@@ -218,7 +222,7 @@ class Scene:
             return None
         return gel / self.unit.modulus_factor - body / self.press.modulus_mpa
 
-    def see(self, solved: contact.Contact, slip: Array | None, exposure: Array, key: Array) -> Recording:
+    def see(self, solved: contact.Contact, slip: Array | None, exposure: Array, key: Array) -> SensorRecording:
         """Everything that is recorded of one frame under pressure and traction."""
         gel = self._gel(solved, slip)
         carried = jnp.zeros(solved.pressure_mpa.shape, jnp.complex64) if slip is None else slip
@@ -230,7 +234,7 @@ class Scene:
             marker_loss=failures.marker_loss(fields.valid),
             border_contact=failures.border_contact(solved.pressure_mpa),
         )
-        return Recording(
+        return SensorRecording(
             frames=picture,
             fields=fields,
             force_n=force,
@@ -257,11 +261,11 @@ class Scene:
         return Gel(depth_mm=depth, marker_depth_mm=into * softer, markers_mm=along * softer, shear_mm=sheared * softer)
 
 
-def _steps(press: Press) -> drag.Step:
+def _steps(press: Press) -> drag.RigidMotion:
     """Motion of every frame since the one before."""
     path = press.path
     slide, twist = (jnp.diff(a, axis=0, prepend=jnp.zeros_like(a[:1])) for a in (path.slide_mm, path.twist_rad))
-    return drag.Step(slide_mm=slide, twist_rad=twist, centre_mm=press.pose.offset_mm + path.slide_mm)
+    return drag.RigidMotion(slide_mm=slide, twist_rad=twist, centre_mm=press.pose.offset_mm + path.slide_mm)
 
 
 def _is_smooth(size: int) -> bool:

@@ -40,7 +40,7 @@ class Gel:
 
 
 @struct.dataclass
-class Fields:
+class FrameFields:
     """One frame on the 20 × 20 grid: displacement, its part by traction, indentation, and which nodes are read."""
 
     deformation_mm: Float[Array, "h w 2"]
@@ -64,7 +64,7 @@ def make_resampling(grid: int, image_px: int) -> Resampling:
     return Resampling(to_image=optics.cubic_matrix(image_px, grid), to_field=jnp.asarray(nodes, jnp.float32))
 
 
-def measure(gel: Gel, unit: Unit, resampling: Resampling, key: UInt32[Array, "2"], sensor: SensorModel) -> Fields:
+def measure(gel: Gel, unit: Unit, resampling: Resampling, key: UInt32[Array, "2"], sensor: SensorModel) -> FrameFields:
     """The fields as the sensor reports them: with its gains, drifting zero plane, noise, and lost nodes set to 0."""
     planes = [gel.markers_mm.real, gel.markers_mm.imag, gel.shear_mm.real, gel.shear_mm.imag, gel.marker_depth_mm]
     nodes = _resample(resampling.to_field, jnp.stack(planes))
@@ -76,7 +76,7 @@ def measure(gel: Gel, unit: Unit, resampling: Resampling, key: UInt32[Array, "2"
     zero = offset + slope_x * x + slope_y * x[:, None]
     depth = nodes[4] * unit.depth_gain + zero + sensor.depth_noise_mm * error[4]
     valid = (noise.uniform(noise.fold(key, 2), cells) >= LOST_NODE_SHARE) & ~_unreadable(gel, resampling, sensor)
-    return Fields(
+    return FrameFields(
         deformation_mm=jnp.where(valid[..., None], jnp.moveaxis(lateral[:2], 0, -1), 0),
         shear_mm=jnp.where(valid[..., None], jnp.moveaxis(lateral[2:], 0, -1), 0),
         depth_mm=jnp.where(valid, depth, 0),

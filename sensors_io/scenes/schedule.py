@@ -53,7 +53,7 @@ class Slot:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LeftOut:
+class StrainLimitCounts:
     """Frames that the protocol would take without regard to what objects bear, by object and force band, [n, bands].
 
     `asked` are all frames of one sensor, `past_limit` those past the object's strain limit on at least one sensor,
@@ -71,7 +71,7 @@ class Schedule:
 
     slots: tuple[Slot, ...]
     limits: strength.Limits
-    left_out: LeftOut
+    left_out: StrainLimitCounts
 
 
 def pace(frames: int) -> motions.Pace:
@@ -180,7 +180,9 @@ def _assign(tasks: list[_Task], rows: np.ndarray, limit: np.ndarray) -> list[_Gi
     return given
 
 
-def _count(frames: int, limit: np.ndarray, bears: np.ndarray, ceiling: np.ndarray, asked: list[_Given]) -> LeftOut:
+def _count(
+    frames: int, limit: np.ndarray, bears: np.ndarray, ceiling: np.ndarray, asked: list[_Given]
+) -> StrainLimitCounts:
     """Count the frames that would have been taken of every object without regard to what it bears.
 
     Args:
@@ -199,7 +201,7 @@ def _count(frames: int, limit: np.ndarray, bears: np.ndarray, ceiling: np.ndarra
         for counts, most in ((total, 0.0), (past, limit[which]), (replaced, kept)):
             beyond = load[load > most + _ROUNDING]
             counts[which] += np.bincount(np.searchsorted(BANDS_N, beyond - _ROUNDING), minlength=len(BANDS_N))
-    return LeftOut(asked=total, past_limit=past, replaced=replaced)
+    return StrainLimitCounts(asked=total, past_limit=past, replaced=replaced)
 
 
 @functools.lru_cache(maxsize=64)

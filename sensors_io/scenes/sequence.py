@@ -10,7 +10,7 @@ from sensors_io.scenes.cards import object_id, region_px
 from sensors_io.scenes.config import GENERATOR, SceneConfig
 from sensors_io.scenes.draws import Draw, Site, draw
 from sensors_io.scenes.effort import Effort
-from sensors_io.scenes.press import Grid, make_kernels, record
+from sensors_io.scenes.press import GridSizes, make_kernels, record
 from sensors_io.scenes.sensors import MODELS, SensorModel
 from sensors_io.scenes.validity import STRAIN_LIMIT
 from sensors_io.schema import ContactKey, Flag, Sequence
@@ -65,7 +65,7 @@ def effort_of(config: SceneConfig, drawn: Draw) -> Effort:
 
 def _record(config: SceneConfig, drawn: Draw, chosen: Effort) -> Any:
     """The `Recording` of the sensor's compiled program, as NumPy arrays."""
-    grid = Grid(contact_grid=chosen.grid, image_px=config.image_px)
+    grid = GridSizes(contact_grid=chosen.grid, image_px=config.image_px)
     limits = (chosen.tolerance, config.solver_max_iterations)
     kernels = make_kernels(drawn.sensor, grid, coupled=config.coupled)
     moving = config.coupled or drawn.hand.motion in _MOVING

@@ -64,7 +64,7 @@ def _strains(
 
     def one(inputs: tuple[surface.Skin, Array, Array]) -> Array:
         skin, turn, modulus = inputs
-        gap = surface.gap(skin, surface.Pose(offset_mm=still, turn_rad=turn, tilt=still), x)
+        gap = surface.gap(skin, surface.SensorPose(offset_mm=still, turn_rad=turn, tilt=still), x)
 
         def strain(case: tuple[Array, Array]) -> Array:
             force, compliance = case

@@ -44,7 +44,7 @@ class Skin:
 
 
 @struct.dataclass
-class Pose:
+class SensorPose:
     """Position of the sensor over the site: offset, turn about the normal, tilt as a slope along x and y."""
 
     offset_mm: Float[Array, "2"]
@@ -86,7 +86,7 @@ def _seam(solid: Solid, variation: Variation, site_mm: np.ndarray) -> Seam:
     return Seam(**{name: jnp.asarray(value, jnp.float32) for name, value in numbers.items()})
 
 
-def gap(skin: Skin, pose: Pose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
+def gap(skin: Skin, pose: SensorPose, x_mm: Float[Array, "N"]) -> Float[Array, "N N"]:
     """Distance of the undeformed skin from the flat gel on the grid [y, x] of `x_mm` × `x_mm`, least value 0.
 
     z = A²/2R₁ + B²/2R₂ − height · pattern(A, B) + Σ a cos(k·r + φ) + tilt · r
@@ -124,7 +124,7 @@ def _relief(skin: Skin, a: Array, b: Array) -> Array:
     return jnp.select([skin.pattern == 0, skin.pattern == 1], [bumps, ridges], plateaus)
 
 
-def _roughness(skin: Skin, pose: Pose, x_mm: Array) -> Array:
+def _roughness(skin: Skin, pose: SensorPose, x_mm: Array) -> Array:
     """Σ a cos(k·r + φ) as two matrix products: cos(k_y y + φ) cos(k_x x) − sin(k_y y + φ) sin(k_x x)."""
     k_x, k_y = _turned(skin.wave_numbers[:, 0], skin.wave_numbers[:, 1], -pose.turn_rad)
     phase = skin.wave_phases_rad + skin.wave_numbers @ skin.site_mm

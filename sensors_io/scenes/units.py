@@ -59,9 +59,9 @@ def on_one_day(unit: Unit, rng: np.random.Generator) -> Unit:
     return dataclasses.replace(unit, light=dataclasses.replace(unit.light, exposure=exposure))
 
 
-def place(turn: float, rng: np.random.Generator) -> surface.Pose:
+def place(turn: float, rng: np.random.Generator) -> surface.SensorPose:
     """The site's direction with this sensor's error of placement."""
-    return surface.Pose(
+    return surface.SensorPose(
         offset_mm=as_f32(rng.normal(0, PLACE_MM, 2)),
         turn_rad=as_f32(turn + rng.normal(0, np.deg2rad(PLACE_TURN_DEG))),
         tilt=as_f32(rng.normal(0, np.deg2rad(PLACE_TILT_DEG), 2)),

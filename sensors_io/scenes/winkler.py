@@ -15,7 +15,7 @@ _TINY = 1e-30
 
 
 @struct.dataclass
-class Look:
+class WinklerEstimate:
     """Estimates of a bed of springs for a scene before anything is solved.
 
     `contact` are the pixels that touch, `radius_mm` is √(area / π), `slope` the rms slope of the undeformed gap inside,
@@ -69,7 +69,7 @@ def rescale(p: Float[Array, "N N"], total: Float[Array, ""]) -> Float[Array, "N 
 
 def look(
     gap_mm: Float[Array, "N N"], force_n: Float[Array, ""], compliance: Float[Array, "M K"], spacing_mm: float
-) -> Look:
+) -> WinklerEstimate:
     """Look at a scene without a single convolution.
 
     Args:
@@ -84,7 +84,7 @@ def look(
     count = jnp.sum(touching)
     slope_y, slope_x = jnp.gradient(gap, spacing_mm)
     inner = jnp.zeros(gap.shape, bool).at[1:-1, 1:-1].set(True)
-    return Look(
+    return WinklerEstimate(
         pressure_mpa=p,
         contact=touching,
         radius_mm=spacing_mm * jnp.sqrt(count / jnp.pi),

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.background import Background, Drift
+from sensors_io.devices.background import Drift, GelBackground
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceError, StaleFrameError
 from sensors_io.devices.intake import Counts
@@ -50,7 +50,7 @@ class Channel:
     def __init__(self, device: Watched, extractor: Extractor | None = None):
         self.device = device
         self._extractor = extractor
-        self._background = Background()
+        self._background = GelBackground()
         self._shown_ns = -1
         self._arrivals: collections.deque[tuple[float, int]] = collections.deque()
         self.sample: Sample | None = None

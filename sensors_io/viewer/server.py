@@ -48,7 +48,7 @@ class Numbers:
     prompt: str = ""
 
 
-class Shown:
+class PublishedState:
     """One published state; each picture is drawn and encoded once, when it is first asked for."""
 
     def __init__(self, version: int, panels: Mapping[str, Panel], numbers: Numbers):
@@ -89,7 +89,7 @@ class LiveView:
     def __init__(self, *, port: int = 8765, host: str = "127.0.0.1"):
         self._wanted = (host, port)
         self._changed = threading.Condition()
-        self._shown = Shown(0, {}, Numbers(title="touch", time_s=0.0, force_n=None, tables={}))
+        self._shown = PublishedState(0, {}, Numbers(title="touch", time_s=0.0, force_n=None, tables={}))
         self._version = 0
         self._ended = False
         self._server: http.server.ThreadingHTTPServer | None = None
@@ -105,16 +105,16 @@ class LiveView:
         """Show these panels and numbers from now on; returns at once, and nothing is drawn that nobody watches."""
         with self._changed:
             self._version += 1
-            self._shown = Shown(self._version, dict(panels), numbers)
+            self._shown = PublishedState(self._version, dict(panels), numbers)
             self._changed.notify_all()
 
     @property
-    def shown(self) -> Shown:
+    def shown(self) -> PublishedState:
         """The last published state."""
         with self._changed:
             return self._shown
 
-    def wait(self, seen: int) -> Shown | None:
+    def wait(self, seen: int) -> PublishedState | None:
         """The state published after version `seen`; `None` when the view has ended."""
         with self._changed:
             while self._version == seen and not self._ended:

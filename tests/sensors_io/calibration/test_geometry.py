@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sensors_io.calibration.geometry import (
-    Geometry,
+    CameraGeometry,
     GeometryError,
     find_pins,
     fit_geometry,
@@ -22,7 +22,7 @@ def lens(radial=(2.0, 0.2), scale=0.06):
     middle = np.array([SIZE[1], SIZE[0]]) / 2
     homography = np.array([[scale, 0.002, 0], [-0.001, scale, 0], [1e-5, 2e-5, 1.0]])
     homography[:2, 2] = -homography[:2, :2] @ middle
-    return Geometry(
+    return CameraGeometry(
         size_px=SIZE,
         centre_px=middle + np.array([4.0, -3.0]),
         radial=np.array(radial),
@@ -82,12 +82,12 @@ def test_a_real_board():
 
 def test_a_geometry_is_saved_and_loaded(tmp_path):
     lens().save(tmp_path / "g.json")
-    loaded = Geometry.load(tmp_path / "g.json")
+    loaded = CameraGeometry.load(tmp_path / "g.json")
     point = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(loaded.to_mm(point), lens().to_mm(point))
     (tmp_path / "g.json").write_text("{}")
     with pytest.raises(GeometryError, match="is no geometry"):
-        Geometry.load(tmp_path / "g.json")
+        CameraGeometry.load(tmp_path / "g.json")
 
 
 def test_bad_boards_are_refused():

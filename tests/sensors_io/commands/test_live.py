@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sensors_io import __main__ as cli
-from sensors_io.calibration.geometry import Geometry
+from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.devices.tac3d_messages import load_recording
 from sensors_io.offsets import Offset, Offsets
 from sensors_io.poses import ForceZero
@@ -130,7 +130,7 @@ def test_a_pin_board_gives_a_geometry(tmp_path):
         9,
     ]
     assert cli.main([*map(str, args), "--pitch-mm", "2.5", "--out", str(tmp_path / "g.json")]) == 0
-    assert Geometry.load(tmp_path / "g.json").held_out_mm < 0.07
+    assert CameraGeometry.load(tmp_path / "g.json").held_out_mm < 0.07
     assert cli.main([*map(str, args), "--pitch-mm", "-1", "--out", str(tmp_path / "h.json")]) == 1
     assert not (tmp_path / "h.json").exists()
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sensors_io.devices.background import Background
+from sensors_io.devices.background import GelBackground
 
 
 def grey(level):
@@ -11,7 +11,7 @@ def grey(level):
 
 
 def test_the_mean_of_untouched_frames_and_its_drift():
-    background = Background(memory=4)
+    background = GelBackground(memory=4)
     for level, touched in [(100, False), (200, True), (102, False), (104, False), (106, False)]:
         background.offer(grey(level), touched=touched)
     assert background.frames == 4
@@ -24,7 +24,7 @@ def test_the_mean_of_untouched_frames_and_its_drift():
 
 
 def test_an_empty_background_has_no_picture_and_no_drift():
-    background = Background()
+    background = GelBackground()
     background.offer(grey(5), touched=True)
     assert background.drift() is None
     with pytest.raises(ValueError, match="holds no frame"):
@@ -33,13 +33,13 @@ def test_an_empty_background_has_no_picture_and_no_drift():
     with pytest.raises(ValueError, match=r"must be \[2, 3, 3\]"):
         background.offer(np.zeros((4, 4, 3), np.uint8), touched=False)
     with pytest.raises(ValueError, match="memory is 0"):
-        Background(0)
+        GelBackground(0)
 
 
 def test_pictures_tell_a_touch_and_not_the_lamps():
     rng = np.random.default_rng(0)
     gel = rng.integers(60, 120, (60, 80, 3)).astype(np.uint8)
-    background = Background()
+    background = GelBackground()
     assert not background.looks_touched(gel)
     background.offer(gel, touched=False)
     noisy = (gel + rng.normal(0, 2, gel.shape)).clip(0, 255).astype(np.uint8)

@@ -45,7 +45,7 @@ def datagrams(arrays, *, number=1, packets=3, **rest):
 @pytest.mark.parametrize("style", ["flow", "block"])
 def test_arrays_come_out_as_they_went_in(style):
     arrays = matrices()
-    decoder, assembler = tac3d_messages.Decoder(), tac3d_messages.Assembler()
+    decoder, assembler = tac3d_messages.Tac3dDecoder(), tac3d_messages.Assembler()
     for index in (10, 11):
         wholes = [assembler.add(d) for d in datagrams(arrays, number=index, index=index, style=style)]
         assert wholes[:-1] == [None] * 3
@@ -57,7 +57,7 @@ def test_arrays_come_out_as_they_went_in(style):
 
 
 def test_a_layout_of_another_shape_is_learnt_anew():
-    decoder = tac3d_messages.Decoder()
+    decoder = tac3d_messages.Tac3dDecoder()
     for arrays in (matrices(), {"3D_ResultantForce": np.ones((1, 3))}):
         data = b"".join(a.tobytes() for a in arrays.values())
         assert decoder.decode(layout(arrays), data).matrices.keys() == arrays.keys()
@@ -71,7 +71,7 @@ def test_packets_may_come_in_any_order_twice_and_between_those_of_other_messages
     assert assembler.add(a[1]) is not None
     layout_b, data_b = assembler.add(b[2])
     np.testing.assert_array_equal(
-        tac3d_messages.Decoder().decode(layout_b, data_b).matrices["3D_Forces"], matrices(2)["3D_Forces"]
+        tac3d_messages.Tac3dDecoder().decode(layout_b, data_b).matrices["3D_Forces"], matrices(2)["3D_Forces"]
     )
 
 
@@ -116,7 +116,7 @@ GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
 )
 def test_damaged_layouts_are_refused(bad, data, message):
     with pytest.raises(DeviceDataError, match=message):
-        tac3d_messages.Decoder().decode(bad, data)
+        tac3d_messages.Tac3dDecoder().decode(bad, data)
 
 
 def pushed(force, move):

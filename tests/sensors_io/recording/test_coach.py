@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sensors_io.recording.coach import Coach, CoachConfig, Stage, protocol
+from sensors_io.recording.coach import Coach, CoachConfig, ContactStage, protocol
 from sensors_io.schema import Phase
 
 CONFIG = CoachConfig(clear_s=0.1, settle_s=0.1, hold_s=0.2, move_s=0.2)
@@ -16,7 +16,7 @@ def led(stage, normals, config=CONFIG):
 
 
 def test_a_press_begins_at_first_touch_and_ends_at_its_force():
-    advice = led(Stage(motion="press", force_n=20), [0, 0, 0, 0.05, 0.2, 10, 18.9, 19.0, 19.5])
+    advice = led(ContactStage(motion="press", force_n=20), [0, 0, 0, 0.05, 0.2, 10, 18.9, 19.0, 19.5])
     assert [a.phase for a in advice] == [Phase.APPROACH] * 4 + [Phase.LOAD] * 5
     assert [a.recording for a in advice] == [False, False] + [True] * 5 + [False, False]
     assert [a.done for a in advice] == [False] * 7 + [True, True]
@@ -25,22 +25,22 @@ def test_a_press_begins_at_first_touch_and_ends_at_its_force():
 
 def test_a_slide_goes_through_all_phases():
     normals = [0, 0, 0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1, 0.0]
-    phases = [a.phase for a in led(Stage(motion="slide_x", force_n=2), normals)]
+    phases = [a.phase for a in led(ContactStage(motion="slide_x", force_n=2), normals)]
     assert phases == [0, 0, 0, 1, 2, 2, 4, 4, 4, 4, 3, 3, 3, 3, 3]
 
 
 def test_a_tap_takes_three():
     normals = [0, 0, 0] + [1, 2, 1, 0] * 3
-    advice = led(Stage(motion="tap", force_n=2), normals)
+    advice = led(ContactStage(motion="tap", force_n=2), normals)
     assert [a.done for a in advice].index(True) == len(normals) - 1
 
 
 def test_nothing_begins_while_something_touches():
-    assert not any(a.recording for a in led(Stage(motion="press", force_n=20), [5] * 20))
+    assert not any(a.recording for a in led(ContactStage(motion="press", force_n=20), [5] * 20))
 
 
 def test_letting_go_early_ends_the_contact_incomplete():
-    last = led(Stage(motion="hold", force_n=2), [0, 0, 0, 1, 2, 2, 0])[-1]
+    last = led(ContactStage(motion="hold", force_n=2), [0, 0, 0, 1, 2, 2, 0])[-1]
     assert last.done
     assert not last.complete
     assert last.prompt == "released too early: again"
@@ -48,12 +48,12 @@ def test_letting_go_early_ends_the_contact_incomplete():
 
 @pytest.mark.parametrize(("normal", "word"), [(23.0, "STOP"), (7.0, "less")])
 def test_too_much_force_is_told(normal, word):
-    assert led(Stage(motion="hold", force_n=5), [0, 0, 0, 1, 5, normal])[-1].prompt.startswith(word)
+    assert led(ContactStage(motion="hold", force_n=5), [0, 0, 0, 1, 5, normal])[-1].prompt.startswith(word)
 
 
 def test_the_protocol_is_a_press_and_six_motions_at_three_forces():
     stages = protocol()
-    assert stages[0] == Stage(motion="press", force_n=20.0)
+    assert stages[0] == ContactStage(motion="press", force_n=20.0)
     assert len(set(stages)) == 19
     assert {s.force_n for s in stages[1:]} == {2.0, 5.0, 10.0}
 

@@ -15,7 +15,7 @@ from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
 from sensors_io.recording.assemble import assemble
 from sensors_io.recording.book import ATTEMPTS, ObjectView
-from sensors_io.recording.coach import CoachConfig, Stage, protocol
+from sensors_io.recording.coach import CoachConfig, ContactStage, protocol
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import SessionConfig, record_session
 from sensors_io.records import RecordsExistError, RecordStore
@@ -29,7 +29,7 @@ BIAS = GravityModel(
 CONFIG = SessionConfig(
     object_id="cup", gravity=BIAS, coach=CoachConfig(move_s=0.2, hold_s=0.2, settle_s=0.05, clear_s=0.1)
 )
-SHORT = dataclasses.replace(CONFIG, stages=(protocol()[0], Stage(motion="slide_x", force_n=2.0)))
+SHORT = dataclasses.replace(CONFIG, stages=(protocol()[0], ContactStage(motion="slide_x", force_n=2.0)))
 
 
 def session(out, hand, config=CONFIG, **rest):

@@ -16,7 +16,7 @@ from sensors_io.scenes.chooser_survey import FEATURES, PLAIN, survey
 from sensors_io.scenes.sensors import BODY, TAC3D
 
 WINDOW_MM, GEL = TAC3D.window_mm, TAC3D.gel
-STAGE = chooser.Stage(gel=GEL, body=BODY, window_mm=WINDOW_MM)
+STAGE = chooser.ContactScene(gel=GEL, body=BODY, window_mm=WINDOW_MM)
 
 surveyed = jax.jit(survey, static_argnums=(4, 5))  # as the chooser calls it; each operation alone compiles for long
 log_error = jax.jit(chooser_law.log_error, static_argnums=2)
@@ -33,11 +33,13 @@ def _bumps(grid: int) -> jnp.ndarray:
     return _ball(grid, 20.0) + jnp.asarray(0.15 * ripple[None] * ripple[:, None], jnp.float32)
 
 
-def _choose(error: float, gap: chooser.Gap = _ball, force_n: float = 2.0, body: Layer | None = None) -> chooser.Choice:
+def _choose(
+    error: float, gap: chooser.Gap = _ball, force_n: float = 2.0, body: Layer | None = None
+) -> chooser.ContactSettings:
     return chooser.choose(error, gap, force_n, GEL, body, WINDOW_MM)
 
 
-def _setting(choice: chooser.Choice) -> Setting:
+def _setting(choice: chooser.ContactSettings) -> Setting:
     return Setting(grid=choice.grid, padded=choice.padded, tolerance=choice.tolerance)
 
 

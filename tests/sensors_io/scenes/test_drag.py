@@ -47,7 +47,7 @@ def _layer() -> drag.Bodies:
 def _run(pressures, slides, twists, bodies, tolerance):
     def one(history, frame):
         pressure, slide, twist = frame
-        step = drag.Step(slide_mm=slide, twist_rad=twist, centre_mm=jnp.zeros(2))
+        step = drag.RigidMotion(slide_mm=slide, twist_rad=twist, centre_mm=jnp.zeros(2))
         return drag.advance(history, pressure, FRICTION, step, bodies, jnp.asarray(X, jnp.float32), tolerance, 200)
 
     return jax.lax.scan(one, drag.at_rest(N), (pressures, slides, twists))[1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import fitting, photometric
-from sensors_io.scenes.fitting import BallPresses
+from sensors_io.scenes.fitting import BallPictures
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 
@@ -27,7 +27,7 @@ def _touches() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def presses(profiles: fitting.Profiles) -> BallPresses:
+def presses(profiles: fitting.Profiles) -> BallPictures:
     """Sixteen presses rendered with the constants of the Mini, with noise and grain."""
     rng = np.random.default_rng(0)
     window = GELSIGHT_MINI.window_mm
@@ -36,7 +36,7 @@ def presses(profiles: fitting.Profiles) -> BallPresses:
     noisy = lambda image: image + (READ + SHOT * np.sqrt(np.maximum(image, 0))) * rng.standard_normal(image.shape)
     axis = (np.arange(PX) - (PX - 1) / 2) * SCALE
     made = [noisy(flat + fitting.change(MINI, profiles, t, axis, window)) for t in _touches()]
-    return BallPresses(pictures=np.array(made), background=flat, radius_mm=RADIUS_MM, mm_per_px=SCALE)
+    return BallPictures(pictures=np.array(made), background=flat, radius_mm=RADIUS_MM, mm_per_px=SCALE)
 
 
 def test_inside_the_contact_the_gel_is_the_ball(profiles: fitting.Profiles) -> None:
@@ -61,7 +61,7 @@ def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> N
     np.testing.assert_allclose(d_y[smooth], numeric_y[smooth], atol=0.03)
 
 
-def test_optics_and_touches_are_found_again(presses: BallPresses, profiles: fitting.Profiles) -> None:
+def test_optics_and_touches_are_found_again(presses: BallPictures, profiles: fitting.Profiles) -> None:
     train = np.arange(0, 16, 2)
     begun = _touches() + np.random.default_rng(3).uniform(-0.4, 0.4, (16, 3))
     told: list[tuple[int, int]] = []
@@ -76,7 +76,7 @@ def test_optics_and_touches_are_found_again(presses: BallPresses, profiles: fitt
     assert np.abs(flat).mean() < 1e-3
 
 
-def test_noise_and_grain_are_found_again(presses: BallPresses) -> None:
+def test_noise_and_grain_are_found_again(presses: BallPictures) -> None:
     noise = fitting.measure_noise(presses, _touches(), MINI)
     for c in range(3):
         level = float(np.sqrt(np.median(presses.background[..., c])))
@@ -85,6 +85,6 @@ def test_noise_and_grain_are_found_again(presses: BallPresses) -> None:
     assert noise.shared == pytest.approx(0.5, abs=0.15)
 
 
-def test_pictures_must_be_square_and_like_the_background(presses: BallPresses) -> None:
+def test_pictures_must_be_square_and_like_the_background(presses: BallPictures) -> None:
     with pytest.raises(ValueError, match=r"must be \[P, N, N, 3\]"):
         dataclasses.replace(presses, pictures=presses.pictures[:, :, 2:])

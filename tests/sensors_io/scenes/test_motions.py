@@ -93,8 +93,8 @@ def test_other_lengths(frames: int) -> None:
         assert made.force_n.max() == pytest.approx(2.0)
 
 
-def _pose(**changes: object) -> surface.Pose:
-    still = surface.Pose(offset_mm=jnp.array([0.4, -0.2]), turn_rad=jnp.array(0.3), tilt=jnp.array([0.01, 0.0]))
+def _pose(**changes: object) -> surface.SensorPose:
+    still = surface.SensorPose(offset_mm=jnp.array([0.4, -0.2]), turn_rad=jnp.array(0.3), tilt=jnp.array([0.01, 0.0]))
     return dataclasses.replace(still, **changes)
 
 

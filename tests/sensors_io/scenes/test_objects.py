@@ -99,7 +99,7 @@ def test_skins_move_rigidly(dx: int, dy: int, seed: int) -> None:
     x = (jnp.arange(n) + 0.5) * spacing - n * spacing / 2
 
     def gap(offset: tuple[float, float]) -> np.ndarray:
-        pose = surface.Pose(offset_mm=jnp.array(offset), turn_rad=jnp.array(0.4), tilt=jnp.zeros(2))
+        pose = surface.SensorPose(offset_mm=jnp.array(offset), turn_rad=jnp.array(0.4), tilt=jnp.zeros(2))
         return np.asarray(surface.gap(skin, pose, x))
 
     here, there = gap((0.0, 0.0)), gap((dx * spacing, dy * spacing))
@@ -115,14 +115,16 @@ def test_a_quarter_turn_of_the_sensor_turns_the_gap() -> None:
     x = (jnp.arange(40) + 0.5) * 0.3 - 6.0
 
     def gap(turn: float) -> np.ndarray:
-        return np.asarray(surface.gap(skin, surface.Pose(offset_mm=jnp.zeros(2), turn_rad=turn, tilt=jnp.zeros(2)), x))
+        return np.asarray(
+            surface.gap(skin, surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=turn, tilt=jnp.zeros(2)), x)
+        )
 
     np.testing.assert_allclose(gap(0.3 + np.pi / 2), np.rot90(gap(0.3), -1), atol=2e-4)
 
 
 def test_roughness_and_relief_show_in_the_gap() -> None:
     x = (jnp.arange(64) + 0.5) * 0.25 - 8.0
-    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
+    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
     for seed in range(5):
         solid = objects.sample(np.random.default_rng(seed), 0.0, 0.8)
         skin = surface.make_skin(solid, np.zeros(2), 1.0)
@@ -208,7 +210,7 @@ def test_the_skin_over_a_seam_is_that_of_each_side() -> None:
     direction = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
     site = direction * v.offset_mm
     x = (jnp.arange(96) + 0.5) * 0.25 - 12.0
-    pose = surface.Pose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
+    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
 
     def heights(what: objects.Solid) -> np.ndarray:
         return np.asarray(surface.gap(surface.make_skin(what, site, 0.0), pose, x))
