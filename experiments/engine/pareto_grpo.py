@@ -34,7 +34,18 @@ from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, grpo_config
 from experiments.engine.peers import JobSize
-from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable
+from touchr1_jax.rl.config import (
+    AnyAlgorithm,
+    Cispo,
+    Dapo,
+    DrGrpo,
+    GRPOConfig,
+    Gspo,
+    Paper,
+    ReinforcePlusPlus,
+    Rloo,
+    Stable,
+)
 
 ALGORITHMS: Mapping[str, AnyAlgorithm] = {
     "paper": Paper(),
@@ -43,6 +54,8 @@ ALGORITHMS: Mapping[str, AnyAlgorithm] = {
     "Dr. GRPO": DrGrpo(),
     "GSPO": Gspo(),
     "CISPO": Cispo(),
+    "RLOO": Rloo(),
+    "REINFORCE++": ReinforcePlusPlus(),
 }
 
 Key = tuple[str, int]

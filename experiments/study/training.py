@@ -77,10 +77,6 @@ class TrainingConfig:
             raise ValueError(
                 f"grpo_share is {self.grpo_share}: must lie between 0 and 1: SFT and GRPO both need objects; change it"
             )
-        if self.grpo.group < 2:
-            raise ValueError(
-                f"grpo.group is {self.grpo.group}: must be at least 2: a rollout is held against its group; raise it"
-            )
         self.source()
         known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
         unknown = sorted(set(self.grpo_attributes) - set(known))

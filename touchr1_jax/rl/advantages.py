@@ -1,10 +1,13 @@
-"""Group-relative advantages, and which groups give a gradient."""
+"""Advantages, and which groups give a gradient."""
+
+from collections.abc import Mapping
+from typing import assert_never
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
-from touchr1_jax.rl.config import Algorithm
+from touchr1_jax.rl.config import Advantage, Algorithm
 
 SPREAD_FLOOR = 1e-5
 """Rewards closer than this are equal: 1, 0.4 and −0.1 are not exact in float32, so σ of a constant group is not 0."""
@@ -15,11 +18,52 @@ def zero_variance(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
     return jnp.max(reward, -1) - jnp.min(reward, -1) < SPREAD_FLOOR
 
 
-def advantages(algorithm: Algorithm, reward: Float[Array, "P G"]) -> Float[Array, "P G"]:
-    """Advantages as the algorithm normalises them."""
-    if algorithm.batch_sigma:
-        return batch_advantage(reward, epsilon=algorithm.epsilon)
-    return group_advantage(reward, epsilon=algorithm.epsilon, normalise=algorithm.normalise)
+def no_signal(
+    algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
+) -> Bool[Array, "P"]:
+    """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
+    match algorithm.advantage:
+        case Advantage.GLOBAL:
+            return jnp.broadcast_to(zero_variance(reward.reshape(-1)), reward.shape[:1])
+        case Advantage.PER_REWARD:
+            return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
+        case _:
+            return zero_variance(reward)
+
+
+def advantages(
+    algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
+) -> Float[Array, "P G"]:
+    """Advantages by the algorithm's comparison, with R̄ and σ those of a group unless a name says otherwise.
+
+    GROUP: (R − R̄)/(σ + ε).  BATCH: (R − R̄)/(σ_batch + ε).  NONE: R − R̄ (Dr. GRPO).  LEAVE_ONE_OUT: R_i less the mean of
+    the group's others (RLOO, arXiv 2402.14740).  GLOBAL: (R − R̄_batch)/(σ_batch + ε) (REINFORCE++, arXiv 2501.03262).
+    PER_REWARD: the sum over rewards of their GROUP advantages, in units of its σ over the batch; every reward then
+    counts alike, for σ takes its weight away (GDPO, arXiv 2601.05242, with equal weights).
+
+    Args:
+      algorithm: which comparison, and ε.
+      reward: total rewards.
+      terms: weighted rewards that it is made of.
+    """
+    epsilon = algorithm.epsilon
+    match algorithm.advantage:
+        case Advantage.GROUP:
+            return group_advantage(reward, epsilon=epsilon)
+        case Advantage.BATCH:
+            return batch_advantage(reward, epsilon=epsilon)
+        case Advantage.NONE:
+            return group_advantage(reward, epsilon=epsilon, normalise=False)
+        case Advantage.LEAVE_ONE_OUT:
+            others = reward.shape[-1] - 1
+            return group_advantage(reward, epsilon=epsilon, normalise=False) * ((others + 1) / others)
+        case Advantage.GLOBAL:
+            return group_advantage(reward.reshape(-1), epsilon=epsilon).reshape(reward.shape)
+        case Advantage.PER_REWARD:
+            total = sum((group_advantage(term, epsilon=epsilon) for term in terms.values()), start=jnp.zeros(()))
+            return total / (jnp.std(total) + epsilon)
+        case _:
+            assert_never(algorithm.advantage)
 
 
 def group_advantage(

@@ -34,6 +34,17 @@ class Average(enum.Enum):
     LENGTH = "length"
 
 
+class Advantage(enum.Enum):
+    """Comparison that makes an advantage of a reward (see `advantages`)."""
+
+    GROUP = "group"
+    BATCH = "batch"
+    NONE = "none"
+    LEAVE_ONE_OUT = "leave-one-out"
+    GLOBAL = "global"
+    PER_REWARD = "per-reward"
+
+
 class TactileUse(enum.Enum):
     """Form of R_tu, the reward for answers that controls without touch do not reach (see `tactile_use`)."""
 
@@ -58,10 +69,8 @@ class Algorithm:
     importance_cap: float | None = None
     """Largest weight of a token for π_learner/π_sampler (truncated importance sampling); `None` trusts the sampler."""
     average: Average = Average.ROLLOUT
-    normalise: bool = True
-    """Divide advantages by σ."""
-    batch_sigma: bool = False
-    """Use one σ for all groups of a step instead of each group's own."""
+    advantage: Advantage = Advantage.GROUP
+    """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
     epsilon: float = 1e-4
     """Added to σ, in the units of the reward."""
     drop_degenerate: bool = False
@@ -139,7 +148,7 @@ class Stable(Algorithm):
     more than 9 % of groups; at the literal δ = .1 a single right answer in eight would pass for touch (18 %).
     """
 
-    batch_sigma: bool = True
+    advantage: Advantage = Advantage.BATCH
     drop_degenerate: bool = True
     beta: float = 0.1
     kl: KLEstimator = "exact"
@@ -170,7 +179,7 @@ class DrGrpo(Algorithm):
     """Dr. GRPO (arXiv 2503.20783): advantages without σ, tokens summed over a constant length, no KL."""
 
     average: Average = Average.LENGTH
-    normalise: bool = False
+    advantage: Advantage = Advantage.NONE
     beta: float = 0.0
     gamma: float = 0.0
 
@@ -198,7 +207,27 @@ class Cispo(Algorithm):
     gamma: float = 0.0
 
 
-AnyAlgorithm = Paper | Stable | Dapo | DrGrpo | Gspo | Cispo
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rloo(Algorithm):
+    """RLOO (arXiv 2402.14740): REINFORCE of whole answers against the mean of the others in the group, no σ, no KL."""
+
+    average: Average = Average.LENGTH
+    advantage: Advantage = Advantage.LEAVE_ONE_OUT
+    beta: float = 0.0
+    gamma: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReinforcePlusPlus(Algorithm):
+    """REINFORCE++ (arXiv 2501.03262): mean and σ of the batch, so that `group` may be 1; tokens averaged, no KL."""
+
+    average: Average = Average.TOKEN
+    advantage: Advantage = Advantage.GLOBAL
+    beta: float = 0.0
+    gamma: float = 0.0
+
+
+AnyAlgorithm = Paper | Stable | Dapo | DrGrpo | Gspo | Cispo | Rloo | ReinforcePlusPlus
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -240,6 +269,11 @@ class GRPOConfig:
         if self.prompts % self.micro_prompts:
             raise ValueError(
                 f"micro_prompts {self.micro_prompts} must divide prompts {self.prompts}; choose a divisor of it"
+            )
+        if self.group < 2 and self.algorithm.advantage is not Advantage.GLOBAL:
+            raise ValueError(
+                f"group is {self.group}: must be at least 2: a rollout is compared with its group; raise it, or choose "
+                "advantage GLOBAL"
             )
         if list(self.buckets) != sorted({*self.buckets} & set(range(2, self.length))):
             raise ValueError(

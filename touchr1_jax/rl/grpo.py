@@ -22,7 +22,14 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl import tactile_use
-from touchr1_jax.rl.advantages import added_after, advantages, dynamic_sampling_rows, prompt_weights, zero_variance
+from touchr1_jax.rl.advantages import (
+    added_after,
+    advantages,
+    dynamic_sampling_rows,
+    no_signal,
+    prompt_weights,
+    zero_variance,
+)
 from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.gradient import Experience, grpo_gradient
@@ -173,7 +180,8 @@ class _Engine:
         if algorithm.tactile_use is not TactileUse.OFF:
             bonus, metrics = tactile_use.tactile_bonus(algorithm, parsed, batch, noise, answer, control_key)
         if algorithm.tactile_use is TactileUse.LITERAL:
-            reward = reward + algorithm.tactile_weight * bonus
+            terms = {**terms, tactile_use.TERM: algorithm.tactile_weight * bonus}
+            reward = reward + terms[tactile_use.TERM]
         return Group(batch, rollout, parsed, reward, terms, bonus), metrics
 
     def draw(self, group: int) -> SampleConfig:
@@ -189,14 +197,14 @@ class _Engine:
 
     def no_signal(self, group: Group) -> Bool[Array, "D"]:
         """Groups without a gradient: the reward is constant, and the bonus where it is added to the advantage."""
-        equal = zero_variance(group.reward)
+        equal = no_signal(self.config.algorithm, group.reward, group.terms)
         counts = self.config.algorithm.tactile_use is TactileUse.RECOMMENDED
         return equal & zero_variance(group.bonus) if counts else equal
 
     def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
-        advantage = advantages(algorithm, group.reward)
+        advantage = advantages(algorithm, group.reward, group.terms)
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             advantage += added_after(group.bonus, algorithm.tactile_weight)
         no_signal = self.no_signal(group)
@@ -276,5 +284,7 @@ class _Engine:
         metrics |= rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.parsed, target)
         metrics |= answer_metrics(group.parsed, target)
         metrics |= group_metrics(group.reward, learn.advantage, right)
-        metrics |= tactile_use.bonus_metrics(self.config.algorithm, group.reward, group.bonus, learn.advantage)
+        metrics |= tactile_use.bonus_metrics(
+            self.config.algorithm, group.reward, group.terms, group.bonus, learn.advantage
+        )
         return metrics | touch_metrics(group.batch.features)

@@ -6,7 +6,7 @@ With s = max(R_acc, 0) and, for each control c of the touch, the mean s̄^c of i
 Both are 0 where nothing is right, and the recommended one does not cancel when all right rollouts earn it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,9 @@ from touchr1_jax.types import Parsed, Target
 
 CONTROLS = ("drop", "noise", "order")
 """Names of the controls, in the order of `controls`."""
+
+TERM = "tactile_use"
+"""Name of the literal bonus among the terms of the reward."""
 
 UNMOVED = 1e-2
 """A bonus that changes advantages by less, a hundredth of a standard deviation, has no effect."""
@@ -90,12 +93,17 @@ def controls(
 
 
 def bonus_metrics(
-    algorithm: Algorithm, reward: Float[Array, "P G"], bonus: Float[Array, "P G"], advantage: Float[Array, "P G"]
+    algorithm: Algorithm,
+    reward: Float[Array, "P G"],
+    terms: Mapping[str, Float[Array, "P G"]],
+    bonus: Float[Array, "P G"],
+    advantage: Float[Array, "P G"],
 ) -> dict[str, Array]:
     """Share of groups whose rollouts earn different bonuses, and of those among them whose advantages ignore it."""
     if algorithm.tactile_use is TactileUse.LITERAL:
         reward = reward - algorithm.tactile_weight * bonus
-    moved = jnp.max(jnp.abs(advantage - advantages(algorithm, reward)), -1)
+        terms = {name: term for name, term in terms.items() if name != TERM}
+    moved = jnp.max(jnp.abs(advantage - advantages(algorithm, reward, terms)), -1)
     differs = ~zero_variance(bonus)
     return {"bonus_telling_share": jnp.mean(differs), "bonus_cancelled_share": jnp.mean(differs & (moved < UNMOVED))}
 

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchr1_jax.rl.advantages import batch_advantage, group_advantage, prompt_weights, zero_variance
+from touchr1_jax.rl.advantages import (
+    advantages,
+    batch_advantage,
+    group_advantage,
+    no_signal,
+    prompt_weights,
+    zero_variance,
+)
+from touchr1_jax.rl.config import Advantage, Paper
 
 
 def test_advantages_by_hand():
@@ -78,6 +86,54 @@ def test_zero_variance_groups_have_no_part_in_the_sigma_of_the_batch():
     expected = np.array([[0.5, -0.5], [0, 0], [0.25, -0.25]]) / sigma
     np.testing.assert_allclose(batch_advantage(reward, epsilon=0.0), expected, rtol=1e-6)
     assert not batch_advantage(jnp.full((2, 3), 0.4)).any()
+
+
+def by_hand(kind: Advantage, terms: list[np.ndarray]) -> np.ndarray:
+    """Advantages of rewards [P, G] in plain NumPy, one rollout after the other."""
+    reward, epsilon = sum(terms), Paper().epsilon
+
+    def of_group(row: np.ndarray) -> np.ndarray:
+        return (row - row.mean()) / (row.std() + epsilon)
+
+    match kind:
+        case Advantage.GROUP:
+            return np.array([of_group(row) for row in reward])
+        case Advantage.NONE:
+            return np.array([row - row.mean() for row in reward])
+        case Advantage.LEAVE_ONE_OUT:
+            return np.array([[r - np.delete(row, i).mean() for i, r in enumerate(row)] for row in reward])
+        case Advantage.BATCH:
+            sigma = np.sqrt(np.mean([row.var() for row in reward]))
+            return np.array([row - row.mean() for row in reward]) / (sigma + epsilon)
+        case Advantage.GLOBAL:
+            return (reward - reward.mean()) / (reward.std() + epsilon)
+        case Advantage.PER_REWARD:
+            total = sum(np.array([of_group(row) for row in term]) for term in terms)
+            return total / (total.std() + epsilon)
+
+
+@pytest.mark.parametrize("kind", Advantage)
+def test_every_comparison_equals_numpy(kind):
+    terms = [np.random.default_rng(seed).random((4, 6)).astype(np.float32) for seed in range(3)]
+    found = advantages(
+        Paper(advantage=kind), jnp.asarray(sum(terms)), {str(i): jnp.asarray(t) for i, t in enumerate(terms)}
+    )
+    np.testing.assert_allclose(found, by_hand(kind, terms), atol=2e-5)
+
+
+@pytest.mark.parametrize("kind", Advantage)
+def test_groups_without_signal_are_those_whose_advantages_are_zero(kind):
+    """Of three groups the first and the last have equal totals; of the last, two terms that cancel."""
+    a = jnp.array([[0.4, 0.4], [0.6, 0.0], [1.0, 0.0]])
+    b = jnp.array([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    algorithm, terms = Paper(advantage=kind), {"a": a, "b": b}
+    idle = no_signal(algorithm, a + b, terms)
+    if kind is not Advantage.PER_REWARD:  # where the terms cancel, they do so in the sum of advantages too
+        np.testing.assert_array_equal(idle, ~jnp.any(advantages(algorithm, a + b, terms) != 0, -1))
+    assert idle.tolist() == {
+        Advantage.GLOBAL: [False, False, False],
+        Advantage.PER_REWARD: [True, False, False],
+    }.get(kind, [True, False, True])
 
 
 def test_weights_of_prompts_that_count():

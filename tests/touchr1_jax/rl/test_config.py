@@ -6,6 +6,7 @@ import pytest
 import tyro
 
 from touchr1_jax.rl.config import (
+    Advantage,
     Average,
     Cispo,
     Dapo,
@@ -13,6 +14,8 @@ from touchr1_jax.rl.config import (
     GRPOConfig,
     Gspo,
     Paper,
+    ReinforcePlusPlus,
+    Rloo,
     Stable,
     Surrogate,
     TactileUse,
@@ -24,7 +27,7 @@ def test_paper_preset():
     c, a = GRPOConfig.paper(), Paper()
     assert (c.group, a.beta, c.learning_rate, a.kl) == (8, 1e-3, 1e-6, "k3")
     assert (a.gamma, a.clip_low, a.clip_high, a.epsilon) == (0.01, 0.2, 0.2, 1e-4)
-    assert a.normalise
+    assert a.advantage is Advantage.GROUP
     assert not a.drop_degenerate
     assert not a.grounding_stop_masked
     assert a.grounding_cap_nat is None
@@ -37,11 +40,14 @@ def test_stable_preset():
     a = GRPOConfig.stable().algorithm
     assert (a.kl, a.grounding_stop_masked, a.grounding_cap_nat, a.drop_degenerate) == ("exact", True, 1.0, True)
     assert (a.tactile_use, a.gamma, a.beta) == (TactileUse.RECOMMENDED, 0.01, 0.1)
+    assert a.advantage is Advantage.BATCH
 
 
 def test_published_variants():
     assert (Dapo().clip_low, Dapo().clip_high, Dapo().average, Dapo().beta) == (0.2, 0.28, Average.TOKEN, 0.0)
-    assert (DrGrpo().normalise, DrGrpo().average) == (False, Average.LENGTH)
+    assert (DrGrpo().advantage, DrGrpo().average) == (Advantage.NONE, Average.LENGTH)
+    assert (Rloo().advantage, Rloo().average) == (Advantage.LEAVE_ONE_OUT, Average.LENGTH)
+    assert (ReinforcePlusPlus().advantage, ReinforcePlusPlus().average) == (Advantage.GLOBAL, Average.TOKEN)
     assert (Gspo().surrogate, Gspo().clip_low, Gspo().clip_high) == (Surrogate.SEQUENCE, 3e-4, 4e-4)
     assert Cispo().surrogate is Surrogate.CISPO
     assert GRPOConfig(prompts=8, algorithm=Dapo()).drawn == 16
@@ -50,6 +56,13 @@ def test_published_variants():
 def test_micro_batches_must_divide():
     with pytest.raises(ValueError, match="micro_prompts 3 must divide prompts 8; choose a divisor"):
         GRPOConfig(prompts=8, micro_prompts=3)
+
+
+def test_a_group_of_one_has_nothing_to_be_compared_with():
+    """Its advantage would be 0 in every step; the mean of the batch needs no group."""
+    with pytest.raises(ValueError, match="group is 1: must be at least 2"):
+        GRPOConfig(group=1)
+    assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
 
 
 @pytest.mark.parametrize(

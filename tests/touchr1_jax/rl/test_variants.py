@@ -10,7 +10,20 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
-from touchr1_jax.rl.config import Cispo, Dapo, DrGrpo, GRPOConfig, Gspo, Paper, Stable, TactileUse, left_out
+from touchr1_jax.rl.config import (
+    Advantage,
+    Cispo,
+    Dapo,
+    DrGrpo,
+    GRPOConfig,
+    Gspo,
+    Paper,
+    ReinforcePlusPlus,
+    Rloo,
+    Stable,
+    TactileUse,
+    left_out,
+)
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 
 G, T = 3, 6
@@ -43,7 +56,9 @@ def plain():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", [DrGrpo(), Gspo(), Cispo()], ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize(
+    "algorithm", [DrGrpo(), Gspo(), Cispo(), Rloo(), ReinforcePlusPlus()], ids=lambda a: type(a).__name__
+)
 def test_published_variants_take_a_finite_step_of_their_own(plain, algorithm):
     state, metrics = take(of(algorithm))
     assert all(np.isfinite(v) for v in metrics.values())
@@ -135,8 +150,12 @@ def test_buckets_must_ascend_below_the_length():
 
 @pytest.mark.parametrize(
     "algorithm",
-    [Stable(), pytest.param(Paper(tactile_use=TactileUse.LITERAL), marks=pytest.mark.slow)],
-    ids=["stable", "literal"],
+    [
+        Stable(),
+        pytest.param(Paper(tactile_use=TactileUse.LITERAL), marks=pytest.mark.slow),
+        pytest.param(Paper(tactile_use=TactileUse.LITERAL, advantage=Advantage.PER_REWARD), marks=pytest.mark.slow),
+    ],
+    ids=["stable", "literal", "literal, per reward"],
 )
 def test_tactile_use_samples_the_controls(algorithm):
     state, metrics = take(of(algorithm))
