@@ -6,8 +6,7 @@ the encoders it is XLA's count of the program before compilation.
 
 import dataclasses
 import functools
-import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -16,9 +15,9 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from experiments.core.context import Context
-from experiments.engine.job import Job, decoder_config, grpo_config
+from experiments.engine.job import Job, config_of, decoder_config
 from experiments.engine.peers import JobSize
+from experiments.engine.speed import Workload
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, counted_peak, grpo_bytes, reserved_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import grpo_work, model_flops
@@ -27,7 +26,7 @@ from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import Paper
 from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
 
 BACKWARD = 2
@@ -35,6 +34,13 @@ BACKWARD = 2
 
 Flash = Literal["cudnn", "xla"]
 """Implementation of `jax.nn.dot_product_attention`: cuDNN's fused kernel, or XLA, which works anywhere."""
+
+
+POLICY = JobSize(
+    prompts=8, group=8, length=256, vocab_size=151_936, hidden_size=1536, num_layers=28, num_heads=12, num_kv_heads=2,
+    head_dim=128, intermediate_size=8960,
+)  # fmt: skip
+"""Qwen2.5's 1.5B."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,22 +74,10 @@ class GpuConfig:
     tactile_px: int = 112
     vision: QwenVisionConfig = QwenVisionConfig(out_size=3584)
     vision_px: int = 448
-    size: JobSize = JobSize(
-        prompts=8,
-        group=8,
-        length=256,
-        vocab_size=151_936,
-        hidden_size=1536,
-        num_layers=28,
-        num_heads=12,
-        num_kv_heads=2,
-        head_dim=128,
-        intermediate_size=8960,
-    )
+    size: JobSize = POLICY
     """Size of the policy, and its prompts, rollouts and tokens."""
     prefix: int = 1024
     """Prompt tokens of the policy."""
-    micro_prompts: int = 1
 
     def __post_init__(self) -> None:
         cell = self.vision.cell_px
@@ -110,14 +104,11 @@ Attention = Callable[[Array, Array, Array], Array]
 """(q, k, v) → [P, L, H, d]."""
 
 
-def draw_heads(prompts: int, tokens: int, heads: int, kv_heads: int, head_dim: int) -> AttentionInputs:
+def draw_heads(config: GpuConfig) -> AttentionInputs:
     """Standard normal numbers in bfloat16."""
-    keys = jax.random.split(jax.random.key(0), 4)
-    shape = lambda count: (prompts, tokens, count, head_dim)
-    counts = (heads, kv_heads, kv_heads, heads)
-    return AttentionInputs(
-        *(jax.random.normal(key, shape(count), jnp.bfloat16) for key, count in zip(keys, counts, strict=True))
-    )
+    c, keys = config, jax.random.split(jax.random.key(0), 4)
+    draw = lambda key, count: jax.random.normal(key, (c.prompts, c.tokens, count, c.head_dim), jnp.bfloat16)
+    return AttentionInputs(*map(draw, keys, (c.heads, c.kv_heads, c.kv_heads, c.heads)))
 
 
 def engine_attention(q: Array, k: Array, v: Array) -> Array:
@@ -147,83 +138,26 @@ def with_gradient(attention: Attention) -> Callable[[AttentionInputs], tuple[Arr
     return both
 
 
-def pairs(prompts: int, tokens: int, heads: int) -> float:
-    """Pairs of a query and a key in causal attention."""
-    return prompts * heads * tokens * (tokens + 1) / 2
-
-
-def attention_errors(h: AttentionInputs, variants: dict[str, Attention], context: Context) -> dict[str, float]:
-    """Largest difference of the first prompt's output and gradients from float32, over the largest number in each.
-
-    Args:
-      h: inputs.
-      variants: by name.
-      context: shows progress.
-    """
+def attention_errors(h: AttentionInputs, variants: Mapping[str, Attention]) -> dict[str, float]:
+    """Largest difference of the first prompt's output and gradients from float32, over the largest number in each."""
     one = jax.tree.map(lambda x: x[:1], h)
     wide = jax.tree.map(lambda x: x.astype(jnp.float32), one)
     with jax.default_matmul_precision("highest"):
         exact = jax.jit(with_gradient(flash_attention("xla")))(wide)
-    found = {}
-    for name, attend in context.each("comparing attention", variants.items()):
-        rounded = jax.jit(with_gradient(attend))(one)
-        found[name] = max(jax.tree.leaves(jax.tree.map(_error, exact, rounded)))
-    return found
 
+    def error(exact: Array, rounded: Array) -> float:
+        a, b = np.asarray(exact, np.float32), np.asarray(rounded, np.float32)
+        return float(np.abs(a - b).max() / np.abs(a).max())
 
-def _error(exact: Array, rounded: Array) -> float:
-    a, b = np.asarray(exact, np.float32), np.asarray(rounded, np.float32)
-    return float(np.abs(a - b).max() / np.abs(a).max())
-
-
-class Workload(NamedTuple):
-    """A call to time, its operations, the bytes it must read, and the number of units it produces."""
-
-    call: Callable[[], Any]
-    flops: float
-    read_bytes: float | None
-    made: float
-    unit: str
-
-
-class TimedWorkload(NamedTuple):
-    """Seconds of a workload in every round, and the workload."""
-
-    seconds: tuple[float, ...]
-    workload: Workload
-
-    @property
-    def median_s(self) -> float:
-        """Median of the rounds."""
-        return statistics.median(self.seconds)
-
-    @property
-    def flops(self) -> float:
-        """Necessary operations a second."""
-        return self.workload.flops / self.median_s
-
-    @property
-    def read_bytes(self) -> float | None:
-        """Necessary bytes read a second, where they are counted."""
-        return None if self.workload.read_bytes is None else self.workload.read_bytes / self.median_s
-
-    @property
-    def made(self) -> str:
-        """Units produced a second, such as `1,200 tokens/s`."""
-        return f"{self.workload.made / self.median_s:,.0f} {self.workload.unit}/s"
-
-
-def product(config: GpuConfig) -> Workload:
-    """A product of two square matrices."""
-    a = jax.random.normal(jax.random.key(0), (config.side, config.side), jnp.bfloat16)
-    multiply = jax.jit(jnp.matmul)
-    return Workload(lambda: multiply(a, a), 2 * config.side**3, None, 1, "products")
+    errors = lambda attend: jax.tree.map(error, exact, jax.jit(with_gradient(attend))(one))
+    return {name: max(jax.tree.leaves(errors(attend))) for name, attend in variants.items()}
 
 
 def attention_workload(config: GpuConfig, heads: AttentionInputs, attend: Attention, *, gradient: bool) -> Workload:
     """Attention of some prompts."""
     compute = jax.jit(with_gradient(attend) if gradient else lambda h: attend(h.q, h.k, h.v))
-    flops = 4 * config.head_dim * pairs(config.prompts, config.tokens, config.heads) * (1 + BACKWARD * gradient)
+    pairs = config.prompts * config.heads * config.tokens * (config.tokens + 1) / 2  # of a query and a key
+    flops = 4 * config.head_dim * pairs * (1 + BACKWARD * gradient)
     return Workload(lambda: compute(heads), flops, None, config.prompts * config.tokens, "tokens")
 
 
@@ -258,7 +192,14 @@ def vision_tower(config: GpuConfig) -> Workload:
 
 def _encoder(module: Any, frames: int, *inputs: Any, static: tuple[Any, ...] = (), kind: DTypeLike) -> Workload:
     shapes = jax.eval_shape(lambda key: module.init(key, *inputs, *static), jax.random.key(0))["params"]
-    params = drawn(shapes, kind)
+
+    def draw(path: tuple[Any, ...], x: jax.ShapeDtypeStruct) -> jax.Array:
+        """N(0, .02²), scales of one."""
+        if path[-1].key == "scale":
+            return jnp.ones(x.shape, kind)
+        return 0.02 * jax.random.normal(jax.random.fold_in(jax.random.key(2), x.size), x.shape, kind)
+
+    params = jax.tree_util.tree_map_with_path(draw, shapes)
 
     def squared(params: Any, *inputs: Any) -> jax.Array:
         out = module.apply({"params": params}, *inputs, *static)
@@ -269,53 +210,31 @@ def _encoder(module: Any, frames: int, *inputs: Any, static: tuple[Any, ...] = (
     return Workload(lambda: step(params, *inputs), float(work["flops"]), None, frames, "frames")
 
 
-def drawn(shapes: Any, kind: DTypeLike) -> Any:
-    """Parameters N(0, .02²), scales of one."""
-
-    def draw(path: tuple[Any, ...], x: jax.ShapeDtypeStruct) -> jax.Array:
-        if path[-1].key == "scale":
-            return jnp.ones(x.shape, kind)
-        key = jax.random.fold_in(jax.random.key(2), x.size)
-        return 0.02 * jax.random.normal(key, x.shape, kind)
-
-    return jax.tree_util.tree_map_with_path(draw, shapes)
-
-
 class PolicyWorkloads:
-    """Decoding and training steps of one policy."""
+    """Decoding and training steps of one policy by the published objective in bfloat16."""
 
     def __init__(self, config: GpuConfig) -> None:
-        self._config, self._job = config, Job(config.size, config.prefix, step_config(config))
-        decoder = decoder_config(config.size)
-        mesh = MeshConfig()
-        self._shape = GRPOShape(decoder=decoder, grpo=step_config(config), mesh=mesh, prompt_tokens=config.prefix)
+        size, grpo = config.size, config_of(config.size, Paper(), bfloat16=True, remat=True)
+        self._size, self._job = size, Job(size, config.prefix, grpo)
+        self._shape = GRPOShape(decoder=decoder_config(size), grpo=grpo, mesh=MeshConfig(), prompt_tokens=config.prefix)
+        self._made = size.prompts * size.group * size.length
 
     def decoding(self) -> Workload:
         """Sample completions of encoded prompts, token by token."""
-        size = self._config.size
-        fns = dataclasses.replace(self._job.fns, cache_dtype=jnp.dtype(jnp.bfloat16))
+        fns, size = dataclasses.replace(self._job.fns, cache_dtype=jnp.dtype(jnp.bfloat16)), self._size
         params = jax.tree.map(lambda x: x.astype(jnp.bfloat16), self._job.state.params)
         prompts = jax.jit(functools.partial(encode_prompts, fns))(params, self._job.batch)
         draw = SampleConfig(group=size.group, length=size.length, end_ids=fns.end_ids, pad_id=0, inverse=True)
         decode = jax.jit(lambda p, prompts, key: sample_prompts(fns, p, prompts, key, draw))
         work, key = grpo_work(self._shape)["sampling"], jax.random.key(3)
-        made = size.prompts * size.group * size.length
-        return Workload(lambda: decode(params, prompts, key), work.flops, work.read_bytes, made, "tokens")
+        return Workload(lambda: decode(params, prompts, key), work.flops, work.read_bytes, self._made, "tokens")
 
     def step(self) -> Workload:
         """Sample, score and update, with the reference and the counterfactual pass."""
-        size = self._config.size
-        made = size.prompts * size.group * size.length
-        return Workload(self._job.step, model_flops(self._shape), None, made, "tokens")
+        return Workload(self._job.step, model_flops(self._shape), None, self._made, "tokens")
 
     def memory(self) -> tuple[Compiled, int]:
         """Bytes that the compiler reserves for a step, and those counted by hand."""
-        state, batch, frozen = self._job.state, self._job.batch, self._job.frozen
-        return reserved_bytes(self._job.lowered().compile()), counted_peak(
-            grpo_bytes(self._shape, state, batch, frozen)
-        )
-
-
-def step_config(config: GpuConfig) -> GRPOConfig:
-    """The published objective in bfloat16."""
-    return grpo_config(config.size, config.micro_prompts, Paper(), bfloat16=True, remat=True)
+        job = self._job
+        counted = grpo_bytes(self._shape, job.state, job.batch, job.frozen)
+        return reserved_bytes(job.lowered().compile()), counted_peak(counted)

@@ -7,12 +7,11 @@ or, in this project's own environment, `pip install -c constraints.txt -e '.[spe
 functions, since the rest of the project has to do without it.
 """
 
-import sys
 import tempfile
 import time
 from typing import Any
 
-from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer
+from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer, run_harness
 
 
 def main(job: PeerJob) -> str:
@@ -112,4 +111,4 @@ def settings(job: PeerJob, folder: str) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(main(PeerJob.from_json(sys.argv[1])) + "\n")
+    run_harness(main)

@@ -7,11 +7,10 @@ An environment of its own is needed: Tunix pins other versions of JAX's companio
 inside the functions, since the rest of the project has to do without it.
 """
 
-import sys
 import time
 from typing import Any
 
-from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer
+from experiments.engine.peers import BETA, CLIP, LEARNING_RATE, PAD_ID, PeerJob, format_answer, run_harness
 
 
 class IdTokenizer:
@@ -140,4 +139,4 @@ def make_policy(job: PeerJob) -> Any:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(main(PeerJob.from_json(sys.argv[1])) + "\n")
+    run_harness(main)

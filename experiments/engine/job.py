@@ -27,6 +27,9 @@ from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 
+PLAIN = Paper(beta=BETA, gamma=0.0)
+"""GRPO with a reference policy and without the counterfactual pass."""
+
 VIEW, TOUCH = 4, 8
 """Prompt tokens that are embeddings of the view and of the touch of the one sensor; the others are text."""
 
@@ -102,18 +105,13 @@ def engine(
     return fns, optimizer, make_grpo_step(fns, score, optimizer, config)
 
 
-def config_of(size: JobSize, micro_prompts: int = 1) -> GRPOConfig:
-    """Plain GRPO with a reference policy."""
-    return grpo_config(size, micro_prompts, Paper(beta=BETA, gamma=0.0))
-
-
-def grpo_config(size: JobSize, micro_prompts: int, algorithm: AnyAlgorithm, **options: Any) -> GRPOConfig:
-    """A step of the job's size by any algorithm; `options` are further fields of `GRPOConfig`."""
+def config_of(size: JobSize, algorithm: AnyAlgorithm = PLAIN, **options: Any) -> GRPOConfig:
+    """A step of the job's size, plain GRPO with a reference policy by default; `options` are fields of `GRPOConfig`."""
     return GRPOConfig(
         prompts=size.prompts,
         group=size.group,
         length=size.length,
-        micro_prompts=micro_prompts,
+        micro_prompts=1,
         algorithm=algorithm,
         inverse_draws=True,
         **options,

@@ -19,15 +19,12 @@ from typing import Any, Literal, NamedTuple
 from experiments.core.context import Context
 from experiments.core.errors import require
 from experiments.core.history import PastRun, runs_of, summary
-from experiments.core.results import Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.variants import STUDIED
 from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
 from experiments.mechanics.tangential_report import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
-
-GRPO_DEFAULT = "paper (default)"
-"""Row of `pareto_grpo` for the preset and group size that the studies use."""
 
 Axes = Mapping[str, Literal["lower", "higher"]]
 """Beginning of a column's name → which of its figures are better."""
@@ -51,37 +48,23 @@ class JudgedDefault(NamedTuple):
     axes: Axes
 
 
-DEFAULTS: tuple[JudgedDefault, ...] = (
-    JudgedDefault(
-        "contact solver", "pareto_contact", "Tiers at", "nested 1e-3", {"time": "lower", "slope median": "lower"}
-    ),
+DEFAULTS = (
+    JudgedDefault("contact solver", "pareto_contact", "Tiers at", "nested 1e-3",
+                  {"time": "lower", "slope median": "lower"}),
     JudgedDefault("friction", "pareto_tangential", "", FRICTION, {"time": "lower", "median error": "lower"}),
-    JudgedDefault(
-        "markers",
-        "pareto_fields",
-        "Markers under known motion",
-        MARKER_DEFAULT,
-        {"time": "lower", "95 %": "lower"},
-    ),
-    JudgedDefault(
-        "dense field", "pareto_fields", "Dense displacement", DENSE_DEFAULT, {"time": "lower", "95 %": "lower"}
-    ),
+    JudgedDefault("markers", "pareto_fields", "Markers under known motion", MARKER_DEFAULT,
+                  {"time": "lower", "95 %": "lower"}),
+    JudgedDefault("dense field", "pareto_fields", "Dense displacement", DENSE_DEFAULT,
+                  {"time": "lower", "95 %": "lower"}),
     JudgedDefault("storage", "pareto_storage", "Codecs:", OWN, {"of raw": "lower", "read": "higher"}),
     JudgedDefault("encoder", "pareto_encoder", "Variants", STUDIED, {"a prompt": "lower", "mean": "higher"}),
-    JudgedDefault("GRPO", "pareto_grpo", "Cost and gain", GRPO_DEFAULT, {"a step": "lower", "score": "higher"}),
-)
+    JudgedDefault("GRPO", "pareto_grpo", "Cost and gain", "paper (default)", {"a step": "lower", "score": "higher"}),
+)  # fmt: skip
 
 CHARTS_ONLY = (
-    "pareto_chooser",
-    "speed_grpo",
-    "scaling",
-    "throughput_scenes",
-    "stability_contact",
-    "stability_fields",
-    "stability_encoder",
-    "stability_grpo",
-    "stability_devices",
-)
+    "pareto_chooser", "speed_grpo", "scaling", "throughput_scenes", "stability_contact", "stability_fields",
+    "stability_encoder", "stability_grpo", "stability_devices",
+)  # fmt: skip
 """Experiments whose charts are shown without a default to judge."""
 
 
@@ -93,8 +76,7 @@ class GatherConfig:
     """Folder of the runs; by default the one that holds this run."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ParetoPoint:
+class ParetoPoint(NamedTuple):
     """A method and its figures on each axis, signed so that lower is better."""
 
     name: str
@@ -105,8 +87,7 @@ class ParetoPoint:
         return all(a <= b for a, b in zip(self.at, other.at, strict=True)) and self.at != other.at
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DefaultJudgement:
+class DefaultJudgement(NamedTuple):
     """A default on one table: all measured points, and those that dominate it (`None`: it was not measured)."""
 
     judged: JudgedDefault
@@ -123,11 +104,10 @@ def run(config: GatherConfig, context: Context) -> Results:
     runs = {name: past for name, past in newest.items() if past is not None}
     missing = [name for name in names if name not in runs]
     judgements = [j for judged in DEFAULTS if judged.experiment in runs for j in judge(judged, runs[judged.experiment])]
-    dominated = sum(bool(j.dominated_by) for j in judgements)
-    count = Requirement(name="defaults that are dominated", measured=dominated, bound=0, better="lower")
+    dominated = at_most("defaults that are dominated", sum(bool(j.dominated_by) for j in judgements), 0)
     return Results(
         verdict=verdict(judgements, missing),
-        requirements=(count,) if judgements else (),
+        requirements=(dominated,) if judgements else (),
         tables=(
             default_table(judgements),
             named_table("Runs", [{"experiment": name, "run": summary(past)} for name, past in runs.items()]),
@@ -150,10 +130,7 @@ def judge(judged: JudgedDefault, past: PastRun) -> list[DefaultJudgement]:
         default = next((str(row[0]) for row in table["rows"] if str(row[0]).startswith(judged.default)), None)
         if table["title"].startswith(judged.table) and default is not None:
             points = points_of(table, judged.axes)
-            beaten_by = dominators(default, points)
-            judgements.append(
-                DefaultJudgement(judged=judged, title=table["title"], points=points, dominated_by=beaten_by)
-            )
+            judgements.append(DefaultJudgement(judged, table["title"], points, dominators(default, points)))
     return judgements
 
 
@@ -174,7 +151,7 @@ def points_of(table: Mapping[str, Any], axes: Axes) -> tuple[ParetoPoint, ...]:
         require(bool(found), f"axis of table {table['title']!r}", axis, f"must begin one of {names}", "rename it")
         signs[found[0]] = 1.0 if better == "lower" else -1.0
     return tuple(
-        ParetoPoint(name=str(row[0]), at=tuple(sign * float(row[i]) for i, sign in signs.items()))
+        ParetoPoint(str(row[0]), tuple(sign * float(row[i]) for i, sign in signs.items()))
         for row in table["rows"]
         if all(isinstance(row[i], int | float) and not isinstance(row[i], bool) for i in signs)
     )
@@ -196,16 +173,14 @@ def dominators(name: str, points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, .
 
 def verdict(judgements: Sequence[DefaultJudgement], missing: Sequence[str]) -> tuple[str, ...]:
     """Name the dominated defaults, the methods that dominate them, and the experiments that have not run."""
-    sentences = [
+    dominated = [
         f"The default of {j.judged.what}, {j.judged.default}, is dominated in '{j.title}' by {_names(j.dominated_by)}."
         for j in judgements
         if j.dominated_by
     ]
-    if judgements and not sentences:
-        sentences.append(f"None of {len(judgements)} judgements finds a default dominated.")
-    if missing:
-        sentences.append(f"Not run yet, so not judged: {', '.join(missing)}.")
-    return tuple(sentences)
+    none = [f"None of {len(judgements)} judgements finds a default dominated."] if judgements else []
+    unmeasured = [f"Not run yet, so not judged: {', '.join(missing)}."] if missing else []
+    return (*(dominated or none), *unmeasured)
 
 
 def _names(points: Sequence[ParetoPoint]) -> str:

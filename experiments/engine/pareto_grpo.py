@@ -32,40 +32,20 @@ from experiments.core.progress import Advance
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
-from experiments.engine.job import Job, grpo_config
+from experiments.engine.job import Job, config_of
 from experiments.engine.peers import JobSize
-from touchr1_jax.rl.config import (
-    AnyAlgorithm,
-    Cispo,
-    Dapo,
-    DrGrpo,
-    GRPOConfig,
-    Gspo,
-    Paper,
-    ReinforcePlusPlus,
-    Rloo,
-    Stable,
-)
+from touchr1_jax.rl import config as rl
 
-ALGORITHMS: Mapping[str, AnyAlgorithm] = {
-    "paper": Paper(),
-    "stable": Stable(),
-    "DAPO": Dapo(),
-    "Dr. GRPO": DrGrpo(),
-    "GSPO": Gspo(),
-    "CISPO": Cispo(),
-    "RLOO": Rloo(),
-    "REINFORCE++": ReinforcePlusPlus(),
-}
+ALGORITHMS: Mapping[str, rl.AnyAlgorithm] = {
+    "paper": rl.Paper(), "stable": rl.Stable(), "DAPO": rl.Dapo(), "Dr. GRPO": rl.DrGrpo(), "GSPO": rl.Gspo(),
+    "CISPO": rl.Cispo(), "RLOO": rl.Rloo(), "REINFORCE++": rl.ReinforcePlusPlus(),
+}  # fmt: skip
 
 Key = tuple[str, int]
 """Algorithm and group size."""
 
-DEFAULT_KEY: Key = ("paper", GRPOConfig().group)
+DEFAULT_KEY: Key = ("paper", rl.GRPOConfig().group)
 """Setting of the studies, marked in charts and tables."""
-
-MOST_NAMES = 4
-"""Settings that a sentence of the verdict lists by name."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,8 +90,7 @@ class LearningCurves:
     def seconds_to(self, target: float) -> float:
         """Median time to the target over the seeds that reach it; NaN where none does."""
         steps = self.steps_to(target)
-        reached = steps[np.isfinite(steps)]
-        return float(np.median(reached)) * self.step_s if len(reached) else np.nan
+        return float(np.median(steps[np.isfinite(steps)])) * self.step_s if np.isfinite(steps).any() else np.nan
 
     def all_reach(self, target: float) -> bool:
         """True if every seed reaches the target."""
@@ -124,22 +103,36 @@ Curves = Mapping[Key, LearningCurves]
 def run(config: ParetoGrpoConfig, context: Context) -> Results:
     """Train every algorithm at every group size, then time their steps in turn."""
     rewards, last = {}, {}
-    keys = tuple(itertools.product(ALGORITHMS, config.groups))
-    with context.progress("seeds", len(keys) * config.seeds) as advance:
-        for name, group in keys:
+    with context.progress("seeds", len(ALGORITHMS) * len(config.groups) * config.seeds) as advance:
+        for name, group in itertools.product(ALGORITHMS, config.groups):
             key = name, group
             rewards[key], last[key] = learn(config, ALGORITHMS[name], group, advance)
             context.print(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
     calls = {f"{name} {group}": job.step for (name, group), job in last.items()}
-    seconds = interleaved(calls, context.rounds("timing steps", config.timed))
+    seconds = interleaved(calls, context.rounds("timing steps", config.timed)).values()
     curves = {
-        (name, group): LearningCurves(rewards=rewards[name, group], step_s=float(np.median(seconds[f"{name} {group}"])))
-        for name, group in keys
+        key: LearningCurves(rewards=rewards[key], step_s=float(np.median(s)))
+        for key, s in zip(last, seconds, strict=True)
     }
     return Results(
         verdict=verdict(config, curves),
         tables=(cost_table(config.target, curves),),
-        pictures=pictures(config.target, curves),
+        pictures=(
+            Picture(
+                name="pareto_grpo",
+                title="Step time, score, and time to the target",
+                caption="Left: score over the time of a step; right: time until the mean reward of a step passes the "
+                "target, median over seeds, hollow where not every seed passed it.  Numbers are group sizes; the ring "
+                "marks the setting of the studies.",
+                content=cost_and_gain(config.target, curves),
+            ),
+            Picture(
+                name="courses",
+                title="Reward over time",
+                caption="Mean over the seeds; the dotted line is the target.",
+                content=reward_over_time(config.target, curves),
+            ),
+        ),
         settings={
             "learning_rate": config.learning_rate,
             "rollouts a step": config.rollouts,
@@ -149,11 +142,11 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
     )
 
 
-def learn(config: ParetoGrpoConfig, algorithm: AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
+def learn(config: ParetoGrpoConfig, algorithm: rl.AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
     """Mean reward of every seed's steps, [seeds, steps], and the last seed's job; `advance` is called after a seed."""
     prompts = config.rollouts // group
     size = dataclasses.replace(config.size, prompts=prompts, group=group)
-    step = grpo_config(size, 1, algorithm)
+    step = config_of(size, algorithm)
     rewards = []
     for seed in range(config.seeds):
         job = Job(size, config.prefix, step, learning_rate=config.learning_rate, seed=seed)
@@ -174,8 +167,7 @@ def verdict(config: ParetoGrpoConfig, curves: Curves) -> tuple[str, ...]:
             name, group = DEFAULT_KEY
             sentences.append(f"The default, {name} in groups of {group}, takes {seconds[DEFAULT_KEY]:.1f} s.")
     if late:
-        which = ", ".join(late) if len(late) <= MOST_NAMES else f"{len(late)} of {len(curves)} (see the table)"
-        sentences.append(f"Not every seed passed {config.target} within {config.steps} steps with {which}.")
+        sentences.append(f"Not every seed passed {config.target} within {config.steps} steps with {', '.join(late)}.")
     return tuple(sentences)
 
 
@@ -210,40 +202,20 @@ def cost_table(target: float, curves: Curves) -> Table:
     )
 
 
-def pictures(target: float, curves: Curves) -> tuple[Picture, ...]:
-    """Cost against gain, and reward over time."""
-    return (
-        Picture(
-            name="pareto_grpo",
-            title="Step time, score, and time to the target",
-            caption="Left: score over the time of a step; right: time until the mean reward of a step passes the "
-            "target, median over seeds, hollow where not every seed passed it.  Numbers are group sizes; the ring "
-            "marks the setting of the studies.",
-            content=cost_and_gain(target, curves),
-        ),
-        Picture(
-            name="courses",
-            title="Reward over time",
-            caption="Mean over the seeds; the dotted line is the target.",
-            content=reward_over_time(target, curves),
-        ),
-    )
-
-
 def cost_and_gain(target: float, curves: Curves) -> bytes:
     """Draw score over the time of a step, and time to the target by algorithm."""
     names = list(dict.fromkeys(name for name, _ in curves))
     colour = colours(names)
+    ring: dict[str, Any] = {"colour": "black", "marker": "o", "line": "", "size": 170.0, "hollow": True}
     left, right = [], []
     for (name, group), c in curves.items():
         look: dict[str, Any] = {"name": name, "colour": colour[name], "marker": "o", "line": "", "labels": [str(group)]}
-        left.append(Series(**look, x=[1e3 * c.step_s], y=[c.score]))
-        row = [names.index(name)]
-        right.append(Series(**look, x=[c.seconds_to(target)], y=row, hollow=not c.all_reach(target)))
-        if (name, group) == DEFAULT_KEY:
-            ring: dict[str, Any] = {"colour": "black", "marker": "o", "line": "", "size": 170.0, "hollow": True}
-            left.append(Series(**ring, x=[1e3 * c.step_s], y=[c.score]))
-            right.append(Series(**ring, x=[c.seconds_to(target)], y=row))
+        gain: dict[str, Any] = {"x": [1e3 * c.step_s], "y": [c.score]}
+        cost: dict[str, Any] = {"x": [c.seconds_to(target)], "y": [names.index(name)]}
+        default = (name, group) == DEFAULT_KEY
+        left += [Series(**look, **gain), *([Series(**ring, **gain)] if default else [])]
+        right += [Series(**look, **cost, hollow=not c.all_reach(target))]
+        right += [Series(**ring, **cost)] if default else []
     label = f"time to a mean reward of {target:g}, s"
     panels = [
         Panel(left, x_label="a step, ms", y_label="score: mean reward at the end", rules=[Rule(y=target)]),

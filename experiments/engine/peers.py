@@ -12,9 +12,10 @@ import json
 import os
 import random
 import resource
+import statistics
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 ANSWER = "measured: "
@@ -37,9 +38,6 @@ OFFLINE_ON_CPU = {
     "TOKENIZERS_PARALLELISM": "false",
 }
 """Environment of a peer."""
-
-LAST_LINES = 15
-"""Lines of a failed peer's errors that are shown."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -123,12 +121,23 @@ class PeerJob:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PeerTimes:
-    """Seconds of a peer's timed iterations and of its first, peak memory of its process, versions of its packages."""
+class EngineTimes:
+    """Seconds of an engine's timed iterations and of its first, and peak memory of its process."""
 
     seconds: tuple[float, ...]
     first_s: float
     peak_gb: float
+
+    @property
+    def median_s(self) -> float:
+        """Median of the timed iterations."""
+        return statistics.median(self.seconds)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PeerTimes(EngineTimes):
+    """Times of a peer, and the versions of its packages."""
+
     versions: Mapping[str, str]
 
 
@@ -149,6 +158,11 @@ def format_answer(job: PeerJob, starts: Sequence[float], versions: Mapping[str, 
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20  # Linux counts in KiB
     times = PeerTimes(seconds=tuple(seconds[WARMUP:]), first_s=seconds[0], peak_gb=peak_gb, versions=versions)
     return ANSWER + json.dumps(dataclasses.asdict(times))
+
+
+def run_harness(main: Callable[[PeerJob], str]) -> None:
+    """Run a harness on the job of the command line, and print its answer."""
+    sys.stdout.write(main(PeerJob.from_json(sys.argv[1])) + "\n")
 
 
 def parse_answer(output: str) -> PeerTimes:
@@ -197,7 +211,7 @@ class Peer:
             errors="replace",
         )
         if done.returncode:
-            errors = "\n".join(done.stderr.splitlines()[-LAST_LINES:])
+            errors = "\n".join(done.stderr.splitlines()[-15:])
             raise PeerFailed(
                 f"{self.name} ended with {done.returncode} at prefix {job.prefix}: {self.python} must be able to run "
                 f"{self.harness}, whose first lines explain how to install it.  Its last errors:\n{errors}",

@@ -13,9 +13,8 @@ import contextlib
 import dataclasses
 import importlib.util
 import os
-import time
 from collections.abc import Iterator, Mapping
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,7 @@ from touchr1_jax.distributed.memory import Compiled, GRPOShape, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.lora import LoraConfig
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.types import Parsed, Target
 
@@ -39,22 +38,12 @@ TINY_PROMPT = PromptShape(streams=2, stream_tokens=4, view_tokens=4, text_tokens
 
 TINY = QwenConfig(
     decoder=DecoderConfig(
-        vocab_size=256,
-        hidden_size=32,
-        num_layers=4,
-        num_heads=4,
-        num_kv_heads=2,
-        head_dim=8,
-        intermediate_size=64,
-        mrope_section=(1, 1, 2),
-        tie_embedding=False,
+        vocab_size=256, hidden_size=32, num_layers=4, num_heads=4, num_kv_heads=2, head_dim=8, intermediate_size=64,
+        mrope_section=(1, 1, 2), tie_embedding=False,
     ),
     vision=QwenVisionConfig(out_size=32, depth=1, hidden_size=32, num_heads=2, intermediate_size=64, full_layers=(0,)),
-    vision_start_id=250,
-    vision_end_id=251,
-    image_id=252,
-    video_id=253,
-)
+    vision_start_id=250, vision_end_id=251, image_id=252, video_id=253,
+)  # fmt: skip
 """A model of the same kind that compiles in seconds."""
 
 OPTIMIZER = optax.adamw(1e-6)
@@ -83,16 +72,13 @@ class Training:
     prompt: PromptShape
     group: int
     length: int
-    micro_rows: int
-    """Prompts of a micro-batch on each device."""
     prompts: int
 
     def shape(self, setup: Setup) -> GRPOShape:
         """The sizes that the memory of a step depends on."""
-        rows = setup.mesh.data * setup.mesh.fsdp
         grpo = GRPOConfig(
             prompts=self.prompts,
-            micro_prompts=min(self.prompts, rows * self.micro_rows),
+            micro_prompts=min(self.prompts, setup.mesh.data * setup.mesh.fsdp),  # one prompt a device
             group=self.group,
             length=self.length,
             remat=True,
@@ -116,11 +102,6 @@ class Training:
         return dataclasses.replace(self, model=dataclasses.replace(self.model, decoder=decoder))
 
 
-def model_of(size: str) -> QwenConfig:
-    """The released model of a size, or the tiny one."""
-    return TINY if size == "tiny" else released(size)
-
-
 def score_of(streams: int):
     """A reward of the right form for a step that is compiled and never run."""
 
@@ -139,9 +120,6 @@ def score_of(streams: int):
 
     return score
 
-
-PER_MACHINE = 8
-"""H200s of one machine."""
 
 H200 = """
 gpu_device_info {
@@ -171,60 +149,48 @@ device_description_str: "NVIDIA H200 141GB HBM3e"
 """
 """The device's description for XLA (`stream_executor.GpuTargetConfigProto`)."""
 
-TOOLKIT = "nvidia.cuda_nvcc"
-"""Python package of NVIDIA's compiler."""
 
-
-class Compilation(NamedTuple):
-    """Bytes that the compiler reserves, and the seconds that it took."""
-
-    compiled: Compiled
-    seconds: float
-
-
-def compile_in_process(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
+def compile_in_process(training: Training, setup: Setup, compiler: Compiler) -> Compiled:
     """Compile in a fresh process.
 
     Raises:
       ModuleNotFoundError: for `h200`, without JAX's plugin for CUDA.
     """
-    flags = {"cpu": f"--xla_force_host_platform_device_count={setup.mesh.devices}"}
+    flags = f"--xla_force_host_platform_device_count={setup.mesh.devices}"
     if compiler == "h200":  # Triton's products would be tuned on the device, and XLA's guesses without it can fail
-        flags["h200"] = f"--xla_gpu_cuda_data_dir={toolkit()} --xla_gpu_enable_triton_gemm=false"
-    environment = {"XLA_FLAGS": flags[compiler], "JAX_PLATFORMS": "cpu"}
+        flags = f"--xla_gpu_cuda_data_dir={toolkit()} --xla_gpu_enable_triton_gemm=false"
+    environment = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     with _environment(environment):
         return in_own_process(compile_here, training, setup, compiler)
 
 
-def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Compilation:
+def compile_here(training: Training, setup: Setup, compiler: Compiler) -> Compiled:
     """Compile in this process, whose environment must fit the compiler."""
-    began = time.perf_counter()
     score = score_of(training.prompt.streams)
     devices = jax.devices() if compiler == "cpu" else h200s(setup.mesh.devices)
-    compiled = compile_grpo(training.step(setup), training.shape(setup), score, OPTIMIZER, devices)
-    return Compilation(compiled, time.perf_counter() - began)
+    return compile_grpo(training.step(setup), training.shape(setup), score, OPTIMIZER, devices)
 
 
-def h200s(count: int) -> list[jax.Device]:
+def h200s(count: int, per_machine: int = 8) -> list[jax.Device]:
     """Devices of as many machines as it takes, to compile for."""
-    machines = -(-count // PER_MACHINE)
+    machines = -(-count // per_machine)
     topology = f"1x{machines}x{count // machines}"
     return list(topologies.get_topology_desc(platform="cuda", target_config=H200, topology=topology).devices)
 
 
-def toolkit() -> str:
+def toolkit(package: str = "nvidia.cuda_nvcc") -> str:
     """Folder of NVIDIA's compiler.
 
     Raises:
       ModuleNotFoundError: it is not installed.
     """
     try:
-        found = importlib.util.find_spec(TOOLKIT)
+        found = importlib.util.find_spec(package)
     except ModuleNotFoundError:
         found = None
     if found is None or not found.submodule_search_locations:
         raise ModuleNotFoundError(
-            f"compiler is h200, but there is no {TOOLKIT}: install jax-cuda12-plugin and jax-cuda12-pjrt of jax "
+            f"compiler is h200, but there is no {package}: install jax-cuda12-plugin and jax-cuda12-pjrt of jax "
             f"{jax.__version__}, without their dependencies, and nvidia-cuda-nvcc-cu12; or choose --compiler cpu"
         )
     return str(found.submodule_search_locations[0])
@@ -233,13 +199,10 @@ def toolkit() -> str:
 @contextlib.contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
     """These variables for the processes that are started inside."""
-    before = {name: os.environ.get(name) for name in values}
+    before = dict(os.environ)
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        os.environ.clear()
+        os.environ.update(before)

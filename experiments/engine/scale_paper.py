@@ -23,21 +23,22 @@ from collections.abc import Mapping
 
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.engine.scale_compiling import (
     PAPER_PROMPT,
+    TINY,
     TINY_PROMPT,
     Compiler,
     Setup,
     Training,
     compile_in_process,
-    model_of,
 )
 from touchr1_jax.distributed.memory import ARGUMENTS, LEARNING, SAMPLING, Compiled, at_depths, counted_peak
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import Machine, model_flops, seconds
 from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.models.qwen.config import released
 
 GB = 1e9
 
@@ -69,11 +70,8 @@ class ScaleConfig:
     layers: tuple[int, int] = (1, 2)
     """Depths that are compiled."""
     prompts: int = 16
-    micro_rows: int = 1
-    """Prompts of a micro-batch on each device."""
     group: int = 8
     length: int = 512
-    lora_rank: int = 16
     machine: Machine = Machine()
 
     def __post_init__(self) -> None:
@@ -89,19 +87,18 @@ class ScaleConfig:
         """The first mesh, the same with adapters, the other meshes."""
         meshes = [MeshConfig(data=d, fsdp=f, tensor=t) for d, f, t in self.meshes]
         first, *others = (Setup(mesh=mesh) for mesh in meshes)
-        return first, Setup(mesh=meshes[0], lora=LoraConfig(rank=self.lora_rank)), *others
+        return first, Setup(mesh=meshes[0], lora=LoraConfig(rank=16)), *others
 
     @property
     def training(self) -> Training:
-        """Trained parameters."""
-        return Training(
-            model=model_of(self.size),
-            prompt=TINY_PROMPT if self.size == "tiny" else PAPER_PROMPT,
-            group=self.group,
-            length=self.length,
-            micro_rows=self.micro_rows,
-            prompts=self.prompts,
-        )
+        """The training to count and compile."""
+        model, prompt = (TINY, TINY_PROMPT) if self.size == "tiny" else (released(self.size), PAPER_PROMPT)
+        return Training(model=model, prompt=prompt, group=self.group, length=self.length, prompts=self.prompts)
+
+    @property
+    def depth(self) -> int:
+        """Layers of the model."""
+        return self.training.model.decoder.num_layers
 
 
 def run(config: ScaleConfig, context: Context) -> Results:
@@ -111,14 +108,13 @@ def run(config: ScaleConfig, context: Context) -> Results:
     reserved = {
         setup: compiled(config, setup, context) for setup in context.each("compilers", config.setups[: config.compiled])
     }
-    full = tuple(setup for setup in config.setups if setup.lora is None)
     return Results(
         verdict=verdict(config, lines, reserved),
         requirements=requirements(config, lines, reserved),
         tables=(
             byte_table(lines),
             *((memory_table(config, lines, reserved),) if reserved else ()),
-            time_table(training, full, config.machine),
+            time_table(config),
         ),
         pictures=(
             Picture(
@@ -137,41 +133,29 @@ def run(config: ScaleConfig, context: Context) -> Results:
     )
 
 
-def depth(config: ScaleConfig) -> int:
-    """Layers of the model."""
-    return config.training.model.decoder.num_layers
-
-
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:
     """Bytes that the compiler reserves at both depths, saved as stages, and by extrapolation at the model's depth."""
     found: dict[int, Compiled] = {}
     for layers in context.each(setup.name, config.layers):
         stage = f"compile/{config.setups.index(setup)}/{layers}"
         if not context.done(stage):
-            outcome = compile_in_process(config.training.of_depth(layers), setup, config.compiler)
-            context.save_stage(stage, {"bytes": outcome.compiled, "seconds": outcome.seconds})
-        saved = context.load_stage(stage)
-        found[layers] = Compiled(*saved["bytes"])
-        context.print(
-            f"{setup.name}, {layers} layers: {found[layers].peak / GB:.2f} GB, compiled in {saved['seconds']:.0f} s"
-        )
-    return found | {depth(config): at_depths(found, depth(config))}
+            with context.timed(stage):
+                reserved = compile_in_process(config.training.of_depth(layers), setup, config.compiler)
+            context.save_stage(stage, reserved)
+        found[layers] = Compiled(*context.load_stage(stage))
+        context.print(f"{setup.name}, {layers} layers: {found[layers].peak / GB:.2f} GB")
+    return found | {config.depth: at_depths(found, config.depth)}
 
 
 def requirements(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[Requirement, ...]:
     """The count and the reserved memory fit the device; the compiled arguments equal the counted ones."""
-
-    def fits(name: str, size: float) -> Requirement:
-        bound = config.machine.memory_bytes / GB
-        return Requirement(name=name, measured=size / GB, bound=bound, better="lower", unit="GB")
-
-    found = [fits(f"{setup.name}: counted", counted_peak(by)) for setup, by in lines.items()]
+    bound = config.machine.memory_bytes / GB
+    found = [at_most(f"{setup.name}: counted", counted_peak(by) / GB, bound, "GB") for setup, by in lines.items()]
     for setup, depths in reserved.items():
-        full = depths[depth(config)]
+        full = depths[config.depth]
         own = sum(lines[setup][name] for name in ARGUMENTS) + COUNTERS_BYTES
-        off, name = abs(full.arguments / own - 1), f"{setup.name}: arguments off the count"
-        found.append(fits(f"{setup.name}: reserved for {config.compiler}", full.peak))
-        found.append(Requirement(name=name, measured=off, bound=1e-3, better="lower"))
+        found.append(at_most(f"{setup.name}: reserved for {config.compiler}", full.peak / GB, bound, "GB"))
+        found.append(at_most(f"{setup.name}: arguments off the count", abs(full.arguments / own - 1), 1e-3))
     return tuple(found)
 
 
@@ -183,7 +167,7 @@ def verdict(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[str,
         f"Counted by hand, a step of the {config.size} on {first.mesh.devices} devices ({first.name}) takes "
         f"{counted_peak(lines[first]) / GB:.1f} of {config.machine.memory_bytes / GB:.0f} GB on each.",
         *(
-            f"XLA reserves {by[depth(config)].peak / GB:.1f} GB for {setup.name} (compiler: {config.compiler}), the "
+            f"XLA reserves {by[config.depth].peak / GB:.1f} GB for {setup.name} (compiler: {config.compiler}), the "
             "reference and the counterfactual passes included."
             for setup, by in reserved.items()
         ),
@@ -211,7 +195,7 @@ def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table
     rows: list[dict[str, Cell]] = []
     for setup, by in reserved.items():
         for layers, c in by.items():
-            full = layers == depth(config)
+            full = layers == config.depth
             rows.append(
                 {
                     "setup": f"{setup.name}, {layers} layers{' (extrapolated)' if full else ''}",
@@ -229,11 +213,12 @@ def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table
     )
 
 
-def time_table(training: Training, setups: tuple[Setup, ...], machine: Machine) -> Table:
-    """Predicted seconds of a step by phase."""
+def time_table(config: ScaleConfig) -> Table:
+    """Predicted seconds of a step of the full training by phase."""
+    machine = config.machine
     rows: list[dict[str, Cell]] = []
-    for setup in setups:
-        shape = training.shape(setup)
+    for setup in (setup for setup in config.setups if setup.lora is None):
+        shape = config.training.shape(setup)
         phases = seconds(shape, machine)
         step_s = sum(phases.values())
         share = model_flops(shape) / step_s / machine.flops / setup.mesh.devices
@@ -267,13 +252,11 @@ def parts(lines: Lines) -> dict[str, list[float]]:
     """Counted gigabytes of each setup: arguments, weights in use, and the larger of sampling and learning."""
     found: dict[str, list[float]] = {name: [] for name in ("arguments", "weights in use", "sampling", "learning")}
     for by in lines.values():
-        phases = {"sampling": sum(by[n] for n in SAMPLING), "learning": sum(by[n] for n in LEARNING)}
-        larger = max(phases, key=lambda name: phases[name])
-        arguments = sum(by[n] for n in ARGUMENTS)
-        found["arguments"].append(arguments / GB)
-        found["weights in use"].append((sum(by.values()) - arguments - sum(phases.values())) / GB)
-        for name, size in phases.items():
-            found[name].append(size / GB if name == larger else 0.0)
+        arguments, *phases = (sum(by[n] for n in names) for names in (ARGUMENTS, SAMPLING, LEARNING))
+        weights = sum(by.values()) - arguments - sum(phases)
+        larger = (size if size == max(phases) else 0 for size in phases)
+        for sizes, size in zip(found.values(), (arguments, weights, *larger), strict=True):
+            sizes.append(size / GB)
     return {name: sizes for name, sizes in found.items() if any(sizes)}
 
 

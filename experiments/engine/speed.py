@@ -1,21 +1,26 @@
-"""Measurements of one GRPO iteration: in a process of its own, beside its variants, over many steps."""
+"""Timing of GRPO steps and other workloads: alone in a process, next to variants, over many steps."""
 
 import dataclasses
+import re
 import resource
+import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
+from experiments.core.results import Requirement, at_most
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
-from experiments.engine.peers import JobSize
+from experiments.engine.peers import EngineTimes, JobSize
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -24,10 +29,19 @@ from touchr1_jax.text.template import prompt_words
 from touchr1_jax.text.tokenizer import word_level
 from touchr1_jax.training.compilation import compilations_kept, return_memory
 
-MATRIX = 1024  # side of the matrices whose product is the yardstick of the machine
-SHORT = 1 / 8  # share of the words that end a completion where answers are to be short
+MATRIX = 1024
+"""Side of the matrices whose product is the yardstick of a CPU."""
+
+SHORT = 1 / 8
+"""Share of the words that end a completion where answers are to be short."""
+
+RESIDENT_EVERY = 100
+"""Steps between two looks at the memory."""
+
+EARLY = 1000
+"""Steps over which time must stay constant; memory must over all."""
+
 GIB, KIB, MIB = 2**30, 2**10, 2**20
-RESIDENT_EVERY = 100  # steps between two looks at the memory
 
 Option = Literal[
     "one micro-batch",
@@ -40,18 +54,171 @@ Option = Literal[
     "short answers",
     "short answers, buckets",
 ]
-"""What can be changed about the engine."""
+"""Changes of the engine."""
+
+
+class Workload(NamedTuple):
+    """A call to time, its operations, the bytes it must read, and the number of units it produces."""
+
+    call: Callable[[], Any]
+    flops: float
+    read_bytes: float | None
+    made: float
+    unit: str
+
+
+class TimedWorkload(NamedTuple):
+    """Seconds of a workload in every round, and the workload."""
+
+    seconds: tuple[float, ...]
+    workload: Workload
+
+    @property
+    def median_s(self) -> float:
+        """Median of the rounds."""
+        return statistics.median(self.seconds)
+
+    @property
+    def flops(self) -> float:
+        """Necessary operations a second."""
+        return self.workload.flops / self.median_s
+
+    @property
+    def read_bytes(self) -> float | None:
+        """Necessary bytes read a second, where they are counted."""
+        return None if self.workload.read_bytes is None else self.workload.read_bytes / self.median_s
+
+    @property
+    def made(self) -> str:
+        """Units produced a second, such as `1,200 tokens/s`."""
+        return f"{self.workload.made / self.median_s:,.0f} {self.workload.unit}/s"
+
+
+def measure(
+    title: str, makers: Mapping[str, Callable[[], Workload]], rounds: int, context: Context
+) -> dict[str, TimedWorkload]:
+    """Make each workload, run it twice, time it, and go on to the next."""
+    timed = {}
+    for name, make in context.each(title, makers.items(), still=True):
+        with context.timed(re.sub(r"\W+", "_", name)):
+            workload = make()
+            _warm(workload.call)
+            seconds = interleaved({name: workload.call}, context.rounds(f"timing {name}", rounds))[name]
+        timed[name] = one = TimedWorkload(tuple(seconds.tolist()), workload)
+        context.print(f"{name}: {1e3 * one.median_s:.4g} ms, {one.flops / 1e12:.3g} TFLOP/s")
+    return timed
+
+
+def matrix_product(side: int, dtype: DTypeLike) -> Workload:
+    """A product of two square matrices of normal numbers."""
+    a = jax.random.normal(jax.random.key(0), (side, side), dtype)
+    multiply = jax.jit(jnp.matmul)
+    return Workload(lambda: multiply(a, a), 2 * side**3, None, 1, "products")
+
+
+def _warm(call: Callable[[], Any]) -> None:
+    for _ in range(2):
+        jax.block_until_ready(call())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ProcessTiming:
-    """One job in a process of its own; `programs` counts those of the step, `first_s` is the first iteration."""
+class ProcessTiming(EngineTimes):
+    """A job in a process of its own: programs compiled for its step, and the best speed of matrix products there."""
 
-    seconds: tuple[float, ...]
-    first_s: float
-    peak_gb: float
     programs: int
     gflops_peak: float
+
+
+def time_alone(size: JobSize, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> ProcessTiming:
+    """Time the first iteration and those after the second, this process's peak memory, and matrix products.
+
+    Args:
+      size: of the job.
+      prefix: prompt tokens.
+      config: the step.
+      rounds: iterations to time.
+      cache: folder of compiled programs.
+    """
+    began = time.perf_counter()
+    with compilations_kept(cache):
+        job = Job(size, prefix, config)
+        jax.block_until_ready(job.step())
+    first_s = time.perf_counter() - began
+    return_memory()
+    jax.block_until_ready(job.step())
+    seconds = interleaved({"step": job.step}, range(rounds))["step"]
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB / GIB
+    product = matrix_product(MATRIX, jnp.float32)
+    jax.block_until_ready(product.call())
+    fastest = interleaved({"product": product.call}, range(10))["product"].min()
+    return ProcessTiming(
+        seconds=tuple(seconds.tolist()),
+        first_s=first_s,
+        peak_gb=peak_gb,
+        programs=job.compilations,
+        gflops_peak=product.flops / fastest / 1e9,
+    )
+
+
+def options(
+    size: JobSize, prefix: int, buckets: tuple[int, ...], names: Sequence[Option]
+) -> dict[str, Callable[[], Job]]:
+    """Makers of the default engine and of variants with one change; short answers are ones that end early."""
+    plain = config_of(size)
+    change = lambda **changes: lambda: Job(size, prefix, dataclasses.replace(plain, **changes))
+    short = lambda config: lambda: Job(size, prefix, config, end_share=SHORT, learning_rate=0.0)
+    makers: dict[Option, Callable[[], Job]] = {
+        "one micro-batch": change(micro_prompts=size.prompts),
+        "Gumbel draws": change(inverse_draws=False),
+        "remat": change(remat=True),
+        "bfloat16": change(bfloat16=True),
+        "lean compilation": change(lean_compilation=True),
+        "importance weights": change(algorithm=dataclasses.replace(plain.algorithm, importance_cap=2.0)),
+        "host reward": lambda: Job(size, prefix, plain, host=True),
+        "short answers": short(plain),
+        "short answers, buckets": short(dataclasses.replace(plain, buckets=buckets)),
+    }
+    if not compiles_leanly():
+        del makers["lean compilation"]
+    return {"this": change()} | {name: makers[name] for name in names if name in makers}
+
+
+def repeated(size: JobSize, prefix: int) -> dict[str, Callable[[], Job]]:
+    """Makers of the default engine and of one that encodes the prefix for every rollout."""
+    plain = config_of(size)
+    return {
+        "this": lambda: Job(size, prefix, plain),
+        "repeated prefix": lambda: Job(size, prefix, plain, repeated=True),
+    }
+
+
+def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, context: Context) -> dict[str, float]:
+    """Median over rounds of each job's time over that of `this` in the same round.
+
+    Args:
+      makers: how to make each job.
+      rounds: of timing.
+      what: title of the progress.
+      context: shows progress.
+    """
+    calls = {}
+    for name, make in context.each(f"compiling {what}", makers.items()):
+        calls[name] = make().step
+        _warm(calls[name])
+    seconds = interleaved(calls, context.rounds(f"timing {what}", rounds))
+    ratios = {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
+    context.print(f"{what}: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}")
+    return ratios
+
+
+def parser_seconds(size: JobSize, rounds: int = 20) -> float:
+    """Median time to parse all completions of one iteration, random words of the touch language."""
+    tokenizer = word_level(TOUCH_LANGUAGE, prompt_words())
+    parse = jax.jit(jax.vmap(jax.vmap(compile_parser(TOUCH_LANGUAGE, tokenizer))))
+    shape = (size.prompts, size.group, size.length)
+    tokens = jnp.asarray(np.random.default_rng(0).integers(0, tokenizer.vocab_size, shape), jnp.int32)
+    jax.block_until_ready(parse(tokens))
+    return float(np.median(interleaved({"parse": lambda: parse(tokens)}, range(rounds))["parse"]))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,112 +238,15 @@ class LongRun:
     programs: int
 
 
-def time_alone(size: JobSize, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> ProcessTiming:
-    """Seconds of each iteration after the first two, of the first, peak memory of this process, matrix products.
-
-    Args:
-      size: of the job.
-      prefix: prompt tokens.
-      config: the step.
-      rounds: iterations to time.
-      cache: folder of compiled programs.
-    """
-    began = time.perf_counter()
-    with compilations_kept(cache):
-        job = Job(size, prefix, config)
-        jax.block_until_ready(job.step())
-    first_s = time.perf_counter() - began
-    return_memory()
-    jax.block_until_ready(job.step())
-    seconds = interleaved({"step": job.step}, range(rounds))["step"]
-    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KIB / GIB
-    return ProcessTiming(
-        seconds=tuple(seconds.tolist()),
-        first_s=first_s,
-        peak_gb=peak_gb,
-        programs=job.compilations,
-        gflops_peak=matrix_gflops(),
-    )
-
-
-def matrix_gflops(rounds: int = 10) -> float:
-    """Speed of large float32 matrix products, 10⁹ multiplications and additions a second, best of some."""
-    a = jnp.asarray(np.random.default_rng(0).normal(size=(MATRIX, MATRIX)), jnp.float32)
-    product = jax.jit(jnp.matmul)
-    jax.block_until_ready(product(a, a))
-    return 2 * MATRIX**3 / interleaved({"product": lambda: product(a, a)}, range(rounds))["product"].min() / 1e9
-
-
-def options(
-    size: JobSize, prefix: int, micro_prompts: int, buckets: tuple[int, ...], names: Sequence[Option]
-) -> dict[str, Callable[[], Job]]:
-    """Makers of the default engine and of variants with one change; short answers are ones that end early."""
-    plain = config_of(size, micro_prompts)
-    change = lambda **changes: lambda: Job(size, prefix, dataclasses.replace(plain, **changes))
-    short = lambda config: lambda: Job(size, prefix, config, end_share=SHORT, learning_rate=0.0)
-    makers: dict[Option, Callable[[], Job]] = {
-        "one micro-batch": change(micro_prompts=size.prompts),
-        "Gumbel draws": change(inverse_draws=False),
-        "remat": change(remat=True),
-        "bfloat16": change(bfloat16=True),
-        "lean compilation": change(lean_compilation=True),
-        "importance weights": change(algorithm=dataclasses.replace(plain.algorithm, importance_cap=2.0)),
-        "host reward": lambda: Job(size, prefix, plain, host=True),
-        "short answers": short(plain),
-        "short answers, buckets": short(dataclasses.replace(plain, buckets=buckets)),
-    }
-    if not compiles_leanly():
-        del makers["lean compilation"]
-    return {"this": lambda: Job(size, prefix, plain)} | {name: makers[name] for name in names if name in makers}
-
-
-def repeated(size: JobSize, prefix: int, micro_prompts: int) -> dict[str, Callable[[], Job]]:
-    """Makers of the default engine and of one that encodes the prefix for every rollout."""
-    plain = config_of(size, micro_prompts)
-    return {
-        "this": lambda: Job(size, prefix, plain),
-        "repeated prefix": lambda: Job(size, prefix, plain, repeated=True),
-    }
-
-
-def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, context: Context) -> dict[str, float]:
-    """Median over rounds of each job's time over that of `this` in the same round.
-
-    Args:
-      makers: how to make each job.
-      rounds: of timing.
-      what: of them differs.
-      context: shows how far it is.
-    """
-    jobs = {}
-    for name, make in context.each(f"compiling {what}", makers.items()):
-        jobs[name] = make()
-        for _ in range(2):
-            jax.block_until_ready(jobs[name].step())
-    calls = {name: job.step for name, job in jobs.items()}
-    seconds = interleaved(calls, context.rounds(f"timing {what}", rounds))
-    return {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
-
-
-def parser_seconds(size: JobSize, rounds: int = 20) -> float:
-    """Median time to parse all completions of one iteration, random words of the touch language."""
-    tokenizer = word_level(TOUCH_LANGUAGE, prompt_words())
-    parse = jax.jit(jax.vmap(jax.vmap(compile_parser(TOUCH_LANGUAGE, tokenizer))))
-    shape = (size.prompts, size.group, size.length)
-    tokens = jnp.asarray(np.random.default_rng(0).integers(0, tokenizer.vocab_size, shape), jnp.int32)
-    jax.block_until_ready(parse(tokens))
-    return float(np.median(interleaved({"parse": lambda: parse(tokens)}, range(rounds))["parse"]))
-
-
 def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: ProgressCallback) -> LongRun:
-    """Steps whose answers end early and late, so that every bucket is taken; nothing is learned, so that they go on to.
+    """Steps whose answers end early and late, so that every bucket is used; the policy stays as it is.
 
     Args:
       size: of the job.
       prefix: prompt tokens.
       buckets: lengths that an update may pay for.
       steps: how many.
-      tell: told of them whenever the memory is looked at.
+      tell: progress callback, called whenever the memory is looked at.
     """
     job = Job(size, prefix, dataclasses.replace(config_of(size), buckets=buckets), end_share=SHORT, learning_rate=0.0)
     for _ in range(3):
@@ -188,7 +258,8 @@ def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int,
         metrics = jax.block_until_ready(job.step())
         seconds[t] = time.perf_counter() - began
         if (t + 1) % RESIDENT_EVERY == 0:
-            resident.append(resident_mb())
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            resident.append(pages * resource.getpagesize() / MIB)
             lengths.append(float(metrics["length"]))
             tell(t + 1, steps)
     return LongRun(
@@ -199,7 +270,29 @@ def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int,
     )
 
 
-def resident_mb() -> float:
-    """Memory that this process holds now (Linux)."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / MIB
+def steadiness(long: LongRun) -> tuple[Requirement, ...]:
+    """Time and memory of late steps against early ones, and one program for all lengths."""
+    early, n = long.seconds[:EARLY], len(long.seconds)
+    tenth = max(1, len(early) // 10)
+    drift = np.median(early[-tenth:]) / np.median(early[:tenth])
+    lengths = "mean lengths of {:.1f} to {:.1f} tokens in {:,} steps".format(*long.lengths, n)
+    return (
+        at_most(f"time of late steps over early ones, of {len(early):,}", drift, 1.1),
+        at_most(f"memory that {n:,} steps add", long.resident_mb[-1] - long.resident_mb[0], 16, "MB"),
+        at_most("programs for all lengths", long.programs, 1, note=lengths),
+    )
+
+
+def over_steps(run: LongRun) -> bytes:
+    """Draw the time of a step, median and 5th to 95th percentile of every hundred, and the memory held."""
+    bins = run.seconds[: len(run.seconds) // RESIDENT_EVERY * RESIDENT_EVERY].reshape(-1, RESIDENT_EVERY)
+    low, middle, high = 1e3 * np.percentile(bins, (5, 50, 95), axis=1)
+    at = RESIDENT_EVERY * np.arange(1, len(bins) + 1)
+    most_ms, most_mb = 1.3 * float(np.percentile(high, 95)), 1.2 * float(run.resident_mb.max())
+    times = Series(x=at, y=middle, low=low, high=high, band=True, marker="")
+    memory = Series(x=at, y=run.resident_mb, marker="")
+    panels = [
+        Panel([times], x_label="step", y_label="a step, ms", y_limits=(0, most_ms)),
+        Panel([memory], x_label="step", y_label="memory held, MB", y_limits=(0, most_mb)),
+    ]
+    return draw(panels, size=(8.2, 3.0))

@@ -15,40 +15,34 @@ Expected: the product reaches 60 to 80 % of the data sheet, flash attention seve
 is bound by the memory, so that a GRPO step stays below a third of the peak.
 """
 
-import dataclasses
 import functools
-import re
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from experiments.core.charts import bars
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.core.timing import interleaved
 from experiments.engine.gpu_workloads import (
     AttentionInputs,
     GpuConfig,
     PolicyWorkloads,
-    TimedWorkload,
-    Workload,
     attention_errors,
     attention_variants,
     attention_workload,
     draw_heads,
-    product,
     tactile_encoder,
     vision_tower,
 )
 from experiments.engine.peers import JobSize
-from touchr1_jax.distributed.memory import Compiled
+from experiments.engine.speed import TimedWorkload, Workload, matrix_product, measure
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 
 PRODUCT, STEP = "matrix product", "GRPO step"
-
-TACTILE = "tactile encoder, float32"
 
 OFF_FLOAT32 = 0.02
 """Largest error of attention in bfloat16, which rounds by .004, over the largest number."""
@@ -60,8 +54,7 @@ class NoAccelerator(OSError):
     """JAX sees no GPU."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DataSheet:
+class DataSheet(NamedTuple):
     """Promised rates: dense bfloat16 operations and bytes of memory read, a second."""
 
     flops: float
@@ -69,11 +62,11 @@ class DataSheet:
 
 
 SHEETS = {
-    "H200": DataSheet(flops=989e12, read_bytes=4.8e12),
-    "H100 PCIe": DataSheet(flops=756e12, read_bytes=2.0e12),
-    "H100": DataSheet(flops=989e12, read_bytes=3.35e12),
-    "A100": DataSheet(flops=312e12, read_bytes=2.0e12),
-    "L40S": DataSheet(flops=362e12, read_bytes=0.864e12),
+    "H200": DataSheet(989e12, 4.8e12),
+    "H100 PCIe": DataSheet(756e12, 2.0e12),
+    "H100": DataSheet(989e12, 3.35e12),
+    "A100": DataSheet(312e12, 2.0e12),
+    "L40S": DataSheet(362e12, 0.864e12),
 }
 """Part of the driver's name of a device → NVIDIA's data sheet; the first that fits counts."""
 
@@ -101,28 +94,25 @@ def accelerator(*, anywhere: bool) -> jax.Device:
 def run(config: GpuConfig, context: Context) -> Results:
     """Time every workload, then compare attention with float32 and memory with the count."""
     device = accelerator(anywhere=config.anywhere)
-    with context.progress("drawing the attention inputs", 1) as advance:
-        heads = draw_heads(config.prompts, config.tokens, config.heads, config.kv_heads, config.head_dim)
-        advance()
-    timed = measured("pieces", without_policy(config, heads), config.rounds, context)
-    off = attention_errors(heads, attention_variants(config), context)
+    heads = draw_heads(config)
+    timed = measure("pieces", without_policy(config, heads), config.rounds, context)
+    off = attention_errors(heads, attention_variants(config))
     del heads
     with context.progress("making the policy", 2) as advance:
         policy = PolicyWorkloads(config)
         advance()
         reserved, counted = policy.memory()
         advance()
-    timed |= measured("the policy", {"decoding": policy.decoding, STEP: policy.step}, config.rounds, context)
+    timed |= measure("the policy", {"decoding": policy.decoding, STEP: policy.step}, config.rounds, context)
     sheet = sheet_of(device.device_kind)
     first = timed[PRODUCT]
     peak = first.workload.flops / min(first.seconds) if sheet is None else sheet.flops
     return Results(
         verdict=verdict(device, timed, peak, sheet),
         requirements=tuple(
-            Requirement(name=f"attention, {name}: off float32", measured=e, bound=OFF_FLOAT32, better="lower")
-            for name, e in off.items()
+            at_most(f"attention, {name}: off float32", error, OFF_FLOAT32) for name, error in off.items()
         ),
-        tables=(time_table(timed, sheet, peak), memory_table(reserved, counted, device)),
+        tables=(time_table(timed, sheet, peak), memory_table(reserved.peak, counted, device)),
         pictures=(
             Picture(
                 name="share",
@@ -139,35 +129,15 @@ def run(config: GpuConfig, context: Context) -> Results:
 
 def without_policy(config: GpuConfig, heads: AttentionInputs) -> dict[str, Callable[[], Workload]]:
     """Makers of the product, attention and the encoders by name."""
-    pieces: dict[str, Callable[[], Workload]] = {PRODUCT: functools.partial(product, config)}
+    pieces: dict[str, Callable[[], Workload]] = {PRODUCT: functools.partial(matrix_product, config.side, jnp.bfloat16)}
     for name, attend in attention_variants(config).items():
         for gradient in (False, True):
             title = f"attention, {name}{', with gradient' if gradient else ''}"
             pieces[title] = functools.partial(attention_workload, config, heads, attend, gradient=gradient)
     return pieces | {
-        TACTILE: functools.partial(tactile_encoder, config),
+        "tactile encoder, float32": functools.partial(tactile_encoder, config),
         "vision tower": functools.partial(vision_tower, config),
     }
-
-
-def measured(
-    title: str, pieces: Mapping[str, Callable[[], Workload]], rounds: int, context: Context
-) -> dict[str, TimedWorkload]:
-    """Make and time some workloads, one after the other."""
-    shown = context.each(title, pieces.items(), still=True)
-    return {name: measure(name, make, rounds, context) for name, make in shown}
-
-
-def measure(name: str, make: Callable[[], Workload], rounds: int, context: Context) -> TimedWorkload:
-    """Make a workload, run it twice, time it."""
-    with context.timed(re.sub(r"\W+", "_", name)):
-        piece = make()
-        for _ in range(2):
-            jax.block_until_ready(piece.call())
-        seconds = interleaved({name: piece.call}, context.rounds(f"timing {name}", rounds))[name]
-    timed = TimedWorkload(tuple(seconds.tolist()), piece)
-    context.print(f"{name}: {1e3 * timed.median_s:.4g} ms, {timed.flops / 1e12:.3g} TFLOP/s")
-    return timed
 
 
 def verdict(
@@ -223,17 +193,16 @@ def time_table(timed: Mapping[str, TimedWorkload], sheet: DataSheet | None, peak
     )
 
 
-def memory_table(reserved: Compiled, counted: int, device: jax.Device) -> Table:
+def memory_table(reserved: int, counted: int, device: jax.Device) -> Table:
     """Bytes of a GRPO step: counted, reserved by the compiler, and the allocator's peak so far."""
-    peak = (device.memory_stats() or {}).get("peak_bytes_in_use")
     figures = {
-        "counted by hand": counted / GB,
-        "XLA's compiler: arguments and what passes": reserved.peak / GB,
-        "the allocator's peak in this process": None if peak is None else peak / GB,
+        "counted by hand": counted,
+        "XLA's compiler: arguments and what passes": reserved,
+        "the allocator's peak in this process": (device.memory_stats() or {}).get("peak_bytes_in_use"),
     }
     return named_table(
         "Memory of a GRPO step",
-        [{"who says so": name, "memory": size} for name, size in figures.items()],
+        [{"who says so": name, "memory": None if size is None else size / GB} for name, size in figures.items()],
         units={"memory": "GB"},
         note="The allocator has seen all pieces; the step is the largest of them.",
     )

@@ -27,11 +27,20 @@ import numpy as np
 
 from experiments.core.charts import bars
 from experiments.core.context import Context
-from experiments.core.results import Column, Picture, Requirement, Results, Table
+from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.engine.feed_demand import grpo_seconds, sft_seconds
-from experiments.engine.feed_scales import FeedScale, answers, clip_bytes, memory_share, questions
-from experiments.engine.feed_supply import BatchCost, idle_share, make_seconds
+from experiments.engine.feeding import (
+    BatchCost,
+    FeedScale,
+    answers,
+    clip_bytes,
+    grpo_seconds,
+    idle_share,
+    make_seconds,
+    memory_share,
+    questions,
+    sft_seconds,
+)
 from experiments.paper import presets
 from experiments.study.study import SMOKE as TINY_STUDY
 from experiments.study.study import open_study_data
@@ -39,6 +48,9 @@ from sensors_io.pipeline import ClipMemory
 from touchr1_jax.distributed.work import Machine
 from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.feeds import Feed
+
+MOST_S = 60.0
+"""Seconds after which the loop ends, but for two steps."""
 
 MOST_IDLE = 0.02
 """Share of the time that a device may stand still for want of a batch."""
@@ -58,11 +70,9 @@ class FeedingConfig:
     """Beside each device."""
     machine: Machine = Machine()
     batches: int = 4
-    """Whose processor time is measured."""
+    """Number whose processor time is measured."""
     steps: int = 12
     """Of the loop, at most."""
-    most_s: float = 60.0
-    """About which the loop ends, but for two steps."""
 
     def __post_init__(self) -> None:
         for name in ("cores", "batches"):
@@ -72,16 +82,14 @@ class FeedingConfig:
             raise ValueError(f"steps is {self.steps}: must be at least 2, the first is not watched; raise it")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class FeedMeasurement:
-    """One feed: what a batch takes, how long a step lasts, and how long the device stood still.
+    """One feed: the cost of a batch, the time of a step, and the share of it that the device stood still.
 
-    `configured`: whether the study would feed it so; else it shows what memory is good for.
+    `configured`: whether the study would feed it so; else it shows the gain of keeping clips in memory.
     """
 
-    scale: str
-    stage: str
-    source: str
+    name: str
     made: BatchCost
     step_s: float
     idle: float
@@ -92,11 +100,6 @@ class FeedMeasurement:
         """That a device needs for its batches."""
         return self.made.cpu_s / self.step_s
 
-    @property
-    def name(self) -> str:
-        """Such as `gpu, SFT, from records`."""
-        return f"{self.scale}, {self.stage}, {self.source}"
-
 
 def run(config: FeedingConfig, context: Context) -> Results:
     """Measure every feed, then run each beside a device that stands in."""
@@ -104,13 +107,7 @@ def run(config: FeedingConfig, context: Context) -> Results:
     return Results(
         verdict=verdict(config, fed),
         requirements=tuple(
-            Requirement(
-                name=f"{one.name}: device stands still",
-                measured=one.idle,
-                bound=MOST_IDLE,
-                better="lower",
-                note="a stand-in",
-            )
+            at_most(f"{one.name}: device stands still", one.idle, MOST_IDLE, note="a stand-in")
             for one in fed
             if one.configured
         ),
@@ -176,71 +173,68 @@ def watch(
     if not context.done(stage):
         ahead = context.each(f"{stage}, ahead", range(warm))
         made = make_seconds(feed, context.rounds(f"{stage}, timing batches", config.batches), ahead)
-        lasts_s = step_s * stretch(config, made.cpu_s / step_s)
-        steps = min(config.steps, max(2, round(config.most_s / lasts_s)))
-        idle = idle_share(feed, lasts_s, steps, context, stage)
+        lasts_s = step_s * stretch(made.cpu_s / step_s, here=cores_here(), there=config.cores)
+        idle = idle_share(feed, lasts_s, min(config.steps, max(2, round(MOST_S / lasts_s))), context, stage)
         context.save_stage(stage, {"made": made._asdict(), "idle": idle})
     saved = context.load_stage(stage)
-    scale, name, source = stage.split("/")
-    return FeedMeasurement(
-        scale=scale,
-        stage=name,
-        source=source,
-        made=BatchCost(**saved["made"]),
-        step_s=step_s,
-        idle=saved["idle"],
-        configured=configured,
-    )
+    name = stage.replace("/", ", ")
+    return FeedMeasurement(name, BatchCost(**saved["made"]), step_s, saved["idle"], configured)
 
 
-def stretch(config: FeedingConfig, needed: float) -> float:
-    """Factor that slows the stand-in's steps until half of the cores here suffice, if so many are there."""
-    return min(max(1.0, 2 * needed / cores_here()), max(1.0, config.cores / cores_here()))
+def stretch(needed: float, *, here: int, there: int) -> float:
+    """Factor that slows the stand-in's steps until half of the cores here suffice, if so many are there.
+
+    Args:
+      needed: cores that the batches of a device need.
+      here, there: cores of this machine, and those beside a device.
+    """
+    return min(max(1.0, 2 * needed / here), max(1.0, there / here))
 
 
 def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
-    """Rates that every feed delivers, and rates that the device needs."""
-    return Table(
-        title="What a batch takes, and what a device asks",
-        columns=(
-            Column(name="feed", meaning="scale, stage, where clips or features lie"),
-            Column(name="batch", unit="MB", meaning="what one device gets"),
-            Column(name="made in", unit="core s", meaning="processor time, all threads"),
-            Column(name="step", unit="s", meaning="predicted"),
-            Column(name="cores needed", format=".2g", meaning=f"of {config.cores} beside a device"),
-            Column(name="device stands still", unit="%", format=".2f", meaning="a stand-in, in the loop that trains"),
-        ),
-        rows=tuple(
-            (
-                one.name,
-                one.made.size_bytes / 1e6,
-                one.made.cpu_s,
-                one.step_s,
-                one.cores,
-                100 * one.idle,
-            )
+    """Cost of the batches of every feed, and the rate at which the device needs them."""
+    return named_table(
+        "What a batch takes, and what a device asks",
+        [
+            {
+                "feed": one.name,
+                "batch": one.made.size_bytes / 1e6,
+                "made in": one.made.cpu_s,
+                "step": one.step_s,
+                "cores needed": one.cores,
+                "device stands still": 100 * one.idle,
+            }
             for one in fed
-        ),
+        ],
+        formats={"cores needed": ".2g", "device stands still": ".2f"},
+        units={"batch": "MB", "made in": "core s", "step": "s", "device stands still": "%"},
+        meanings={
+            "feed": "scale, stage, where clips or features lie",
+            "batch": "bytes for one device",
+            "made in": "processor time, all threads",
+            "step": "predicted",
+            "cores needed": f"of {config.cores} beside a device",
+            "device stands still": "a stand-in, in the loop that trains",
+        },
         note=f"Steps are as short as {config.machine.flops_share:.0%} of {config.machine.flops / 1e12:.0f} TFLOP/s "
         "make them.",
     )
 
 
 def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str, ...]:
-    """Which feed is the hardest, how long devices stand still, and that it is no measurement of one."""
+    """Name the feed that needs the most cores, and the idle share of devices; no device is measured."""
     used = [one for one in fed if one.configured]
     worst, hardest = max(used, key=lambda one: one.idle), max(used, key=lambda one: one.cores)
-    said = [
+    return (
         "No accelerator was at work: what its steps take is predicted, and a stand-in waited for the batches.",
         f"It stands still for at most {worst.idle:.2%} of the time ({worst.name}); the hardest to feed asks for "
         f"{hardest.cores:.2g} of {config.cores} cores ({hardest.name}).",
-    ]
-    said += [
-        f"Without the memory {one.name} would ask for {one.cores:.2g}, and stand still for {one.idle:.1%}."
-        for one in fed
-        if not one.configured
-    ]
-    return tuple(said)
+        *(
+            f"Without the memory {one.name} would ask for {one.cores:.2g}, and stand still for {one.idle:.1%}."
+            for one in fed
+            if not one.configured
+        ),
+    )
 
 
 DEFAULT = FeedingConfig()

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import load_weights
-from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint, shards
+from experiments.engine.load_weights import READERS, SHAPES, measure, random_checkpoint, shards
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.load import peak_memory
 
@@ -29,7 +29,7 @@ def test_experiment_runs_shrunken(tmp_path):
 
 def test_readers_read_the_same(tmp_path):
     told: list[tuple[int, int]] = []
-    size = random_checkpoint(tmp_path, TINY, 50_000, seed=1, tell=lambda *word: told.append(word))
+    size = random_checkpoint(tmp_path, TINY, 50_000, tell=lambda *word: told.append(word))
     assert told == sorted(told)
     assert told[-1] == (size, size)
     assert len(list(tmp_path.glob("*.safetensors"))) > 3
@@ -50,7 +50,7 @@ def digest(x: jax.Array) -> tuple[tuple[int, ...], bytes]:
 
 
 def test_contents_are_small_numbers(tmp_path):
-    random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
     for x in READERS["streamed"](tmp_path, TINY, silent):
         size = jnp.abs(x.astype(jnp.float32))
         assert float(size.min()) >= 2**-7
@@ -78,7 +78,7 @@ def test_a_reader_that_is_stopped_is_named(tmp_path):
 
 @pytest.mark.parametrize("reader", READERS)
 def test_bytes_are_told_from_the_process_that_reads(tmp_path, reader):
-    size = random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    size = random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
     told: list[tuple[int, int]] = []
     measure(READERS[reader], tmp_path, TINY, lambda *word: told.append(word))
     assert told == sorted(told)
@@ -98,6 +98,6 @@ def test_sizes_must_have_shapes_and_room(tmp_path):
 def test_peak_memory_is_that_of_the_program_and_not_of_its_parent(tmp_path):
     """This process has imported more than the reader will, and has held what its child has not."""
     held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
-    random_checkpoint(tmp_path, TINY, 10**9, seed=1, tell=silent)
+    random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
     assert measure(READERS["streamed"], tmp_path, TINY, silent).before < peak_memory()
     assert peak_memory() >= held.nbytes

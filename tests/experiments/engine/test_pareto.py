@@ -17,7 +17,7 @@ from experiments.engine.pareto import (
 )
 from tests.experiments.shrunk import run_shrunk
 
-A, B, C, D = (ParetoPoint(name=n, at=at) for n, at in zip("abcd", [(1, 4), (2, 2), (3, 3), (2, 2)], strict=True))
+A, B, C, D = (ParetoPoint(n, at) for n, at in zip("abcd", [(1, 4), (2, 2), (3, 3), (2, 2)], strict=True))
 TABLE = {
     "title": "Tiers at 128²",
     "columns": [{"name": "method"}, {"name": "time"}, {"name": "slope median"}],
@@ -37,7 +37,7 @@ def test_a_point_is_dominated_where_another_is_nowhere_worse_and_somewhere_bette
 
 def test_points_are_rows_with_a_number_on_every_axis():
     points = points_of(TABLE, {"time": "lower", "slope": "higher"})
-    assert points[0] == ParetoPoint(name="Winkler", at=(0.1, -0.5))
+    assert points[0] == ParetoPoint("Winkler", (0.1, -0.5))
     assert [p.name for p in points] == ["Winkler", "nested 1e-3", "plain"]
     with pytest.raises(ResultsError, match="'speed'"):
         points_of(TABLE, {"speed": "lower"})

@@ -1,5 +1,7 @@
 """The GPU's experiment without a GPU: it refuses, or tries its code and says so."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,15 +12,14 @@ from experiments.core.runner import main
 from experiments.engine import speed_gpu
 from experiments.engine.gpu_workloads import (
     GpuConfig,
-    TimedWorkload,
-    Workload,
     attention_errors,
+    attention_workload,
     draw_heads,
     engine_attention,
     flash_attention,
-    pairs,
     with_gradient,
 )
+from experiments.engine.speed import TimedWorkload, Workload
 from experiments.engine.speed_gpu import NoAccelerator, accelerator, sheet_of
 from tests.experiments.shrunk import run_shrunk
 
@@ -46,19 +47,23 @@ def test_sizes_that_do_not_fit_are_named(changes, message):
         GpuConfig(**changes)
 
 
-def test_both_ways_to_attend_are_one_in_float32_and_near_it_in_bfloat16(context):
-    heads = draw_heads(2, 12, 4, 2, 8)
+HEADS = GpuConfig(prompts=2, tokens=12, heads=4, kv_heads=2, head_dim=8)
+
+
+def test_both_kinds_of_attention_agree_in_float32_and_nearly_in_bfloat16():
+    heads = draw_heads(HEADS)
     variants = {"engine": engine_attention, "flash": flash_attention("xla")}
     wide = jax.tree.map(lambda x: x.astype(jnp.float32), heads)
     a, b = (jax.jit(with_gradient(attend))(wide) for attend in variants.values())
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
-    off = attention_errors(heads, variants, context)
-    assert all(0 < e < speed_gpu.OFF_FLOAT32 for e in off.values())
+    assert all(0 < e < speed_gpu.OFF_FLOAT32 for e in attention_errors(heads, variants).values())
 
 
 def test_work_and_shares_by_hand():
-    """Three tokens look at 1 + 2 + 3 keys; 8 operations in a median of 2 seconds are 4 a second."""
-    assert pairs(2, 3, 4) == 2 * 4 * 6
+    """Three tokens attend to 1 + 2 + 3 keys; 8 operations in a median of 2 seconds are 4 a second."""
+    small = dataclasses.replace(HEADS, tokens=3)
+    work = lambda gradient: attention_workload(small, draw_heads(small), engine_attention, gradient=gradient).flops
+    assert (work(False), work(True)) == (4 * 8 * 2 * 4 * 6, 3 * 4 * 8 * 2 * 4 * 6)
     timed = TimedWorkload((1.0, 2.0, 5.0), Workload(lambda: None, 8.0, 6.0, 4.0, "tokens"))
     assert (timed.flops, timed.read_bytes, timed.made) == (4.0, 3.0, "2 tokens/s")
 

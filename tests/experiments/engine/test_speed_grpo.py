@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.runner import main
 from experiments.engine import speed_grpo
 from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
 from experiments.engine.peers import JobSize, PeerFailed, PeerTimes
 from experiments.engine.processes import in_own_process
-from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
-from experiments.engine.speed_report import steadiness
+from experiments.engine.speed import LongRun, Option, many_steps, options, steadiness, time_alone
+from tests.experiments.shrunk import run_shrunk
 
 TINY = speed_grpo.SMOKE.size
 
@@ -38,7 +37,7 @@ def test_the_second_process_reads_what_the_first_compiled(tmp_path):
 @pytest.fixture(scope="module")
 def jobs():
     """Every option, small, after one step each."""
-    every = options(TINY, 16, 1, (4,), get_args(Option))
+    every = options(TINY, 16, (4,), get_args(Option))
     return {name: (job, jax.device_get(job.step())) for name, job in ((name, make()) for name, make in every.items())}
 
 
@@ -64,28 +63,19 @@ def test_options_change_the_cost_and_not_the_step(jobs):
     assert cut["grad_norm"] == pytest.approx(float(short["grad_norm"]), rel=1e-4)
 
 
-def test_one_program_serves_all_steps():
-    job = Job(TINY, 16, config_of(TINY))
-    before = jax.tree.map(np.array, job.state.params)
-    for _ in range(3):
-        job.step()
-    assert job.compilations == 1
-    assert any(
-        (a != np.asarray(b)).any() for a, b in zip(*map(jax.tree.leaves, (before, job.state.params)), strict=True)
-    )
-
-
-def test_seeds_share_a_program_and_nothing_else():
+def test_seeds_share_a_program_that_serves_all_steps():
     one, two = (Job(TINY, 16, config_of(TINY), seed=seed) for seed in (0, 1))
     assert (one.batch.ids != two.batch.ids).any()
-    norms = [float(job.step()["grad_norm"]) for job in (one, two)]
+    before = jax.tree.leaves(jax.tree.map(np.array, one.state.params))
+    norms = [[float(job.step()["grad_norm"]) for _ in range(2)] for job in (one, two)]
     assert norms[0] != norms[1]
     assert one.compilations == two.compilations == 1
+    assert any((a != np.asarray(b)).any() for a, b in zip(before, jax.tree.leaves(one.state.params), strict=True))
 
 
 @pytest.mark.slow
 def test_many_steps_take_every_length_in_one_program():
-    size = dataclasses.replace(speed_grpo.SMOKE.steps_size, vocab_size=16, hidden_size=16)
+    size = dataclasses.replace(speed_grpo.LONG_SIZE, vocab_size=16, hidden_size=16)
     told: list[tuple[int, int]] = []
     course = many_steps(size, 16, (4, 8), 200, lambda *word: told.append(word))
     assert told == [(100, 200), (200, 200)]
@@ -108,11 +98,7 @@ def test_drift_and_growth_by_hand():
 @pytest.mark.slow
 def test_the_experiment_reports_every_prefix(tmp_path):
     small = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16,), words=256)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(speed_grpo, "EXPERIMENT", dataclasses.replace(speed_grpo.EXPERIMENT, config=small))
-        patch.setattr(speed_grpo, "in_own_process", lambda work, *arguments, **tell: work(*arguments, **tell))
-        assert main(["speed_grpo", "--runs-dir", str(tmp_path)]) == 0
-    (directory,) = (p for p in (tmp_path / "speed_grpo").iterdir() if not p.is_symlink())
+    directory = run_shrunk(speed_grpo, small, tmp_path)
     results = read_json(directory / "results.json")
     assert [row[0] for row in results["tables"][0]["rows"]] == [16]
     names = {row[0] for row in results["tables"][1]["rows"]}
@@ -135,12 +121,11 @@ class FailingPeer:
         return PeerTimes(seconds=(1.0,), first_s=2.0, peak_gb=0.5, versions={})
 
 
-def test_an_engine_that_fails_at_a_long_prefix_costs_no_other_figure(context, monkeypatch):
+def test_an_engine_that_fails_at_a_long_prefix_costs_no_other_figure(context):
     config = dataclasses.replace(speed_grpo.SMOKE, prefixes=(16, 32))
-    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (FailingPeer("Short", 16), FailingPeer("Long", 32)))
-    found, failed = speed_grpo.measure_peers(config, context)
+    peers = FailingPeer("Short", 16), FailingPeer("Long", 32)
+    found, failed = speed_grpo.measure_peers(config, peers, context)
     assert list(found) == [("Short", 16), ("Long", 16), ("Long", 32)]
     assert failed == ("Short has no figure at 32: its process ended with -9.",)
-    monkeypatch.setattr(speed_grpo, "installed_peers", lambda *_: (FailingPeer("None", 0),))
     with pytest.raises(PeerFailed, match="None ended with -9"):
-        speed_grpo.measure_peers(config, context)
+        speed_grpo.measure_peers(config, [FailingPeer("None", 0)], context)
