@@ -1,10 +1,10 @@
-"""Descriptions of all videos of a folder, made once and cached."""
+"""Descriptions of the videos of a folder and of generated scenes, made once and cached."""
 
 import dataclasses
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,46 +12,56 @@ from jaxtyping import Float, Int
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
+from experiments.recordings.description_policy import LANGUAGE
 from experiments.recordings.descriptors import describe, families
-from experiments.recordings.policy import LANGUAGE
-from experiments.recordings.touches import read_touch
+from experiments.recordings.touches import read_touch, touch_of_scene
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.importers.keep import ImportSourceError, Skip
-from sensors_io.importers.physiclear import read_labels
+from sensors_io.importers.physiclear import PhysiclearConfig, read_labels
 from sensors_io.importers.video import VideoError
+from sensors_io.records import RecordStore
+from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.schema import ATTRIBUTES
+from sensors_io.schema import LEVELS as SCENE_LEVELS
 
 VERSION = 1
 """Raised when a description changes, so that no cache outlives it."""
 
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")
-"""What counts as a video in a folder that no table lists."""
+"""File names that count as videos in a folder that no table lists."""
+
+SENSOR = "gelsight_mini"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Described:
+class DescribedVideos:
     """n videos: name, object, levels (−1 unknown) and description of each, and those that could not be read."""
 
     names: np.ndarray
     objects: np.ndarray
     label: Int[np.ndarray, "n A"]
     x: Float[np.ndarray, "n D"]
-    skipped: tuple[Skip, ...]
+    skipped: tuple[Skip, ...] = ()
 
-    @property
-    def family(self) -> np.ndarray:
-        """Name of the family of each of the D numbers."""
-        return np.array(families())
-
-    def labelled(self) -> "Described":
+    def labelled(self) -> "DescribedVideos":
         """The videos whose levels are all known."""
-        return self.rows(np.flatnonzero((self.label >= 0).all(1)))
+        return self.rows(np.all(self.label >= 0, 1))
 
-    def rows(self, chosen: np.ndarray) -> "Described":
-        """Some of the videos."""
+    def rows(self, chosen: np.ndarray) -> "DescribedVideos":
+        """Some of the videos, by index or by mask."""
         take = {name: getattr(self, name)[chosen] for name in ("names", "objects", "label", "x")}
         return dataclasses.replace(self, **take)
 
 
-def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> Described:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DescribedScenes:
+    """n touches of generated objects: descriptions, and their properties one-hot, level by level."""
+
+    x: Float[np.ndarray, "n D"]
+    target: Float[np.ndarray, "n T"]
+
+
+def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> DescribedVideos:
     """Describe the videos of a folder that holds labels.json and videos/.
 
     Args:
@@ -70,11 +80,11 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     files = [source / "videos" / name for entry in entries for name in entry.videos]
     owner = np.array([entry.card.object_id for entry in entries for _ in entry.videos])
     levels = [[e.card.labels[a.name] for a in LANGUAGE.attributes] for e in entries for _ in e.videos]
-    return _describe(files, owner, np.array(levels, np.int32).reshape(len(files), -1), frames, context)
+    return _describe_files(files, owner, np.array(levels, np.int32).reshape(len(files), -1), frames, context)
 
 
-def describe_folder(folder: Path, frames: int, context: Context) -> Described:
-    """Describe the videos that lie in a folder, of which nothing is known.
+def describe_folder(folder: Path, frames: int, context: Context) -> DescribedVideos:
+    """Describe the videos of a folder without labels.
 
     Raises:
       ImportSourceError: no such folder, no video in it, or not one that can be read.
@@ -83,40 +93,67 @@ def describe_folder(folder: Path, frames: int, context: Context) -> Described:
     if not files:
         raise ImportSourceError(f"predict is {folder}: must hold videos ({', '.join(SUFFIXES)}); correct it")
     unknown = np.full((len(files), len(LANGUAGE.attributes)), -1, np.int32)
-    return _describe(files, np.array([p.name for p in files]), unknown, frames, context)
+    return _describe_files(files, np.array([p.name for p in files]), unknown, frames, context)
 
 
-def _describe(
+def _describe_files(
     files: Sequence[Path], objects: np.ndarray, label: np.ndarray, frames: int, context: Context
-) -> Described:
-    """Descriptions from the cache, made first where it lacks them."""
+) -> DescribedVideos:
+    def make() -> dict[str, np.ndarray]:
+        x, reasons = np.zeros((len(files), len(families())), np.float32), []
+        with context.timed("descriptions"):
+            for i, file in enumerate(context.each("describing touches", files)):
+                try:
+                    x[i] = describe(read_touch(file, frames))
+                    reasons.append("")
+                except VideoError as error:
+                    reasons.append(str(error))
+        return {"x": x, "reasons": np.array(reasons)}
+
     sizes = [(str(p.resolve()), p.stat().st_size if p.is_file() else -1) for p in files]
-    identity = hashlib.sha256(json.dumps([VERSION, frames, families(), sizes]).encode()).hexdigest()[:16]
-    path = context.cache_dir / f"descriptions-{identity}.npz"
-    if not path.exists():
-        _make(files, frames, path, context)
-    with np.load(path) as cached:
-        x, reasons = cached["x"], cached["reasons"]
+    cached = _cached(context, "descriptions", [VERSION, frames, families(), sizes], make)
+    reasons = cached["reasons"]
     read = np.flatnonzero(reasons == "")
     if not len(read):
         raise ImportSourceError(f"{files[0].parent}: no video can be read, the first {reasons[0]}; check the folder")
     skipped = tuple(Skip(name=file.name, reason=str(why)) for file, why in zip(files, reasons, strict=True) if why)
     names = np.array([p.name for p in files])
-    return Described(names=names[read], objects=objects[read], label=label[read], x=x[read], skipped=skipped)
+    return DescribedVideos(
+        names=names[read], objects=objects[read], label=label[read], x=cached["x"][read], skipped=skipped
+    )
 
 
-def _make(files: Sequence[Path], frames: int, path: Path, context: Context) -> None:
-    """Read and describe every video; one that cannot be read leaves its reason."""
-    x, reasons = np.zeros((len(files), len(families())), np.float32), []
-    with context.progress("describing touches", len(files)) as advance, context.timed("descriptions"):
-        for i, file in enumerate(files):
-            try:
-                x[i] = describe(read_touch(file, frames))
-                reasons.append("")
-            except VideoError as error:
-                reasons.append(str(error))
-            advance()
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, x=x, reasons=np.array(reasons))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, buffer.getvalue())
+def describe_scenes(config: SceneConfig, context: Context) -> DescribedScenes:
+    """Generate and describe presses as a GelSight Mini sees them."""
+
+    def make() -> dict[str, np.ndarray]:
+        source = SourceConfig(kind="generated", directory=None, scenes=config, physiclear=PhysiclearConfig())
+        store = RecordStore(prepare_records(source, context))
+        x, target = [], []
+        with context.timed("scenes"):
+            for i, key in enumerate(context.each("describing scenes", store.contacts)):
+                frames = store.contact(i, fields=False)[SENSOR].frames
+                if frames is None:
+                    raise ValueError(f"{key}: {SENSOR} has no camera frames: scenes must be generated with pictures")
+                levels = store.objects[key.object_id].label_row()
+                x.append(describe(touch_of_scene(frames)))
+                one_hot = [np.eye(SCENE_LEVELS[a])[level] for a, level in zip(ATTRIBUTES, levels, strict=True)]
+                target.append(np.concatenate(one_hot))
+        return {"x": np.array(x), "target": np.array(target)}
+
+    return DescribedScenes(**_cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make))
+
+
+def _cached(
+    context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
+) -> dict[str, np.ndarray]:
+    """Arrays from a file of the cache that is named by the hash of an identity; made first if it is missing."""
+    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
+    path = context.cache_dir / f"{name}-{digest}.npz"
+    if not path.exists():
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **make())  # type: ignore[arg-type]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, buffer.getvalue())
+    with np.load(path) as file:
+        return dict(file)

@@ -1,19 +1,19 @@
 """A fixed description of a touch: at which scales, how strongly and how unevenly it differs from the gel at rest.
 
 The change of colour is nearly linear in the slope of the gel, so its energy at a scale is the energy of the relief at
-that scale: fine octaves are roughness, middle ones bumps, the sharpness of contact edges tells a hard from a soft
-object.  Six octaves of a Gaussian pyramid, and of each
+that scale: fine octaves are roughness, middle ones bumps, and the sharpness of contact edges separates hard from soft
+objects.  Six octaves of a Gaussian pyramid, and of each
 
     spread      mean |band| of the colours' sum and of two differences
     patches     quantiles over a 15 × 20 grid of the local energy: a few sharp edges or texture all over
     edges       energy, orientedness and steepest part of the structure tensor
 
 then of the `contact` the energy of every octave where the middle ones are strong, and the area over which they are.
-Energies are logarithms, in which the press of a hand, unknown here, is a shift.  Of the video as a whole `course` says
-how the change grows, spreads, moves and fades: what yields spreads as it is pressed.
+Energies are logarithms, in which the press of a hand, unknown here, is a shift.  Of the whole video, `course` describes
+how the change grows, spreads, moves and fades: soft objects spread as they are pressed.
 
 Second-order scattering (Bruna & Mallat 2013), skewness, kurtosis and the relief integrated from the slopes were tried
-too: none made the answers about unseen objects better.
+too: none improved the answers about unseen objects.
 """
 
 import functools
@@ -22,16 +22,16 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from experiments.recordings.touches import PROBE_PX, Touch
+from experiments.recordings.touches import PROBE_PX, VideoTouch
 
 OCTAVES = 6
 
 COLOURS = (np.array([[1, 1, 1], [1, -1, 0], [0.5, 0.5, -1]]).T / np.sqrt([3, 2, 1.5])).astype(np.float32)
 """Orthonormal: the sum of the colours, red against green, both against blue.  A lamp of each colour shines from one
-side, so that the differences carry the slope along two directions and the sum what is common to all."""
+side, so that the differences carry the slope along two directions, and the sum carries the part common to all."""
 
 FLOOR = 0.05
-"""Grey levels added to every energy before its logarithm: the codec's noise, below which nothing is felt."""
+"""Grey levels added to every energy before its logarithm: the codec's noise."""
 
 AREAS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Local energies, grey levels, whose excess area is measured."""
@@ -42,8 +42,12 @@ GRID = (15, 20)
 QUANTILES = (10.0, 50.0, 90.0, 98.0)
 """Percentiles of the local energies over the grid."""
 
+_LEAST = (64, 64)  # rows and columns that six octaves can halve
 
-def describe(touch: Touch) -> np.ndarray:
+_Part = tuple[str, np.ndarray]
+
+
+def describe(touch: VideoTouch) -> np.ndarray:
     """Describe a touch, float32 [D], D = `len(families())`: the mean over its frames in contact, then its course."""
     frames = [np.concatenate([values for _, values in _parts(frame @ COLOURS)]) for frame in touch.difference]
     return np.concatenate([np.mean(frames, 0), _course(touch.change)]).astype(np.float32)
@@ -57,11 +61,6 @@ def families() -> tuple[str, ...]:
     return (*of_frames, *["course"] * len(_course(np.zeros((3, *PROBE_PX), np.float32))))
 
 
-_LEAST = (64, 64)  # rows and columns that six octaves can halve
-
-_Part = tuple[str, np.ndarray]
-
-
 def _parts(picture: np.ndarray) -> Iterator[_Part]:
     """Families of numbers of one picture [H, W, 3], in order."""
     picture = np.ascontiguousarray(picture, np.float32)
@@ -69,18 +68,14 @@ def _parts(picture: np.ndarray) -> Iterator[_Part]:
     for _ in range(OCTAVES):
         smooth = _blur(picture, 1.0)
         size = np.abs(picture - smooth)
-        local.append(cv2.resize(size.sum(-1), GRID[::-1], interpolation=_towards(size.shape[:2])))
-        yield from _octave(size, smooth, local[-1])
-        picture = _half(smooth)
+        resize_by = cv2.INTER_AREA if size.shape[0] >= GRID[0] else cv2.INTER_LINEAR
+        local.append(cv2.resize(size.sum(-1), GRID[::-1], interpolation=resize_by))
+        yield "spread", np.log(size.mean((0, 1)) + FLOOR)
+        yield "patches", np.log(np.percentile(local[-1], QUANTILES) + FLOOR)
+        yield "edges", _edges(smooth)
+        picture = cv2.resize(smooth, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     yield "spread", np.log(np.abs(picture).mean((0, 1)) + FLOOR)
     yield from _contact(np.stack(local))
-
-
-def _octave(size: np.ndarray, smooth: np.ndarray, local: np.ndarray) -> Iterator[_Part]:
-    """Descriptors of one octave from |band|, the coarser picture [h, w, 3] and local energies."""
-    yield "spread", np.log(size.mean((0, 1)) + FLOOR)
-    yield "patches", np.log(np.percentile(local, QUANTILES) + FLOOR)
-    yield "edges", _edges(smooth)
 
 
 def _edges(smooth: np.ndarray) -> np.ndarray:
@@ -128,19 +123,8 @@ def _course(change: np.ndarray) -> np.ndarray:
 
 def _growth(x: np.ndarray, y: np.ndarray) -> float:
     """Slope of y over x by least squares; 0 where x hardly varies."""
-    if len(x) < 4 or np.ptp(x) <= 0.05:
-        return 0.0
-    return float(np.polyfit(x, y, 1)[0])
+    return 0.0 if len(x) < 4 or np.ptp(x) <= 0.05 else float(np.polyfit(x, y, 1)[0])
 
 
 def _blur(x: np.ndarray, sigma: float) -> np.ndarray:
     return cv2.GaussianBlur(x, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
-
-
-def _half(x: np.ndarray) -> np.ndarray:
-    return cv2.resize(x, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-
-
-def _towards(shape: tuple[int, int]) -> int:
-    """Area means to shrink to the grid, straight lines to grow to it."""
-    return cv2.INTER_AREA if shape[0] >= GRID[0] else cv2.INTER_LINEAR

@@ -1,11 +1,9 @@
-"""From described videos to a trained policy, and from a trained policy to answers."""
+"""An ensemble of policies trained on described videos, its answers, and its file."""
 
 import dataclasses
-import functools
 import hashlib
 import io
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +15,9 @@ from jaxtyping import Float, Int
 
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
-from experiments.recordings.descriptions import Described
-from experiments.recordings.evidence import EvidenceConfig, cross_probe, probe, standardise
-from experiments.recordings.policy import COMBINATIONS, LEVELS, PolicyShape, assemble_policy, choose, utility
-from experiments.recordings.scenes import Scenes, sense
-from experiments.recordings.training import (
+from experiments.recordings.description_policy import COMBINATIONS, LEVELS, PolicyShape, choose, description_policy
+from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
+from experiments.recordings.fine_tuning import (
     READING,
     Lesson,
     ReinforceConfig,
@@ -31,7 +27,8 @@ from experiments.recordings.training import (
     reinforce,
     tune,
 )
-from experiments.recordings.validation import object_weights
+from experiments.recordings.level_probes import AuxiliaryData, LevelProbeConfig, ProbedVideos, standardise
+from experiments.recordings.object_folds import object_weights
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
 
@@ -44,18 +41,16 @@ ROWS = 64
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LearnConfig:
-    """Architecture and training of a policy.
+    """Architecture and training of an ensemble.
 
     Args:
-      evidence: probes whose log-probabilities the encoder reads, and whose verdict `perceive` repeats.
-      read_evidence: whether the encoder reads them.
-      reading, tune, reinforce: first to read made-up evidence, then the answers of real objects, then GRPO.
-      components: principal components of the description that it reads beside them.
+      evidence: probes whose log-probabilities the encoder reads, and whose most likely levels `perceive` repeats.
+      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.
+      components: principal components of the description that the encoder reads too.
       members: policies of different seeds whose log-probabilities are averaged.
     """
 
-    evidence: EvidenceConfig = EvidenceConfig()
-    read_evidence: bool = True
+    evidence: LevelProbeConfig = LevelProbeConfig()
     components: int = 0
     members: int = 3
     shape: PolicyShape = PolicyShape()
@@ -63,168 +58,114 @@ class LearnConfig:
     tune: TuneConfig = TuneConfig()
     reinforce: ReinforceConfig = ReinforceConfig()
 
-    def __post_init__(self) -> None:
-        if not self.read_evidence and not self.components:
-            raise ValueError("components is 0 and read_evidence False: the encoder must read something; raise one")
+    @property
+    def inputs(self) -> int:
+        """Numbers that the encoder reads."""
+        return len(self.evidence.families) * COMBINATIONS.shape[1] * LEVELS + self.components
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Background:
-    """Data without labels of real objects: scenes, and descriptions of unlabelled videos [m, D]."""
-
-    scenes: Scenes
-    unlabelled: Float[np.ndarray, "m D"]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Learned:
-    """A trained policy: parameters of its members, and what its probes remember."""
+class TrainedEnsemble:
+    """Parameters of the members, stacked, and the data that its probes are fitted on."""
 
     config: LearnConfig
     params: Params
-    memory: Described
-    background: Background
+    training: DescribedVideos
+    auxiliary: AuxiliaryData
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Said:
-    """Answers about n videos: what was perceived, log-probabilities of the 27 conclusions, and the one chosen."""
+class VideoAnswers:
+    """Answers about n videos: levels perceived, and log-probabilities of the 27 conclusions."""
 
     percept: Int[np.ndarray, "n A"]
     log_prob: Float[np.ndarray, "n 27"]
 
     @property
     def conclude(self) -> Int[np.ndarray, "n A"]:
-        """The levels that are expected to score most."""
-        return choose(self.log_prob, utility())
+        """The levels of highest expected utility."""
+        return choose(self.log_prob)
 
 
 def learn(
-    config: LearnConfig, training: Described, background: Background, seed: int, context: Context
-) -> tuple[Learned, dict[str, np.ndarray]]:
+    config: LearnConfig,
+    training: DescribedVideos,
+    auxiliary: AuxiliaryData,
+    seed: int,
+    context: Context,
+    stage: str,
+) -> TrainedEnsemble:
     """Train every member on labelled videos.
 
     Args:
-      config: the policy.
+      config: the ensemble.
       training: videos, all of known levels.
-      background: what else is known.
-      seed: of members and folds; member m has 1000 · seed + m, but what it reads with is the same for all seeds.
-      context: shows how far it is.
-
-    Returns:
-      The policy, and its loss and rewards by step, [members, steps].
+      auxiliary: scenes and unlabelled videos.
+      seed: of members and folds; member m has 1000 · seed + m, but its training on made-up evidence does not depend
+        on it.
+      context: keeps log, times and checkpoints.
+      stage: name of the stage; that of the training on made-up evidence begins with `reading`, that of GRPO with
+        `grpo`.
     """
-    policy = assemble_policy(config.shape)
-    everywhere = np.ones(len(training.names), bool)
-    weight = object_weights(training.objects, everywhere)
-    felt = _Felt(training, background, training, config)
-    families = len(config.evidence.families) if config.read_evidence else 0
-    trained, losses, rewards = [], [], []
-    for member in context.each("members", range(config.members)):
-        own = 1000 * seed + member
-        x, percept = felt.inputs(own)
-        params = _reader(config.shape, config.reading, families, config.components, 1000 + member)
-        lesson = _lesson(x, percept, training.label, weight)
-        params, loss = tune(policy, config.tune, params, lesson, own)
-        params, log = reinforce(policy, config.reinforce, params, lesson, own)
-        trained.append(params)
-        losses.append(loss)
-        rewards.append([row["reward"] for row in log])
+    policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
+    with context.timed(stage):
+        read = ProbedVideos(training, auxiliary, training, config.evidence)
+        weight = object_weights(training.objects, np.ones(len(training.names), bool))
+        components, _ = principal_components(read, config.components)
+        lessons = [_lesson(read.crossed(own), components, training.label, weight) for own in seeds]
+        readers = [_reader(config, 1000 + m, context) for m in range(config.members)]
+    members = tune(policy, config.tune, readers, lessons, seeds, context, stage)
+    trained = [
+        reinforce(policy, config.reinforce, params, lesson, own, context, f"grpo/{stage}/{own}")
+        for params, lesson, own in zip(members, lessons, seeds, strict=True)
+    ]
     params = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(trained))
-    return Learned(config=config, params=params, memory=training, background=background), {
-        "loss": np.array(losses),
-        "reward": np.array(rewards),
-    }
+    return TrainedEnsemble(config=config, params=params, training=training, auxiliary=auxiliary)
 
 
-@functools.cache
-def _reader(shape: PolicyShape, reading: TuneConfig, families: int, components: int, seed: int) -> Params:
-    """A policy that can read the evidence of so many families and has met no object; made once for all folds."""
-    policy = assemble_policy(shape)
-    params = policy.init(jax.random.key(seed), families * COMBINATIONS.shape[1] * LEVELS + components)
-    if not families:
-        return params
-    return tune(policy, reading, params, reading_lesson(families, components, READINGS, seed), seed)[0]
+def _reader(config: LearnConfig, seed: int, context: Context) -> Params:
+    """A policy that can read evidence and has met no object."""
+    shape, families, components = config.shape, len(config.evidence.families), config.components
+    policy, lesson = description_policy(shape), reading_lesson(families, components, READINGS, seed)
+    params, stage = policy.fresh(jax.random.key(seed), config.inputs), f"reading/{families}-{components}/{seed}"
+    return tune(policy, config.reading, [params], [lesson], [seed], context, stage)[0]
 
 
-def say(learned: Learned, videos: Described) -> Said:
-    """Ask a trained policy about videos, known or not; their levels and objects are not looked at."""
-    policy = assemble_policy(learned.config.shape)
-    x, _ = _Felt(learned.memory, learned.background, videos, learned.config).inputs(None)
+def answer(trained: TrainedEnsemble, videos: DescribedVideos) -> VideoAnswers:
+    """Answer about videos, known or not; their levels and objects are ignored."""
+    config = trained.config
+    read = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence)
+    x = np.concatenate([evidence_inputs(read.evidence()), principal_components(read, config.components)[1]], 1)
     padded = jnp.asarray(_padded(x), jnp.float32)
-    members = jnp.broadcast_to(padded, (learned.config.members, *padded.shape))
-    percept, log_prob = jax.device_get(policy.posterior(learned.params, members))
-    return Said(percept=COMBINATIONS[percept[: len(x)]], log_prob=log_prob[: len(x)])
+    members = jnp.broadcast_to(padded, (config.members, *padded.shape))
+    percept, log_prob = jax.device_get(description_policy(config.shape).posterior(trained.params, members))
+    return VideoAnswers(percept=COMBINATIONS[percept[: len(x)]], log_prob=log_prob[: len(x)])
 
 
-def evidence_alone(
-    config: LearnConfig, training: Described, background: Background, videos: Described
+def probe_answers(
+    config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos
 ) -> Int[np.ndarray, "n A"]:
     """Answers of the probes without a policy: the most likely level of each attribute, families averaged."""
-    return _Felt(training, background, videos, config).evidence.mean(1).argmax(-1)
+    return ProbedVideos(training, auxiliary, videos, config.evidence).evidence().mean(1).argmax(-1)
 
 
-class _Felt:
-    """Training videos and others as their probes and encoders read them.
-
-    Args:
-      training: videos to learn from.
-      background: what else is known.
-      videos: videos to read; those of the training themselves, to learn.
-      config: of the policy.
-    """
-
-    def __init__(self, training: Described, background: Background, videos: Described, config: LearnConfig) -> None:
-        world = np.concatenate([training.x, background.unlabelled])
-        widen = lambda x: np.concatenate([x, sense(background.scenes, world, x, config.evidence)], 1)
-        self._config, self._training = config, training
-        self._x, self._other = widen(training.x).astype(np.float64), widen(videos.x).astype(np.float64)
-        senses = self._x.shape[1] - training.x.shape[1]
-        self._family = np.array([*training.family, *["scenes"] * senses])
-        self._weight = object_weights(training.objects, np.ones(len(training.names), bool))
-
-    @functools.cached_property
-    def evidence(self) -> Float[np.ndarray, "n M A K"]:
-        """Predictions for other videos by probes that were fitted on all training videos."""
-        n = len(self._x)
-        label = np.zeros((n + len(self._other), self._training.label.shape[1]), np.int32)
-        label[:n] = self._training.label
-        weight = np.concatenate([self._weight, np.zeros(len(self._other))])
-        x = np.concatenate([self._x, self._other])
-        return probe(x, label, weight, self._family, self._config.evidence)[n:]
-
-    def crossed(self, seed: int) -> Float[np.ndarray, "n M A K"]:
-        """Predictions for the training videos by probes that were fitted without the object in question."""
-        t = self._training
-        return cross_probe(self._x, t.label, self._weight, t.objects, self._family, self._config.evidence, seed)
-
-    def inputs(self, seed: int | None) -> tuple[Float[np.ndarray, "n D"], Int[np.ndarray, "n A"]]:
-        """Input of the encoder, and the probes' probabilities.
-
-        With a seed, of the training videos by out-of-fold evidence, else of the others.
-        """
-        said = self.evidence if seed is None else self.crossed(seed)
-        fitted, others = _components(self._x, self._other, self._config.components, self._config.evidence.clip)
-        read = evidence_inputs(said) if self._config.read_evidence else np.zeros((len(said), 0))
-        return np.concatenate([read, others if seed is None else fitted], 1), said.mean(1).argmax(-1)
-
-
-def _components(training: np.ndarray, videos: np.ndarray, count: int, clip: float) -> tuple[np.ndarray, np.ndarray]:
-    """Principal components of standardised descriptions, of the training videos and of others."""
-    both = np.concatenate([training, videos]).astype(np.float64)
-    fitted = np.arange(len(both)) < len(training)
-    z = standardise(both, fitted, clip)
+def principal_components(read: ProbedVideos, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Principal components of standardised descriptions, of the training videos and of the others."""
+    both = np.concatenate([read.fitted, read.others])
+    fitted = np.arange(len(both)) < len(read.fitted)
+    z = standardise(both, fitted)
     _, _, axes = np.linalg.svd(z[fitted] - z[fitted].mean(0), full_matrices=False)
-    scores = standardise(z @ axes[:count].T, fitted, clip)
+    scores = standardise(z @ axes[:count].T, fitted)
     return scores[fitted], scores[~fitted]
 
 
-def _lesson(x: np.ndarray, percept: np.ndarray, label: np.ndarray, weight: np.ndarray) -> Lesson:
+def _lesson(evidence: np.ndarray, components: np.ndarray, label: np.ndarray, weight: np.ndarray) -> Lesson:
     """Padded by videos of weight 0, so that folds of different sizes share one compiled program."""
-    pad = lambda y, kind: jnp.asarray(_padded(np.asarray(y)), kind)
+    x = np.concatenate([evidence_inputs(evidence), components], 1)
+    pad: Any = lambda y, kind: jnp.asarray(_padded(y), kind)
     return Lesson(
         x=pad(x, jnp.float32),
-        percept=pad(percept, jnp.int32),
+        percept=pad(evidence.mean(1).argmax(-1), jnp.int32),
         label=pad(label, jnp.int32),
         weight=pad(weight, jnp.float32),
     )
@@ -235,29 +176,24 @@ def _padded(x: np.ndarray) -> np.ndarray:
     return np.pad(x, [(0, -len(x) % ROWS), *[(0, 0)] * (x.ndim - 1)])
 
 
-def save(path: Path, learned: Learned) -> None:
-    """Publish a policy as one file."""
-    flat: Mapping[str, Any] = traverse_util.flatten_dict(learned.params, sep="/")
-    memory = {name: getattr(learned.memory, name) for name in _MEMORY}
-    memory |= {"unlabelled": learned.background.unlabelled}
-    memory |= {"scenes_x": learned.background.scenes.x, "scenes_target": learned.background.scenes.target}
+def save(path: Path, trained: TrainedEnsemble) -> None:
+    """Publish an ensemble as one file."""
+    scenes, videos = trained.auxiliary.scenes, trained.training
+    memory = {name: getattr(videos, name) for name in _VIDEOS} | {"unlabelled": trained.auxiliary.unlabelled}
+    memory |= {"scenes_x": scenes.x, "scenes_target": scenes.target}
+    arrays = traverse_util.flatten_dict({"params": trained.params, "memory": memory}, sep="/")
     buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        identity=identity(learned.config),
-        **{f"params/{k}": v for k, v in flat.items()},
-        **{f"memory/{k}": v for k, v in memory.items()},
-    )
+    np.savez(buffer, identity=identity(trained.config), **arrays)
     write_bytes(path, buffer.getvalue())
 
 
 def identity(config: LearnConfig) -> str:
-    """Hash of what a policy is made of and how it is trained."""
+    """Hash of the settings of an ensemble."""
     return hashlib.sha256(json.dumps(jsonable(config), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def load(path: Path, config: LearnConfig) -> Learned:
-    """The policy that `save` published.
+def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
+    """The ensemble that `save` published.
 
     Raises:
       ImportSourceError: no such file, or a policy of another configuration.
@@ -267,15 +203,15 @@ def load(path: Path, config: LearnConfig) -> Learned:
     with np.load(path) as file:
         if str(file["identity"]) != identity(config):
             raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
-        part = lambda head: {k.removeprefix(head): file[k] for k in file.files if k.startswith(head)}
-        params, memory = traverse_util.unflatten_dict(part("params/"), sep="/"), part("memory/")
-    scenes = Scenes(x=memory["scenes_x"], target=memory["scenes_target"])
-    return Learned(
+        found = traverse_util.unflatten_dict(dict(file), sep="/")
+    memory = found["memory"]
+    scenes = DescribedScenes(x=memory["scenes_x"], target=memory["scenes_target"])
+    return TrainedEnsemble(
         config=config,
-        params=params,
-        memory=Described(**{name: memory[name] for name in _MEMORY}, skipped=()),
-        background=Background(scenes=scenes, unlabelled=memory["unlabelled"]),
+        params=found["params"],
+        training=DescribedVideos(**{name: memory[name] for name in _VIDEOS}),
+        auxiliary=AuxiliaryData(scenes=scenes, unlabelled=memory["unlabelled"]),
     )
 
 
-_MEMORY = ("names", "objects", "label", "x")
+_VIDEOS = ("names", "objects", "label", "x")

@@ -18,24 +18,27 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import jax
 import numpy as np
 
 from experiments.core.artifacts import write_bytes, write_json
+from experiments.core.charts import Panel, Rule, draw, estimates
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.results import Cell, Column, Picture, Requirement, Results, Table
+from experiments.core.look import PALETTE
+from experiments.core.pictures import heatmaps
+from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.recordings.charts import against_objects, confusions
-from experiments.recordings.descriptions import Described, describe_folder, describe_source
-from experiments.recordings.learning import Background, LearnConfig, identity, learn, load, save, say
-from experiments.recordings.limits import agreement, cross_answers, growth, label_limits, objects_for
-from experiments.recordings.policy import LEVELS, assemble_policy
-from experiments.recordings.scenes import describe_scenes
-from experiments.recordings.trials import ablate, ablate_probes, cross_validate
-from experiments.recordings.validation import Row, constants, deal_folds, fold_table, intervals, score_table
+from experiments.core.text import bounds
+from experiments.recordings.cross_validation import CrossValidation, agreement, objects_for
+from experiments.recordings.description_policy import LANGUAGE, description_policy
+from experiments.recordings.descriptions import DescribedVideos, describe_folder, describe_scenes, describe_source
+from experiments.recordings.learning import LearnConfig, answer, identity, learn, load, save
+from experiments.recordings.level_probes import AuxiliaryData
+from experiments.recordings.object_folds import constants, deal_folds, fold_table, intervals, score_table
+from experiments.study.levels import confusion_map
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
 
@@ -49,8 +52,11 @@ GOALS: Mapping[str, float] = {"all right": 45.0, "mean": 75.0, "OMAE": 0.28}
 MINUTES = 60.0
 """Bound of the training time, all folds together."""
 
-MADE = {"descriptions": "descriptions of videos", "data": "scenes", "scenes": "descriptions of scenes"}
-"""Stages that cost time only where the cache lacks what they make, and what that is."""
+ABLATION_SEED = 101
+"""Of the partition that the ablations are measured on."""
+
+CACHED = {"descriptions": "descriptions of videos", "data": "scenes", "scenes": "descriptions of scenes"}
+"""Stages that cost time only where the cache lacks their output, and that output."""
 
 _ABLATION = "On the partition that settings were chosen on, not that of the first table."
 _LIMITS = "Probes alone, on another partition.  To vote, and to have touched the object before, is not allowed above."
@@ -77,10 +83,8 @@ class PhysiclearStudy:
     """Of the partition into folds, and of the training."""
     ablations: bool = True
     """Whether variants of the policy are trained too."""
-    ablation_seed: int = 101
-    """Of the partition that the ablations are measured on."""
     scenes: SceneConfig = SceneConfig(objects=800, sites=1)
-    """What is generated to learn from beside the videos."""
+    """Scenes that are generated for training, in addition to the videos."""
     learn: LearnConfig = LearnConfig()
 
 
@@ -101,76 +105,64 @@ def run(config: PhysiclearStudy, context: Context) -> Results:
 
 def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) -> Results:
     """Answer for a folder of videos with a trained policy."""
-    path = config.policy or kept(config, context)
+    path = config.policy or cached_policy(config, context)
     if config.data_dir is not None and not path.exists():
         everything = describe_source(config.data_dir, config.frames, context, config.objects)
-        keep(config, everything.labelled(), background_of(config, everything, context), context)
-    learned = load(path, config.learn)
+        train_policy(config, everything.labelled(), auxiliary_data(config, everything, context), context)
+    trained = load(path, config.learn)
     videos = describe_folder(folder, config.frames, context)
-    said = say(learned, videos)
     answers = {
         str(name): dict(zip(NAMES, levels.tolist(), strict=True))
-        for name, levels in zip(videos.names, said.conclude, strict=True)
+        for name, levels in zip(videos.names, answer(trained, videos).conclude, strict=True)
     }
     write_json(out, answers)
-    left = "".join(f" Left out: {skip.name}, {skip.reason}." for skip in videos.skipped)
-    columns = (Column(name="video"), *(Column(name=name, format="d") for name in NAMES))
-    rows = tuple((name, *levels.values()) for name, levels in answers.items())
+    left_out = "".join(f" Left out: {skip.name}, {skip.reason}." for skip in videos.skipped)
+    rows = [{"video": name, **levels} for name, levels in answers.items()]
     return Results(
-        verdict=(f"{len(answers)} videos answered in {out}.{left}",),
-        tables=(Table(title="Answers", columns=columns, rows=rows),),
-        settings={"objects learned from": len(np.unique(learned.memory.objects))},
+        verdict=(f"{len(answers)} videos answered in {out}.{left_out}",),
+        tables=(named_table("Answers", rows, formats=dict.fromkeys(NAMES, "d")),),
+        settings={"objects learned from": len(np.unique(trained.training.objects))},
     )
 
 
 def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Results:
-    """Cross-validate, measure what contributes and what limits, keep a policy of all objects."""
+    """Cross-validate, measure contributions and limits, train and keep a policy of all objects."""
     everything = describe_source(data_dir, config.frames, context, config.objects)
-    videos = everything.labelled()
-    background = background_of(config, everything, context)
-    fold = deal_folds(videos.objects, videos.label, config.folds, config.seed)
-    answer = cross_validate(config.learn, videos, background, fold, config.seed, context, "fold")
-    spent = {stage: seconds for stage, seconds in context.timing().items() if stage.startswith((*MADE, "fold/"))}
-    keep(config, videos, background, context)
-    baselines = [Row(name=name, answer=said) for name, said in constants(videos.label, videos.objects, fold).items()]
-    probes = Row(name="probes alone", answer=cross_answers(config.learn, videos, background, fold, context))
-    policy = Row(name="policy", answer=answer)
-    main = intervals(answer, videos.label, videos.objects)
-    elsewhere = deal_folds(videos.objects, videos.label, config.folds, config.ablation_seed)
-    curve = growth(config.learn, videos, background, elsewhere, context)
-    contributions = ablate_probes(config.learn, videos, background, elsewhere, context)
+    videos, auxiliary = everything.labelled(), auxiliary_data(config, everything, context)
+    split = lambda seed: CrossValidation(
+        config=config.learn,
+        videos=videos,
+        auxiliary=auxiliary,
+        fold=deal_folds(videos.objects, videos.label, config.folds, seed),
+        context=context,
+    )
+    blind, elsewhere = split(config.seed), split(ABLATION_SEED)
+    answers = blind.policy_answers(config.learn, config.seed, "fold")
+    spent = {stage: seconds for stage, seconds in context.timing().items() if stage.startswith((*CACHED, "fold/"))}
+    train_policy(config, videos, auxiliary, context)
+    methods = {"policy": answers, "probes alone": blind.probe_answers(config.learn, auxiliary)}
+    methods |= constants(videos.label, videos.objects, blind.fold)
+    curve, parts = elsewhere.growth(), elsewhere.probe_variants()
     if config.ablations:
-        contributions += ablate(config.learn, videos, background, elsewhere, config.ablation_seed, context)
-    limits = label_limits(config.learn, videos, background, elsewhere, context)
-    score = lambda title, rows, note="": score_table(title, rows, videos.label, videos.objects, note)
+        parts |= elsewhere.policy_variants(ABLATION_SEED)
+    limits = elsewhere.label_limits()
+    main = intervals(answers, videos.label, videos.objects)
+    score = lambda title, rows, note: score_table(title, rows, videos.label, videos.objects, note)
     return Results(
-        verdict=verdict(main, curve, videos, answer),
+        verdict=verdict(main, curve, videos),
         requirements=requirements(main, spent),
         tables=(
-            score("Unseen objects", [policy, probes, *baselines], "One answer to each video; no object in two folds."),
-            fold_table(answer, videos.label, videos.objects, fold),
-            score("What contributes", contributions, _ABLATION),
+            score("Unseen objects", methods, "One answer to each video; no object in two folds."),
+            fold_table(answers, videos.label, videos.objects, blind.fold),
+            score("What contributes", parts, _ABLATION),
             score("What limits", limits, _LIMITS),
-            object_table(videos, answer),
+            object_table(videos, answers),
         ),
-        pictures=(
-            Picture(
-                name="confusions",
-                title="What is answered for each label",
-                caption="Share and number of videos; each row sums to 100 %.",
-                content=confusions(answer, videos.label, NAMES),
-            ),
-            Picture(
-                name="objects",
-                title="More objects, better answers",
-                caption="Probes alone, on another partition; bars are 95 % intervals over objects, dots the goals.",
-                content=against_objects(_curves(curve), {"all right": GOALS["all right"], "mean": GOALS["mean"]}),
-            ),
-        ),
+        pictures=(confusions(answers, videos.label), object_curves(curve)),
         settings={
             "folds": config.folds,
-            "answers alike, pairs of videos of one object": f"{agreement(answer, videos.objects):.0f} %",
-            "policy": f"{config.learn.members} members, {_parameters(config.learn, videos):,} parameters each",
+            "answers alike, pairs of videos of one object": f"{agreement(answers, videos.objects):.0f} %",
+            "policy": f"{config.learn.members} members, {_parameters(config.learn):,} parameters each",
         },
         data={
             "objects": len(np.unique(videos.objects)),
@@ -181,64 +173,53 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     )
 
 
-def keep(config: PhysiclearStudy, videos: Described, background: Background, context: Context) -> None:
+def train_policy(config: PhysiclearStudy, videos: DescribedVideos, auxiliary: AuxiliaryData, context: Context) -> None:
     """Train on all objects and keep the policy in the run and, for predictions, in the cache."""
     path = context.directory / POLICY
     if not path.exists():
-        with context.timed("policy"):
-            learned, _ = learn(config.learn, videos, background, config.seed, context)
-        save(path, learned)
+        save(path, learn(config.learn, videos, auxiliary, config.seed, context, "policy"))
     if config.objects is None:
-        write_bytes(kept(config, context), path.read_bytes())
+        write_bytes(cached_policy(config, context), path.read_bytes())
 
 
-def kept(config: PhysiclearStudy, context: Context) -> Path:
+def cached_policy(config: PhysiclearStudy, context: Context) -> Path:
     """Where the cache keeps the policy of all objects."""
     return context.cache_dir / f"physiclear-policy-{identity(config.learn)}.npz"
 
 
-def background_of(config: PhysiclearStudy, everything: Described, context: Context) -> Background:
-    """Scenes, and the videos that nobody labelled."""
+def auxiliary_data(config: PhysiclearStudy, everything: DescribedVideos, context: Context) -> AuxiliaryData:
+    """Scenes, and the videos without labels."""
     unlabelled = everything.x[(everything.label < 0).any(1)]
-    return Background(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled)
+    return AuxiliaryData(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled)
 
 
 def requirements(main: Mapping[str, Interval], spent: Mapping[str, float]) -> tuple[Requirement, ...]:
     """Requirements and measured figures; `spent` are the seconds of the stages that are counted."""
-    side: Mapping[str, Literal["lower", "higher"]] = {"all right": "higher", "mean": "higher", "OMAE": "lower"}
-    kept = [
-        Requirement(
-            name=name,
-            measured=main[name].mean,
-            bound=bound,
-            better=side[name],
-            unit="levels" if name == "OMAE" else "%",
-            note=f"95 % over objects {main[name].low:.3g} to {main[name].high:.3g}",
-        )
-        for name, bound in GOALS.items()
-    ]
-    found = [made for stage, made in MADE.items() if stage not in spent]
-    time = Requirement(
-        name="data and training, all folds",
-        measured=sum(spent.values()) / 60,
-        bound=MINUTES,
-        better="lower",
-        unit="min",
-        note=f"found in the cache and not counted: {', '.join(found)}" if found else "nothing was found in the cache",
+    notes = {name: f"95 % over objects {main[name].low:.3g} to {main[name].high:.3g}" for name in GOALS}
+    found = [output for stage, output in CACHED.items() if stage not in spent]
+    return (
+        *(at_least(name, main[name].mean, GOALS[name], "%", notes[name]) for name in ("all right", "mean")),
+        at_most("OMAE", main["OMAE"].mean, GOALS["OMAE"], "levels", notes["OMAE"]),
+        at_most(
+            "data and training, all folds",
+            sum(spent.values()) / 60,
+            MINUTES,
+            "min",
+            f"found in the cache and not counted: {', '.join(found)}" if found else "nothing was found in the cache",
+        ),
     )
-    return (*kept, time)
 
 
 def verdict(
-    main: Mapping[str, Interval], curve: Mapping[int, Mapping[str, Interval]], videos: Described, answer: np.ndarray
+    main: Mapping[str, Interval], curve: Mapping[int, Mapping[str, Interval]], videos: DescribedVideos
 ) -> tuple[str, ...]:
-    """The answer, and what limits it."""
+    """The scores on unseen objects, and the number of objects that the goals would need."""
     some, many = min(curve), max(curve)
+    right, mean = main["all right"], main["mean"]
     return (
         f"Of {len(videos.names)} videos of {len(np.unique(videos.objects))} objects that it never touched, the policy "
-        f"answers {main['all right'].mean:.1f} % right in all three [{main['all right'].low:.1f}, "
-        f"{main['all right'].high:.1f}] and {main['mean'].mean:.1f} % of the levels [{main['mean'].low:.1f}, "
-        f"{main['mean'].high:.1f}], {main['OMAE'].mean:.2f} levels off on average.",
+        f"answers {right.mean:.1f} % right in all three {bounds(right.low, right.high, '.1f')} and {mean.mean:.1f} % "
+        f"of the levels {bounds(mean.low, mean.high, '.1f')}, {main['OMAE'].mean:.2f} levels off on average.",
         f"From {some} to {many} objects learned from, the levels answered right by the probes rise from "
         f"{curve[some]['mean'].mean:.0f} to {curve[many]['mean'].mean:.0f} %; by the power law through that curve, "
         f"{GOALS['mean']:.0f} % takes {needed(curve, 'mean')} of them, {GOALS['all right']:.0f} % all right "
@@ -252,31 +233,52 @@ def needed(curve: Mapping[int, Mapping[str, Interval]], name: str) -> str:
     return f"{found:.0f}" if math.isfinite(found) else "more than any number"
 
 
-def object_table(videos: Described, answer: np.ndarray) -> Table:
-    """Every object: its label, what is answered of its videos, the share of levels right."""
+def object_table(videos: DescribedVideos, answers: np.ndarray) -> Table:
+    """Every object: its label, the answers to its videos, the share of levels right."""
     text = lambda levels: "".join(map(str, levels))
-    rows: list[tuple[Cell, ...]] = []
+    rows = []
     for name in np.unique(videos.objects):
         mine = videos.objects == name
-        right = 100 * float((answer[mine] == videos.label[mine]).mean())
-        rows.append((str(name), text(videos.label[mine][0]), " ".join(map(text, answer[mine])), right))
-    columns = (
-        Column(name="object"),
-        Column(name="label", meaning="hardness, roughness, bumps"),
-        Column(name="answers", meaning="one to each video"),
-        Column(name="levels right", unit="%", format=".0f"),
+        right = 100 * float((answers[mine] == videos.label[mine]).mean())
+        row = {"object": str(name), "label": text(videos.label[mine][0]), "answers": " ".join(map(text, answers[mine]))}
+        rows.append(row | {"levels right": right})
+    meanings = {"label": "hardness, roughness, bumps", "answers": "one to each video"}
+    return named_table(
+        "Every object", rows, formats={"levels right": ".0f"}, units={"levels right": "%"}, meanings=meanings
     )
-    return Table(title="Every object", columns=columns, rows=tuple(rows))
 
 
-def _curves(curve: Mapping[int, Mapping[str, Interval]]) -> dict[str, dict[int, Interval]]:
-    return {name: {n: found[name] for n, found in curve.items()} for name in ("all right", "mean")}
+def confusions(answers: np.ndarray, label: np.ndarray) -> Picture:
+    """Frequency of each answered level for each label, one panel per attribute."""
+    words = [[level[0] for level in attribute.levels] for attribute in LANGUAGE.attributes]
+    maps = [confusion_map(answers[:, a], label[:, a], words[a], name) for a, name in enumerate(NAMES)]
+    return Picture(
+        name="confusions",
+        title="What is answered for each label",
+        caption="Share and number of videos; each row sums to 100 %.",
+        content=heatmaps(maps, x_label="answered", y_label="label", size=(9.0, 3.2)),
+    )
 
 
-def _parameters(config: LearnConfig, videos: Described) -> int:
-    """Numbers that a member learns."""
-    inputs = len(config.evidence.families) * len(NAMES) * LEVELS * config.read_evidence + config.components
-    shapes = jax.eval_shape(lambda: assemble_policy(config.shape).init(jax.random.key(0), inputs))
+def object_curves(curve: Mapping[int, Mapping[str, Interval]]) -> Picture:
+    """Scores over the number of objects learned from, with their intervals and goals."""
+    at, names = list(curve), ("all right", "mean")
+    series = [estimates(name, [found[name] for found in curve.values()], at=at) for name in names]
+    rules = [Rule(y=GOALS[name], colour=colour) for name, colour in zip(names, PALETTE, strict=False)]
+    axes: dict[str, Any] = {"x_label": "objects learned from", "y_label": "%", "x_limits": (0, None)}
+    axes |= {"y_limits": (0, 100), "x_ticks": {n: str(n) for n in at}, "rules": rules}
+    return Picture(
+        name="objects",
+        title="More objects, better answers",
+        caption="Probes alone, on another partition; bars are 95 % intervals over objects, dots the goals.",
+        content=draw([Panel(series, **axes)], size=(6.4, 3.6)),
+    )
+
+
+def _parameters(config: LearnConfig) -> int:
+    """Number of parameters of a member."""
+    policy = description_policy(config.shape)
+    shapes = jax.eval_shape(lambda: policy.fresh(jax.random.key(0), config.inputs))
     return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(shapes))
 
 

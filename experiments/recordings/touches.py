@@ -26,13 +26,13 @@ CONTACT_SHARE = 0.4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Touch:
+class VideoTouch:
     """Contact data of a video.
 
     Args:
-      rest: float32 [H, W, 3], the gel that nothing touches, RGB counts.
+      rest: float32 [H, W, 3], the untouched gel, RGB counts.
       frames: uint8 [F, H, W, 3], frames in contact, in order of time.
-      position: int [F], where they stand in the video.
+      position: int [F], their indices in the video.
       change: float32 [N, h, w], change of every frame of the video against `rest` at a quarter of its size, grey levels
         summed over the colours.
     """
@@ -48,26 +48,17 @@ class Touch:
         return self.frames.astype(np.float32) - self.rest
 
 
-def read_touch(path: Path, count: int) -> Touch:
-    """Decode a video and find its touch.
-
-    Args:
-      path: the video.
-      count: F, frames to keep.
-
-    Raises:
-      VideoError: as `read_video`, or fewer than three frames.
-    """
-    video = read_video(path, Keep(height=0, max_frames=0))
-    return find_touch(video.frames, count)
+def read_touch(path: Path, count: int) -> VideoTouch:
+    """Decode a video and find its touch; arguments and errors are those of `read_video` and `find_touch`."""
+    return find_touch(read_video(path, Keep(height=0, max_frames=0)).frames, count)
 
 
-def find_touch(frames: np.ndarray, count: int) -> Touch:
-    """The gel at rest is the mean of the first frames like the very first; the touch lies where the change is large.
+def find_touch(frames: np.ndarray, count: int) -> VideoTouch:
+    """Find the touch where the change is large; the gel at rest is the mean of the first frames like the very first.
 
     The F frames cut the sum of the change over the frames in contact into equal parts, at their middles, so that they
-    lie denser the more is felt.  A video of fewer frames than F in contact repeats some.  One that begins in contact
-    has no rest: its first frame stands for it, and what is described is the motion since.
+    are denser where the contact is stronger.  A video of fewer frames than F in contact repeats some.  One that begins
+    in contact has no rest: its first frame takes that place, and the motion since then is described.
 
     Args:
       frames: uint8 [N, H, W, 3], RGB.
@@ -79,17 +70,17 @@ def find_touch(frames: np.ndarray, count: int) -> Touch:
     if len(frames) < 3:
         raise VideoError(f"holds {len(frames)} frames: a touch needs three, at rest, in contact and between; record it")
     small = np.stack([_resize(frame, PROBE_PX) for frame in frames]).astype(np.float32)
-    since_start = _change(small, small[0])
+    since_start = np.abs(small - small[0]).mean((1, 2, 3))
     quiet = np.flatnonzero(since_start <= max(REST_COUNTS, float(np.quantile(since_start, 0.1))))[:REST_FRAMES]
     change = np.abs(small - small[quiet].mean(0)).sum(-1)
-    position = _spread(change.mean((1, 2)), count)
+    position = _equal_parts(change.mean((1, 2)), count)
     rest = np.stack([_resize(frames[n], SIZE_PX) for n in quiet]).mean(0, dtype=np.float32)
     kept = np.stack([_resize(frames[n], SIZE_PX) for n in position])
-    return Touch(rest=rest, frames=kept, position=position, change=change)
+    return VideoTouch(rest=rest, frames=kept, position=position, change=change)
 
 
-def touch_of_scene(frames: np.ndarray) -> Touch:
-    """The touch of a generated press: its first, lightest frame stands for rest, its later half is in contact.
+def touch_of_scene(frames: np.ndarray) -> VideoTouch:
+    """The touch of a generated press: its first, lightest frame counts as rest, its later half is in contact.
 
     The last frame is left out: few hands press with 20 N.
 
@@ -98,7 +89,7 @@ def touch_of_scene(frames: np.ndarray) -> Touch:
     """
     position = np.arange(max(1, (len(frames) - 1) // 2), len(frames) - 1)
     small = np.stack([_resize(frame, PROBE_PX) for frame in frames]).astype(np.float32)
-    return Touch(
+    return VideoTouch(
         rest=_resize(frames[0], SIZE_PX).astype(np.float32),
         frames=np.stack([_resize(frames[n], SIZE_PX) for n in position]),
         position=position,
@@ -106,19 +97,15 @@ def touch_of_scene(frames: np.ndarray) -> Touch:
     )
 
 
-def _spread(change: np.ndarray, count: int) -> np.ndarray:
+def _equal_parts(change: np.ndarray, count: int) -> np.ndarray:
     """Positions of the frames that share the change in contact equally, int [count]; the greatest is among them."""
     least, most = float(change.min()), float(change.max())
     contact = np.flatnonzero(change >= least + CONTACT_SHARE * (most - least))
-    felt = np.cumsum(np.maximum(change[contact], np.finfo(np.float32).tiny))
-    share = (np.arange(count) + 0.5) / count * felt[-1]
-    position = contact[np.minimum(np.searchsorted(felt, share), len(contact) - 1)]
+    total = np.cumsum(np.maximum(change[contact], np.finfo(np.float32).tiny))
+    share = (np.arange(count) + 0.5) / count * total[-1]
+    position = contact[np.minimum(np.searchsorted(total, share), len(contact) - 1)]
     position[np.argmin(np.abs(position - change.argmax()))] = change.argmax()
     return np.sort(position)
-
-
-def _change(small: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    return np.abs(small - rest).mean((1, 2, 3))
 
 
 def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:

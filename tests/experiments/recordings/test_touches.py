@@ -1,4 +1,4 @@
-"""The gel at rest, the frames in contact, and what describes them."""
+"""The gel at rest, the frames in contact, and their description."""
 
 import dataclasses
 
@@ -62,7 +62,7 @@ def test_twice_the_change_shifts_the_energies_by_log_2(touch):
     np.testing.assert_allclose(describe(double)[coarse] - describe(one)[coarse], np.log(2), atol=0.1)
 
 
-def test_nothing_felt_is_described_by_the_floor():
+def test_an_untouched_gel_is_described_by_the_floor():
     still = np.full((6, 120, 160, 3), 90, np.uint8)
     x = describe(find_touch(still, 3))
     np.testing.assert_allclose(x[np.array(families()) == "spread"], np.log(0.05), atol=1e-4)

@@ -2,7 +2,7 @@
 
 The prompt asks for hardness, roughness and protrusion at once, so that the answer is drawn from their joint
 distribution: the decoder writes roughness knowing the hardness that it wrote.  All 27 answers can be scored, so the
-answer is not sampled but chosen by what it is expected to earn (`choose`).
+answer is not sampled but chosen by its expected utility (`choose`).
 """
 
 import dataclasses
@@ -17,15 +17,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
+from touchr1_jax.models.policy import Features, Policy, PolicyConfig
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.language import HARDNESS, PROTRUSION, ROUGHNESS, SENSORS, Language
-from touchr1_jax.text.parser import Parser, compile_parser
-from touchr1_jax.text.template import PromptLayout, answer_text, build_layout, encode_answer, prompt_words
-from touchr1_jax.text.tokenizer import Tokenizer, word_level
+from touchr1_jax.text.parser import compile_parser
+from touchr1_jax.text.template import answer_text, build_layout, encode_answer, prompt_words
+from touchr1_jax.text.tokenizer import word_level
 from touchr1_jax.types import Params
 
 LANGUAGE = Language(attributes=(HARDNESS, ROUGHNESS, PROTRUSION), sensors=SENSORS[:1])
@@ -63,16 +64,12 @@ class DescriptionEncoder(nn.Module):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class TouchPolicy:
-    """Everything static; parameters are `{"encoder", "decoder"}` and always an argument."""
+class DescriptionPolicy(TouchPolicy):
+    """A policy whose encoder reads descriptions; its parameters are `{"encoder", "decoder"}`."""
 
     shape: PolicyShape
-    tokenizer: Tokenizer
-    layout: PromptLayout
-    fns: PolicyFns
-    parser: Parser
 
-    def init(self, key: Array, inputs: int) -> Params:
+    def fresh(self, key: Array, inputs: int) -> Params:
         """Fresh parameters for descriptions of so many numbers."""
         encoder_key, decoder_key = jax.random.split(key)
         encoder = DescriptionEncoder(self.shape).init(encoder_key, jnp.zeros(inputs))["params"]
@@ -102,13 +99,13 @@ class TouchPolicy:
 
     @functools.cached_property
     def slots(self) -> np.ndarray:
-        """Where an answer says its levels, int [2, A]: in `perceive`, in `conclude`."""
-        said = [self.answer(np.full(3, a), np.full(3, b))[0] for a, b in ((0, 0), (1, 0), (0, 1))]
-        perceived, concluded = (np.flatnonzero(said[0] != other) for other in said[1:])
+        """Positions of the levels in an answer, int [2, A]: in `perceive`, in `conclude`."""
+        first, *others = (self.answer(np.full(3, a), np.full(3, b))[0] for a, b in ((0, 0), (1, 0), (0, 1)))
+        perceived, concluded = (np.flatnonzero(first != other) for other in others)
         return np.stack([perceived[: len(concluded)], concluded])
 
     def answer(self, perceive: np.ndarray, conclude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tokens of an answer and what of them counts, [T] each; with one sensor, `compare` is what it perceives."""
+        """Tokens of an answer and the mask of those that count, [T] each; with one sensor `compare` is `perceive`."""
         streams = np.ones(1, bool)
         asked = np.ones(len(LANGUAGE.attributes), bool)
         text = answer_text(
@@ -119,8 +116,7 @@ class TouchPolicy:
     @functools.cached_property
     def answers(self) -> np.ndarray:
         """Every answer to every percept, int32 [27, 27, T]."""
-        rows = [[self.answer(p, c)[0] for c in COMBINATIONS] for p in COMBINATIONS]
-        return np.array(rows, np.int32)
+        return np.array([[self.answer(p, c)[0] for c in COMBINATIONS] for p in COMBINATIONS], np.int32)
 
     @functools.cached_property
     def posterior(self) -> Any:
@@ -144,7 +140,7 @@ class TouchPolicy:
 
 
 @functools.cache
-def assemble_policy(shape: PolicyShape) -> TouchPolicy:
+def description_policy(shape: PolicyShape) -> DescriptionPolicy:
     """Tokenizer, prompt, decoder and parser of one question about one sensor; made once, as are its programs."""
     tokenizer = word_level(LANGUAGE, prompt_words())
     asked = [[attribute.name for attribute in LANGUAGE.attributes]]
@@ -154,23 +150,23 @@ def assemble_policy(shape: PolicyShape) -> TouchPolicy:
         vision=VisionConfig(),
         decoder=dataclasses.replace(shape.decoder, vocab_size=tokenizer.vocab_size),
     )
-    fns = PolicyFns(
-        module=Policy(config),
-        slots=Slots(layout.touch, layout.view, layout.stream_text),
-        banned=tokenizer.banned,
-        end_ids=tokenizer.end_ids,
-        pad_id=tokenizer.pad_id,
+    return DescriptionPolicy(
+        model=TouchConfig(completion_tokens=LENGTH),
+        language=LANGUAGE,
+        tokenizer=tokenizer,
+        layout=layout,
+        fns=PolicyFns.for_layout(Policy(config), layout, tokenizer),
+        parser=compile_parser(LANGUAGE, tokenizer),
+        shape=shape,
     )
-    parser = compile_parser(LANGUAGE, tokenizer)
-    return TouchPolicy(shape=shape, tokenizer=tokenizer, layout=layout, fns=fns, parser=parser)
 
 
-def choose(log_prob: Float[np.ndarray, "n 27"], utility: Float[np.ndarray, "27 27"]) -> Int[np.ndarray, "n A"]:
-    """Levels of the answer that is expected to earn most, argmax_y Σ_t p(t) u(y, t)."""
-    return COMBINATIONS[(np.exp(log_prob) @ utility.T).argmax(-1)]
+def choose(log_prob: Float[np.ndarray, "n 27"]) -> Int[np.ndarray, "n A"]:
+    """Levels of the answer with the highest expected utility, argmax_y Σ_t p(t) u(y, t)."""
+    return COMBINATIONS[(np.exp(log_prob) @ utility().T).argmax(-1)]
 
 
 def utility() -> Float[np.ndarray, "27 27"]:
-    """u(y, t) = 1[y = t] + mean 1[y_a = t_a] − mean |y_a − t_a|: what is reported, each with weight 1."""
+    """u(y, t) = 1[y = t] + mean 1[y_a = t_a] − mean |y_a − t_a|: the reported scores, each with weight 1."""
     distance = np.abs(COMBINATIONS[:, None] - COMBINATIONS[None])
     return (distance == 0).all(-1) + (distance == 0).mean(-1) - distance.mean(-1)

@@ -1,16 +1,15 @@
-"""Cross-validation over objects: folds, constant baselines, what is scored and with which interval."""
+"""Folds and weights of objects, constant baselines, scores with intervals over objects, and their tables."""
 
 import collections
-import dataclasses
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import ConfigurationError
-from experiments.core.results import Cell, Column, Table
-from experiments.recordings.policy import COMBINATIONS, LANGUAGE, LEVELS
+from experiments.core.results import Cell, Table, named_table
+from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LEVELS
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 
@@ -20,7 +19,9 @@ SCORES: Mapping[str, str] = {
     "OMAE": "mean distance between answer and label, levels",
     **{a.name: f"videos whose {a.name} is answered right" for a in LANGUAGE.attributes},
 }
-"""What is reported of answers, and what it means; all but OMAE in per cent."""
+"""Reported scores and their meaning; all but OMAE in per cent."""
+
+FORMATS, UNITS = dict.fromkeys(SCORES, ".1f") | {"OMAE": ".3f"}, dict.fromkeys(SCORES, "%") | {"OMAE": ""}
 
 
 def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, seed: int) -> Int[np.ndarray, "n"]:
@@ -48,7 +49,7 @@ def object_weights(objects: np.ndarray, chosen: Bool[np.ndarray, "n"]) -> Float[
 
 
 def constants(label: np.ndarray, objects: np.ndarray, fold: np.ndarray) -> dict[str, Int[np.ndarray, "n A"]]:
-    """Answers that know no touch: per attribute and joint mode of the training objects of each fold."""
+    """Answers without touch: per attribute and joint mode of the training objects of each fold."""
     answers = {name: np.zeros_like(label) for name in ("constant, each attribute's mode", "constant, joint mode")}
     for k in np.unique(fold):
         weight = object_weights(objects, fold != k)
@@ -60,7 +61,7 @@ def constants(label: np.ndarray, objects: np.ndarray, fold: np.ndarray) -> dict[
 
 
 def scores(answer: Int[np.ndarray, "n A"], label: Int[np.ndarray, "n A"]) -> dict[str, Scores]:
-    """Those of `SCORES`."""
+    """The scores of `SCORES`."""
     whole = (answer == label).all(1).astype(int)
     levels = np.full(label.shape[1], LEVELS)
     return {
@@ -79,51 +80,28 @@ def intervals(answer: np.ndarray, label: np.ndarray, objects: np.ndarray) -> dic
     }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Row:
-    """Answers of one method about some videos."""
-
-    name: str
-    answer: Int[np.ndarray, "n A"]
-
-
-def score_table(title: str, rows: Sequence[Row], label: np.ndarray, objects: np.ndarray, note: str = "") -> Table:
+def score_table(
+    title: str, answers: Mapping[str, np.ndarray], label: np.ndarray, objects: np.ndarray, note: str = ""
+) -> Table:
     """One line per method; all right, mean and OMAE with their intervals."""
-    columns = [Column(name="answers by")]
-    for name, meaning in SCORES.items():
-        columns.append(Column(name=name, unit=_unit(name), meaning=meaning, format=_format(name)))
-        if name in _HEAD:
-            columns.append(Column(name=f"{name}, 95 %", meaning=f"interval of {name} over objects"))
-    cells: list[tuple[Cell, ...]] = []
-    for row in rows:
-        found = intervals(row.answer, label, objects)
-        line: list[Cell] = [row.name]
-        for name, interval in found.items():
-            line.append(interval.mean)
-            if name in _HEAD:
-                line.append(f"{interval.low:{_format(name)}}–{interval.high:{_format(name)}}")
-        cells.append(tuple(line))
-    return Table(title=title, columns=tuple(columns), rows=tuple(cells), note=note)
+    with_interval = ("all right", "mean", "OMAE")
+    rows = []
+    for method, answer in answers.items():
+        row: dict[str, Cell] = {"answers by": method}
+        for name, found in intervals(answer, label, objects).items():
+            row[name] = found.mean
+            if name in with_interval:
+                row[f"{name}, 95 %"] = f"{found.low:{FORMATS[name]}}–{found.high:{FORMATS[name]}}"
+        rows.append(row)
+    meanings = dict(SCORES) | {f"{name}, 95 %": f"interval of {name} over objects" for name in with_interval}
+    return named_table(title, rows, formats=FORMATS, units=UNITS, meanings=meanings, note=note)
 
 
 def fold_table(answer: np.ndarray, label: np.ndarray, objects: np.ndarray, fold: np.ndarray) -> Table:
-    """Every fold by itself."""
-    columns = [Column(name="fold"), Column(name="objects", format="d"), Column(name="videos", format="d")]
-    columns += [Column(name=name, format=_format(name), unit=_unit(name)) for name in SCORES]
-    rows: list[tuple[Cell, ...]] = []
+    """Scores of every fold."""
+    rows = []
     for k in np.unique(fold):
         here = fold == k
-        found = [score.mean() for score in scores(answer[here], label[here]).values()]
-        rows.append((str(k + 1), len(np.unique(objects[here])), int(here.sum()), *found))
-    return Table(title="Every fold", columns=tuple(columns), rows=tuple(rows))
-
-
-_HEAD = ("all right", "mean", "OMAE")
-
-
-def _unit(name: str) -> str:
-    return "" if name == "OMAE" else "%"
-
-
-def _format(name: str) -> str:
-    return ".3f" if name == "OMAE" else ".1f"
+        row = {"fold": str(k + 1), "objects": len(np.unique(objects[here])), "videos": int(here.sum())}
+        rows.append(row | {name: score.mean() for name, score in scores(answer[here], label[here]).items()})
+    return named_table("Every fold", rows, formats=FORMATS | {"objects": "d", "videos": "d"}, units=UNITS)

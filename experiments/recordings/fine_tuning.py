@@ -1,0 +1,235 @@
+"""Supervised fine-tuning of an ensemble of policies, and GRPO after it."""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from experiments.core.context import Context
+from experiments.core.loops import run_loop, stage_hooks
+from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS, DescriptionPolicy
+from touchr1_jax import masked
+from touchr1_jax.rewards import make_rewards
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.rl.scoring import ScoreFn, make_score
+from touchr1_jax.training.loop import Batches, LoopConfig
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.questions import ONE_AT_A_TIME
+from touchr1_jax.training.sft import SFTState
+from touchr1_jax.training.train_grpo import train_grpo
+from touchr1_jax.types import Params
+
+REWARD = {"accuracy": 0.5, "exact": 0.5}
+"""Reward of GRPO → weight."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneConfig:
+    """Supervised fine-tuning; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 40
+    batch_size: int = 32
+    drop: float = 0.3
+    """Probability with which an input of the encoder is left out, the others growing to the same sum."""
+    noise: float = 0.5
+    """Standard deviation of the noise added to each input; the inputs have 1."""
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=30.0, weight_decay=0.05)
+
+
+READING = TuneConfig(
+    steps=600,
+    batch_size=64,
+    drop=0.0,
+    noise=0.0,
+    optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=400.0, weight_decay=0.01),
+)
+"""Training on made-up evidence, by which a policy learns to read it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReinforceConfig:
+    """GRPO after it; 0 steps leave it out."""
+
+    steps: int = 0
+    grpo: GRPOConfig = dataclasses.field(
+        default_factory=lambda: dataclasses.replace(
+            GRPOConfig.paper(), prompts=32, micro_prompts=32, length=LENGTH, lr_scale=300.0
+        )
+    )
+
+
+@struct.dataclass
+class Lesson:
+    """Training data of a policy: n videos; those of weight 0 are never drawn.
+
+    `percept` is the level by out-of-fold evidence about a video, `label` the annotators' level of its object.
+    """
+
+    x: Float[Array, "n D"]
+    percept: Int[Array, "n A"]
+    label: Int[Array, "n A"]
+    weight: Float[Array, "n"]
+
+
+def reading_lesson(families: int, others: int, rows: int, seed: int) -> Lesson:
+    """Made-up evidence, and the answers that repeat it: the most likely levels perceived, the conclusion drawn from it.
+
+    With p ~ Dirichlet(1, 1, 1) of each family and attribute, p̄ their mean, and the input log p less its mean,
+    percept = argmax p̄ and conclusion ~ p̄³ / Σ p̄³: ridge regression shrinks its probabilities, and a policy that
+    repeats them would, by its own small errors, turn near ties.  This lesson costs no label.
+
+    Args:
+      families: M, probes whose evidence is read.
+      others: further inputs, which are independent of the answer here.
+      rows: examples.
+      seed: of the draws.
+    """
+    rng, attributes = np.random.default_rng(seed), len(LANGUAGE.attributes)
+    p = rng.dirichlet(np.ones(LEVELS), (rows, families, attributes))
+    mean = p.mean(1)
+    sure = mean**3 / (mean**3).sum(-1, keepdims=True)
+    drawn = (rng.random((rows, attributes, 1)) > sure.cumsum(-1)).sum(-1)
+    x = np.concatenate([evidence_inputs(p), rng.standard_normal((rows, others))], 1)
+    return Lesson(
+        x=jnp.asarray(x, jnp.float32),
+        percept=jnp.asarray(mean.argmax(-1), jnp.int32),
+        label=jnp.asarray(np.minimum(drawn, LEVELS - 1), jnp.int32),
+        weight=jnp.ones(rows, jnp.float32),
+    )
+
+
+def evidence_inputs(p: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n E"]:
+    """Probabilities as inputs: their logarithms less the mean over the levels."""
+    log = np.log(np.maximum(p, 1e-3))
+    return (log - log.mean(-1, keepdims=True)).reshape(len(p), -1)
+
+
+def tune(
+    policy: DescriptionPolicy,
+    config: TuneConfig,
+    members: Sequence[Params],
+    lessons: Sequence[Lesson],
+    seeds: Sequence[int],
+    context: Context,
+    stage: str,
+) -> list[Params]:
+    """Train the members of an ensemble on verified answers, each on its lesson; 0 steps leave them as they are.
+
+    Args:
+      policy: of all members.
+      config: steps, batches, optimizer.
+      members: parameters of each.
+      lessons, seeds: of each member.
+      context: keeps log and checkpoints; the loss is the mean over the members.
+      stage: name of the stage.
+    """
+    if not config.steps:
+        return list(members)
+    optimizer, advance = _tune_program(policy, config)
+    first = tuple(SFTState(params=p, opt_state=optimizer.init(p), step=jnp.zeros((), jnp.int32)) for p in members)
+    keys = [jax.random.split(jax.random.key(seed), config.steps) for seed in seeds]
+
+    def step(states: tuple[SFTState, ...], t: int) -> tuple[tuple[SFTState, ...], dict[str, Array]]:
+        moved = [advance(state, key[t], lesson) for state, key, lesson in zip(states, keys, lessons, strict=True)]
+        return tuple(state for state, _ in moved), {"loss": jnp.mean(jnp.stack([loss for _, loss in moved]))}
+
+    trained = run_loop(step, first, _feed(range(config.steps)), LoopConfig(steps=config.steps), context, stage)
+    return [state.params for state in trained]
+
+
+def _feed(batches: Any) -> Batches:
+    """Some batches, or what makes them, as an iterator that can go back to a state."""
+    return iter(grain.MapDataset.source(batches).to_iter_dataset(ONE_AT_A_TIME))
+
+
+@functools.cache
+def _tune_program(policy: DescriptionPolicy, config: TuneConfig) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer, and the compiled (state, key, lesson) → (state, loss), made once for all members and folds."""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+    answers = jnp.asarray(policy.answers)
+    counted = jnp.asarray(policy.answer(COMBINATIONS[0], COMBINATIONS[0])[1])
+
+    def loss(params: Params, x: Array, tokens: Array) -> Array:
+        each = jax.vmap(lambda row, answer: policy.log_probs(params, row, answer[None])[0])(x, tokens)
+        return -masked.mean(each, counted[None])
+
+    def advance(state: SFTState, key: Array, lesson: Lesson) -> tuple[SFTState, Array]:
+        draw, change = jax.random.split(key)
+        share = lesson.weight / jnp.sum(lesson.weight)
+        rows = jax.random.choice(draw, len(share), (config.batch_size,), p=share)
+        tokens = answers[number(lesson.percept), number(lesson.label)][rows]
+        value, grads = jax.value_and_grad(loss)(state.params, disturb(change, lesson.x[rows], config), tokens)
+        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        return SFTState(params=params, opt_state=opt_state, step=state.step + 1), value
+
+    return optimizer, jax.jit(advance)
+
+
+def disturb(key: Array, x: Float[Array, "n D"], config: TuneConfig) -> Float[Array, "n D"]:
+    """Inputs with some left out and noise on the rest."""
+    drop_key, noise_key = jax.random.split(key)
+    kept = jax.random.bernoulli(drop_key, 1 - config.drop, x.shape)
+    return jnp.where(kept, x + config.noise * jax.random.normal(noise_key, x.shape), 0.0) / (1 - config.drop)
+
+
+def number(levels: Int[Array, "*n A"]) -> Int[Array, "*n"]:
+    """Index of a combination of levels in `COMBINATIONS`."""
+    return jnp.sum(levels * LEVELS ** jnp.arange(levels.shape[-1])[::-1], -1)
+
+
+def reinforce(
+    policy: DescriptionPolicy,
+    config: ReinforceConfig,
+    params: Params,
+    lesson: Lesson,
+    seed: int,
+    context: Context,
+    stage: str,
+) -> Params:
+    """GRPO of one member's decoder, whose encoder stays as it is; 0 steps leave it as it is."""
+    if not config.steps:
+        return params
+    rng = np.random.default_rng(seed)
+    noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
+    weight = np.asarray(lesson.weight, np.float64)
+    drawn = [rng.choice(len(weight), config.grpo.drawn, p=weight / weight.sum()) for _ in range(config.steps)]
+    batches = grain.MapDataset.source(drawn).map(functools.partial(_questions, policy, params, lesson))
+    with stage_hooks(context, stage, config.steps) as hooks:
+        return train_grpo(
+            policy,
+            params,
+            iter(batches.to_iter_dataset(ONE_AT_A_TIME)),
+            _score(policy),
+            config.grpo,
+            LoopConfig(steps=config.steps),
+            hooks,
+            noise=policy.features(params, noise).touch,
+            seed=seed,
+        )
+
+
+@functools.cache
+def _score(policy: DescriptionPolicy) -> ScoreFn:
+    equal = np.full((len(LANGUAGE.attributes), LEVELS), 1 / LEVELS, np.float32)
+    return make_score(policy.parser, make_rewards(equal), REWARD)
+
+
+def _questions(policy: DescriptionPolicy, params: Params, lesson: Lesson, rows: np.ndarray) -> GRPOBatch:
+    """The one question about each of some videos."""
+    first = np.zeros(len(rows), int)
+    return GRPOBatch(
+        features=policy.features(params, lesson.x[rows]),
+        ids=jnp.asarray(policy.layout.ids[first]),
+        mask=jnp.asarray(policy.layout.mask[first]),
+        target=policy.target(first, np.asarray(lesson.label)[rows], np.ones((len(rows), 1), bool)),
+    )
