@@ -8,7 +8,7 @@ fields and forces as int16 counts of a recorded scale:
 
     counts = round(x / scale),   scale = the smallest power of two with max|x| ≤ 32767 · scale
 
-The error is at most scale/2 and must not exceed `TOLERANCE`.  A power of two makes decoding exact in float32, so that
+The error is at most scale/2 and must not exceed `TOLERANCE`; forces and moments past that range are stored as float32.  A power of two makes decoding exact in float32, so that
 storing a decoded sequence again gives the same bytes: copies of a data set never drift.
 
 Entries of the first version, TCH1, stored their frames as they are and are read as well.
@@ -39,6 +39,11 @@ TOLERANCE: Mapping[str, float] = {
 """Largest storage error of each quantised array, in the unit of its name."""
 
 FIELDS = ("deformation_mm", "shear_mm", "depth_mm", "valid")
+
+WIDEST: Mapping[str, float] = {
+    name: 32767 * 2.0 ** math.floor(math.log2(2 * tolerance)) for name, tolerance in TOLERANCE.items()
+}
+"""Largest value of each quantised array that int16 carries within its tolerance: 32 mm, 64 N, 512 N mm."""
 
 _MAGIC, _OLD_MAGIC = b"TCH2", b"TCH1"
 _PREFIX = struct.Struct("<4sII")
@@ -119,9 +124,8 @@ def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float
     mantissa, exponent = math.frexp(max(top / _TOP, _LEAST_SCALE))
     scale = math.ldexp(1.0, exponent - (mantissa == 0.5))
     if scale > 2 * TOLERANCE[name]:
-        limit = _TOP * 2.0 ** math.floor(math.log2(2 * TOLERANCE[name]))
         raise SchemaError(
-            f"{where}: {name} reaches {top:g}: int16 carries at most {limit:g} at an error of {TOLERANCE[name]:g}; "
+            f"{where}: {name} reaches {top:g}: int16 carries at most {WIDEST[name]:g} at an error of {TOLERANCE[name]:g}; "
             "check the unit or drop the broken frames"
         )
     return np.rint(x / np.float32(scale)).astype(np.int16), scale
@@ -133,7 +137,7 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
         if array is None:
             continue
         entry: dict[str, Any] = {"name": name, "shape": list(array.shape)}
-        if name in TOLERANCE:
+        if name in TOLERANCE and not _wide(name, array):
             array, entry["scale"] = quantise(name, array, where=where)
         elif array.dtype == np.bool_:
             array, entry["bits"] = np.packbits(array), True
@@ -153,6 +157,11 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
     body = b"".join([text, *payloads])
     size = struct.pack("<I", len(text))
     return _PREFIX.pack(_MAGIC, zlib.crc32(body, zlib.crc32(size)), len(text)) + body
+
+
+def _wide(name: str, x: np.ndarray) -> bool:
+    """True of a force or moment that int16 cannot carry; a field past its range is a broken sample or another unit."""
+    return name not in FIELDS and WIDEST[name] < float(np.abs(x).max(initial=0.0)) < math.inf
 
 
 def _open(data: bytes, kind: str) -> tuple[dict[str, Any], memoryview]:

@@ -5,6 +5,7 @@ import dataclasses
 from rich.table import Table
 
 from sensors_io.commands.console import OUT
+from sensors_io.devices.base import Device
 from sensors_io.devices.cameras import SYSFS, find_cameras
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.devices.netft import NetFtConfig
@@ -13,12 +14,12 @@ from sensors_io.devices.tac3d import PORT, Tac3dConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Devices:
-    """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T answers."""
+    """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T at a given address answers."""
 
     tac3d_port: int = PORT
     """On which the vendor's program of a Tac3D sends."""
-    netft_host: str = NetFtConfig().host
-    """Address of a Net F/T."""
+    netft_host: str | None = None
+    """Address of a Net F/T; without one none is asked for."""
     wait_s: float = 1.0
     """For each of them."""
 
@@ -31,11 +32,12 @@ class Devices:
             interface = "" if camera.interface is None else f", interface {camera.interface}"
             where = f"{camera.node} ({camera.usb_id or 'not USB'}{interface})"
             table.add_row("camera", camera.product, camera.serial or "–", where)
-        tac3d, netft = (
-            Tac3dConfig(port=self.tac3d_port, wait_s=self.wait_s),
-            NetFtConfig(host=self.netft_host, wait_s=self.wait_s),
-        )
-        for name, device in (("tac3d", tac3d.open()), ("netft", netft.open())):
+        asked: dict[str, Device] = {"tac3d": Tac3dConfig(port=self.tac3d_port, wait_s=self.wait_s).open()}
+        if self.netft_host is not None:
+            asked["netft"] = NetFtConfig(host=self.netft_host, wait_s=self.wait_s).open()
+        else:
+            table.add_row("netft", "not asked", "–", "give its address by --netft-host")
+        for name, device in asked.items():
             try:
                 with device:
                     identity = device.identity

@@ -41,3 +41,7 @@ class SettingRefusedWarning(UserWarning):
 
 class OverloadWarning(UserWarning):
     """The consumer falls behind: samples were overwritten before anybody read them."""
+
+
+class WrongRateWarning(UserWarning):
+    """A device that sends at another rate than it was said to."""

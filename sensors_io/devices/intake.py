@@ -34,7 +34,7 @@ class Counts:
       delivered: read by the consumer in order.
       overwritten: pushed out of the full ring unread.
       waiting: in the ring now.
-      missing: never arrived; `missing_away` of them while the device was disconnected.
+      missing: never arrived, less those that arrived broken; `missing_away` of them while the device was disconnected.
       late: arrived after they had been counted as missing, and are no longer.
       broken: left out because they broke the protocol.
       disconnects, reconnects, timeouts: how often.
@@ -88,6 +88,7 @@ class Intake:
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
         self._away = False
+        self._broken_since = 0  # the last whole sample
         self._warned_at = 0
 
     def opened(self, identity: Identity) -> None:
@@ -115,6 +116,7 @@ class Intake:
         """Take note of a sample that broke the protocol."""
         with self._changed:
             self._counts.broken += 1
+            self._broken_since += 1
 
     def fail(self, error: DeviceError) -> None:
         """End the stream: readers get what is in the ring, then this error."""
@@ -243,7 +245,8 @@ class Intake:
         counts = self._counts
         counts.restarts += step.restarted
         counts.late += step.late
-        counts.missing += step.missing - step.late
+        broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
+        counts.missing += step.missing - step.late - broken
         if self._away:
             counts.missing_away += step.missing
             self._away = False

@@ -13,6 +13,7 @@ import enum
 import socket
 import struct
 import time
+import warnings
 from collections import deque
 from collections.abc import Mapping
 from types import TracebackType
@@ -22,7 +23,13 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.devices.errors import (
+    DeviceDataError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    WrongRateWarning,
+)
 
 RDT_PORT = 49152
 TCP_PORT = 49151
@@ -75,7 +82,8 @@ class NetFtConfig:
     Args:
       host: its address.
       rdt_port, tcp_port: as shipped.
-      rate_hz: of the records, as set on its configuration page; told so that losses can be timed.
+      rate_hz: of the records, as set on its configuration page; a rate that the records contradict warns with
+        `WrongRateWarning`.
       buffered: several records in one datagram, for rates at which single ones would be lost.
       wait_s: for its answers, on opening.
     """
@@ -116,6 +124,39 @@ def parse_calibration(answer: bytes) -> NetFtScale:
     )
 
 
+class _RateCheck:
+    """Compares the numbers of records, over the rate they are said to have, with the times of their arrival.
+
+    A record that waited is late, none is early: the least delay in each quarter of a second stays where it was if the
+    rate is right, and drifts if it is not.
+    """
+
+    _EVERY_NS = NS_PER_S // 4
+    _ALLOWED_NS = 20_000_000  # the scheduler's share
+    _DRIFT = 1e-3  # of two clocks
+
+    def __init__(self, rate_hz: float):
+        self._rate_hz = rate_hz
+        self._first: tuple[int, int] | None = None  # number and arrival
+        self._least: int | None = None
+        self._until_ns = 0
+        self.measured_hz: float | None = None
+
+    def step(self, number: int, arrival_ns: int) -> None:
+        """Take a record into account; `measured_hz` is set once the rate is seen to be wrong."""
+        if self._first is None:
+            self._first, self._until_ns = (number, arrival_ns), arrival_ns + self._EVERY_NS
+            return
+        records, elapsed_ns = (number - self._first[0]) % 2**32, arrival_ns - self._first[1]
+        late_ns = elapsed_ns - round(records * NS_PER_S / self._rate_hz)
+        self._least = late_ns if self._least is None else min(self._least, late_ns)
+        if arrival_ns < self._until_ns:
+            return
+        if abs(self._least) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
+            self.measured_hz = records * NS_PER_S / elapsed_ns
+        self._least, self._until_ns = None, arrival_ns + self._EVERY_NS
+
+
 class NetFt:
     """A 6-D force sensor; its samples carry `force_n` [3] and `moment_nmm` [3] in its own frame, uncompensated."""
 
@@ -126,6 +167,7 @@ class NetFt:
         self._socket: socket.socket | None = None
         self._calibration: NetFtScale | None = None
         self._records: deque[tuple[int, bytes]] = deque()
+        self._rate = _RateCheck(config.rate_hz)
 
     @property
     def identity(self) -> Identity:
@@ -139,6 +181,7 @@ class NetFt:
 
     def __enter__(self) -> Self:
         c = self._config
+        self._rate = _RateCheck(c.rate_hz)
         try:
             self._calibration = parse_calibration(self._ask_calibration())
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -170,9 +213,12 @@ class NetFt:
             raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
+        self._check_rate(number, stamp_ns)
         return Sample(
             host_time_ns=stamp_ns,
-            device_time_ns=round(number * NS_PER_S / self._config.rate_hz),
+            device_time_ns=(
+                None if self._rate.measured_hz is not None else round(number * NS_PER_S / self._config.rate_hz)
+            ),
             index=number,
             arrays={
                 "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),
@@ -184,6 +230,20 @@ class NetFt:
     def take_zero(self) -> None:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
+
+    def _check_rate(self, number: int, stamp_ns: int) -> None:
+        """Warn once of a wrong rate; from then on a record has the time of its arrival alone."""
+        if self._rate.measured_hz is not None:
+            return
+        self._rate.step(number, stamp_ns)
+        if self._rate.measured_hz is not None:
+            warnings.warn(
+                f"NetFT at {self._config.host} sends about {self._rate.measured_hz:.0f} records a second: rate_hz is "
+                f"{self._config.rate_hz:g}; set it to what the sensor's communication page says.  Records are timed "
+                "by their arrival until then",
+                WrongRateWarning,
+                stacklevel=3,
+            )
 
     def _receive(self, timeout_s: float) -> None:
         if self._socket is None:

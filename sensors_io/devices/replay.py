@@ -213,26 +213,30 @@ class Replay:
     def _timeline(self) -> Iterator[tuple[int, Sample]]:
         """Arrival on the host's clock and content of all samples, round after round."""
         assert self._start_ns is not None  # a generator starts when it is first asked, after the device was opened
-        arrival_ns = shift_ns = count = 0
+        arrival_ns = shift_ns = base = 0
         while True:
             last_ns = previous_ns = 0
+            first = last = None
             for recorded in self._source.samples():
                 time_ns = shift_ns + recorded.time_ns
                 if self._end_ns is not None and time_ns >= self._end_ns:
                     return
                 delay = self._rng.exponential(self._faults.jitter_s) if self._faults.jitter_s else 0.0
                 arrival_ns = max(arrival_ns, time_ns + round(delay * NS_PER_S))
-                yield self._start_ns + arrival_ns, self._sample(recorded, time_ns, count)
-                count += 1
+                first = recorded.index if first is None else first
+                last = recorded.index
+                yield self._start_ns + arrival_ns, self._sample(recorded, time_ns, base)
                 previous_ns, last_ns = last_ns, recorded.time_ns
             if self._end_ns is None:
                 return
+            if first is not None and last is not None:  # the counter goes on: gaps of the recording stay gaps
+                base += last + 1 - first
             period = self.identity.period_s
             shift_ns += last_ns + (last_ns - previous_ns if period is None else round(period * NS_PER_S))
 
-    def _sample(self, recorded: Recorded, time_ns: int, count: int) -> Sample:
+    def _sample(self, recorded: Recorded, time_ns: int, base: int) -> Sample:
         f = self._faults
-        index = recorded.index if self._end_ns is None else count
+        index = None if recorded.index is None else recorded.index + base
         return Sample(
             host_time_ns=0,
             device_time_ns=None if f.hide_clock else self._CLOCK_AHEAD_NS + round(time_ns * (1 + f.skew)),

@@ -8,7 +8,12 @@ from typing import Self
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.devices.errors import (
+    DeviceDataError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+)
 from sensors_io.devices.tac3d_messages import Assembler, Tac3dDecoder, to_schema
 
 PORT = 9988
@@ -64,7 +69,7 @@ class Tac3dSensor:
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._RECEIVE_BUFFER)
             self._socket.bind((c.address, c.port))
-            self._first = self.read(c.wait_s)
+            self._first = self._read_first(time.monotonic() + c.wait_s)
         except OSError as error:
             self._close()
             raise DeviceNotFoundError(
@@ -74,7 +79,7 @@ class Tac3dSensor:
             self._close()
             raise DeviceNotFoundError(
                 f"Tac3D {c.serial or '(any)'}: nothing heard on port {c.port} in {c.wait_s} s; start the vendor's "
-                "program and let it send there"
+                f"program and let it send there ({silence})"
             ) from silence
         return self
 
@@ -88,15 +93,19 @@ class Tac3dSensor:
         if self._first is not None:
             sample, self._first = self._first, None
             return sample
-        deadline = time.monotonic() + timeout_s
+        deadline, starting = time.monotonic() + timeout_s, ""
         while True:
-            datagram, sender = self._receive(deadline, timeout_s)
+            datagram, sender = self._receive(deadline, timeout_s, starting)
             stamp_ns = time.monotonic_ns()
-            whole = self._assembler.add(datagram)
+            whole = self._assembler.add(datagram, sender)
             if whole is None:
                 continue
             message = self._decoder.decode(*whole)
-            if self._serial in ("", message.serial):
+            if self._serial not in ("", message.serial):
+                continue
+            if message.initialised < 100:  # its fields are not measured yet
+                starting = f"; its program has started to {message.initialised} %"
+            else:
                 self._serial, self._sender = message.serial, sender
                 return Sample(
                     host_time_ns=stamp_ns,
@@ -104,6 +113,14 @@ class Tac3dSensor:
                     index=message.index,
                     arrays=to_schema(message.matrices),
                 )
+
+    def _read_first(self, deadline: float) -> Sample:
+        """The first whole message; broken ones before it are passed over."""
+        while True:
+            try:
+                return self.read(max(deadline - time.monotonic(), 0.0))
+            except DeviceDataError:
+                continue
 
     def take_zero(self) -> None:
         """Make the sensor take its present state as zero; nothing may touch it."""
@@ -114,7 +131,7 @@ class Tac3dSensor:
             raise DeviceLostError("Tac3D is not open: read from it before a command is sent")
         self._socket.sendto(command, self._sender)
 
-    def _receive(self, deadline: float, timeout_s: float) -> tuple[bytes, tuple[str, int]]:
+    def _receive(self, deadline: float, timeout_s: float, starting: str) -> tuple[bytes, tuple[str, int]]:
         if self._socket is None:
             raise DeviceLostError("Tac3D is not open; use it in a with block")
         left = deadline - time.monotonic()
@@ -124,7 +141,9 @@ class Tac3dSensor:
             self._socket.settimeout(left)
             return self._socket.recvfrom(_LARGEST)
         except TimeoutError as silence:
-            raise DeviceTimeoutError(f"Tac3D sent nothing in {timeout_s} s; look at the vendor's program") from silence
+            raise DeviceTimeoutError(
+                f"Tac3D sent no whole message in {timeout_s:g} s{starting}; look at the vendor's program"
+            ) from silence
         except OSError as error:
             raise DeviceLostError(f"Tac3D: its socket failed ({error}); open it again") from error
 

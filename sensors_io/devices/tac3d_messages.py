@@ -31,7 +31,8 @@ _IN_FLIGHT = 8  # messages whose packets may come interleaved
 _CACHED_LAYOUTS = 16
 
 _TYPES: Mapping[str, np.dtype[Any]] = {"f64": np.dtype("<f8"), "i32": np.dtype("<i4")}
-_SCALAR = re.compile(rb"^([A-Za-z_]\w*):[ \t]*([^\r\n]*?)[ \t]*\r?$", re.MULTILINE)
+_NAME = re.compile(rb"[A-Za-z_]\w*")
+_LATEST_S = 9e9  # what nanoseconds in 64 bits carry
 _DATA = re.compile(rb"^data:[^\n]*(?:\n[ \t-][^\n]*)*", re.MULTILINE)
 _FLOW_ITEM = re.compile(r"\{([^{}]*)\}")
 
@@ -53,6 +54,11 @@ class Message:
     send_time_s: float
     note: str
     matrices: Mapping[str, np.ndarray]
+
+    @property
+    def initialised(self) -> int:
+        """Percentage of the vendor's program's start-up; the fields mean nothing before it is 100."""
+        return int(self.matrices.get("InitializeProgress", np.array(100)).flat[0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +90,8 @@ class Tac3dDecoder:
         items = self._layouts.get(block)
         if items is None:
             items = self._learn(block)
-        scalars = dict(_SCALAR.findall(layout[: found.start()] + layout[found.end() :]))
+        lines = (line.partition(b":") for line in (layout[: found.start()] + layout[found.end() :]).split(b"\n"))
+        scalars = {name: value.strip() for name, colon, value in lines if colon and _NAME.fullmatch(name)}
         matrices = {}
         for item in items:
             if item.end > len(data):
@@ -93,10 +100,17 @@ class Tac3dDecoder:
                 )
             matrices[item.name] = np.frombuffer(data, item.dtype, item.count, item.offset).reshape(item.shape)
         try:
+            send_time_s = float(scalars[b"timestamp"])
+            index = int(scalars[b"index"])
+            if not abs(send_time_s) <= _LATEST_S or abs(index) >= 1 << 63:
+                raise DeviceDataError(
+                    f"Tac3D message {index} at {send_time_s} s: must be within ±2^63 and ±{_LATEST_S:g} s; look at the "
+                    "vendor's program"
+                )
             return Message(
-                index=int(scalars[b"index"]),
+                index=index,
                 serial=_plain(scalars[b"SN"]),
-                send_time_s=float(scalars[b"timestamp"]),
+                send_time_s=send_time_s,
                 note=_plain(scalars.get(b"msg", b"")),
                 matrices=matrices,
             )
@@ -154,22 +168,27 @@ class Assembler:
     """Joins datagrams to messages; packets may come in any order, and what is never completed is counted."""
 
     def __init__(self) -> None:
-        self._parts: collections.OrderedDict[int, list[bytes | None]] = collections.OrderedDict()
-        self._left: dict[int, int] = {}
+        self._parts: collections.OrderedDict[tuple[object, int], list[bytes | None]] = collections.OrderedDict()
+        self._left: dict[tuple[object, int], int] = {}
         self.incomplete = 0
 
-    def add(self, datagram: bytes) -> tuple[bytes, bytes] | None:
+    def add(self, datagram: bytes, sender: object = None) -> tuple[bytes, bytes] | None:
         """Layout and data of a message that this datagram completes, else `None`.
+
+        Args:
+          datagram: its bytes.
+          sender: address that it came from; two programs on one port number their messages alike.
 
         Raises:
           DeviceDataError: a datagram that is too short or numbers its packets wrongly.
         """
         if len(datagram) < _PACKET.size:
             raise DeviceDataError(f"Tac3D datagram of {len(datagram)} bytes: its header alone has {_PACKET.size}")
-        serial, count, packet = _PACKET.unpack_from(datagram)
+        message, count, packet = _PACKET.unpack_from(datagram)
+        serial = (sender, message)
         parts = self._parts.get(serial)
         if not 0 < count <= _MAX_PACKETS or packet > count or (parts is not None and len(parts) != count + 1):
-            raise DeviceDataError(f"Tac3D datagram {packet} of {count} in message {serial} is misnumbered")
+            raise DeviceDataError(f"Tac3D datagram {packet} of {count} in message {message} is misnumbered")
         if parts is None:
             parts = self._parts[serial] = [None] * (count + 1)
             self._left[serial] = count + 1
@@ -193,7 +212,14 @@ def to_schema(matrices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Returns:
       `deformation_mm` [20, 20, 2], `depth_mm` [20, 20], `force_n` [3], `moment_nmm` [3], float32; each where the
       vendor's array is there.
+
+    Raises:
+      DeviceDataError: an array of another size.
     """
+    sizes = {"3D_Displacements": GRID * GRID * 3, "3D_ResultantForce": 3, "3D_ResultantMoment": 3}
+    for name, size in sizes.items():
+        if name in matrices and matrices[name].size != size:
+            raise DeviceDataError(f"Tac3D array {name} has {matrices[name].size} numbers: must have {size}")
     fields: dict[str, np.ndarray] = {}
     if "3D_Displacements" in matrices:
         grid = matrices["3D_Displacements"].reshape(GRID, GRID, 3)[::-1, ::-1].astype(np.float32)

@@ -1,12 +1,17 @@
 """Pickled arrays and dictionaries of published data sets, read without running what else a pickle may hold.
 
-A pickle is a program.  This reader lets it build numbers, text, lists, dictionaries and NumPy arrays, and refuses it
-where it asks for anything else.
+A pickle is a program.  Here it may build numbers, text, lists and dictionaries; where it asks for NumPy it gets
+stand-ins written in Python, which check shape, type and size before an array is made.  NumPy's own functions are never
+called by a pickle, for `ndarray.__setstate__` and `dtype.__setstate__` trust what they are given with memory.
 """
 
+import dataclasses
 import io
+import math
 import pathlib
 import pickle
+import pickletools
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -14,9 +19,68 @@ import numpy as np
 
 from sensors_io.importers.keep import UnreadableError
 
+_DEPTH = 64
+"""Lists and dictionaries inside one another: far above what data sets nest."""
+
+_SIMPLE = re.compile(r"[<>|=]?([biufc]\d{1,2}|[SU]\d{1,6})")
+"""Names of the types whose values are plain bytes."""
+
 
 class PickleError(UnreadableError):
     """A pickle that is damaged or holds more than data."""
+
+
+class _DType:
+    """Stand-in of a pickled `numpy.dtype`: numbers, booleans, fixed text, or `O` for a list of objects."""
+
+    def __init__(self, name: str, align: object = False, copy: object = True):
+        if name not in ("O", "O8") and not (isinstance(name, str) and _SIMPLE.fullmatch(name)):
+            raise PickleError(f"asks for an array of type {name!r}: only numbers, text and lists of them are read")
+        self.objects = name in ("O", "O8")
+        self.dtype = np.dtype(object if self.objects else name)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        order = state[1] if isinstance(state, tuple) and len(state) >= 5 else None
+        if order not in ("<", ">", "|", "=") or any(part is not None for part in state[2:5]):
+            raise PickleError(f"asks for an array of a structured type, {state!r}: split its fields")
+        self.dtype = self.dtype.newbyteorder(order)
+
+
+@dataclasses.dataclass
+class _Array:
+    """Stand-in of a pickled `numpy.ndarray`; `value` is made once its state is known."""
+
+    value: np.ndarray | None = None
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, fortran, data = state
+        self.value = _array(data, kind, shape, "F" if fortran else "C")
+
+
+def _array(data: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
+    """An array of its own memory, after shape, type and size were seen to agree."""
+    shape = (shape,) if isinstance(shape, int) else shape
+    ok = isinstance(shape, tuple) and len(shape) <= 32 and all(type(n) is int and n >= 0 for n in shape)
+    if not ok or not isinstance(kind, _DType) or order not in ("C", "F"):
+        raise PickleError(f"asks for an array of shape {shape!r}: must be a tuple of sizes, with a type")
+    if kind.objects:
+        if not isinstance(data, list) or len(data) != math.prod(shape):
+            raise PickleError(f"an array of objects of shape {shape} must hold as many")
+        flat = np.empty(len(data), object)
+        for i, item in enumerate(data):
+            flat[i] = item
+        return flat.reshape(shape, order=order)
+    size = math.prod(shape) * kind.dtype.itemsize
+    if not isinstance(data, bytes | bytearray) or len(data) != size:
+        raise PickleError(f"an array of {kind.dtype}{list(shape)} must have {size} bytes")
+    return np.frombuffer(bytes(data), kind.dtype).reshape(shape, order=order).copy()
+
+
+def _scalar(kind: Any, data: Any) -> Any:
+    """One number; of a type that holds objects nothing is read."""
+    if not isinstance(kind, _DType) or kind.objects:
+        raise PickleError("asks for a single object as a number")
+    return _array(data, kind, (), "C")[()]
 
 
 def _latin1(text: str, encoding: str) -> bytes:
@@ -26,26 +90,37 @@ def _latin1(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
-_BUILDERS: dict[str, Any] = {
-    "_reconstruct": np.empty(0).__reduce_ex__(2)[0],
-    "_frombuffer": np.empty(0).__reduce_ex__(5)[0],
-    "scalar": np.float64(0).__reduce_ex__(2)[0],
-}
-"""The functions that NumPy's pickles call, by name, taken from such pickles."""
+def _bytes() -> bytes:
+    """No bytes at all, as protocol 2 spells them."""
+    return b""
+
+
+def _reconstruct(kind: object, shape: object, code: object) -> _Array:
+    """An array whose state follows."""
+    return _Array()
+
+
+def _frombuffer(data: Any, kind: Any, shape: Any, order: Any) -> _Array:
+    return _Array(_array(data, kind, shape, order))
+
 
 _ALLOWED: Mapping[tuple[str, str], Callable[..., Any]] = {
-    ("numpy", "ndarray"): np.ndarray,
-    ("numpy", "dtype"): np.dtype,
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _DType,
     ("_codecs", "encode"): _latin1,
+    ("__builtin__", "bytes"): _bytes,
     **{
-        (f"numpy.{core}.{module}", name): _BUILDERS[name]
+        (f"numpy.{core}.{module}", function.__name__.replace("_scalar", "scalar")): function
         for core in ("core", "_core")  # the first until NumPy 2
-        for module, name in (("multiarray", "_reconstruct"), ("multiarray", "scalar"), ("numeric", "_frombuffer"))
+        for module, function in (("multiarray", _reconstruct), ("multiarray", _scalar), ("numeric", _frombuffer))
     },
 }
 """All that a pickle may ask for."""
 
-_BROKEN = (pickle.UnpicklingError, EOFError, ValueError, TypeError, IndexError, KeyError, AttributeError)
+_BROKEN = (
+    pickle.UnpicklingError, EOFError, ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError,
+    RecursionError, MemoryError,
+)  # fmt: skip
 """Errors that truncated or foreign bytes raise during unpickling."""
 
 
@@ -67,14 +142,54 @@ def read_pickle(path: pathlib.Path) -> Any:
     try:
         stream = io.BytesIO(path.read_bytes())
         if path.suffix != ".npy":
-            return _DataUnpickler(stream).load()
+            return _load(stream)
         version = np.lib.format.read_magic(stream)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(stream)
         if not dtype.hasobject:
             raise PickleError(f"{path.name} holds an array of {dtype}{list(shape)}, not a pickled object")
-        return np.asarray(_DataUnpickler(stream).load(), object).item()
+        return np.asarray(_load(stream), object).item()
     except PickleError:
         raise
     except _BROKEN as error:
         raise PickleError(f"{path.name} is damaged ({error!r})") from error
+
+
+def _load(stream: io.BytesIO) -> Any:
+    """The object that follows, its stand-ins replaced by the arrays that they checked."""
+    start = stream.tell()
+    operations = 0
+    for opcode, argument, _ in pickletools.genops(stream):
+        operations += 1
+        # the unpickler allocates a table as long as the greatest number that an object is remembered by
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > operations:
+            raise pickle.UnpicklingError(f"object {argument} is remembered after {operations} operations")
+    stream.seek(start)
+    return _plain(_DataUnpickler(stream).load(), _DEPTH)
+
+
+def _plain(data: Any, depth: int) -> Any:
+    if not depth:
+        raise PickleError(f"nests its data more than {_DEPTH} deep: must be flatter")
+    if isinstance(data, _Array):
+        if data.value is None:
+            raise pickle.UnpicklingError("an array without its data")
+        if data.value.dtype == object:
+            data.value[...] = _array_of(data.value, depth)
+        return data.value
+    if isinstance(data, _DType):
+        return data.dtype
+    if isinstance(data, dict):
+        return {_plain(k, depth - 1): _plain(v, depth - 1) for k, v in data.items()}
+    if isinstance(data, list | tuple | set | frozenset):
+        return type(data)(_plain(v, depth - 1) for v in data)
+    if isinstance(data, type) or callable(data):
+        raise PickleError(f"holds the name {data!r} as data: only numbers, text and arrays are read")
+    return data
+
+
+def _array_of(values: np.ndarray, depth: int) -> np.ndarray:
+    out = np.empty(values.shape, object)
+    for i, value in enumerate(values.flat):
+        out.flat[i] = _plain(value, depth - 1)
+    return out

@@ -3,6 +3,7 @@
 All their times are on one clock: that of the host, less what each sensor is known to be stamped late by.
 """
 
+import collections
 import dataclasses
 import pathlib
 from collections.abc import Mapping
@@ -12,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
+from sensors_io.codec import FIELDS, WIDEST
 from sensors_io.force import ForceError, at_frames
 from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
+_INT64 = np.iinfo(np.int64)
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
 
 
@@ -103,26 +106,35 @@ class _Shared:
         """That of one stream."""
         start, stream = self.start, self.start["streams"][number]
         identity, key = stream["identity"], ContactKey(**start["key"])
+        given = len(frames)
+        frames = _alike(frames)
         time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
         force = _Force.at(time_ns, self.entries if number == 0 else ())
         flags = np.where(gaps | force.uncovered, np.uint32(Flag.TIME_GAP), np.uint32(0))
-        flags |= np.where(force.out_of_range, np.uint32(Flag.INCOMPLETE), np.uint32(0))
-        device = [e.plain["device_time_ns"] for e in frames]
-        pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
         arrays: dict[str, Any] = {**own, **force.arrays}
+        broken = _mend(arrays)
+        incomplete = np.any([force.out_of_range, *broken.values()], axis=0)
+        flags |= np.where(incomplete, np.uint32(Flag.INCOMPLETE), np.uint32(0))
+        device = [e.plain["device_time_ns"] for e in frames]
+        timed = all(t is not None and _INT64.min <= t <= _INT64.max for t in device)
+        pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
         region = start["contact_region_px"]
         return Sequence(
             key=key,
             sensor=identity["sensor"],
             serial=identity["serial"],
-            camera={"settings": identity["settings"], "recording": self._recording(stream, key, force.residual_n)},
+            camera={
+                "settings": identity["settings"],
+                "recording": self._recording(stream, key, force.residual_n)
+                | {"left_out": given - len(frames), "broken": {name: int(rows.sum()) for name, rows in broken.items()}},
+            },
             contact_region_px=None if region is None else tuple(region),
             mm_per_px=identity["mm_per_px"],
             frames=np.stack(pictures) if len(pictures) == len(frames) else None,
             host_time_ns=time_ns,
-            device_time_ns=None if None in device else np.array(device, np.int64),
+            device_time_ns=np.array(device, np.int64) if timed else None,
             target_force_n=np.full(len(frames), start["target_n"], np.float32),
             phase=_phases(self.entries, time_ns),
             flags=flags,
@@ -145,6 +157,33 @@ class _Shared:
             "drift": stream["drift"],
             "background": background_name(key, sensor).as_posix() if sensor in self.backgrounds else None,
         }
+
+
+def _alike(frames: Seq[JournalEntry]) -> Seq[JournalEntry]:
+    """Frames whose arrays have the names, shapes and types of most: a device that changes them breaks its protocol."""
+    kinds = [tuple((name, a.dtype.str, a.shape) for name, a in sorted(e.arrays.items())) for e in frames]
+    (usual, _), *_ = collections.Counter(kinds).most_common(1)
+    return [e for e, kind in zip(frames, kinds, strict=True) if kind == usual]
+
+
+def _mend(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Put 0 where a value is not finite, or a field too large for the records; fields are not `valid` there.
+
+    Returns:
+      Array → rows that held such a value, bool [N]; an array without any is left out.
+    """
+    broken = {}
+    for name in [name for name in arrays if name in WIDEST]:
+        value = arrays[name]
+        good = np.isfinite(value) & ((name not in FIELDS) | (np.abs(value) <= WIDEST[name]))
+        if good.all():
+            continue
+        arrays[name] = np.where(good, value, np.float32(0))
+        broken[name] = ~good.reshape(len(value), -1).all(1)
+        if name in FIELDS:
+            point = good.all(-1) if value.ndim == 4 else good
+            arrays["valid"] = arrays.get("valid", True) & point
+    return broken
 
 
 def _own_arrays(frames: Seq[JournalEntry]) -> dict[str, np.ndarray]:

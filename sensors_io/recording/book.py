@@ -9,8 +9,8 @@ import numpy as np
 
 from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import ContactStage
-from sensors_io.records import RecordWriter
-from sensors_io.schema import ContactKey, ObjectCard
+from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.schema import ContactKey, ObjectCard, SchemaError
 
 ATTEMPTS = 16
 """Of one contact: trial = level · ATTEMPTS + attempt."""
@@ -56,7 +56,7 @@ class Book:
     def __init__(self, writer: RecordWriter, journals: pathlib.Path, report: Report):
         self._writer, self._journals, self._report = writer, journals, report
         self._incomplete: list[list[Any]] = list(writer.notes.get("incomplete", []))
-        self._unpublished: list[pathlib.Path] = []
+        self._unpublished: dict[pathlib.Path, ContactKey] = {}
 
     def add_object(self, object_id: str, view: ObjectView | None = None) -> None:
         """Store the card of an object that has none; a view is published at once, for no journal holds it."""
@@ -95,26 +95,39 @@ class Book:
         if found is None:
             path.unlink()
             return None
-        self._unpublished.append(path)
         key = found.sequences[0].key
         if key not in self._writer:  # else it was published, and its journal not yet deleted
             self.add_object(key.object_id)
             for sensor, picture in found.backgrounds.items():
                 _write_picture(self._journals.parent / background_name(key, sensor), picture)
-            self._writer.write_contact(found.sequences)
+            try:
+                self._writer.write_contact(found.sequences)
+            except SchemaError as error:  # set aside, or it would stop every later session
+                kept = path.rename(path.with_suffix(".refused"))
+                raise SchemaError(f"{error}; nothing is lost: the contact's journal is kept as {kept}") from error
             self._report.contacts += 1
             if not found.complete:
                 self._report.incomplete += 1
                 self._incomplete.append(_plain(key))
                 self._writer.note(incomplete=self._incomplete)
+        self._unpublished[path] = key
         if len(self._unpublished) >= _PER_SHARD:
             self.publish()
         return found.complete
 
     def publish(self) -> None:
-        """Make everything visible; only then are its journals deleted."""
+        """Make everything visible; a journal is deleted once its contact has been read back from the records.
+
+        Raises:
+          CorruptRecordsError: a contact that cannot be read back; its journal stays.
+        """
         self._writer.publish()
-        for path in self._unpublished:
+        if not self._unpublished:
+            return
+        store = RecordStore(self._journals.parent, allow_incomplete=True)
+        numbers = {key: i for i, key in enumerate(store.contacts)}
+        for path, key in self._unpublished.items():
+            store.contact(numbers[key])
             path.unlink()
         self._unpublished.clear()
 

@@ -46,3 +46,48 @@ def test_damage_is_named(tmp_path):
     np.save(tmp_path / "plain.npy", np.arange(3))
     with pytest.raises(PickleError, match="holds an array of int64"):
         read_pickle(tmp_path / "plain.npy")
+
+
+def state(build, *state):
+    """A pickle that builds something with a state of its own, as a crafted file would."""
+
+    class Crafted:
+        def __reduce__(self):
+            return (*build, state if len(state) > 1 else state[0])
+
+    return pickle.dumps(Crafted(), 2)
+
+
+EMPTY = np.empty(0).__reduce__()[:2]
+TYPE = (np.dtype, ("f8", False, True))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (state(EMPTY, 1, (4,), np.dtype(object), False, b"\xff" * 32), "of objects of shape"),
+        (state(EMPTY, 1, (2,), np.dtype(object), False, [1]), "must hold as many"),
+        (state(EMPTY, 1, (1 << 40,), np.dtype("f8"), False, b"\0" * 8), "must have 8796093022208 bytes"),
+        (state(EMPTY, 1, (-1,), np.dtype("f8"), False, b""), "tuple of sizes"),
+        (state(TYPE, 3, "<", None, ("a",), {"a": (np.dtype("f8"), 99)}, 8, 8, 0), "structured"),
+        (pickle.dumps(np.zeros(1, [("a", object)])), "V8"),
+        (pickle.dumps([0])[:-1] + b"r\xff\xff\xff\x7f.", "remembered"),
+        (b"\x80\x02" + b"]" * 2000 + b"a" * 1999 + b".", "nests"),
+        (pickle.dumps(np.ndarray), "as data"),
+    ],
+)
+def test_crafted_pickles_are_refused_before_memory_is_touched(tmp_path, data, message):
+    (tmp_path / "a.pkl").write_bytes(data)
+    with pytest.raises(PickleError, match=message):
+        read_pickle(tmp_path / "a.pkl")
+
+
+def test_arrays_of_every_order_and_type_come_back(tmp_path):
+    data = [np.asfortranarray(np.ones((2, 3))), np.arange(3, dtype=">i4"), np.array(["a", "bc"]), np.bool_(1)]
+    nested = np.array([{"a": np.arange(2)}, None], object)
+    for protocol in (0, 2, 4, 5):
+        (tmp_path / "a.pkl").write_bytes(pickle.dumps([*data, np.empty(0), nested], protocol))
+        *found, empty, objects = read_pickle(tmp_path / "a.pkl")
+        np.testing.assert_equal(found, data)
+        assert (empty.shape, objects.shape, objects[1]) == ((0,), (2,), None)
+        np.testing.assert_array_equal(objects[0]["a"], [0, 1])

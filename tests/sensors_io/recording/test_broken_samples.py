@@ -1,0 +1,110 @@
+"""Samples that a sensor got wrong: the contact is kept, the rows are flagged and counted, later sessions go on."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import pytest
+
+from sensors_io.devices.base import Sample
+from sensors_io.recording.session import record_session
+from sensors_io.records import CorruptRecordsError, RecordStore
+from sensors_io.schema import Flag, SchemaError
+from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
+from tests.sensors_io.recording.test_session import CONFIG, SHORT
+
+FREE = dataclasses.replace(CONFIG, free_s=0.5)
+
+
+class Odd(Skin):
+    """A skin whose samples from the 20th to the 22nd are changed."""
+
+    def __init__(self, hand, change):
+        super().__init__(hand)
+        self.change = change
+
+    def drain(self):
+        (sample,) = super().drain()
+        return [self.change(sample) if 20 <= self.count < 23 else sample]
+
+
+def with_arrays(**arrays):
+    return lambda sample: dataclasses.replace(sample, arrays={**sample.arrays, **arrays})
+
+
+def recorded(out, change, config=FREE):
+    hand = Hand()
+    record_session(out, config, [Odd(hand, change)], None, show=hand.show)
+    return RecordStore(out).contact(0)["tac3d"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("depth_mm", np.where(np.eye(3), np.nan, 0.5).astype(np.float32)),
+        ("depth_mm", np.where(np.eye(3), 40.0, 0.5).astype(np.float32)),
+        ("force_n", np.array([np.inf, 0, 0], np.float32)),
+    ],
+)
+def test_values_that_no_sensor_measures_are_flagged_and_counted_and_the_rest_is_kept(tmp_path, name, value):
+    made = recorded(tmp_path, with_arrays(**{name: value}))
+    rows = np.flatnonzero(made.flags & np.uint32(Flag.INCOMPLETE))
+    assert len(rows) == 3
+    assert made.camera["recording"]["broken"] == {name: 3}
+    assert np.isfinite(made.depth_mm).all()
+    assert np.isfinite(made.force_n).all()
+    if name == "depth_mm":
+        np.testing.assert_array_equal(made.valid[rows[0]], ~np.eye(3, dtype=bool))
+        np.testing.assert_allclose(made.depth_mm[rows[0]][made.valid[rows[0]]], 0.5, atol=5e-4)
+        assert made.valid[[i for i in range(len(made)) if i not in rows]].all()
+
+
+def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
+    made = recorded(tmp_path, with_arrays(depth_mm=np.zeros((4, 4), np.float32)))
+    assert made.camera["recording"]["left_out"] == 3
+    assert np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP)).tolist() == [19]
+
+
+def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):
+    assert recorded(tmp_path, lambda s: dataclasses.replace(s, device_time_ns=10**20)).device_time_ns is None
+
+
+class Heavy(Scale):
+    """A force sensor of a larger range: 70 N and 600 N mm are nothing unusual to it."""
+
+    def drain(self):
+        arrays = {"force_n": np.array([70.0, 0, 1.0], np.float32), "moment_nmm": np.array([0, 600, 0], np.float32)}
+        return [Sample(host_time_ns=s.host_time_ns, arrays=arrays) for s in super().drain()]
+
+
+def test_forces_and_moments_past_16_bits_are_kept(tmp_path):
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand)], Heavy(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    np.testing.assert_array_equal(made.force_n[5], np.array([70, 0, 0], np.float32))
+    np.testing.assert_array_equal(made.moment_nmm[5], np.array([0, 600, 0], np.float32))
+    assert not (made.flags & np.uint32(Flag.INCOMPLETE)).any()
+
+
+def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):
+    hand = Hand()
+    refuse = lambda writer, sequences: (_ for _ in ()).throw(SchemaError("frames is None: refused for the test"))
+    with monkeypatch.context() as patched:
+        patched.setattr("sensors_io.records.RecordWriter.write_contact", refuse)
+        with pytest.raises(SchemaError, match=r"nothing is lost: .*cup-0-press-0\.refused"):
+            record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
+    assert [p.name for p in (tmp_path / ".journals").iterdir()] == ["cup-0-press-0.refused"]
+    hand = Hand()
+    assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
+
+
+def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch):
+    hand = Hand()
+
+    def damaged(store, i):
+        raise CorruptRecordsError("the entry's checksum does not hold")
+
+    monkeypatch.setattr("sensors_io.records.RecordStore.contact", damaged)
+    with pytest.raises(CorruptRecordsError):
+        record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
+    assert len(list(pathlib.Path(tmp_path / ".journals").glob("*.journal"))) == 2
