@@ -8,8 +8,9 @@ fields and forces as int16 counts of a recorded scale:
 
     counts = round(x / scale),   scale = the smallest power of two with max|x| ≤ 32767 · scale
 
-The error is at most scale/2 and must not exceed `TOLERANCE`; forces and moments past that range are stored as float32.  A power of two makes decoding exact in float32, so that
-storing a decoded sequence again gives the same bytes: copies of a data set never drift.
+The error is at most scale/2 and must not exceed `TOLERANCE`; forces and moments past that range are stored as float32.
+A power of two makes decoding exact in float32, so that storing a decoded sequence again gives the same bytes: copies of
+a data set never drift.
 
 Entries of the first version, TCH1, stored their frames as they are and are read as well.
 """
@@ -125,8 +126,8 @@ def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float
     scale = math.ldexp(1.0, exponent - (mantissa == 0.5))
     if scale > 2 * TOLERANCE[name]:
         raise SchemaError(
-            f"{where}: {name} reaches {top:g}: int16 carries at most {WIDEST[name]:g} at an error of {TOLERANCE[name]:g}; "
-            "check the unit or drop the broken frames"
+            f"{where}: {name} reaches {top:g}: int16 carries at most {WIDEST[name]:g} at an error of "
+            f"{TOLERANCE[name]:g}; check the unit or drop the broken frames"
         )
     return np.rint(x / np.float32(scale)).astype(np.int16), scale
 

@@ -14,7 +14,7 @@ from sensors_io.devices.tac3d import PORT, Tac3dConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Devices:
-    """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T at a given address answers."""
+    """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T answers at its address."""
 
     tac3d_port: int = PORT
     """On which the vendor's program of a Tac3D sends."""

@@ -158,9 +158,7 @@ def read_pickle(path: pathlib.Path) -> Any:
 def _load(stream: io.BytesIO) -> Any:
     """The object that follows, its stand-ins replaced by the arrays that they checked."""
     start = stream.tell()
-    operations = 0
-    for opcode, argument, _ in pickletools.genops(stream):
-        operations += 1
+    for operations, (opcode, argument, _) in enumerate(pickletools.genops(stream), 1):
         # the unpickler allocates a table as long as the greatest number that an object is remembered by
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > operations:
             raise pickle.UnpicklingError(f"object {argument} is remembered after {operations} operations")

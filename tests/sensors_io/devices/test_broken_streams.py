@@ -102,7 +102,7 @@ def test_a_broken_sample_is_lost_once():
 
 def test_a_repeated_replay_keeps_the_gaps_of_the_recording(tmp_path):
     np.savez(tmp_path / "a.npz", index=[3, 4, 7], sendTimestamp=[0.0, 0.03, 0.12])
-    with Replay(Tac3dRecording(path=tmp_path / "a.npz"), seconds=0.3, clock=JumpingClock()) as device:
+    with Replay(Tac3dRecording(path=tmp_path / "a.npz"), seconds=0.4, clock=JumpingClock()) as device:
         assert [device.read(1.0).index for _ in range(6)] == [3, 4, 7, 8, 9, 12]
 
 
@@ -115,8 +115,11 @@ def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
                 time.sleep(0.01)
                 yield datagram
 
-    with sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _), config.open() as device:
-        with pytest.warns(WrongRateWarning, match="rate_hz is 1000"):
-            stamps = [device.read(5.0).device_time_ns for _ in range(60)]
+    with (
+        sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _),
+        config.open() as device,
+        pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
+    ):
+        stamps = [device.read(5.0).device_time_ns for _ in range(60)]
     assert stamps[0] == 0
-    assert stamps[-30:] == [None] * 30
+    assert stamps[-5:] == [None] * 5

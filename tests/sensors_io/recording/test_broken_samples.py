@@ -34,7 +34,7 @@ def with_arrays(**arrays):
 
 def recorded(out, change, config=FREE):
     hand = Hand()
-    record_session(out, config, [Odd(hand, change)], None, show=hand.show)
+    record_session(out, config, [Camera(hand), Odd(hand, change)], None, show=hand.show)
     return RecordStore(out).contact(0)["tac3d"]
 
 
