@@ -10,7 +10,6 @@ import hypothesis
 import jax
 import pytest
 
-from experiments.core.machine import FLAGS, compiled_quickly
 from tests.typecheck import install
 
 install("touchr1_jax")
@@ -44,6 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
     Most of XLA's optimisations are left out: they take longer here than all the arithmetic.  A worker's products of
     matrices keep to one thread: each has a core, and threads that wait for that of another take eight times as long.
     """
+    from touchr1_jax.training.compilation import FLAGS, compiled_quickly  # after `install`, which checks its imports
+
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if LEAN not in os.environ.get(FLAGS, ""):  # else this is a worker, with the environment of its session
         os.environ[FLAGS] = f"{os.environ.get(FLAGS, '')} {LEAN}".strip()

@@ -40,7 +40,10 @@ def jsonable(value: Any, where: str = "value") -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name), f"{where}.{f.name}") for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {_key(key, where): jsonable(item, f"{where}.{key}") for key, item in value.items()}
+        for key in value:
+            if not isinstance(key, str):
+                raise ValueError(f"{where} has the key {key!r}: keys must be strings in JSON; rename it")
+        return {key: jsonable(item, f"{where}.{key}") for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [jsonable(item, f"{where}[{i}]") for i, item in enumerate(value)]
     if hasattr(value, "__array__"):  # NumPy and JAX arrays and scalars alike
@@ -106,9 +109,3 @@ def point_link(link: Path, target: str) -> None:
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)
     os.replace(temporary, link)
-
-
-def _key(key: Any, where: str) -> str:
-    if not isinstance(key, str):
-        raise ValueError(f"{where} has the key {key!r}: keys must be strings in JSON; rename it")
-    return key

@@ -9,15 +9,9 @@ A chart is a sequence of `Panel`s, a panel a sequence of `Series`:
         )
     ])
 
-- Lines, points and both: `Series.line`, `Series.marker`.  `low` and `high` add intervals, with `band=True` a band.
-- `estimates` makes a series from `statistics.Interval` or `results.Estimate`.
-- Series of one name have one colour, one marker and one entry in the legend in all panels; unnamed ones have no entry.
-- `Panel.rows` names rows from the top in place of a y axis: for bars (`Series.bar`) and for intervals of named things.
-- `Series.labels` writes a name at each point where it hides neither points nor other names.
-- `Rule` draws a bound: a line across the panel, or a corner where x and y must both be kept.
-
-`bars` and `speed_against_error` are charts that many experiments share.  `experiments.core.pictures` draws matrices and
-grids of pictures.
+Series of one name have one colour, one marker and one entry in the legend in all panels; unnamed ones have no entry.
+`estimates` makes a series from `statistics.Interval` or `results.Estimate`; `bars` and `speed_against_error` are charts
+that many experiments share.  `experiments.core.pictures` draws matrices and grids of pictures.
 """
 
 import dataclasses
@@ -128,7 +122,7 @@ class Panel:
       x_scale, y_scale: "symlog" is linear up to `linear_to`, logarithmic beyond.
       x_limits, y_limits: ends of the axes; an end that is `None` follows the data.
       x_ticks, y_ticks: position → text; by default matplotlib's choice.
-      x_format, y_format: of the ticks, such as "{x:.0%}".
+      y_format: of its ticks, such as "{x:.0%}".
       rules: bounds.
       rows: names of rows from the top, in place of a y axis.
       stacked: whether bars of several series are put end to end.
@@ -147,7 +141,6 @@ class Panel:
     y_limits: tuple[float | None, float | None] = (None, None)
     x_ticks: Mapping[float, str] | None = None
     y_ticks: Mapping[float, str] | None = None
-    x_format: str = ""
     y_format: str = ""
     rules: Sequence[Rule] = ()
     rows: Sequence[str] = ()
@@ -204,23 +197,18 @@ def bars(
     bounds: Sequence[float] = (),
     logarithmic: bool = False,
 ) -> bytes:
-    """Draw one bar for each name, its figure written at its end, as SVG.
-
-    Args:
-      values: name → figure, from the top; above 0 where the axis is logarithmic.
-      label: of the axis, with the unit.
-      written: format of a figure.
-      bounds: drawn as dotted lines.
-      logarithmic: whether equal distances are equal ratios.
-    """
-    figures, series = (*values.values(), *bounds), Series(x=list(values.values()), bar=True)
-    limits = (min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, 1.12 * max(figures))
-    scale: Scale = "log" if logarithmic else "linear"
-    rules = [Rule(x=bound) for bound in bounds]
-    rows = list(values)
-    return draw(
-        [Panel([series], rows=rows, x_label=label, x_scale=scale, x_limits=limits, rules=rules, written=written)]
+    """Draw one bar for each name, its figure written at its end in the format `written`; bounds are dotted lines."""
+    figures = (*values.values(), *bounds)
+    panel = Panel(
+        [Series(x=list(values.values()), bar=True)],
+        rows=list(values),
+        x_label=label,
+        x_scale="log" if logarithmic else "linear",
+        x_limits=(min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, 1.12 * max(figures)),
+        rules=[Rule(x=bound) for bound in bounds],
+        written=written,
     )
+    return draw([panel])
 
 
 Point = tuple[str, float, float, float]
@@ -290,7 +278,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         _draw_rule(axes, rule)
     if panel.x_limits != (None, None):  # else it would end the autoscaling of an axis that panels share
         axes.set_xlim(*panel.x_limits)
-    _set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks, panel.x_format)
+    _set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks)
     if not panel.rows:
         if panel.y_limits != (None, None):
             axes.set_ylim(*panel.y_limits)
@@ -348,7 +336,7 @@ def _draw_rule(axes: Axes, rule: Rule) -> None:
         axes.axhline(rule.y, **look)
 
 
-def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str) -> None:
+def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str = "") -> None:
     """The ticks given, else matplotlib's; on a short logarithmic axis also 2 and 5 times the powers of ten."""
     if ticks is not None:
         axis.set_ticks(list(ticks), list(ticks.values()))
@@ -380,6 +368,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 
 def _write_labels(axes: Axes, panel: Panel) -> None:
     texts, points = [], []
+    line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
     behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # legible on lines that it crosses
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
@@ -390,7 +379,5 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
                 texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=behind))
     if texts:
-        line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
-        adjust_text(
-            texts, *zip(*points, strict=True), ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS
-        )
+        x, y = zip(*points, strict=True)
+        adjust_text(texts, x, y, ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS)

@@ -11,10 +11,8 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from experiments.core import runs
+from experiments.core import new, runs
 from experiments.core.artifacts import DamagedFileError
-from experiments.core.history import PastRun, locate, read_run, summary
-from experiments.core.new import FAMILY, NewError, write_new
 
 PROG = "python -m experiments"
 
@@ -26,9 +24,6 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
 
 COMMANDS = ("list", "new", "compare")
 """Names that no experiment can have."""
-
-ANSWER = "<perceive> xense soft </perceive> <compare> soft </compare> <conclude> soft </conclude>"
-"""An answer to try a reward on."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,8 +56,7 @@ def find(package: str) -> dict[str, CatalogueEntry]:
             if path.stem in found:
                 raise ValueError(f"{module} has the name of {found[path.stem].module}: names are unique; rename one")
             question = (ast.get_docstring(tree) or "").partition("\n")[0]
-            family = parts[0] if len(parts) > 1 else ""
-            found[path.stem] = CatalogueEntry(module=module, family=family, question=question)
+            found[path.stem] = CatalogueEntry(module=module, family="/".join(parts[:-1]), question=question)
     return dict(sorted(found.items(), key=lambda item: (item[1].family, item[0])))
 
 
@@ -85,12 +79,12 @@ class ListCommand:
         """Print the list and return the exit status."""
         entries = find(package)
         if self.name and self.name not in entries:
-            print_error(unknown_name(self.name, entries))
+            print_error(_unknown_name(self.name, entries))
             return 2
         if self.name:
-            print_lines(listing_of_runs(self.name, entries[self.name].question, self.runs_dir))
+            print_lines(*_listing_of_runs(self.name, entries[self.name].question, self.runs_dir))
         else:
-            print_lines(listing(entries, self.runs_dir))
+            print_lines(_listing(entries, self.runs_dir))
         return 0
 
 
@@ -108,32 +102,15 @@ class NewCommand:
     def run(self, package: str) -> int:
         """Write the files, print the next steps, and return the exit status."""
         folders = (path.name for path in (self.root / "experiments").glob("*/"))
+        taken = {*COMMANDS, *folders, *find(package)}
         try:
-            made, changed = write_new(
-                self.root, self.name, reward=self.reward, taken={*COMMANDS, *folders, *find(package)}
-            )
-        except (NewError, OSError) as error:
+            made, changed = new.write_new(self.root, self.name, reward=self.reward, taken=taken)
+        except (new.NewError, OSError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
-        lines = [f"made     {path}" for path in made] + [f"changed  {path}" for path in changed]
-        print_lines(*lines, "", "The experiment runs as it is.  Next:", *(f"  {step}" for step in self._next_steps()))
+        print_lines(*(f"made     {path}" for path in made), *(f"changed  {path}" for path in changed))
+        print_lines("", "The experiment runs as it is.  Next:", *new.next_steps(self.name, reward=self.reward))
         return 0
-
-    def _next_steps(self) -> Sequence[str]:
-        run = [
-            f"edit {FAMILY}/{self.name}.py: its question, its arms, the result that you expect",
-            f'make experiment EXP={self.name} ARGS="--scale smoke"',
-            f"make experiment EXP={self.name}",
-        ]
-        if not self.reward:
-            return run
-        return [
-            f"edit touchr1_jax/rewards/{self.name}.py: the formula, in its docstring and below",
-            f"edit tests/touchr1_jax/rewards/test_{self.name}.py: its hand values",
-            f"python -m pytest tests/touchr1_jax/rewards/test_{self.name}.py",
-            f'python -m touchr1_jax.rewards explain --weights {self.name} 1 --text "{ANSWER}"',
-            *run,
-        ]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -156,7 +133,7 @@ class CompareCommand:
         from experiments.core.compare import ComparisonError, compare_runs  # SciPy, which no other command needs
 
         try:
-            a, b = (read_run(locate(name, self.runs_dir)) for name in (self.run_a, self.run_b))
+            a, b = (runs.read_run(runs.locate(name, self.runs_dir)) for name in (self.run_a, self.run_b))
             print_lines(compare_runs(a, b, self.most))
         except (ComparisonError, DamagedFileError, FileNotFoundError) as error:
             print_error(f"{type(error).__name__}: {error}")
@@ -177,54 +154,51 @@ def run_command(arguments: Sequence[str], package: str) -> int | None:
         return tyro.cli(Command, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,)).run(package)
     entries = find(package)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print_lines(USAGE, listing(entries))
+        print_lines(USAGE, _listing(entries))
         return 0 if arguments else 2
     if arguments[0] in entries:
         return None
-    print_error(f"{unknown_name(arguments[0], entries)}\n{listing(entries)}")
+    print_error(f"{_unknown_name(arguments[0], entries)}\n{_listing(entries)}")
     return 2
 
 
-def unknown_name(name: str, entries: Mapping[str, CatalogueEntry]) -> str:
-    """The error for a name that no experiment has."""
+def _unknown_name(name: str, entries: Mapping[str, CatalogueEntry]) -> str:
     close = difflib.get_close_matches(name, entries)
     return f"There is no experiment {name!r}." + (f" Did you mean {' or '.join(close)}?" if close else "")
 
 
-def listing(entries: Mapping[str, CatalogueEntry], runs_dir: Path | None = None) -> str:
+def _listing(entries: Mapping[str, CatalogueEntry], runs_dir: Path | None = None) -> str:
     """Experiments by family; with a folder of runs, below each one its newest run and the start of its verdict."""
     lines: list[str] = []
-    width = max(map(len, entries), default=0)
-    for family in dict.fromkeys(entry.family for entry in entries.values()):
-        lines += ["", f"{family}:"] if family else []
-        for name in (name for name, entry in entries.items() if entry.family == family):
-            lines.append(f"  {name:<{width}}  {entries[name].question}")
-            past, damaged = _readable(runs_dir / name) if runs_dir else ([], [])
-            for run in past[:1]:
-                more = f" (and {len(past) - 1} more)" if len(past) > 1 else ""
-                lines.append(f"  {'':<{width}}    {summary(run)}{more}  {' '.join(run.outcome[:1])}".rstrip())
-            lines += [f"  {'':<{width}}    {complaint}" for complaint in damaged]
+    width, family = max(map(len, entries), default=0), ""
+    for name, entry in entries.items():
+        lines += ["", f"{entry.family}:"] if entry.family != family else []
+        lines.append(f"  {name:<{width}}  {entry.question}")
+        family, (past, damaged) = entry.family, _past_runs(runs_dir / name) if runs_dir else ([], [])
+        more = f" (and {len(past) - 1} more)" if len(past) > 1 else ""
+        newest = [f"{run.summary}{more}  {' '.join(run.outcome[:1])}".rstrip() for run in past[:1]]
+        lines += [f"  {'':<{width}}    {line}" for line in newest + damaged]
     return "\n".join(lines).strip("\n")
 
 
-def listing_of_runs(name: str, question: str, runs_dir: Path) -> str:
+def _listing_of_runs(name: str, question: str, runs_dir: Path) -> list[str]:
     """Every run of one experiment with its whole verdict, the newest first."""
-    past, damaged = _readable(runs_dir / name)
+    past, damaged = _past_runs(runs_dir / name)
     lines = [f"{name}: {question}"]
     for run in past:
         report = run.directory / "report.html"
-        lines += [f"  {summary(run)}", *(f"      {sentence}" for sentence in run.outcome)]
+        lines += [f"  {run.summary}", *(f"      {sentence}" for sentence in run.outcome)]
         lines += [f"      report: {report}"] if report.exists() else []
     lines += [f"  {complaint}" for complaint in damaged]
-    return "\n".join(lines if len(lines) > 1 else [*lines, f"  has not run under {runs_dir}"])
+    return lines if len(lines) > 1 else [*lines, f"  has not run under {runs_dir}"]
 
 
-def _readable(home: Path) -> tuple[list[PastRun], list[str]]:
+def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
     """The readable runs under `runs/NAME`, the newest first, and the errors of the others."""
     past, damaged = [], []
-    for directory in sorted(runs.started(home), reverse=True):
+    for directory in runs.started(home):
         try:
-            past.append(read_run(directory))
+            past.append(runs.read_run(directory))
         except (DamagedFileError, FileNotFoundError) as error:
             damaged.append(str(error))
     return past, damaged

@@ -1,21 +1,19 @@
 """Comparison of two runs: settings, code, machine, and every figure that differs."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
-from experiments.core.history import PastRun, summary
-from experiments.core.runs import continuing
+from experiments.core.runs import PastRun, continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
 
 Verdict = Literal["0 lies outside", "differs", "only in A", "only in B", "may be chance", "same"]
-"""With paired seeds: 0 lies outside the interval of the difference, or the difference may be chance; else `differs`."""
+"""With paired seeds: 0 lies outside the interval of the difference, or the difference may be chance; else `differs`.
 
-VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-"""The most important first."""
+The most important is the first."""
 
 CHANCE = 0.05
 """Rate at which a 95 % interval of no difference excludes 0."""
@@ -61,26 +59,22 @@ def compare_runs(a: PastRun, b: PastRun, most: int) -> str:
                 f"continue it with: {continuing(run.description['command'])}"
             )
     figures = list(compare_results(a.results or {}, b.results or {}))
-    if not any(f.verdict not in ("only in A", "only in B") for f in figures):
+    if all(f.verdict in ("only in A", "only in B") for f in figures):
         raise ComparisonError(
             f"{a.directory} ({a.name}) and {b.directory} ({b.name}) have no figure in common; "
             "compare two runs of one experiment"
         )
-    cost_a, cost_b = (ABSENT if run.seconds is None else duration(run.seconds) for run in (a, b))
-    return "\n\n".join(
-        [
-            aligned([("A", a.name, summary(a)), ("B", b.name, summary(b))]),
-            _differences(
-                "Different settings", *({"scale": r.description["scale"]} | r.description["config"] for r in (a, b))
-            ),
-            _differences(
-                "Different code or machine",
-                *({"code": r.code} | r.description["versions"] | r.description["machine"] for r in (a, b)),
-            ),
-            _figures_block(figures, most),
-            f"Cost: A {cost_a}, B {cost_b}",
-        ]
-    )
+    settings = ({"scale": r.description["scale"]} | r.description["config"] for r in (a, b))
+    code = ({"code": r.code} | r.description["versions"] | r.description["machine"] for r in (a, b))
+    cost = (ABSENT if run.seconds is None else duration(run.seconds) for run in (a, b))
+    parts = [
+        aligned([("A", a.name, a.summary), ("B", b.name, b.summary)]),
+        _differences("Different settings", *settings),
+        _differences("Different code or machine", *code),
+        _figures_block(figures, most),
+        "Cost: A {}, B {}".format(*cost),
+    ]
+    return "\n\n".join(parts)
 
 
 def compare_results(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[ComparedFigure]:
@@ -91,13 +85,6 @@ def compare_results(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[Comp
         if where in one and where in two:
             change, verdict = _compare(one[where], two[where])
         yield ComparedFigure(where, _shown(one.get(where)), _shown(two.get(where)), change, verdict)
-
-
-def flat(value: Any, name: str = "") -> dict[str, Any]:
-    """The leaves of nested objects by dotted name; a list is a leaf."""
-    if not isinstance(value, Mapping):
-        return {name: value}
-    return {key: leaf for k, item in value.items() for key, leaf in flat(item, f"{name}.{k}" if name else k).items()}
 
 
 def _figures(results: Mapping[str, Any]) -> dict[str, Any]:
@@ -140,14 +127,14 @@ def _shown(value: Any) -> str:
     return ABSENT if value is None else str(value)
 
 
-def _figures_block(figures: Sequence[ComparedFigure], most: int) -> str:
+def _figures_block(figures: list[ComparedFigure], most: int) -> str:
     """The number of figures of each verdict, and the figures that differ."""
-    counts = {verdict: sum(f.verdict == verdict for f in figures) for verdict in VERDICTS}
+    counts = {verdict: sum(f.verdict == verdict for f in figures) for verdict in get_args(Verdict)}
     head = f"{len(figures)} figures; " + "; ".join(f"{verdict}: {count}" for verdict, count in counts.items() if count)
     paired = counts["0 lies outside"] + counts["may be chance"]
     if paired:
         head += f" (of {paired} intervals, chance alone excludes 0 from {paired * CHANCE:.1f})"
-    differing = sorted((f for f in figures if f.verdict != "same"), key=lambda f: VERDICTS.index(f.verdict))
+    differing = sorted((f for f in figures if f.verdict != "same"), key=lambda f: list(counts).index(f.verdict))
     if not differing:
         return head
     left = f"\n… and {len(differing) - most} more; --most shows them" if len(differing) > most else ""
@@ -156,10 +143,19 @@ def _figures_block(figures: Sequence[ComparedFigure], most: int) -> str:
 
 def _differences(title: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> str:
     """The leaves of two nested mappings that are not equal."""
-    one, two = flat(a), flat(b)
+    one, two = (dict(_leaves(tree)) for tree in (a, b))
     rows = [
         (key, str(one.get(key, ABSENT)), str(two.get(key, ABSENT)))
         for key in one | two
         if key not in one or key not in two or one[key] != two[key]
     ]
     return f"{title}:\n{aligned([('', 'A', 'B'), *rows])}" if rows else f"{title}: nothing"
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted names and values of the leaves of nested objects; a list is a leaf."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

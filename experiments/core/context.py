@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
-from experiments.core.distributed import SINGLE_PROCESS, ProcessGroup, SingleDevice
-from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, progress
+from experiments.core.machine import SINGLE_PROCESS, ProcessGroup, SingleDevice
+from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, show_progress
 from experiments.core.stopping import Stopping
 
 T = TypeVar("T")
@@ -26,13 +26,9 @@ _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-
 
 
 class MetricLog:
-    """`metrics.jsonl`: one line per logged step, the same file whether or not the run was ever interrupted.
+    """`metrics.jsonl`: one line per logged step, each passed to the watchers.
 
-    Lines hold no clock, so that an interrupted and an uninterrupted run can be compared byte for byte.
-
-    Args:
-      path: of the file.
-      watchers: called with every line.
+    Lines hold no clock: the file is the same, byte for byte, whether or not the run was ever interrupted.
     """
 
     def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
@@ -46,7 +42,8 @@ class MetricLog:
         """Drop the lines of a stage at or past a step: they are about to be computed again."""
         self._seen.add(stage)
         lines = _whole_lines(self._path)
-        kept = [line for line in lines if _before(_row(line, self._path), stage, step)]
+        before = lambda row: row["stage"] != stage or row["step"] < step
+        kept = [line for line in lines if before(_row(line, self._path))]
         if len(kept) < len(lines):
             self._file.close()
             write_text(self._path, "".join(kept))
@@ -103,6 +100,7 @@ class Context:
         devices: SingleDevice | None = None,
     ) -> None:
         self.directory = directory
+        self._timing_file = directory / "timing.json"
         self.cache_dir = cache_dir
         self.console = console
         self.stopping = stopping or Stopping()
@@ -149,13 +147,18 @@ class Context:
         """
         loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops))
         self.loops.append(loop)
+
+        def notify() -> None:
+            for watcher in self._watchers:
+                watcher.looping(self.loops)
+
         try:
-            self._looping()
-            with progress(self.console, loop, self._looping) as advance:
+            notify()
+            with show_progress(self.console, loop, notify) as advance:
                 yield advance
         finally:
             self.loops.remove(loop)
-        self._looping()
+        notify()
 
     def each(self, title: str, items: Iterable[T], *, still: bool = False) -> Iterator[T]:
         """Yield the items under a progress bar; an item counts as done when the next one is requested."""
@@ -176,15 +179,15 @@ class Context:
         The first report opens the bar; steps done by then do not count into the rate.
         """
         with contextlib.ExitStack() as stack:
-            bar: list[Advance] = []
+            advance: Advance | None = None
             seen = 0
 
             def report(done: int, total: int) -> None:
-                nonlocal seen
-                if not bar:
-                    bar.append(stack.enter_context(self.progress(title, total, done, still=still)))
+                nonlocal advance, seen
+                if advance is None:
+                    advance = stack.enter_context(self.progress(title, total, done, still=still))
                 elif done > seen:
-                    bar[0](done - seen)
+                    advance(done - seen)
                 seen = done
 
             yield report
@@ -202,10 +205,6 @@ class Context:
         if missing:
             how = f"of stage {stage} {len(missing)} of {steps} steps are missing, the first is {missing[0]}"
             raise _damaged(self.directory / "metrics.jsonl", how)
-
-    def _looping(self) -> None:
-        for watcher in self._watchers:
-            watcher.looping(self.loops)
 
     def checkpoint_dir(self, stage: str) -> Path:
         """The directory of a stage's checkpoints, created."""
@@ -238,7 +237,6 @@ class Context:
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Add the wall time of the block to the stage's in `timing`, which adds up over interruptions."""
-        _checked(stage)
         start = time.monotonic()
         try:
             yield
@@ -266,10 +264,6 @@ class Context:
             self._log.close()
         for watcher in self._watchers:
             watcher.closed()
-
-    @property
-    def _timing_file(self) -> Path:
-        return self.directory / "timing.json"
 
     def _stage_file(self, stage: str) -> Path:
         path = self.directory / "stages" / _checked(stage)
@@ -302,10 +296,6 @@ def _row(line: str, path: Path) -> dict[str, Any]:
 
 def _damaged(path: Path, how: str) -> DamagedFileError:
     return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start a new run with --fresh")
-
-
-def _before(row: dict[str, Any], stage: str, step: int) -> bool:
-    return row["stage"] != stage or row["step"] < step
 
 
 def _checked(stage: str) -> str:

@@ -17,17 +17,21 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 
 def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:
-    """Sort logged lines into phase → scalar → (arm, seed) → curve; the arm is empty where the stage names none."""
-    points: dict[str, dict[str, dict[tuple[str, str], list[tuple[int, float]]]]] = {}
+    """Sort logged lines into phase → scalar → (arm, seed) → curve; the arm is empty where the stage names none.
+
+    Of several lines with one step the last counts.
+    """
+    points: dict[str, dict[str, dict[tuple[str, str], dict[int, float]]]] = {}
     for line in rows:
         phase, *middle = line["stage"].split("/")
         seed = middle.pop() if middle else "0"
         for name, value in line.items():
             if name not in ("stage", "step") and isinstance(value, int | float):
                 series = points.setdefault(phase, {}).setdefault(name, {})
-                series.setdefault(("/".join(middle), seed), []).append((line["step"], float(value)))
+                series.setdefault(("/".join(middle), seed), {})[line["step"]] = float(value)
+    curve = lambda found: (np.array(sorted(found)), np.array([found[step] for step in sorted(found)]))
     return {
-        phase: {name: {key: _curve(p) for key, p in series.items()} for name, series in scalars.items()}
+        phase: {name: {key: curve(found) for key, found in series.items()} for name, series in scalars.items()}
         for phase, scalars in points.items()
     }
 
@@ -67,12 +71,7 @@ def draw_phases(
 
 
 def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:
-    """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm.
-
-    Args:
-      scalars: scalar → (arm, seed) → curve, of one phase.
-      colour: that of each arm; a curve of no arm is grey.
-    """
+    """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm."""
     columns = min(3, len(scalars))
     panels = [
         Panel(_seeds_and_means(series, colour), title=name, x_label="step" if i >= len(scalars) - columns else "")
@@ -104,11 +103,8 @@ def accuracy_against_middle(
     series = [s for name, row in arms.items() for s in _point(name, row, colour[name], "o")]
     for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
         series += _point(name, row, SHARED, marker)
-    labels: dict[str, Any] = {
-        "x_label": f"{METRICS['middle_rate'].meaning} (%)",
-        "y_label": f"{METRICS['acc'].title} (%)",
-    }
-    return draw([Panel(series, **labels)], size=(6.6, 3.9)) if series else None
+    x_label, y_label = f"{METRICS['middle_rate'].meaning} (%)", f"{METRICS['acc'].title} (%)"
+    return draw([Panel(series, x_label=x_label, y_label=y_label)], size=(6.6, 3.9)) if series else None
 
 
 def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> list[Series]:
@@ -132,10 +128,3 @@ def running_mean(values: np.ndarray) -> np.ndarray:
     low = np.maximum(np.arange(len(values)) - half, 0)
     high = np.minimum(np.arange(len(values)) + half + 1, len(values))
     return (total[high] - total[low]) / (high - low)
-
-
-def _curve(points: Sequence[tuple[int, float]]) -> Curve:
-    """Sorted by step; of several lines with one step the last counts."""
-    last = dict(points)
-    steps = sorted(last)
-    return np.array(steps), np.array([last[s] for s in steps])

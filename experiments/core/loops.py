@@ -15,10 +15,8 @@ KEPT = "kept"
 """Stages whose results say how much of a stage's adapters is in the merged weights (see `lora.kept_share`)."""
 
 
-def plain_log(context: Context, stage: str, start: int) -> Log:
-    """Log the metrics of each step unchanged."""
-    del start
-    return lambda t, metrics: context.log(stage, t, **metrics)
+MakeLog = Callable[[Context, str, int], Log]
+"""From the run, a stage and its first step to what receives (step, metrics)."""
 
 
 @contextlib.contextmanager
@@ -27,7 +25,7 @@ def stage_hooks(
     stage: str,
     steps: int,
     *,
-    make_log: Callable[[Context, str, int], Log] = plain_log,
+    make_log: MakeLog | None = None,
     scored: bool = False,
 ) -> Iterator[Hooks]:
     """Hooks that make a training stage part of a run; inside the block the stage is timed.
@@ -36,14 +34,13 @@ def stage_hooks(
       context: the run.
       stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
       steps: of the whole stage, for the progress bar.
-      make_log: from context, stage and first step to what receives (step, metrics).
+      make_log: by default the metrics are logged unchanged.
       scored: keep the checkpoint of the highest held-out score too.
     """
     times, logs = LoopTime(), list[Log]()
+    folder = context.checkpoint_dir(stage)
     with (
-        Checkpoints(
-            context.checkpoint_dir(stage), better="higher" if scored else None, say=context.print
-        ) as checkpoints,
+        Checkpoints(folder, better="higher" if scored else None, say=context.print) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         contextlib.ExitStack() as bar,
@@ -52,7 +49,9 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
-            write = make_log(context, stage, start)
+            write: Log = lambda t, metrics: context.log(stage, t, **metrics)
+            if make_log is not None:
+                write = make_log(context, stage, start)
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps)))
 
             def log(t: int, metrics: dict[str, float]) -> None:
@@ -74,9 +73,8 @@ def stage_hooks(
         if times.steps:
             context.add_time(f"{STEPPING}/{stage}", times.total_s)
             context.add_time(f"{WAITING}/{stage}", times.input_s)
-            context.print(
-                f"{stage}: {1e3 * times.total_s / times.steps:.3g} ms a step, {times.input_share:.2%} of it {WAITING}"
-            )
+            ms = 1e3 * times.total_s / times.steps
+            context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
 
 
 def run_loop(
@@ -87,14 +85,9 @@ def run_loop(
     context: Context,
     stage: str,
     *,
-    make_log: Callable[[Context, str, int], Log] = plain_log,
+    make_log: MakeLog | None = None,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
-    """`fit` with `stage_hooks`: a stopped stage goes on from its newest checkpoint and ends in the same state.
-
-    Args:
-      step, state, batches, loop, held_out: as in `fit`.
-      context, stage, make_log: as in `stage_hooks`.
-    """
+    """Call `fit` with `stage_hooks`: a stopped stage goes on from its newest checkpoint and ends in the same state."""
     with stage_hooks(context, stage, loop.steps, make_log=make_log, scored=held_out is not None) as hooks:
         return fit(step, state, batches, loop, hooks, held_out=held_out)

@@ -1,19 +1,156 @@
-"""The machine of a run: the accelerators that a scale needs, and quick compilation for scales that run briefly."""
+"""The machine of a run: its processes, its devices, and the accelerators that a scale needs.
 
-import contextlib
+    python -m experiments NAME --distributed --mesh.fsdp 8                                  Slurm, MPI, Kubernetes
+    python -m experiments NAME --distributed --mesh.fsdp 8 --coordinator HOST:PORT --processes N --process I
+
+Every process runs the same program.  Process 0 alone writes files; the others wait where a file decides the next step.
+All must see the same run and cache directories, as over a network file system.
+"""
+
 import dataclasses
-import os
-from collections.abc import Iterator
+import json
+from collections.abc import Callable
+from typing import Any
 
 import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.placement import DeviceMesh
+from touchr1_jax.training.loop import SingleDevice
 
 GIB = 2**30
 
-OLDER_LOOPS = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
-"""Flag of XLA: the older of its two ways to write a fused loop, as long as it exists, compiles twice as fast."""
+MESSAGE_BYTES = 8192
+"""Longest value that process 0 can send to the others: twice Linux's longest path."""
 
-FLAGS = "XLA_FLAGS"
-"""Environment variable that XLA reads when it compiles its first program, and never again."""
+
+class ProcessesNotFoundError(RuntimeError):
+    """The other processes of a distributed run cannot be found."""
+
+
+class MachineError(Exception):
+    """A machine that has less than a scale needs; the message names both and the fix."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Launch:
+    """The processes and devices of a run.  No part of its configuration: it can continue on others.
+
+    Raises:
+      ValueError: an incomplete address, an address of a run that is not distributed, a process beyond the last.
+    """
+
+    distributed: bool = False
+    """Be one of several processes; Slurm, Open MPI or Kubernetes name the others."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, where no such system names it."""
+    processes: int | None = None
+    """Number of processes, where no such system names it."""
+    process: int | None = None
+    """Number of this process, from 0, where no such system names it."""
+    mesh: MeshConfig = MeshConfig()
+    """Mesh over the devices of all processes."""
+
+    def __post_init__(self) -> None:
+        address = {"coordinator": self.coordinator, "processes": self.processes, "process": self.process}
+        missing = [name for name, value in address.items() if value is None]
+        if missing and len(missing) < len(address):
+            raise ValueError(
+                f"{', '.join(missing)} is not given, and {address} are: must be all or none; give all three or none"
+            )
+        if not missing and not self.distributed:
+            raise ValueError(f"coordinator is {self.coordinator}, but the run is not distributed; add --distributed")
+        if self.processes is not None and not 0 <= (self.process or 0) < self.processes:
+            raise ValueError(f"process is {self.process}: must be 0 … {self.processes - 1}, one of the processes")
+
+
+@dataclasses.dataclass(frozen=True)
+class ProcessGroup:
+    """The processes of a run; with a single one JAX is never asked for others."""
+
+    count: int = 1
+    index: int = 0
+
+    @property
+    def writes(self) -> bool:
+        """True in the one process that writes files."""
+        return self.index == 0
+
+    def write_once(self, write: Callable[[], object]) -> None:
+        """Let process 0 write files, between two barriers; all processes must make the same calls.
+
+        Before the call every process sees the old files, after it every process sees the new ones.
+        """
+        self._barrier()
+        if self.writes:
+            write()
+        self._barrier()
+
+    def broadcast(self, choose: Callable[[], Any]) -> Any:
+        """Return in all processes the small JSON value that `choose` returns in process 0."""
+        if self.count == 1:
+            return choose()
+        letters = np.zeros(MESSAGE_BYTES, np.uint8)
+        if self.writes:
+            chosen = json.dumps(choose()).encode()
+            letters[: len(chosen)] = np.frombuffer(chosen, np.uint8)
+        return json.loads(bytes(multihost_utils.broadcast_one_to_all(letters)).rstrip(b"\0"))
+
+    def any(self, here: bool) -> bool:
+        """True if it is true in any process; with several it waits for their computations."""
+        return here if self.count == 1 else bool(np.any(multihost_utils.process_allgather(np.array(here))))
+
+    def split_work(self, rows: np.ndarray, make: Callable[[np.ndarray], Any]) -> Any:
+        """Return make(rows); each process computes a part.
+
+        Args:
+          rows: one entry for each piece of work; parts are contiguous, the last one padded with the last row.
+          make: from some rows to a tree of host arrays with one entry a row.
+        """
+        if self.count == 1:
+            return make(rows)
+        size = -(-len(rows) // self.count)
+        mine = np.minimum(np.arange(size) + self.index * size, len(rows) - 1)
+        made = multihost_utils.process_allgather(make(rows[mine]), tiled=True)
+        return jax.tree.map(lambda x: x[: len(rows)], made)
+
+    def _barrier(self) -> None:
+        if self.count > 1:
+            multihost_utils.sync_global_devices("experiments")
+
+
+SINGLE_PROCESS = ProcessGroup()
+
+
+def join_processes(launch: Launch) -> ProcessGroup:
+    """Join the processes of a run; must come before any computation.
+
+    Raises:
+      ProcessesNotFoundError: a distributed run without an address, and no cluster that JAX knows to name one.
+    """
+    if not launch.distributed:
+        return SINGLE_PROCESS
+    try:
+        jax.distributed.initialize(launch.coordinator, launch.processes, launch.process)
+    except ValueError as error:
+        raise ProcessesNotFoundError(
+            f"--distributed finds no other processes ({error}): start them with srun, mpirun or as an indexed "
+            "Kubernetes job, or give --coordinator HOST:PORT --processes N --process I in each"
+        ) from error
+    return ProcessGroup(jax.process_count(), jax.process_index())
+
+
+def select_devices(launch: Launch) -> SingleDevice:
+    """Select the devices of a run.
+
+    Raises:
+      ValueError: the mesh has another number of devices than the processes.
+    """
+    if launch.mesh.devices == 1 and not launch.distributed:
+        return SingleDevice()
+    return DeviceMesh(launch.mesh.build())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,10 +162,6 @@ class Accelerators:
 
     def __str__(self) -> str:
         return f"{self.number} accelerator{'s' if self.number > 1 else ''} of {self.memory_gib:g} GiB"
-
-
-class MachineError(Exception):
-    """A machine that has less than a scale needs; the message names both and the fix."""
 
 
 def require_accelerators(scale: str, needed: Accelerators | None, present: Accelerators | None = None) -> None:
@@ -60,25 +193,3 @@ def accelerators() -> Accelerators:
         return Accelerators(number=0, memory_gib=0.0)
     limits = [(d.memory_stats() or {}).get("bytes_limit", 0) for d in jax.local_devices()]
     return Accelerators(number=len(devices), memory_gib=min(limits) / GIB)
-
-
-@contextlib.contextmanager
-def compiled_quickly() -> Iterator[None]:
-    """Leave out most of XLA's optimisations inside the block: a training step compiles in a quarter of the time.
-
-    This pays for programs that run a few times only.  They compute the same up to rounding; their speed says nothing
-    about that of others.  The older loops stay chosen for the whole process where its first program is compiled inside
-    the block.
-    """
-    flags, before = os.environ.get(FLAGS), jax.config.values["jax_disable_most_optimizations"]
-    if OLDER_LOOPS not in (flags or ""):
-        os.environ[FLAGS] = f"{flags or ''} {OLDER_LOOPS}".strip()
-    jax.config.update("jax_disable_most_optimizations", True)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_disable_most_optimizations", before)
-        if flags is None:
-            os.environ.pop(FLAGS, None)
-        else:
-            os.environ[FLAGS] = flags

@@ -49,22 +49,32 @@ class Loop:
       total: steps of the whole loop.
       completed: steps of earlier sessions; they do not count into the rate.
       still: redraw with each step only, not ten times a second, which would take time from what is timed.
+      clock: seconds.
     """
 
-    def __init__(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> None:
+    def __init__(
+        self,
+        title: str,
+        total: int,
+        completed: int = 0,
+        *,
+        still: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.title, self.total, self.completed, self.still, self.note = title, total, completed, still, ""
-        self._began = self._first_call = (completed, time.monotonic())
+        self._clock = clock
+        self._began = self._first_call = (completed, clock())
 
     def advance(self, steps: int, note: str = "") -> None:
         """Count further steps as done."""
         self.completed, self.note = self.completed + steps, note
         if self._first_call is self._began:
-            self._first_call = (self.completed, time.monotonic())
+            self._first_call = (self.completed, self._clock())
 
     @property
     def elapsed_s(self) -> float:
         """Seconds since its beginning in this session."""
-        return time.monotonic() - self._began[1]
+        return self._clock() - self._began[1]
 
     @property
     def share(self) -> float:
@@ -74,26 +84,20 @@ class Loop:
     @property
     def rate(self) -> float:
         """Steps per second, without the first call as soon as there is another, since the first one compiled."""
-        completed, since = self._began if self.starting else self._first_call
-        elapsed_s = time.monotonic() - since
+        completed, since = self._began if self._only_one_call else self._first_call
+        elapsed_s = self._clock() - since
         return (self.completed - completed) / elapsed_s if elapsed_s > 0 else 0.0
 
     @property
-    def starting(self) -> bool:
-        """True until the second call: the only known speed is that of the call that compiled."""
+    def _only_one_call(self) -> bool:
         return self.completed == self._first_call[0]
 
     @property
-    def left_s(self) -> float | None:
-        """Seconds to the end at this rate, `None` before the first step."""
-        return (self.total - self.completed) / self.rate if self.rate > 0 else None
-
-    @property
     def left(self) -> str:
-        """The same in words, empty before the first step and at the end; "at most" while `starting`."""
-        if not self.left_s:
+        """Time to the end at this rate; "at most" while the only known rate is that of the call that compiled."""
+        if self.rate <= 0 or self.completed >= self.total:
             return ""
-        return f"{'at most ' if self.starting else ''}{duration(self.left_s)}"
+        return f"{'at most ' * self._only_one_call}{duration((self.total - self.completed) / self.rate)}"
 
 
 class Watcher:
@@ -113,7 +117,7 @@ class Watcher:
 
 
 @contextlib.contextmanager
-def progress(
+def show_progress(
     console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, every_s: float = PLAIN_EVERY_S
 ) -> Iterator[Advance]:
     """Show the progress of one loop.
@@ -124,16 +128,32 @@ def progress(
       after: called after each advance.
       every_s: see `console`.
     """
-    if console.is_terminal:
-        with _bar(console, loop.still) as bar:
-            task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
-            draw = lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
-            yield _advance(loop, draw, after)
-    else:
-        lines = _PlainLines(console, loop, every_s)
-        yield _advance(loop, lines.look, after)
-        if lines.completed != loop.completed:
-            lines.print()
+    with (_bar if console.is_terminal else _plain_lines)(console, loop, every_s) as show:
+
+        def advance(steps: int = 1, note: str = "") -> None:
+            loop.advance(steps, note)
+            show()
+            after()
+
+        yield advance
+
+
+@contextlib.contextmanager
+def _bar(console: Console, loop: Loop, every_s: float) -> Iterator[Callable[[], None]]:
+    del every_s
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        RateColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),
+    )
+    with Progress(*columns, console=console, auto_refresh=not loop.still) as bar:
+        task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
+        yield lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
 
 
 class RateColumn(ProgressColumn):
@@ -145,45 +165,20 @@ class RateColumn(ProgressColumn):
         return Text("" if speed is None else f"{speed:.3g}/s", style="progress.data.speed")
 
 
-def _advance(loop: Loop, *shows: Callable[[], None]) -> Advance:
-    def advance(steps: int = 1, note: str = "") -> None:
-        loop.advance(steps, note)
-        for show in shows:
-            show()
+@contextlib.contextmanager
+def _plain_lines(console: Console, loop: Loop, every_s: float) -> Iterator[Callable[[], None]]:
+    last_s, printed = time.monotonic(), -1
 
-    return advance
-
-
-def _bar(console: Console, still: bool) -> Progress:
-    return Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", style="dim", markup=False),
-        console=console,
-        auto_refresh=not still,
-    )
-
-
-class _PlainLines:
-    """The same figures as lines of text; `completed` is that of the last line."""
-
-    def __init__(self, console: Console, loop: Loop, every_s: float) -> None:
-        self._console, self._loop, self._every_s = console, loop, every_s
-        self._printed_s = time.monotonic()
-        self.completed: int | None = None
-
-    def look(self) -> None:
-        if time.monotonic() - self._printed_s >= self._every_s:
-            self.print()
-
-    def print(self) -> None:
-        self._printed_s, self.completed, loop = time.monotonic(), self._loop.completed, self._loop
+    def print_line(due_s: float = 0.0) -> None:
+        nonlocal last_s, printed
+        if time.monotonic() - last_s < due_s:
+            return
+        last_s, printed = time.monotonic(), loop.completed
         left = f", {loop.left} left" if loop.left else ""
         note = f"  {loop.note}" if loop.note else ""
         line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {duration(loop.elapsed_s)}{left}{note}"
-        self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    yield lambda: print_line(every_s)
+    if printed != loop.completed:
+        print_line()

@@ -1,18 +1,23 @@
-"""The report of a run: one HTML file without scripts that needs nothing from outside itself."""
+"""Pages of a run from the templates in `templates/`: self-contained, without scripts; text is escaped."""
 
-from collections.abc import Mapping, Sequence
+import base64
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import cv2
+import jinja2
+import numpy as np
 
 from experiments.core import curves
 from experiments.core.artifacts import write_bytes, write_text
 from experiments.core.context import read_metrics
 from experiments.core.look import colours
-from experiments.core.pages import render
-from experiments.core.results import Comparison, Results
+from experiments.core.results import Cell, Column, Comparison, Results, Slot
+from experiments.core.text import bounds, number, plain
 from touchr1_jax.bench.scoring import REPORTED
-
-ARROW = {"higher": " ↑", "lower": " ↓", "none": ""}
 
 
 def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:
@@ -20,11 +25,11 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
     Args:
       directory: the run's; its `metrics.jsonl` holds the curves.
+      results: of the run.
       about: docstring of the experiment; its first line is the question.
       description: content of the run's `config.json`.
     """
-    colour = colours(results.arms)
-    settings = dict(results.settings)
+    colour, settings = colours(results.arms), dict(results.settings)
     middle, drawn = None, {}
     if results.arms:
         settings["seeds"] = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
@@ -35,20 +40,20 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     plots |= {} if middle is None else {"accuracy_against_middle.svg": middle}
     for name, content in plots.items():
         write_bytes(directory / "plots" / name, content)
+    measured = {name for row in (*results.arms.values(), *results.baselines.values()) for name in row}
     page = render(
         "report.jinja",
         about=about,
         description=description,
+        timing=results.timing,
         settings=settings,
         verdict=results.verdict,
         data=results.data,
         data_title="Data and time",
-        timing=results.timing,
         results=results,
         colour=colour,
         reported=REPORTED,
-        arrow=ARROW,
-        metric_groups=_metric_groups(results),
+        metrics={name: metric for name, metric in REPORTED.items() if name in measured},
         best={(metric, arm) for arm in results.arms for metric in REPORTED if is_best(metric, arm, results)},
         pairs=_pairs(results.comparisons),
         compared_over=", ".join(dict.fromkeys(f"{c.n} {c.over}" for c in results.comparisons)),
@@ -62,29 +67,17 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
 def is_best(metric: str, arm: str, results: Results) -> bool:
     """True if an arm has the best mean, and the paired interval between it and every other arm excludes 0."""
-    better = REPORTED[metric].better
     means = {name: row[metric].mean for name, row in results.arms.items() if metric in row}
     others = set(means) - {arm}
-    if better == "none" or arm not in means or not others:
+    if arm not in means or not others or REPORTED[metric].better == "none":
         return False
-    sign = 1.0 if better == "higher" else -1.0
-    return all(sign * (means[arm] - means[other]) > 0 and _clear(metric, {arm, other}, results) for other in others)
+    sign = 1.0 if REPORTED[metric].better == "higher" else -1.0
 
+    def clear(other: str) -> bool:
+        found = [c for c in results.comparisons if c.metric == metric and {c.arm, c.against} == {arm, other}]
+        return bool(found) and all(c.low > 0 or c.high < 0 for c in found)
 
-def _clear(metric: str, pair: set[str], results: Results) -> bool:
-    """True if the two are compared on the metric and every interval between them excludes 0."""
-    found = [c for c in results.comparisons if c.metric == metric and {c.arm, c.against} == pair]
-    return bool(found) and all(c.low > 0 or c.high < 0 for c in found)
-
-
-def _metric_groups(results: Results) -> dict[str, dict[str, Any]]:
-    """Heading → the measured metrics under it; the main ones have no heading."""
-    present = {name for row in (*results.arms.values(), *results.baselines.values()) for name in row}
-    groups = {
-        title: {name: metric for name, metric in REPORTED.items() if metric.secondary == beside and name in present}
-        for title, beside in (("", False), ("Further metrics", True))
-    }
-    return {title: metrics for title, metrics in groups.items() if metrics}
+    return all(sign * (means[arm] - means[other]) > 0 and clear(other) for other in others)
 
 
 def _pairs(comparisons: Sequence[Comparison]) -> dict[tuple[str, str, str], dict[str, Comparison]]:
@@ -93,3 +86,88 @@ def _pairs(comparisons: Sequence[Comparison]) -> dict[tuple[str, str, str], dict
     for c in comparisons:
         pairs.setdefault((c.metric, c.arm, c.against), {})[c.over] = c
     return pairs
+
+
+def render(
+    template: str, *, about: str, description: Mapping[str, Any], timing: Mapping[str, float], **rest: Any
+) -> str:
+    """Fill a page of a run.
+
+    Args:
+      template: name of a file that extends `page.jinja`.
+      about: docstring of the experiment; its first line is the question.
+      description: content of the run's `config.json`.
+      timing: stage, or stage and seed → seconds.
+      rest: what else the template names.
+    """
+    question, _, more = about.strip().partition("\n")
+    times: dict[str, list[float]] = {}
+    for stage, seconds in timing.items():
+        times.setdefault(stage.rpartition("/")[0] or stage, []).append(seconds)
+    page = {"question": question, "rest": more.strip(), "description": description, "times": times}
+    return ENVIRONMENT.get_template(template).render(**page, **rest)
+
+
+def cell_text(cell: Cell, column: Column) -> str:
+    """A cell of a table as it is shown."""
+    if isinstance(cell, bool):
+        return "yes" if cell else "no"
+    return cell if isinstance(cell, str) else number(cell, column.format if isinstance(cell, float) else ",")
+
+
+def pieces(text: str, slots: Sequence[Slot]) -> Iterator[tuple[str, str]]:
+    """Pieces of a text, each with the segment that it belongs to; the name is empty between segments."""
+    end = 0
+    for start, stop, kind in slots:
+        yield text[end:start], ""
+        yield text[start:stop], kind
+        end = stop
+    yield text[end:], ""
+
+
+def strip(frames: np.ndarray) -> np.ndarray:
+    """The frames of a sensor side by side with two white pixels between them, uint8 [H, F (W + 2), 3].
+
+    Args:
+      frames: uint8 [F, H, W, 3].
+    """
+    return np.concatenate(list(np.pad(frames, ((0, 0), (0, 0), (1, 1), (0, 0)), constant_values=255)), axis=1)
+
+
+def png(picture: np.ndarray) -> bytes:
+    """Encode a uint8 RGB picture [H, W, 3]."""
+    done, content = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+    if not done:
+        raise ValueError(f"picture is {picture.dtype}{list(picture.shape)}: OpenCV cannot encode it; give uint8 RGB")
+    return content.tobytes()
+
+
+def _data_uri(content: bytes, kind: str) -> str:
+    media = {"svg": "svg+xml", "png": "png"}[kind]
+    return f"data:image/{media};base64,{base64.b64encode(content).decode()}"
+
+
+def _consecutive(every: Iterable[Any], attribute: str) -> list[tuple[str, list[Any]]]:
+    """Neighbours of one value of an attribute; jinja's own `groupby` sorts."""
+    return [(key, list(of)) for key, of in itertools.groupby(every, lambda one: getattr(one, attribute))]
+
+
+ENVIRONMENT = jinja2.Environment(
+    loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+ENVIRONMENT.filters |= {
+    "bounds": lambda found, spec: bounds(found.low, found.high, spec),
+    "cell": cell_text,
+    "consecutive": _consecutive,
+    "data_uri": _data_uri,
+    "indented": lambda value: json.dumps(value, indent=2, ensure_ascii=False),
+    "number": number,
+    "pieces": pieces,
+    "plain": plain,
+    "png": png,
+    "strip": strip,
+}

@@ -17,7 +17,6 @@ SETTINGS = ("preset", "lr_scale")
 Slot = tuple[int, int, str]
 """Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
 
-
 Cell = str | float | int | bool | None
 """What a table holds; `None` where nothing was measured."""
 
@@ -37,10 +36,6 @@ class Requirement:
     def met(self) -> bool:
         """True if the figure keeps its bound."""
         return self.measured <= self.bound if self.better == "lower" else self.measured >= self.bound
-
-    def to_json(self) -> dict[str, Any]:
-        """Its fields, and whether it is met."""
-        return dataclasses.asdict(self) | {"met": self.met}
 
 
 def at_most(name: str, measured: float, bound: float, unit: str = "", note: str = "") -> Requirement:
@@ -122,18 +117,14 @@ class Picture:
 
 
 class _Ci95:
-    """Ends of a 95 % interval by name."""
-
     ci95: tuple[float, float]
 
     @property
     def low(self) -> float:
-        """Lower end of the interval."""
         return self.ci95[0]
 
     @property
     def high(self) -> float:
-        """Upper end of the interval."""
         return self.ci95[1]
 
 
@@ -276,12 +267,19 @@ class Results:
         require(not missing, "settings", dict(self.settings), f"must hold {', '.join(missing)}", "add them")
         both = sorted(set(self.arms) & set(self.baselines))
         require(not both, "baselines", both, "must not take the names of arms", "rename them")
-        for name, row in {**self.arms, **self.baselines}.items():
+        known = {**self.arms, **self.baselines}
+        for name, row in known.items():
             _check_row(name, row)
         seeds = {arm: len(next(iter(row.values())).per_seed) for arm, row in self.arms.items()}
         require(len(set(seeds.values())) == 1, "arms", seeds, "must all have the same seeds", "run the missing ones")
-        for i, comparison in enumerate(self.comparisons):
-            self._check_comparison(f"comparisons[{i}]", comparison)
+        for i, c in enumerate(self.comparisons):
+            field = f"comparisons[{i}]"
+            _check_estimate(field, c.metric, c.difference, c.ci95)
+            for side in (c.arm, c.against):
+                require(side in known, field, side, f"must be one of {', '.join(known)}", "name an arm or baseline")
+            for name, share in (("p_value", c.p_value), ("improvement", c.improvement)):
+                ok = share is None or 0 <= share <= 1
+                require(ok, f"{field}.{name}", share, "must lie in [0, 1]", "correct it")
 
     def to_json(self, description: Mapping[str, Any]) -> dict[str, Any]:
         """The content of `results.json`.
@@ -296,28 +294,18 @@ class Results:
             "experiment": description["experiment"],
             "scale": description["scale"],
             "git": git["commit"] + ("-dirty" if git["dirty"] else ""),
-            "requirements": jsonable([r.to_json() for r in self.requirements], where="requirements"),
+            "requirements": jsonable(
+                [dataclasses.asdict(r) | {"met": r.met} for r in self.requirements], where="requirements"
+            ),
             **{name: jsonable(getattr(self, name), where=name) for name in names},
             "config": description["config"],
         }
-
-    def _check_comparison(self, field: str, comparison: Comparison) -> None:
-        _check_metric(f"{field}.metric", comparison.metric)
-        known = {**self.arms, **self.baselines}
-        for side in (comparison.arm, comparison.against):
-            require(side in known, field, side, f"must be one of {', '.join(known)}", "name an arm or baseline")
-        _check_interval(field, comparison.difference, comparison.ci95)
-        for name in ("p_value", "improvement"):
-            share = getattr(comparison, name)
-            ok = share is None or 0 <= share <= 1
-            require(ok, f"{field}.{name}", share, "must lie in [0, 1]", "correct it")
 
 
 def _check_row(name: str, row: Mapping[str, Estimate]) -> None:
     require(bool(row), name, dict(row), "must hold one metric at least", "add the metrics")
     for metric, value in row.items():
-        _check_metric(name, metric)
-        _check_interval(f"{name}.{metric}", value.mean, value.ci95)
+        _check_estimate(f"{name}.{metric}", metric, value.mean, value.ci95)
         finite = all(math.isfinite(x) for x in value.per_seed)
         require(finite, f"{name}.{metric}.per_seed", value.per_seed, "must be finite", "leave the metric out")
     counts = {metric: len(value.per_seed) for metric, value in row.items()}
@@ -325,13 +313,9 @@ def _check_row(name: str, row: Mapping[str, Estimate]) -> None:
     require(ok, f"{name}.per_seed", counts, "must have the same length, ≥ 1, for every metric", "add the missing seeds")
 
 
-def _check_metric(field: str, metric: str) -> None:
-    require(
-        metric in REPORTED, field, metric, f"must be one of {', '.join(REPORTED)}", "rename it or add it to METRICS"
-    )
-
-
-def _check_interval(field: str, mean: float, ci95: tuple[float, float]) -> None:
+def _check_estimate(field: str, metric: str, mean: float, ci95: tuple[float, float]) -> None:
+    known = ", ".join(REPORTED)
+    require(metric in REPORTED, field, metric, f"must be one of {known}", "rename it or add it to METRICS")
     finite = all(math.isfinite(x) for x in (mean, *ci95))
     require(finite, field, (mean, ci95), "must be finite", "leave an undefined metric out")
     require(ci95[0] <= ci95[1], f"{field}.ci95", ci95, "must be (low, high)", "swap its ends")

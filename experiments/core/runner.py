@@ -9,6 +9,7 @@ command, the cost and the expected result, and it defines `EXPERIMENT`.
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import itertools
 import shlex
@@ -20,15 +21,20 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import tyro
 from rich.console import Console
 
-from experiments.core import events, runs
+from experiments.core import runs, watchers
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_json
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
-from experiments.core.distributed import Launch, ProcessesNotFoundError, ProcessGroup, join_processes, select_devices
-from experiments.core.history import seconds_of_last
-from experiments.core.live import LivePage
-from experiments.core.machine import Accelerators, MachineError, compiled_quickly, require_accelerators
-from experiments.core.progress import Watcher
+from experiments.core.machine import (
+    Accelerators,
+    Launch,
+    MachineError,
+    ProcessesNotFoundError,
+    ProcessGroup,
+    join_processes,
+    require_accelerators,
+    select_devices,
+)
 from experiments.core.report import write_report
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
@@ -37,14 +43,12 @@ from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.rewards import RewardError
 from touchr1_jax.training.checkpoint import CheckpointError
-from touchr1_jax.training.compilation import compilations_kept
+from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.loop import NonFiniteGradientError
 from touchr1_jax.training.questions import NoLabelsError
 
 EVENTS = "events"
 """Folder of a run that holds its TensorBoard events."""
-
-EVENTS_HELP = f"Also write TensorBoard events: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
 
 COMPILED = "compiled"
 """Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
@@ -136,7 +140,7 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
 
 
 def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> int:
-    """Run or continue an experiment; returns the exit code.
+    """Run or continue an experiment; returns the exit code, 128 + n after signal n.
 
     Args:
       experiment: with its configurations.
@@ -149,26 +153,37 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     except ValueError as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
+    if command.tensorboard and not watchers.tensorboard_installed():
+        print_error(watchers.TENSORBOARD_HINT)
+        return 2
+    if not experiment.spreads and command.launch != Launch():
+        print_error(f"{experiment.name} runs in one process on one device; leave --distributed and --mesh out")
+        return 2
     with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
-        return execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
+        return _execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:
     """Resolve the command line: `.scale`, `.fresh`, `.tensorboard`, two directories and the overridden `.config`.
 
-    The scale is picked out first, since it chooses the defaults that everything else overrides.
+    The scale is picked out first, since it chooses the defaults that everything else overrides; tyro refuses an unknown
+    one.
 
     Raises:
       SystemExit: code 2 after the correction of a typo, 0 after help.
     """
-    configs = experiment.configs()
-    scale = _scale(arguments, configs)
+    configs, scale = experiment.configs(), "default"
+    for flag, value in itertools.pairwise([*arguments, ""]):
+        named = value if flag == "--scale" else flag.removeprefix("--scale=")
+        if flag.startswith("--scale") and named in configs:
+            scale = named
+    events = f"Also write TensorBoard events: `tensorboard --logdir runs/NAME/latest/{EVENTS}`."
     command = dataclasses.make_dataclass(
         "Command",
         [
             ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Set of defaults.")], scale),
             ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")], False),
-            ("tensorboard", Annotated[bool, tyro.conf.arg(help=EVENTS_HELP)], False),
+            ("tensorboard", Annotated[bool, tyro.conf.arg(help=events)], False),
             ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")], Path("runs")),
             ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")], Path("data")),
             ("launch", Annotated[Launch, tyro.conf.arg(name="")], Launch()),
@@ -181,16 +196,8 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     return tyro.cli(command, args=arguments, default=command(), prog=prog, description=about)
 
 
-def execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
-    """Run or continue an experiment; returns the exit code, 128 + n after signal n."""
-    if command.tensorboard and not events.installed():
-        print_error(events.HINT)
-        return 2
-    if not experiment.spreads and command.launch != Launch():
-        print_error(f"{experiment.name} runs in one process on one device; leave --distributed and --mesh out")
-        return 2
-    stopping = Stopping()
-    directory = None
+def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
+    stopping, directory = Stopping(), None
     try:
         processes = join_processes(command.launch)
         require_accelerators(command.scale, experiment.needs.get(command.scale))
@@ -219,63 +226,46 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     """The run's directory, and whether it is that of an unfinished run."""
     config = jsonable(command.config, where="config")
     home = command.runs_dir / experiment.name
-    unfinished = None if command.fresh else runs.newest_unfinished(home, config)
+    unfinished = None if command.fresh else runs.newest(home, config, finished=False)
     if unfinished is not None:
         return str(unfinished), True
     return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
-
-
-def _compute(
-    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, processes: ProcessGroup
-) -> None:
-    """Compute and, in the process that writes, publish; an error that ends the run is shown on its page."""
-    place = (directory, command.cache_dir)
-    if not processes.writes:
-        context = Context(*place, Console(quiet=True), (), stopping, processes, select_devices(command.launch))
-        with contextlib.closing(context):
-            experiment.run(command.config, context)
-        return
-    description = read_json(directory / "config.json")
-    usual_s = seconds_of_last(directory.parent, description["config"])
-    page = LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
-    watchers: list[Watcher] = [page]
-    try:
-        if command.tensorboard:
-            watchers.append(events.Events(directory / EVENTS))
-        context = Context(*place, Console(), watchers, stopping, processes, select_devices(command.launch))
-        with contextlib.closing(context), context.timed("total"):
-            results = experiment.run(command.config, context)
-        _publish(results, context, description, about)
-    except BaseException as error:
-        page.end(error)
-        raise
-
-
-def _publish(results: Results, context: Context, description: Mapping[str, Any], about: str) -> None:
-    """Write the report and, last, `results.json`, which marks the run as finished."""
-    results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
-    report = write_report(context.directory, results, about=about, description=description)
-    write_json(context.directory / "results.json", results.to_json(description))
-    context.print(f"report: {report}")
-    for sentence in results.verdict:
-        context.print(sentence)
 
 
 def _announce(directory: Path, resumed: bool) -> None:
     """Print whether the run is new, the path of its page, and a note if the code has changed since it began."""
     print_lines(f"continuing {directory} (--fresh starts a new run)" if resumed else f"new run {directory}")
     print_lines(f"to watch: {directory / 'report.html'}")
-    began, now = read_json(directory / "config.json")["git"], dataclasses.asdict(runs.revision())
+    began, now = runs.Revision(**read_json(directory / "config.json")["git"]), runs.revision()
     if resumed and began != now:
-        print_lines(f"note: this run began at {runs.Revision(**began)}, the code is now at {runs.Revision(**now)}")
+        print_lines(f"note: this run began at {began}, the code is now at {now}")
 
 
-def _scale(arguments: Sequence[str], configs: Mapping[str, Any]) -> str:
-    """The scale that the arguments name; `default` where they name none or an unknown one, which tyro then refuses."""
-    named = "default"
-    for flag, value in itertools.pairwise([*arguments, ""]):
-        if flag == "--scale":
-            named = value
-        elif flag.startswith("--scale="):
-            named = flag.removeprefix("--scale=")
-    return named if named in configs else "default"
+def _compute(
+    experiment: Experiment[Any], command: Any, directory: Path, about: str, stopping: Stopping, processes: ProcessGroup
+) -> None:
+    """Compute and, in the process that writes, publish; an error that ends the run is shown on its page."""
+    devices = select_devices(command.launch)
+    make_context = functools.partial(
+        Context, directory, command.cache_dir, stopping=stopping, processes=processes, devices=devices
+    )
+    if not processes.writes:
+        with contextlib.closing(make_context(Console(quiet=True))) as context:
+            experiment.run(command.config, context)
+        return
+    description = read_json(directory / "config.json")
+    last = runs.newest(directory.parent, description["config"], finished=True)
+    usual_s = None if last is None else runs.read_run(last).seconds
+    page = watchers.LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
+    try:
+        events = [watchers.Events(directory / EVENTS)] if command.tensorboard else []
+        context = make_context(Console(), [page, *events])
+        with contextlib.closing(context), context.timed("total"):
+            results = experiment.run(command.config, context)
+        results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
+        report = write_report(directory, results, about=about, description=description)
+        write_json(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
+    except BaseException as error:
+        page.end(error)
+        raise
+    print_lines(f"report: {report}", *results.verdict)

@@ -1,4 +1,4 @@
-"""Run directories `runs/NAME/STAMP`: creating, finding and locking them, and the provenance of the code.
+"""Run directories `runs/NAME/STAMP`: creating, locking, finding and reading them, and the provenance of the code.
 
     runs/NAME/latest -> STAMP
     runs/NAME/STAMP/{config.json, metrics.jsonl, timing.json, stages/, checkpoints/, plots/, report.html, results.json}
@@ -15,14 +15,18 @@ import os
 import platform
 import shlex
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from experiments.core.artifacts import point_link, read_json, write_json
+from experiments.core.text import duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
 """Packages whose versions are kept with a run."""
+
+FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
+"""Fields in `config.json` of a run; that of a model has others."""
 
 UNKNOWN = "unknown"
 """Commit of code outside a checkout."""
@@ -33,23 +37,6 @@ ROOT = Path(__file__).resolve().parents[2]
 
 class RunInUse(RuntimeError):
     """Another process is working in the run directory."""
-
-
-class NoCheckoutError(FileNotFoundError):
-    """The code is installed without a checkout."""
-
-
-def checkout(root: Path = ROOT) -> Path:
-    """The top of the checkout of this code.
-
-    Raises:
-      NoCheckoutError: there is none.
-    """
-    if not (root / "pyproject.toml").exists():
-        raise NoCheckoutError(
-            f"{root} holds no pyproject.toml: must be a checkout of the project; clone it and work there"
-        )
-    return root
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,47 +52,35 @@ class Revision:
 
 def revision(root: Path = ROOT) -> Revision:
     """The revision of a checkout, `unknown` where there is no git or `root` is not the top of a checkout."""
-    top = _git(root, "rev-parse", "--show-toplevel")
-    commit = _git(root, "rev-parse", "HEAD")
+    top, commit = _git(root, "rev-parse", "--show-toplevel"), _git(root, "rev-parse", "HEAD")
     if top is None or commit is None or Path(top).resolve() != root.resolve():
         return Revision(commit=UNKNOWN, dirty=False)
     return Revision(commit=commit, dirty=bool(_git(root, "status", "--porcelain")))
 
 
+def _git(root: Path, *arguments: str) -> str | None:
+    """The output of a git command, `None` without git or a checkout."""
+    try:
+        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide what a run computes."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version()} | dict.fromkeys(PACKAGES, "not installed")
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "not installed"
     return found
-
-
-def newest_unfinished(home: Path, config: Any) -> Path | None:
-    """The newest run under `runs/NAME` with this resolved configuration and no results, or `None`.
-
-    Args:
-      config: the resolved configuration in JSON's types.
-    """
-    for directory in sorted(started(home), reverse=True):
-        if read_json(directory / "config.json")["config"] == config and not (directory / "results.json").exists():
-            return directory
-    return None
-
-
-def started(home: Path) -> list[Path]:
-    """The run directories of an experiment; one without `config.json` never started."""
-    if not home.is_dir():
-        return []
-    return [p for p in home.iterdir() if not p.is_symlink() and (p / "config.json").exists()]
 
 
 def create(home: Path, description: dict[str, Any]) -> Path:
     """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the local time, made unique by a suffix.
 
     Args:
+      home: `runs/NAME`.
       description: the resolved `config` and its provenance, in JSON's types.
     """
     home.mkdir(parents=True, exist_ok=True)
@@ -155,7 +130,107 @@ def locked(directory: Path) -> Iterator[None]:
         yield
 
 
-def in_use(directory: Path) -> bool:
+def continuing(command: str) -> str:
+    """The command that continues the run of a command."""
+    return shlex.join(part for part in shlex.split(command) if part != "--fresh")
+
+
+def started(home: Path) -> list[Path]:
+    """The run directories under `runs/NAME`, the newest first; one without `config.json` never started."""
+    found = home.iterdir() if home.is_dir() else ()
+    return sorted((p for p in found if not p.is_symlink() and (p / "config.json").exists()), reverse=True)
+
+
+def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
+    """The newest finished, or unfinished, run under `runs/NAME` with this configuration, or `None`.
+
+    Args:
+      home: `runs/NAME`.
+      config: the resolved configuration in JSON's types.
+      finished: whether it must have results or must have none.
+    """
+    of_kind = (run for run in started(home) if (run / "results.json").exists() == finished)
+    return next((run for run in of_kind if read_json(run / "config.json")["config"] == config), None)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PastRun:
+    """A run, read from its directory.
+
+    Attributes:
+      directory: `runs/NAME/STAMP`.
+      description: content of `config.json`.
+      seconds: wall time of all its sessions; `None` before the first one ended.
+      results: content of `results.json`; `None` while it is unfinished.
+      in_use: a process is working in it.
+    """
+
+    directory: Path
+    description: Mapping[str, Any]
+    seconds: float | None
+    results: Mapping[str, Any] | None
+    in_use: bool
+
+    @property
+    def name(self) -> str:
+        """The experiment's."""
+        return self.description["experiment"]
+
+    @property
+    def state(self) -> str:
+        """`finished`, `running`, or `unfinished`."""
+        if self.results is not None:
+            return "finished"
+        return "running" if self.in_use else "unfinished"
+
+    @property
+    def code(self) -> str:
+        """Short commit, with a plus where files differed from it; the version of a package without a checkout."""
+        git = self.description["git"]
+        if git["commit"] == UNKNOWN:
+            return f"version {self.description['versions'].get(PACKAGES[0], UNKNOWN)}"
+        return git["commit"][:7] + ("+" if git["dirty"] else "")
+
+    @property
+    def outcome(self) -> tuple[str, ...]:
+        """The number of requirements met and the verdict; of an unfinished run the command that continues it."""
+        if self.state == "unfinished":
+            return (f"to continue: {continuing(self.description['command'])}",)
+        results = self.results or {"verdict": ()}
+        kept = [r["met"] for r in results.get("requirements", ())]  # older runs of trained arms have none
+        met = [f"{sum(kept)} of {len(kept)} requirements met."] if kept else []
+        return (*met, *results["verdict"])
+
+    @property
+    def summary(self) -> str:
+        """Stamp, scale, code, state and cost."""
+        cost = "" if self.seconds is None else f", {duration(self.seconds)}"
+        return f"{self.directory.name}  {self.description['scale']}, code {self.code}: {self.state}{cost}"
+
+
+def read_run(directory: Path) -> PastRun:
+    """Read the directory of a run.
+
+    Raises:
+      FileNotFoundError: no `config.json`, or not that of a run.
+      DamagedFileError: a damaged file.
+    """
+    path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
+    if not path.exists():
+        raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
+    description = read_json(path)
+    if not isinstance(description, Mapping) or not description.keys() >= FIELDS:
+        raise FileNotFoundError(f"{path} is not that of a run: must be its directory; correct the path")
+    return PastRun(
+        directory=directory,
+        description=description,
+        seconds=read_json(times).get("total") if times.exists() else None,  # stages come before the total
+        results=read_json(results) if results.exists() else None,
+        in_use=_in_use(directory),
+    )
+
+
+def _in_use(directory: Path) -> bool:
     """True if a process works in a run directory; while this checks, none can begin."""
     lock = directory / ".lock"
     if not lock.exists():
@@ -168,15 +243,16 @@ def in_use(directory: Path) -> bool:
     return False
 
 
-def continuing(command: str) -> str:
-    """The command that continues the run of a command."""
-    return shlex.join(part for part in shlex.split(command) if part != "--fresh")
+def locate(name: str, runs_dir: Path) -> Path:
+    """Find the directory of a run by its path, by `NAME/STAMP`, or by `NAME` for the latest of an experiment.
 
-
-def _git(root: Path, *arguments: str) -> str | None:
-    """The output of a git command, `None` without git or a checkout."""
-    try:
-        done = subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=False)
-    except FileNotFoundError:
-        return None
-    return done.stdout.strip() if done.returncode == 0 else None
+    Raises:
+      FileNotFoundError: there is none.
+    """
+    for directory in (Path(name), Path(name) / "latest", runs_dir / name, runs_dir / name / "latest"):
+        if (directory / "config.json").exists():
+            return directory.resolve()
+    raise FileNotFoundError(
+        f"{name!r} is no run: must be a directory with config.json, NAME/STAMP or NAME under {runs_dir}; "
+        "`python -m experiments list` shows all runs"
+    )

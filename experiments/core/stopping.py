@@ -7,7 +7,6 @@ import sys
 import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 """Control-C, and the signal that a scheduler sends before it takes the machine away."""
@@ -48,7 +47,7 @@ class Stopping:
         before = {n: signal.signal(n, self._handle) for n in SIGNALS}
         before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._again)
         report = sys.unraisablehook
-        sys.unraisablehook = lambda lost: self._lost(lost, report)
+        sys.unraisablehook = lambda lost: None if isinstance(lost.exc_value, Stopped) else report(lost)
         try:
             yield
         finally:
@@ -94,10 +93,6 @@ class Stopping:
             raise self._stopped(number)
         with contextlib.suppress(OSError):  # nobody may be reading
             os.write(STDERR, PATIENCE)  # a print could strike within another
-
-    def _lost(self, lost: Any, report: Callable[[Any], Any]) -> None:
-        if not isinstance(lost.exc_value, Stopped):
-            report(lost)
 
     def _again(self, number: int, frame: FrameType | None) -> None:
         """Raise another `Stopped` if the last one is gone; while it propagates, it is alive."""

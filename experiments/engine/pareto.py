@@ -18,9 +18,9 @@ from typing import Any, Literal, NamedTuple
 
 from experiments.core.context import Context
 from experiments.core.errors import require
-from experiments.core.history import PastRun, runs_of, summary
 from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.core.runs import PastRun, read_run, started
 from experiments.encoder.variants import STUDIED
 from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
 from experiments.mechanics.tangential_report import MAIN as FRICTION
@@ -110,7 +110,7 @@ def run(config: GatherConfig, context: Context) -> Results:
         requirements=(dominated,) if judgements else (),
         tables=(
             default_table(judgements),
-            named_table("Runs", [{"experiment": name, "run": summary(past)} for name, past in runs.items()]),
+            named_table("Runs", [{"experiment": name, "run": past.summary} for name, past in runs.items()]),
         ),
         pictures=tuple(picture for name, past in runs.items() for picture in charts(name, past)),
         settings={"runs": str(home), "not run yet": ", ".join(missing) or "none"},
@@ -119,7 +119,7 @@ def run(config: GatherConfig, context: Context) -> Results:
 
 def newest_run(home: Path) -> PastRun | None:
     """The newest finished run of an experiment; any scale is preferred to `smoke`."""
-    finished = [past for past in runs_of(home) if past.results is not None]
+    finished = [past for past in map(read_run, started(home)) if past.results is not None]
     return min(finished, key=lambda past: past.description["scale"] == "smoke", default=None)
 
 

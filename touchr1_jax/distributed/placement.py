@@ -4,20 +4,22 @@ The steps of all stages, (state, batch, …) → (state, metrics), stay as they 
 program that they trace to by the shardings of its arguments and results.
 """
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, Self
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, state_shardings, whole
 from touchr1_jax.models.layers import RMSNorm
-from touchr1_jax.training.loop import Step
+from touchr1_jax.training.loop import Batches, SingleDevice, Step
 
 LAYERS = (nn.Dense, nn.Embed, RMSNorm)
 """Layers whose results are constrained to a sharding; others follow from them."""
@@ -133,3 +135,59 @@ def split_activations(mesh: Mesh) -> AbstractContextManager[None]:
         return jax.lax.with_sharding_constraint(y, NamedSharding(mesh, activation_axes(layer, y.ndim)))
 
     return nn.intercept_methods(constrain)
+
+
+class DeviceMesh(SingleDevice):
+    """Training steps run on the devices of a mesh, including those of other processes."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._mesh = mesh
+        self.shape = mesh.devices.shape
+        self.gather_params = functools.partial(gather_params, mesh)
+        self._compiled: dict[Step, Step] = {}
+
+    def local_rows(self, batch_size: int) -> np.ndarray:
+        """Rows whose devices belong to this process."""
+        return local_rows(self._mesh, batch_size)
+
+    def shard(
+        self, step: Step, state: Any, batches: Batches, batch_size: int, *constants: Any
+    ) -> tuple[Step, Any, Batches]:
+        """The same, split by the sharding rules; one step is compiled once."""
+        placed = PlacedBatches(batches, self._mesh, batch_size)
+        if step not in self._compiled:
+            self._compiled[step] = shard_step(step, self._mesh, state, placed.shapes(), *constants)
+        on_mesh, there = self._compiled[step], [place_state(self._mesh, x) for x in constants]
+        return lambda s, b: on_mesh(s, b, *there), place_state(self._mesh, state), placed
+
+    def gather(self, tree: Any) -> Any:
+        """Arrays gathered from all devices of all processes."""
+        return jax.tree.map(jnp.asarray, multihost_utils.process_allgather(tree, tiled=True))
+
+
+class PlacedBatches:
+    """Batches on a mesh, made from the rows that each process reads."""
+
+    def __init__(self, batches: Batches, mesh: Mesh, batch_size: int) -> None:
+        self._batches, self._mesh, self._size = batches, mesh, batch_size
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Any:
+        return place_batch(self._mesh, next(self._batches), self._size)
+
+    def get_state(self) -> Any:
+        """Position in the data; the same in all processes, whatever their number."""
+        return self._batches.get_state()
+
+    def set_state(self, state: Any) -> None:
+        """Return to a position."""
+        self._batches.set_state(state)
+
+    def shapes(self) -> Any:
+        """Shapes and dtypes of a whole batch, from the first one, which is read again."""
+        before = self.get_state()
+        first = next(self._batches)
+        self.set_state(before)
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct((self._size, *x.shape[1:]), x.dtype), first)

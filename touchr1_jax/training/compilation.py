@@ -1,8 +1,9 @@
-"""Compiled programs that outlive the process."""
+"""Compiled programs that outlive the process, and quick compilation of programs that run a few times."""
 
 import contextlib
 import ctypes
 import hashlib
+import os
 import platform
 import time
 from collections.abc import Iterator, Mapping
@@ -17,6 +18,12 @@ WORTH_KEEPING_S = 0.1
 
 MOST_BYTES = 4 * 2**30
 """Size of the cache; what was not used for longest goes.  Only with a bound does JAX lock the entries it writes."""
+
+OLDER_LOOPS = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
+"""Flag of XLA: the older of its two ways to write a fused loop, as long as it exists, compiles twice as fast."""
+
+FLAGS = "XLA_FLAGS"
+"""Environment variable that XLA reads when it compiles its first program, and never again."""
 
 
 @contextlib.contextmanager
@@ -46,6 +53,28 @@ def compilations_kept(directory: Path) -> Iterator[None]:
         yield
     finally:
         _set(before)
+
+
+@contextlib.contextmanager
+def compiled_quickly() -> Iterator[None]:
+    """Leave out most of XLA's optimisations inside the block: a training step compiles in a quarter of the time.
+
+    This pays for programs that run a few times only.  They compute the same up to rounding; their speed says nothing
+    about that of others.  The older loops stay chosen for the whole process where its first program is compiled inside
+    the block.
+    """
+    flags, before = os.environ.get(FLAGS), jax.config.values["jax_disable_most_optimizations"]
+    if OLDER_LOOPS not in (flags or ""):
+        os.environ[FLAGS] = f"{flags or ''} {OLDER_LOOPS}".strip()
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+        if flags is None:
+            os.environ.pop(FLAGS, None)
+        else:
+            os.environ[FLAGS] = flags
 
 
 def remove_half_written(folder: Path, older_than_s: float = 60.0) -> int:

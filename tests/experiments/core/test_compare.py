@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.core.compare import compare_results, flat
+from experiments.core.compare import compare_results
 from experiments.core.runner import main
 
 FAKES = "tests.experiments.fakes"
@@ -57,10 +57,6 @@ def test_requirements_and_cells_of_tables():
         "Errors | spg #2 | error": ("", "differs"),
         "Errors | spg #2 | converged": ("", "same"),
     }
-
-
-def test_configurations_are_compared_by_dotted_name():
-    assert flat({"a": {"b": 1, "c": [1, 2]}, "d": None}) == {"a.b": 1, "a.c": [1, 2], "d": None}
 
 
 @pytest.fixture(scope="module")

@@ -1,43 +1,54 @@
-"""A scale is refused on a machine that lacks what it needs; quick compilation ends with its block."""
+"""Processes of a run: who writes, what each reads, the figures of one process; accelerators that a scale needs."""
 
 import dataclasses
+import json
 import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental import multihost_utils
+from rich.console import Console
 
+from experiments.core.context import Context
 from experiments.core.machine import (
-    FLAGS,
     GIB,
-    OLDER_LOOPS,
+    SINGLE_PROCESS,
     Accelerators,
+    Launch,
     MachineError,
+    ProcessesNotFoundError,
+    ProcessGroup,
     accelerators,
-    compiled_quickly,
+    join_processes,
     require_accelerators,
-)  # fmt: skip
+    select_devices,
+)
 from experiments.core.runner import Experiment, run_experiment
 from tests.experiments.fakes import coin
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.training.compilation import OLDER_LOOPS
+from touchr1_jax.training.loop import SingleDevice
 
+ADDRESS = {"distributed": True, "coordinator": "h:1", "processes": 2, "process": 1}
 ONE = Accelerators(number=1, memory_gib=70.0)
-
-
-def test_a_processor_is_no_accelerator():
-    with pytest.raises(MachineError, match="needs 1 accelerator of 70 GiB, and this machine has none, only cpu"):
-        require_accelerators("gpu", ONE)
-    require_accelerators("default", None)
+PATIENCE_S = 1800
+"""A process takes minutes of a core of its own, and shares it with another and with whatever else runs here."""
 
 
 @pytest.mark.parametrize(("number", "gib", "enough"), [(1, 80, True), (1, 40, False), (16, 140, True), (0, 0, False)])
 def test_number_and_memory_must_suffice(number, gib, enough):
     present = Accelerators(number=number, memory_gib=gib)
+    require_accelerators("default", None, present)
     if enough:
         require_accelerators("gpu", ONE, present)
     else:
-        with pytest.raises(MachineError, match="scale is 'gpu'"):
+        with pytest.raises(MachineError, match="scale is 'gpu': needs 1 accelerator of 70 GiB"):
             require_accelerators("gpu", ONE, present)
 
 
@@ -51,52 +62,151 @@ def test_accelerators_are_those_of_all_processes_with_the_least_memory_of_this_o
 def test_a_run_is_refused_before_it_begins(tmp_path, capsys):
     experiment = dataclasses.replace(coin.EXPERIMENT, needs={"smoke": ONE})
     assert run_experiment(experiment, ["--scale", "smoke", "--runs-dir", str(tmp_path)], "Why?") == 1
-    assert "needs 1 accelerator" in "".join(capsys.readouterr())
+    assert "needs 1 accelerator of 70 GiB, and this machine has none, only cpu" in capsys.readouterr().err
+    assert run_experiment(experiment, ["--distributed", "--runs-dir", str(tmp_path)], "Why?") == 2
+    assert "runs in one process on one device" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_needs_are_of_scales():
     with pytest.raises(ValueError, match="must be scales"):
         Experiment(name="coin", config=coin.Config(), run=coin.run, needs={"huge": ONE})
 
 
-SETTING = "jax_disable_most_optimizations"
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"process": None}, r"process is not given, .*; give all three or none"),
+        ({"distributed": False}, r"coordinator is h:1, but the run is not distributed; add --distributed"),
+        ({"process": 2}, r"process is 2: must be 0 … 1, one of the processes"),
+    ],
+)
+def test_an_address_is_whole(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Launch(**ADDRESS | changes)
 
 
-@pytest.fixture
-def well(monkeypatch):
-    """A process that compiles well, as one outside of the tests does."""
-    monkeypatch.delenv(FLAGS, raising=False)
-    before = jax.config.values[SETTING]
-    jax.config.update(SETTING, False)
-    yield
-    jax.config.update(SETTING, before)
+def test_without_a_cluster_the_address_is_asked_for(monkeypatch):
+    def nobody(*address):
+        assert address == (None, None, None)
+        raise ValueError("coordinator_address should be defined.")
+
+    monkeypatch.setattr(jax.distributed, "initialize", nobody)
+    with pytest.raises(ProcessesNotFoundError, match="give --coordinator HOST:PORT"):
+        join_processes(Launch(distributed=True))
 
 
-def test_it_ends_with_its_block_even_by_an_error(well):
-    seen = {}
-
-    def fail():
-        seen.update(setting=jax.config.values[SETTING], flags=os.environ.get(FLAGS, ""))
-        raise KeyError
-
-    with pytest.raises(KeyError), compiled_quickly():
-        fail()
-    assert seen == {"setting": True, "flags": OLDER_LOOPS}
-    assert not jax.config.values[SETTING]
-    assert FLAGS not in os.environ
+def test_one_process_asks_no_other(monkeypatch):
+    for name in ("process_allgather", "broadcast_one_to_all", "sync_global_devices"):
+        monkeypatch.setattr(multihost_utils, name, None)
+    assert join_processes(Launch()) is SINGLE_PROCESS
+    assert type(select_devices(Launch())) is SingleDevice
+    assert SINGLE_PROCESS.broadcast(lambda: ["runs/x", True]) == ["runs/x", True]
+    assert SINGLE_PROCESS.any(True)
+    assert not SINGLE_PROCESS.any(False)
+    assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
 
 
-def test_flags_of_the_user_stay(well, monkeypatch):
-    monkeypatch.setenv(FLAGS, "--xla_force_host_platform_device_count=2")
-    with compiled_quickly(), compiled_quickly():
-        assert os.environ[FLAGS].split() == ["--xla_force_host_platform_device_count=2", *OLDER_LOOPS.split()]
-    assert os.environ[FLAGS] == "--xla_force_host_platform_device_count=2"
+def test_a_mesh_of_other_devices_is_refused():
+    with pytest.raises(ValueError, match="must be the number of devices"):
+        select_devices(Launch(mesh=MeshConfig(fsdp=64)))
 
 
-def test_results_are_the_same(well):
-    x = jnp.linspace(-2, 2, 7)
-    f = jax.grad(lambda x: jnp.sum(jnp.tanh(x) ** 2))
-    with compiled_quickly():
-        quick = jax.jit(f)(x)
-    np.testing.assert_allclose(quick, f(x), atol=1e-6)
+def test_the_parts_of_all_processes_are_what_one_makes(monkeypatch):
+    """Five rows of three processes: two each, the last row once more."""
+    made = {}
+
+    def gathered(part, tiled):
+        assert tiled
+        made[len(made)] = part
+        return np.concatenate([make(np.array(rows)) for rows in ([0, 1], [2, 3], [4, 4])])
+
+    make = lambda rows: 10 * rows
+    monkeypatch.setattr(multihost_utils, "process_allgather", gathered)
+    for process, own in enumerate(([0, 10], [20, 30], [40, 40])):
+        found = ProcessGroup(3, process).split_work(np.arange(5), make)
+        assert found.tolist() == [0, 10, 20, 30, 40]
+        assert made[process].tolist() == own
+
+
+def test_only_the_first_process_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(multihost_utils, "sync_global_devices", lambda name: None)
+    follower = Context(tmp_path, tmp_path, Console(quiet=True), processes=ProcessGroup(2, 1))
+    follower.log("sft/0", 0, loss=1.0)
+    follower.rewind("sft/0", 0)
+    follower.save_stage("sft/0", {})
+    with follower.timed("sft/0"):
+        pass
+    follower.close()
+    assert not list(tmp_path.iterdir())
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen:
+    """A tiny study in a process that compiles quickly, as the tests do; all share the generated data."""
+    environment = {"XLA_FLAGS": OLDER_LOOPS, "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    where = ["--runs-dir", str(folder), "--cache-dir", str(folder.parent / "data")]
+    command = [sys.executable, "-m", "tests.experiments.core.tiny_study", *arguments, *where]
+    return subprocess.Popen(
+        command, env=os.environ | environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def finish(process: subprocess.Popen, code: int = 0) -> str:
+    with process:
+        try:
+            output, _ = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+    assert process.returncode == code, output[-4000:]
+    return output
+
+
+def two(folder: Path, name: str, *, code: int = 0, struck: tuple[str, ...] = ()) -> list[str]:
+    """The outputs of two processes over loopback; the second may be sent a signal."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    launch = ["--distributed", "--mesh.fsdp", "2", "--coordinator", address, "--processes", "2", "--process"]
+    workers = [start(folder, *(struck if i else ()), name, *launch, str(i)) for i in range(2)]
+    try:
+        return [finish(worker, code) for worker in workers]
+    finally:
+        workers[1].kill()  # the first may have been given up
+
+
+def lines_of(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "latest/metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.slow
+def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path):
+    """Parameters and batches split between two processes over loopback; every logged figure to 1e-5, every answer.
+
+    A SIGTERM to the second of them in its third batch, the first of which gave shapes alone, ends both after
+    that step, saved; they then go on.
+    """
+    name = "ablation_ordinal"
+    finish(start(tmp_path / "one", name))
+    stopped = two(tmp_path / "two", name, code=143, struck=("--strike", "4"))
+    assert all("Stopped by SIGTERM" in output for output in stopped)
+    folders = [tmp_path / run / name for run in ("one", "two")]
+    assert [(line["stage"], line["step"]) for line in lines_of(folders[1])] == [("sft/0", 0), ("sft/0", 1)]
+    leader, follower = two(tmp_path / "two", name)
+    assert "report: " in leader
+    assert "report: " not in follower
+    one, both = (lines_of(folder) for folder in folders)
+    assert [(a["stage"], a["step"], *a) for a in both] == [(a["stage"], a["step"], *a) for a in one]
+    for a, b in zip(one, both, strict=True):
+        for field in a.keys() - {"stage"}:
+            assert b[field] == pytest.approx(a[field], rel=1e-5, abs=1e-5), (a["stage"], a["step"], field)
+    arms = [json.loads((folder / "latest/results.json").read_text())["arms"] for folder in folders]
+    assert arms[0] == arms[1]
+    assert len(list(folders[1].iterdir())) == 2  # one run, and `latest`
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["main_table", "ablation_leave_one_out"])
+def test_other_studies_in_two_processes_give_the_results_of_one(tmp_path, name):
+    """Probes on the encoder, and evaluation variants that train."""
+    finish(start(tmp_path / "one", name))
+    two(tmp_path / "two", name)
+    found = [json.loads((tmp_path / run / name / "latest/results.json").read_text()) for run in ("one", "two")]
+    assert found[0]["arms"] == found[1]["arms"]
+    assert found[0]["baselines"] == found[1]["baselines"]

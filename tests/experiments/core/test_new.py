@@ -1,12 +1,12 @@
 """`python -m experiments new`: what is written, and that nothing is where something is wrong."""
 
 import ast
+import os
 import shutil
 from pathlib import Path
 
 import pytest
 
-from experiments.core import new
 from experiments.core.new import DICTIONARY, EXAMPLES, NewError, with_entry, write_new
 from experiments.core.runner import main
 
@@ -92,16 +92,10 @@ def test_outside_a_checkout_nothing_is_written(tmp_path, capsys):
     assert not contents(tmp_path)
 
 
-def test_what_was_written_is_taken_back_when_a_file_cannot_be(checkout, monkeypatch):
+def test_what_was_written_is_taken_back_when_a_file_cannot_be(checkout):
     before = contents(checkout)
-
-    def full(path: Path, text: str) -> None:
-        if path.name == DICTIONARY.name:
-            raise OSError("no space left on device")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-    monkeypatch.setattr(new, "write_text", full)
-    with pytest.raises(OSError, match="no space left"):
+    rewards = checkout / DICTIONARY.parent
+    (rewards / f".{DICTIONARY.name}.{os.getpid()}").mkdir()  # where its new content would be written
+    with pytest.raises(OSError, match=DICTIONARY.name):
         write_new(checkout, "brevity", reward=True, taken=())
     assert contents(checkout) == before

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from experiments.core.artifacts import read_json, write_json
-from experiments.core.recorded import BEGIN, END, FigureError, figure, filled, main, record
+from experiments.core.recorded import BEGIN, END, RECORDED, TABLE, FigureError, figure, filled, main, record
 from experiments.core.runs import ROOT
 
 RESULTS = {
@@ -26,17 +26,17 @@ def root(tmp_path):
     return tmp_path
 
 
-def test_a_row_is_filled_with_its_figures(root):
+def test_rows_are_filled_with_their_figures(root):
     figures = (
         "{arms > paid > acc > mean | .0f} % of {tables > Tosses > gold > heads | d}, "
         "{requirements > least gain > measured | +.2f}"
     )
-    rows = [("coin", "tosses", figures)]
-    text = filled(f"before {BEGIN} old {END} after", rows, root)
+    (root / RECORDED / TABLE).write_text(f"| tosses | {figures} | `coin` |\n")
+    text = filled(f"before {BEGIN} old {END} after", root)
     assert "| tosses | 63 % of 7, −0.25 | `coin` |" in text
     assert text.startswith("before ")
     assert text.endswith(" after")
-    assert filled(text, rows, root) == text
+    assert filled(text, root) == text
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_a_figure_that_no_run_gives_is_refused(root, name, path, spec, message):
 
 def test_a_document_without_the_block_is_refused(root):
     with pytest.raises(FigureError, match="must hold one"):
-        filled("text", [], root)
+        filled("text", root)
 
 
 def test_a_run_is_recorded_whole_and_only_when_finished(root, tmp_path, capsys):

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
-from experiments.core.pages import pieces, png, strip
-from experiments.core.report import is_best, write_report
+from experiments.core.report import is_best, pieces, png, strip, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin

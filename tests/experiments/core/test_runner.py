@@ -177,35 +177,5 @@ def test_a_signal_stops_cleanly_and_says_how_to_go_on(workplace, number, code):
     assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"
 
 
-def git(directory, *arguments):
-    identity = ("-c", "user.name=a", "-c", "user.email=a@b")
-    subprocess.run(["git", *identity, *arguments], cwd=directory, check=True, capture_output=True)
-
-
-def test_revision_tells_clean_dirty_and_unknown(tmp_path, monkeypatch):
-    assert runs.revision(tmp_path).commit == "unknown"
-    git(tmp_path, "init")
-    (tmp_path / "code.py").write_text("1")
-    git(tmp_path, "add", ".")
-    git(tmp_path, "commit", "-m", "one")
-    clean = runs.revision(tmp_path)
-    assert len(clean.commit) == 40
-    assert not clean.dirty
-    (tmp_path / "code.py").write_text("2")
-    assert str(runs.revision(tmp_path)) == f"{clean.commit}-dirty"
-    (tmp_path / "inside").mkdir()
-    assert runs.revision(tmp_path / "inside").commit == "unknown"  # installed below somebody else's checkout
-    monkeypatch.setenv("PATH", "")
-    assert runs.revision(tmp_path).commit == "unknown"
-
-
-def test_runs_of_one_second_get_their_own_directories(tmp_path):
-    made = {runs.create(tmp_path / "coin", {"config": {}}) for _ in range(3)}
-    assert len(made) == 3
-    assert runs.newest_unfinished(tmp_path / "coin", {}) == max(made)
-    assert runs.newest_unfinished(tmp_path / "coin", {"a": 1}) is None
-    assert runs.newest_unfinished(tmp_path / "none", {}) is None
-
-
 def test_no_argument_at_all_is_the_default_scale():
     assert parse(coin.EXPERIMENT, [], "about").scale == "default"

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax.distributed.problems import ROWS, feed, words
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.placement import local_rows, place_batch, place_state, shard_step
+from touchr1_jax.distributed.placement import DeviceMesh, local_rows, place_batch, place_state, shard_step
+from touchr1_jax.training.loop import SingleDevice
 
 MESH = MeshConfig().build(jax.devices()[:1])
 
@@ -34,3 +36,26 @@ def test_a_placed_state_has_buffers_of_its_own():
     after, _ = step(after, {"ids": np.zeros(2)})
     assert (int(state["step"]), int(after["step"])) == (0, 2)
     assert after["key"] == state["key"]
+
+
+def test_a_stage_on_a_mesh_computes_what_one_device_does_and_compiles_its_step_once():
+    problem, devices, traced = words(), DeviceMesh(MESH), []
+
+    @jax.jit
+    def step(state, batch):
+        traced.append(batch)
+        return problem.step(state, batch)
+
+    losses = []
+    for where in (SingleDevice(), devices, devices):
+        state = jax.tree.map(jnp.copy, problem.state)
+        placed, state, batches = where.shard(step, state, feed(problem), ROWS)
+        losses.append([])
+        for _ in range(3):
+            state, metrics = placed(state, next(batches))
+            losses[-1].append(float(metrics["loss"]))
+        assert jax.tree.structure(where.gather(state.params)) == jax.tree.structure(problem.state.params)
+    np.testing.assert_allclose(losses[1], losses[0], atol=1e-6)
+    assert losses[1] == losses[2]
+    assert len(traced) == 2  # on one device, on the mesh
+    assert devices.local_rows(ROWS).tolist() == list(range(ROWS))

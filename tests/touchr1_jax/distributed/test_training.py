@@ -11,10 +11,10 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.core.machine import OLDER_LOOPS
 from tests.touchr1_jax.distributed.problems import PROBLEMS, STEPS, feed
 from tests.touchr1_jax.distributed.worker import SAVE_AT, plain_losses
 from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.compilation import OLDER_LOOPS
 
 TOLERANCE = 1e-5
 PATIENCE_S = 280

@@ -6,11 +6,20 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
 from touchr1_jax.training import compilation
-from touchr1_jax.training.compilation import compilations_kept, processor, remove_half_written, return_memory
+from touchr1_jax.training.compilation import (
+    FLAGS,
+    OLDER_LOOPS,
+    compilations_kept,
+    compiled_quickly,
+    processor,
+    remove_half_written,
+    return_memory,
+)
 
 
 @pytest.fixture
@@ -88,3 +97,45 @@ def test_a_cache_of_the_users_own_stays(keeping, tmp_path):
         compiled(0.9)
     assert entries(mine)
     assert not other.exists()
+
+
+SETTING = "jax_disable_most_optimizations"
+
+
+@pytest.fixture
+def well(monkeypatch):
+    """A process that compiles well, as one outside of the tests does."""
+    monkeypatch.delenv(FLAGS, raising=False)
+    before = jax.config.values[SETTING]
+    jax.config.update(SETTING, False)
+    yield
+    jax.config.update(SETTING, before)
+
+
+def test_quick_compilation_ends_with_its_block_even_by_an_error(well):
+    seen = {}
+
+    def fail():
+        seen.update(setting=jax.config.values[SETTING], flags=os.environ.get(FLAGS, ""))
+        raise KeyError
+
+    with pytest.raises(KeyError), compiled_quickly():
+        fail()
+    assert seen == {"setting": True, "flags": OLDER_LOOPS}
+    assert not jax.config.values[SETTING]
+    assert FLAGS not in os.environ
+
+
+def test_flags_of_the_user_stay(well, monkeypatch):
+    monkeypatch.setenv(FLAGS, "--xla_force_host_platform_device_count=2")
+    with compiled_quickly(), compiled_quickly():
+        assert os.environ[FLAGS].split() == ["--xla_force_host_platform_device_count=2", *OLDER_LOOPS.split()]
+    assert os.environ[FLAGS] == "--xla_force_host_platform_device_count=2"
+
+
+def test_quickly_compiled_programs_compute_the_same(well):
+    x = jnp.linspace(-2, 2, 7)
+    f = jax.grad(lambda x: jnp.sum(jnp.tanh(x) ** 2))
+    with compiled_quickly():
+        quick = jax.jit(f)(x)
+    np.testing.assert_allclose(quick, f(x), atol=1e-6)

@@ -1,4 +1,4 @@
-"""What ran, as `list` shows it, and how a run is named."""
+"""Run directories, the revision of the code, and past runs as `list` shows them."""
 
 import dataclasses
 import subprocess
@@ -6,14 +6,47 @@ import sys
 
 import pytest
 
+from experiments.core import runs
 from experiments.core.artifacts import write_json
-from experiments.core.history import locate, read_run
 from experiments.core.runner import main
-from experiments.core.runs import locked
 from experiments.core.text import aligned, duration
 
 FAKES = "tests.experiments.fakes"
 COMMAND = "python -m experiments coin --steps 9"
+FINISHED = {"verdict": ["It is a coin.", "Really."], "requirements": [{"met": True}, {"met": False}]}
+
+
+def git(directory, *arguments):
+    identity = ("-c", "user.name=a", "-c", "user.email=a@b")
+    subprocess.run(["git", *identity, *arguments], cwd=directory, check=True, capture_output=True)
+
+
+def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
+    assert runs.revision(tmp_path).commit == "unknown"
+    git(tmp_path, "init")
+    (tmp_path / "code.py").write_text("1")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-m", "one")
+    clean = runs.revision(tmp_path)
+    assert len(clean.commit) == 40
+    assert not clean.dirty
+    (tmp_path / "code.py").write_text("2")
+    assert str(runs.revision(tmp_path)) == f"{clean.commit}-dirty"
+    (tmp_path / "inside").mkdir()
+    assert runs.revision(tmp_path / "inside").commit == "unknown"  # installed below somebody else's checkout
+    monkeypatch.setenv("PATH", "")
+    assert runs.revision(tmp_path).commit == "unknown"
+
+
+def test_runs_of_one_second_get_their_own_directories(tmp_path):
+    made = {runs.create(tmp_path / "coin", {"config": {}}) for _ in range(3)}
+    assert len(made) == 3
+    assert runs.newest(tmp_path / "coin", {}, finished=False) == max(made)
+    write_json(max(made) / "results.json", FINISHED)
+    assert runs.newest(tmp_path / "coin", {}, finished=True) == max(made)
+    assert runs.newest(tmp_path / "coin", {}, finished=False) == sorted(made)[1]
+    assert runs.newest(tmp_path / "coin", {"a": 1}, finished=False) is None
+    assert runs.newest(tmp_path / "none", {}, finished=False) is None
 
 
 def make_run(home, stamp, *, results=None, total=None):
@@ -36,17 +69,6 @@ def make_run(home, stamp, *, results=None, total=None):
     return directory
 
 
-FINISHED = {"verdict": ["It is a coin.", "Really."], "requirements": [{"met": True}, {"met": False}]}
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (1170, "19 min 30 s"), (7500, "2 h 5 min")],
-)
-def test_times_are_read_easily(seconds, text):
-    assert duration(seconds) == text
-
-
 def test_the_list_shows_the_newest_run_its_cost_and_its_result(tmp_path, capsys):
     make_run(tmp_path, "20260101-000000", total=5)
     make_run(tmp_path, "20260102-000000", results=FINISHED, total=1170)
@@ -56,27 +78,25 @@ def test_the_list_shows_the_newest_run_its_cost_and_its_result(tmp_path, capsys)
     assert "20260101" not in out
 
 
-def test_the_list_of_one_experiment_shows_every_run_and_how_to_go_on(tmp_path, capsys):
+def test_the_list_of_one_experiment_shows_every_run_and_how_to_continue(tmp_path, capsys):
     oldest = make_run(tmp_path, "20260101-000000")
     make_run(tmp_path, "20260102-000000")
     make_run(tmp_path, "20260103-000000", results=FINISHED, total=2)
-    with locked(oldest):
+    with runs.locked(oldest):
         assert main(["list", "coin", "--runs-dir", str(tmp_path)], package=FAKES) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines if line.strip().startswith("2026")] == [
-        "20260103-000000", "20260102-000000", "20260101-000000",
-    ]  # fmt: skip
+        lines = capsys.readouterr().out.splitlines()
+        assert runs.read_run(oldest).state == "running"
+    assert runs.read_run(oldest).state == "unfinished"
+    stamps = [line.split()[0] for line in lines if line.strip().startswith("2026")]
+    assert stamps == ["20260103-000000", "20260102-000000", "20260101-000000"]
     assert "      Really." in lines
     assert f"      to continue: {COMMAND}" in lines
     assert lines[-1].endswith("running")
-    with locked(oldest):  # looking at it has left it free
-        assert read_run(oldest).state == "running"
-    assert read_run(oldest).state == "unfinished"
 
 
-def test_an_experiment_without_runs_says_so(tmp_path, capsys):
+def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsys):
     assert main(["list", "coin", "--runs-dir", str(tmp_path)], package=FAKES) == 0
-    assert "has not run under" in capsys.readouterr().out
+    assert f"has not run under {tmp_path}" in capsys.readouterr().out
     assert main(["list", "coyn", "--runs-dir", str(tmp_path)], package=FAKES) == 2
     assert "Did you mean coin?" in capsys.readouterr().err
 
@@ -94,7 +114,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
 
 
 def test_a_run_of_an_installed_package_shows_its_version(tmp_path):
-    run = read_run(make_run(tmp_path, "20260101-000000"))
+    run = runs.read_run(make_run(tmp_path, "20260101-000000"))
     away = {**run.description, "git": {"commit": "unknown", "dirty": False}, "versions": {"touchr1-jax": "0.1.0"}}
     assert dataclasses.replace(run, description=away).code == "version 0.1.0"
 
@@ -103,18 +123,26 @@ def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
     directory = make_run(tmp_path, "20260101-000000")
     (tmp_path / "coin" / "latest").symlink_to(directory.name)
     for name in (str(directory), "coin/20260101-000000", "coin", str(tmp_path / "coin")):
-        assert locate(name, tmp_path) == directory.resolve()
+        assert runs.locate(name, tmp_path) == directory.resolve()
     with pytest.raises(FileNotFoundError, match=r"'dice' is no run: must be a directory with config\.json"):
-        locate("dice", tmp_path)
+        runs.locate("dice", tmp_path)
     with pytest.raises(FileNotFoundError, match=r"holds no config\.json"):
-        read_run(tmp_path)
+        runs.read_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (1170, "19 min 30 s"), (7500, "2 h 5 min")],
+)
+def test_times_are_read_easily(seconds, text):
+    assert duration(seconds) == text
 
 
 def test_columns_are_aligned():
     assert aligned([("a", "bb", ""), ("ccc", "d", "e")]) == "a    bb\nccc  d   e"
 
 
-def test_listing_runs_waits_for_nothing_heavy():
+def test_listing_runs_imports_nothing_heavy():
     """JAX, SciPy and charts take seconds to import, of use to runs alone."""
     source = "import sys, experiments.__main__; sys.exit(bool({'jax', 'scipy', 'matplotlib'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0

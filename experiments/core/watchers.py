@@ -1,0 +1,164 @@
+"""Watchers of a run in progress: the page that a browser reloads, and TensorBoard's event files."""
+
+import importlib
+import importlib.util
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.core.artifacts import read_json, write_text
+from experiments.core.context import read_metrics
+from experiments.core.curves import PhaseCurves, draw_phases
+from experiments.core.progress import Loop, Watcher
+from experiments.core.report import render
+from experiments.core.runs import continuing
+from experiments.core.text import duration
+
+PAGE_EVERY_S = 10
+"""Least seconds between two pages, and between two reloads by a browser."""
+
+PAGE_SHARE = 0.01
+"""Share of the run's time for pages: after one that took a second, the next follows after 100 s."""
+
+MOST_PANELS = 9
+"""Panels of a phase whose scalars the experiment does not choose."""
+
+TENSORBOARD = "tensorboardX"
+
+TENSORBOARD_HINT = (
+    f"--tensorboard needs the package {TENSORBOARD}, which is not installed: "
+    "pip install 'touchr1-jax[tensorboard]', or leave the flag out"
+)
+
+FLUSH_S = 10
+"""Seconds until an event is on the disk."""
+
+
+class LivePage(Watcher):
+    """Writes `report.html` during a run, until the report replaces it; no server, no script.
+
+    Args:
+      directory: the run's.
+      about: docstring of the experiment; its first line is the question.
+      description: content of the run's `config.json`.
+      curves: phase → scalars to draw.
+      usual_s: duration of the last run of the same configuration; `None` if there was none.
+      clock: seconds.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        about: str,
+        description: Mapping[str, Any],
+        curves: Mapping[str, Sequence[str]],
+        usual_s: float | None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._directory, self._about, self._description = directory, about, description
+        self._wanted, self._usual_s, self._clock = curves, usual_s, clock
+        self._loops: Sequence[Loop] = ()
+        self._drawn: dict[str, tuple[int, dict[str, PhaseCurves]]] = {}
+        self._began = self._due = clock()
+        self._write_if_due()
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """Write the page again if it is time."""
+        self._write_if_due()
+
+    def looping(self, loops: Sequence[Loop]) -> None:
+        """Write the page again if it is time."""
+        self._loops = loops
+        self._write_if_due()
+
+    def end(self, error: BaseException) -> None:
+        """Write the last page of a session that an error or a signal ended: the cause, and how to continue."""
+        why = f"{type(error).__name__}: {error}".rstrip(": ")
+        command = continuing(self._description["command"])
+        self._write(f"Ended on {_now()} by {why}. To continue: {command}", reload_s=None)
+
+    def _write_if_due(self) -> None:
+        began = self._clock()
+        if began >= self._due:
+            self._write(f"Running: this page is of {_now()} and reloads itself.", reload_s=PAGE_EVERY_S)
+            now = self._clock()
+            self._due = now + max(PAGE_EVERY_S, (now - began) / PAGE_SHARE)
+
+    def _write(self, state: str, reload_s: int | None) -> None:
+        times = self._directory / "timing.json"
+        timing = read_json(times) if times.exists() else {}
+        spent = f"{duration(timing.pop('total', 0.0) + self._clock() - self._began)} so far"
+        usual = "no run of this configuration has finished yet"
+        if self._usual_s is not None:
+            usual = f"the last run of this configuration took {duration(self._usual_s)}"
+        page = render(
+            "live.jinja",
+            about=self._about,
+            description=self._description,
+            timing=timing,
+            verdict=(state, f"{spent}; {usual}."),
+            data_title="Time so far",
+            loops=self._loops,
+            curves=self._draw(),
+            reload_s=reload_s,
+        )
+        write_text(self._directory / "report.html", page)
+
+    def _draw(self) -> dict[str, PhaseCurves]:
+        """The curves of each phase; a phase without new lines is not drawn again."""
+        rows: dict[str, list[Mapping[str, Any]]] = {}
+        for line in read_metrics(self._directory):
+            rows.setdefault(line["stage"].partition("/")[0], []).append(line)
+        for phase, lines in rows.items():
+            if self._drawn.get(phase, (0,))[0] != len(lines):
+                self._drawn[phase] = len(lines), draw_phases(lines, self._wanted, most=MOST_PANELS)
+        return {name: drawn for phase in rows for name, drawn in self._drawn[phase][1].items()}
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S")
+
+
+def tensorboard_installed() -> bool:
+    """True if event files can be written."""
+    return importlib.util.find_spec(TENSORBOARD) is not None
+
+
+class Events(Watcher):
+    """Writes every number of every logged line to TensorBoard's event files, a folder for every stage.
+
+    A continued stage gets one more file, whose first event makes TensorBoard drop the events of the last session at or
+    past its step.  Events have a time, lines of `metrics.jsonl` do not.
+
+    Args:
+      folder: a folder for each stage is made in it.
+
+    Raises:
+      ModuleNotFoundError: tensorboardX is not installed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._make = importlib.import_module(TENSORBOARD).SummaryWriter
+        self._writers: dict[str, Any] = {}
+
+    def rewound(self, stage: str, step: int) -> None:
+        """Begin a file of the stage."""
+        if stage in self._writers:
+            self._writers[stage].close()
+        suffix = f".{time.time_ns()}"  # two files of one second would be one
+        folder = str(self._folder / stage)
+        self._writers[stage] = self._make(folder, purge_step=step, flush_secs=FLUSH_S, filename_suffix=suffix)
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """Write the numbers among the scalars."""
+        for name, value in scalars.items():
+            if isinstance(value, int | float):
+                self._writers[stage].add_scalar(name, value, step)
+
+    def closed(self) -> None:
+        """Write what is left and close the files."""
+        for writer in self._writers.values():
+            writer.close()
