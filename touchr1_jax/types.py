@@ -29,7 +29,7 @@ class TouchBatch:
 
 @struct.dataclass
 class Target:
-    """The right answer that a rollout is scored against; −1 marks an unknown label.
+    """The truth that a rollout is scored against: the level of every attribute, asked or not; −1 marks an unknown one.
 
     `asked` selects the attributes of the question, `streams` the sensors that were present.
     """

@@ -35,6 +35,7 @@ from experiments.engine.world import (
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards import make_rewards
+from touchr1_jax.rewards.base import reward_value
 from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.counterfactual import noise_touch, shuffle_touch, swap_touch
@@ -259,7 +260,7 @@ def make_world_score(variant: GrpoVariant, values: Hyperparameters) -> ScoreFn:
 
     def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
         parsed = PARSER(tokens)
-        terms = {name: weight * rewards[name].value(parsed, target) for name, weight in weights.items()}
+        terms = {name: weight * reward_value(name, rewards[name], parsed, target) for name, weight in weights.items()}
         terms["lenient"] = values.lenient * lenient_credit(tokens, parsed, target)
         return sum(terms.values(), start=jnp.float32(0)), terms, parsed
 

@@ -52,7 +52,8 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     params = run_sft(policy, data, evidence, sft, context, seed=0, stage=STAGES[0])
     features = encode_rows(policy, params, data, data.parts["grpo"], context)
     noise = noise_bank(policy, params, data, seed=0)
-    contacts = EncodedContacts(features=features, label=data.label[data.parts["grpo"]], noise=noise)
+    label = data.label[data.parts["grpo"]]
+    contacts = EncodedContacts(features=features, label=label, truth=label, noise=noise)
     arm = make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
     run_grpo(policy, arm, contacts, params, context, seed=0, stage=STAGES[1])
     blind = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)

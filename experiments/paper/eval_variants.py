@@ -55,7 +55,12 @@ def without_sft(weights: Weights, algorithm: AnyAlgorithm, trained: TrainedPolic
     grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
     arm = make_arm(policy, weights, data.prior(), grpo, config.grpo_loop, config.grpo_lora)
     noise = noise_bank(policy, params, data, seed=trained.seed)
-    contacts = EncodedContacts(features=encode(rows=data.parts["grpo"]), label=trained.grpo_label, noise=noise)
+    contacts = EncodedContacts(
+        features=encode(rows=data.parts["grpo"]),
+        label=trained.grpo_label,
+        truth=data.label[data.parts["grpo"]],
+        noise=noise,
+    )
     stage = f"grpo/no_sft/{trained.seed}"
     tuned = run_grpo(policy, arm, contacts, params, trained.context, seed=trained.seed, stage=stage)
     return ask_policy(policy, tuned, encode(rows=data.parts["test"]), trained.label, trained.context)

@@ -82,4 +82,5 @@ def level_answers(
         ),
         label=asked.label,
         alone=single if sensors > 1 else None,
+        truth=asked.truth,
     )

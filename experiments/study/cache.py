@@ -100,7 +100,11 @@ def cached_grpo(
         "seed": seed,
         "mesh": context.devices.shape,
     }
-    named = dataclasses.asdict(contacts.features) | {"label": contacts.label, "noise": contacts.noise}
+    named = dataclasses.asdict(contacts.features) | {
+        "label": contacts.label,
+        "truth": contacts.truth,
+        "noise": contacts.noise,
+    }
     arrays = _flat(params) | {f"input/{name}": np.asarray(x) for name, x in named.items()} | {"input/prior": arm.prior}
     return _cached(
         context.cache_dir / "grpo" / f"{fingerprint(values, arrays, source_digest(NEVER))}.npz",

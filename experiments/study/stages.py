@@ -204,7 +204,7 @@ def make_arm(
     lora: LoraConfig | None = None,
 ) -> GRPOArm:
     """An arm whose total reward is made of its weights and the prior."""
-    score = make_score(policy.parser, make_rewards(prior), weights)
+    score = make_score(policy.parser, make_rewards(prior), weights, policy.tokenizer.decode)
     return GRPOArm(weights=weights, prior=prior, score=score, config=config, loop=loop, lora=lora)
 
 
@@ -215,11 +215,13 @@ class EncodedContacts:
     Attributes:
       features: their encoded touch.
       label: their levels [n, A]; −1 where nothing may be asked.
+      truth: all their levels, −1 unknown, which rewards see.
       noise: the encoder's noise bank.
     """
 
     features: Features
     label: Int[np.ndarray, "n A"]
+    truth: Int[np.ndarray, "n A"]
     noise: Float[Array, "K S N D"]
 
 
@@ -235,7 +237,10 @@ def run_grpo(
 ) -> Params:
     """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed."""
     own = context.devices.local_rows(arm.config.drawn)
-    feed = QuestionFeed(policy, contacts.features, contacts.label, batch_size=arm.config.drawn, seed=seed, own=own)
+    size = arm.config.drawn
+    feed = QuestionFeed(
+        policy, contacts.features, contacts.label, batch_size=size, seed=seed, own=own, truth=contacts.truth
+    )
     with stage_hooks(context, stage, arm.loop.steps, make_log=alarm_log) as hooks:
         return train_grpo(
             policy, params, feed, arm.score, arm.config, arm.loop, hooks, noise=contacts.noise, lora=arm.lora, seed=seed

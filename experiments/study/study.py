@@ -271,7 +271,7 @@ class _Seed:
         encode = functools.partial(encode_rows, policy, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(policy, params, data, seed=self.seed, contacts=self.config.noise_contacts)
-        contacts = EncodedContacts(features=train, label=self._grpo_label(), noise=noise)
+        contacts = EncodedContacts(features=train, label=self._grpo_label(), truth=self._label("grpo"), noise=noise)
         self._evaluate_all(SFT, params, test, noise)
         make_grpo = cached_grpo if self.share else run_grpo
         for name, arm in self.arms.items():

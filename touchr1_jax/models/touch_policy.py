@@ -104,11 +104,11 @@ class TouchPolicy:
         return jax.jit(lambda key, batch: init_policy(module, key, batch, layout.ids[0], layout.mask[0], slots))
 
     def target(self, attribute: Int[np.ndarray, "n"], label: Int[np.ndarray, "n A"], streams: np.ndarray) -> Target:
-        """Targets of single-attribute questions, on the host; labels of attributes that are not asked are hidden."""
+        """Targets of single-attribute questions, on the host; labels of attributes that are not asked stay visible."""
         asked = self.layout.asked[attribute]
         of: dict[str, Any] = {
             "asked": asked,
-            "label": np.where(asked, label, -1).astype(np.int32),
+            "label": label.astype(np.int32),
             "levels": np.tile(np.array(self.levels, np.int32), (len(asked), 1)),
             "ordinal": np.tile([a.ordinal for a in self.language.attributes], (len(asked), 1)),
             "streams": streams,

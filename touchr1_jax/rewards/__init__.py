@@ -4,16 +4,34 @@ import numpy as np
 
 from touchr1_jax.rewards.accuracy import accuracy
 from touchr1_jax.rewards.accuracy_debiased import accuracy_debiased, uniform_prior
-from touchr1_jax.rewards.base import Reward, RewardError, check_weights, total_reward
+from touchr1_jax.rewards.base import (
+    AnyReward,
+    GroupReward,
+    HostReward,
+    Reward,
+    RewardError,
+    check_weights,
+    total_reward,
+)
 from touchr1_jax.rewards.consistency import consistency, consistency_applies
 from touchr1_jax.rewards.consistency_gated import consistency_gated
 from touchr1_jax.rewards.exact import exact
 from touchr1_jax.rewards.formatted import formatted
 
-__all__ = ["Reward", "RewardError", "check_weights", "make_rewards", "total_reward", "uniform_prior"]
+__all__ = [
+    "AnyReward",
+    "GroupReward",
+    "HostReward",
+    "Reward",
+    "RewardError",
+    "check_weights",
+    "make_rewards",
+    "total_reward",
+    "uniform_prior",
+]
 
 
-def make_rewards(prior: np.ndarray) -> dict[str, Reward]:
+def make_rewards(prior: np.ndarray) -> dict[str, AnyReward]:
     """All rewards by name, for `total_reward` to choose from.
 
     Args:

@@ -19,7 +19,9 @@ from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
 
-from touchr1_jax.rewards import Reward, check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.rewards import AnyReward, check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.rewards.base import GROUP, reward_value
+from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.lexer import tags_of
 from touchr1_jax.text.oracle import Reading, read
@@ -79,6 +81,8 @@ class ExplainAnswer:
     """Tokens before the end token; by default the words of the text."""
     truncated: bool = False
     """The answer was cut off: no end token came."""
+    longest: int = 20
+    """Most tokens of a completion."""
 
     def run(self) -> int:
         """Print both tables and return the exit status."""
@@ -91,7 +95,7 @@ class ExplainAnswer:
             streams = self._streams(language, reading)
             targets = ((w, _target(language, asked, label, streams)) for w, label in self._labels(language, asked))
             parsed = self._parsed(reading)
-            earned = terms_table(rewards, weights, parsed, targets)
+            earned = terms_table(rewards, weights, parsed, targets, self.text, self.longest)
         except ValueError as error:
             _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
             return 1
@@ -153,7 +157,7 @@ class ExplainAnswer:
         )
 
 
-def all_rewards(language: Language) -> dict[str, Reward]:
+def all_rewards(language: Language) -> dict[str, AnyReward]:
     """Every reward, debiased for levels that are all as likely."""
     return make_rewards(uniform_prior([len(attribute.levels) for attribute in language.attributes]))
 
@@ -176,31 +180,47 @@ def level_words(language: Language) -> str:
 
 
 def terms_table(
-    rewards: Mapping[str, Reward],
+    rewards: Mapping[str, AnyReward],
     weights: Mapping[str, float],
     parsed: Parsed,
     targets: Iterator[tuple[str, Target]],
+    text: str = "",
+    longest: int = 20,
 ) -> Table:
-    """Value, weight and share of every term, and the total, for each target.
+    """Value, weight and share of every term, and the total, for each target; the answer is a group of its own.
 
     Raises:
-      RewardError: as `total_reward` does where it is traced, as training will: what cannot be trained is not shown.
+      RewardError: as training does: a reward that cannot be traced or can be NaN is named, not shown.
     """
     table = Table("if it is", "reward", "value", "weight", "adds", title="What it earns")
+    words = text.split()[:longest]
+    tokens = jnp.array([*map(sorted(set(words)).index, words), *[len(words)] * (longest - len(words))], jnp.int32)
+
+    def write(tokens: np.ndarray) -> str:
+        del tokens
+        return text
+
+    def of_rollout(tokens: Array, parsed: Parsed, target: Target) -> tuple[Array, Mapping[str, Array], Mapping]:
+        total, parts = total_reward(rewards, weights, parsed, target, tokens, write)
+        sensors, attributes = parsed.perceive.shape
+        prove_rewards(rewards, weights, sensors, attributes, longest)
+        values = {n: reward_value(n, rewards[n], parsed, target, tokens, write) for n in weights}
+        terms = {n: (values[n], rewards[n].applies(target)) for n in weights}
+        return total, parts, terms
 
     @jax.jit  # one program for all targets: one for each operation would take seconds to compile
     def score(target: Target) -> tuple[Array, Mapping[str, Array], Mapping[str, tuple[Array, Array]]]:
-        total, parts = total_reward(rewards, weights, parsed, target)
-        terms = {name: (rewards[name].value(parsed, target), rewards[name].applies(target)) for name in weights}
-        return total, parts, terms
+        alone = jax.tree.map(lambda x: x[None], parsed)
+        scored = jax.vmap(of_rollout, in_axes=(0, 0, None), axis_name=GROUP)(tokens[None], alone, target)
+        return jax.tree.map(lambda x: x[0], scored)
 
-    for words, target in targets:
+    for said, target in targets:
         total, parts, terms = score(target)
         for name, weight in weights.items():
             value, applies = terms[name]
             shown = f"{float(value):.3f}" if applies else NOT_DEFINED
-            table.add_row(words, name, shown, f"{weight:g}", f"{float(parts[name]):+.3f}")
-            words = ""
+            table.add_row(said, name, shown, f"{weight:g}", f"{float(parts[name]):+.3f}")
+            said = ""
         table.add_row("", "total", "", "", f"{float(total):+.3f}", style="bold", end_section=True)
     return table
 

@@ -40,7 +40,7 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
     def value(parsed: Parsed, target: Target) -> Float[Array, ""]:
         answer = parsed.conclude
         expected, exists = _constant_earnings(prior, target)
-        own = jnp.take_along_axis(expected, jnp.maximum(answer, 0)[:, None], axis=1)[:, 0]
+        own = jnp.take_along_axis(expected, jnp.maximum(answer, 0)[:, None], axis=1, mode="clip")[:, 0]
         bias = jnp.where((answer < 0) | (target.label < 0), 0.0, own - masked.mean(expected, exists, axis=1))
         earned = credit(answer, target.label, target.levels, target.ordinal)
         return masked.mean(earned - bias, target.asked)

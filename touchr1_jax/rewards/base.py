@@ -1,18 +1,24 @@
-"""The type of a reward, and the weighted sum of rewards."""
+"""The types of rewards, and the weighted sum of rewards."""
 
 import math
 import traceback
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.errors import ConcretizationTypeError, TracerArrayConversionError
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.types import Parsed, Target
 
 UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError)
 """Errors of JAX where Python or NumPy needs a number that the compiled program will compute."""
+
+
+GROUP = "group"
+"""Name of the `vmap` axis over the rollouts of one prompt."""
 
 
 class RewardError(ValueError):
@@ -38,8 +44,43 @@ class Reward(NamedTuple):
     applies: Callable[[Target], Bool[Array, ""]] = always
 
 
+class GroupReward(NamedTuple):
+    """A reward of all rollouts of one prompt together, for what a single answer does not show: tokens and the others.
+
+    Attributes:
+      value: (tokens int32 [G, T], parsed answers [G, …], target) → float [G], finite for any G ≥ 1.
+      applies: as in `Reward`.
+    """
+
+    value: Callable[[Int[Array, "G T"], Parsed, Target], Float[Array, "G"]]
+    applies: Callable[[Target], Bool[Array, ""]] = always
+
+
+class HostReward(NamedTuple):
+    """A reward that Python computes from the text on the host, for what cannot be traced: slower, the device waits.
+
+    Attributes:
+      value: (text, parsed answer, target), all NumPy → a finite number; pure, for it may be called again.
+      applies: as in `Reward`, traced.
+    """
+
+    value: Callable[[str, Parsed, Target], float]
+    applies: Callable[[Target], Bool[Array, ""]] = always
+
+
+AnyReward = Reward | GroupReward | HostReward
+
+Decode = Callable[[np.ndarray], str]
+"""Tokens [T] → their text."""
+
+
 def total_reward(
-    rewards: Mapping[str, Reward], weights: Mapping[str, float], parsed: Parsed, target: Target
+    rewards: Mapping[str, AnyReward],
+    weights: Mapping[str, float],
+    parsed: Parsed,
+    target: Target,
+    tokens: Int[Array, "T"] | None = None,
+    decode: Decode | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Weighted sum of the rewards that apply, R = W Σ_n a_n w_n r_n / Σ_n a_n w_n with W = Σ_n w_n.
 
@@ -50,6 +91,8 @@ def total_reward(
       weights: weight ≥ 0 of each reward that counts.
       parsed: the parsed rollout.
       target: the right answer.
+      tokens: the rollout, which a `GroupReward` and a `HostReward` see; the first also needs the axis `GROUP`.
+      decode: writes the text that a `HostReward` sees.
 
     Returns:
       R, and the part of each weighted reward; the parts sum to R.
@@ -60,8 +103,8 @@ def total_reward(
       Exception: any other of a reward, with a note of its name.
     """
     check_weights(rewards, weights)
-    values = {name: _scalar(name, "value", jnp.floating, rewards[name].value, parsed, target) for name in weights}
-    applies = {name: _scalar(name, "applies", jnp.bool_, rewards[name].applies, target) for name in weights}
+    values = {name: reward_value(name, rewards[name], parsed, target, tokens, decode) for name in weights}
+    applies = {name: _checked(name, "applies", jnp.bool_, (), rewards[name].applies, target) for name in weights}
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
     in_force = sum(share.values())
     scale = jnp.where(in_force > 0, sum(weights.values()) / jnp.where(in_force > 0, in_force, 1.0), 0.0)
@@ -69,7 +112,68 @@ def total_reward(
     return sum(parts.values(), start=jnp.float32(0)), parts
 
 
-def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -> None:
+def reward_value(
+    name: str,
+    reward: AnyReward,
+    parsed: Parsed,
+    target: Target,
+    tokens: Int[Array, "T"] | None = None,
+    decode: Decode | None = None,
+) -> Float[Array, ""]:
+    """Value of a reward of any kind for one rollout; arguments and errors as in `total_reward`."""
+    if isinstance(reward, Reward):
+        return _checked(name, "value", jnp.floating, (), reward.value, parsed, target)
+    if tokens is None or (decode is None and isinstance(reward, HostReward)):
+        raise RewardError(f"reward {name!r} sees tokens or text: must be given them; pass `tokens` and `decode`")
+    if isinstance(reward, HostReward) and decode is not None:
+        of_text = lambda t, p, y: {name: reward.value(decode(t), p, y)}
+        return on_host(of_text, (name,), tokens, parsed, target)[0]
+    try:
+        row = jax.lax.axis_index(GROUP)
+    except NameError as error:
+        raise RewardError(
+            f"reward {name!r} compares the rollouts of a group: must be scored along the axis {GROUP!r}; write "
+            "jax.vmap(score, in_axes=(0, None), axis_name=GROUP)"
+        ) from error
+    tokens, parsed = jax.tree.map(lambda x: jax.lax.all_gather(x, GROUP), (tokens, parsed))
+    return _checked(name, "value", jnp.floating, tokens.shape[:1], reward.value, tokens, parsed, target)[row]
+
+
+def on_host(
+    score: Callable[[np.ndarray, Parsed, Target], Mapping[str, float]],
+    terms: tuple[str, ...],
+    tokens: Int[Array, "T"],
+    parsed: Parsed,
+    target: Target,
+) -> Float[Array, "n"]:
+    """Terms of one rollout by a Python function on the host, called once a step for all rollouts of the batch.
+
+    Raises (when run):
+      ValueError: other terms than announced, or one that is not finite.
+    """
+
+    def rows(tokens: np.ndarray, parsed: Parsed, target: Target) -> np.ndarray:
+        batch = tokens.shape[:-1]
+        row = lambda tree, i: jax.tree.map(lambda x: np.broadcast_to(x, (*batch, *x.shape[len(batch) :]))[i], tree)
+        out = np.empty((*batch, len(terms)), np.float32)
+        for i in np.ndindex(batch):
+            out[i] = _host_terms(score(np.asarray(tokens[i]), row(parsed, i), row(target, i)), terms)
+        return out
+
+    shape = jax.ShapeDtypeStruct((len(terms),), jnp.float32)
+    return jax.pure_callback(rows, shape, tokens, parsed, target, vmap_method="broadcast_all")
+
+
+def _host_terms(found: Mapping[str, float], terms: tuple[str, ...]) -> list[float]:
+    if set(found) != set(terms):
+        raise ValueError(f"host reward returned terms {sorted(found)}: must be {sorted(terms)}; correct `terms`")
+    for name, value in found.items():
+        if not np.isfinite(value):
+            raise ValueError(f"host reward {name!r} is {value}: must be finite; give an undefined answer a number")
+    return [float(found[name]) for name in terms]
+
+
+def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]) -> None:
     """Check the names and sizes of weights.
 
     Raises:
@@ -79,7 +183,7 @@ def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -
     for name, weight in weights.items():
         if name not in rewards:
             raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
-        if not isinstance(rewards[name], Reward):
+        if not isinstance(rewards[name], AnyReward):
             raise RewardError(f"rewards[{name}] is {rewards[name]!r}: must be a Reward; write Reward(function)")
         if not (math.isfinite(weight) and weight >= 0):
             raise RewardError(
@@ -89,8 +193,8 @@ def check_weights(rewards: Mapping[str, Reward], weights: Mapping[str, float]) -
         raise RewardError(f"weights is {dict(weights)}: at least one must be above 0; give a reward some weight")
 
 
-def _scalar(name: str, part: str, kind: type, function: Callable[..., Any], *of: Parsed | Target) -> Any:
-    """Value of a part of a reward, checked to be a scalar of that kind."""
+def _checked(name: str, part: str, kind: type, shape: tuple[int, ...], function: Callable[..., Any], *of: Any) -> Any:
+    """Value of a part of a reward, checked to be of that kind and shape."""
     try:
         value = function(*of)
     except UNTRACEABLE as error:
@@ -98,16 +202,16 @@ def _scalar(name: str, part: str, kind: type, function: Callable[..., Any], *of:
         raise RewardError(
             f"reward {name!r}: {part} cannot be traced, {line.filename}:{line.lineno} needs a number that is "
             "computed later; choose with jnp.where instead of `if`, compute with jnp instead of numpy or float(), or "
-            "score on the host with rl.scoring.make_host_score"
+            "make it a HostReward"
         ) from error
     except Exception as error:
         error.add_note(f"raised by reward {name!r}, its {part}")
         raise
     number = isinstance(value, (jnp.ndarray, jnp.generic, bool, int, float))
-    shape, dtype = (jnp.shape(value), jnp.result_type(value)) if number else ((), None)
-    if shape != () or dtype is None or not jnp.issubdtype(dtype, kind):
-        got = f"has type {dtype}{list(shape)}" if number else f"is {value!r}"
-        wanted = "bool[]" if kind is jnp.bool_ else "float[]"
+    found, dtype = (jnp.shape(value), jnp.result_type(value)) if number else ((), None)
+    if found != shape or dtype is None or not jnp.issubdtype(dtype, kind):
+        got = f"has type {dtype}{list(found)}" if number else f"is {value!r}"
+        wanted = ("bool" if kind is jnp.bool_ else "float") + str(list(shape))
         raise RewardError(
             f"reward {name!r}: {part} {got}, must be {wanted}; return one number per rollout, of that type"
         )

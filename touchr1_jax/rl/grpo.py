@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.rewards.base import GROUP
 from touchr1_jax.rl import tactile_use
 from touchr1_jax.rl.advantages import (
     added_after,
@@ -167,7 +168,7 @@ class _Engine:
         fns, params = self.fns.with_context(self.gather), self.gather(at_precision(self.config, params))
         prompts = encode_prompts(fns, params, batch)
         rollout = sample_prompts(fns, params, prompts, key, self.draw(self.config.group))
-        score = jax.vmap(jax.vmap(self.score, in_axes=(0, None)))
+        score = jax.vmap(jax.vmap(self.score, in_axes=(0, None), axis_name=GROUP))
         reward, terms, parsed = score(rollout.tokens, batch.target)
 
         def answer(features: Features, key: Array) -> Parsed:

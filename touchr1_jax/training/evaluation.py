@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
+from touchr1_jax.rewards.base import GROUP, Decode
 from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, make_answer
 from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
 from touchr1_jax.types import Params, Parsed
@@ -29,6 +30,7 @@ class Evaluation:
       contact, attribute, streams: the question, and the streams that were shown.
       tokens, parsed: the answer.
       label: −1 where not asked.
+      truth: level of every attribute, −1 unknown, which rewards see; `None` where only `label` was kept.
       alone: conclusions of the policy that is shown each stream alone; `None` where it was not asked so.
     """
 
@@ -39,6 +41,7 @@ class Evaluation:
     parsed: Parsed
     label: Int[np.ndarray, "N A"]
     alone: Int[np.ndarray, "N S A"] | None
+    truth: Int[np.ndarray, "N A"] | None = None
 
 
 def evaluate_policy(
@@ -89,6 +92,7 @@ def evaluate_policy(
         parsed=together.parsed,
         label=np.where(policy.layout.asked[attribute], label[contact], -1),
         alone=np.stack([x.parsed.conclude for x in each_alone], 1) if each_alone else None,
+        truth=label[contact],
     )
 
 
@@ -109,16 +113,19 @@ def reward_terms(
       weights: of the rewards.
       prior: share of each level among the training labels.
     """
-    target = policy.target(evaluation.attribute, evaluation.label, evaluation.streams)
-    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape)
-    return jax.device_get(score(jax.tree.map(jnp.asarray, evaluation.parsed), target))
+    truth = evaluation.label if evaluation.truth is None else evaluation.truth
+    target = policy.target(evaluation.attribute, truth, evaluation.streams)
+    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape, policy.tokenizer.decode)
+    groups_of_one = jax.tree.map(lambda x: jnp.asarray(x)[:, None], (evaluation.parsed, evaluation.tokens))
+    return jax.tree.map(lambda x: x[:, 0], jax.device_get(score(*groups_of_one, target)))
 
 
 @functools.cache
-def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...]) -> Any:
-    """Compiled reward terms of many answers, made once for each set of weights."""
+def reward_program(weights: tuple[tuple[str, float], ...], prior: bytes, shape: tuple[int, ...], decode: Decode) -> Any:
+    """Compiled reward terms of groups of answers, made once for each set of weights."""
     rewards = make_rewards(np.frombuffer(prior, np.float32).reshape(shape))
-    return jax.jit(jax.vmap(lambda p, t: total_reward(rewards, dict(weights), p, t)[1]))
+    one = lambda parsed, tokens, target: total_reward(rewards, dict(weights), parsed, target, tokens, decode)[1]
+    return jax.jit(jax.vmap(jax.vmap(one, in_axes=(0, 0, None), axis_name=GROUP)))
 
 
 def rewards_of(

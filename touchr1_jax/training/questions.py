@@ -25,7 +25,8 @@ class NoLabelsError(ValueError):
 class QuestionFeed(Feed):
     """GRPO batches: encoded contacts in random order, each with the question for one attribute.
 
-    Where several processes share a batch, each makes the rows `own` of it.
+    Where several processes share a batch, each makes the rows `own` of it.  `truth` [n, A] are all levels that are
+    known, which rewards see; by default those of `label`, which may be asked about.
     """
 
     def __init__(
@@ -38,11 +39,12 @@ class QuestionFeed(Feed):
         seed: int,
         full_share: float = 0.75,
         own: np.ndarray | None = None,
+        truth: np.ndarray | None = None,
     ) -> None:
         contact, attribute = labelled_questions(label)
         order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
         super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
-        self._policy, self._features, self._label = policy, features, label
+        self._policy, self._features, self._truth = policy, features, label if truth is None else truth
         self._contact, self._attribute, self._full_share = contact, attribute, full_share
         self._own = np.arange(batch_size) if own is None else own
 
@@ -51,7 +53,7 @@ class QuestionFeed(Feed):
         contact, attribute = self._contact[element], self._attribute[element]
         streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
         own = self._own
-        return question_batch(self._policy, self._features, self._label, contact[own], attribute[own], streams[own])
+        return question_batch(self._policy, self._features, self._truth, contact[own], attribute[own], streams[own])
 
 
 def labelled_questions(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:
@@ -74,7 +76,7 @@ def question_batch(
     attribute: np.ndarray,
     streams: np.ndarray,
 ) -> GRPOBatch:
-    """One question per row: row i asks attribute[i] about contact[i], shown streams[i]."""
+    """One question per row: row i asks attribute[i] about contact[i], shown streams[i]; rewards see all its labels."""
     chosen = take(features, contact)
     asked: dict[str, Any] = {
         "ids": policy.layout.ids[attribute],

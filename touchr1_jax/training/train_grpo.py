@@ -13,11 +13,13 @@ from jaxtyping import Array, Float
 from touchr1_jax.models.lora import LoraConfig, adapt
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.rewards import Reward, check_weights, total_reward
+from touchr1_jax.rewards import AnyReward, check_weights, total_reward
+from touchr1_jax.rewards.base import GROUP
+from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import LEAN, FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
-from touchr1_jax.rl.scoring import ScoreFn, check_finite
+from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
@@ -72,7 +74,7 @@ def train_grpo(
     return {**params, **(found if lora is None else merge_adapters(decoder, found, lora, hooks))}
 
 
-def check_rewards(rewards: Mapping[str, Reward], weights: Mapping[str, float], language: Language) -> None:
+def check_rewards(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], language: Language) -> None:
     """Try every weighted reward on an empty answer, so that a misfit is reported before anything is made.
 
     Raises:
@@ -91,9 +93,11 @@ def check_rewards(rewards: Mapping[str, Reward], weights: Mapping[str, float], l
     )
     target = Target(asked=level > 0, label=level, levels=level, ordinal=level > 0, streams=jnp.zeros(sensors, bool))
     check_weights(rewards, weights)
-    jax.eval_shape(functools.partial(total_reward, rewards, weights), parsed, target)
-    for name in weights:
-        check_finite(name, rewards[name], sensors, attributes)
+    of_group = jax.vmap(
+        lambda p, t, tokens: total_reward(rewards, weights, p, t, tokens, str), in_axes=(0, None, 0), axis_name=GROUP
+    )
+    jax.eval_shape(of_group, jax.tree.map(lambda x: x[None], parsed), target, jnp.zeros((1, 1), jnp.int32))
+    prove_rewards(rewards, weights, sensors, attributes)
 
 
 @functools.cache

@@ -88,7 +88,9 @@ def reinforce(policy, params, data, tmp_path):
         context = Context(tmp_path / name, tmp_path / "cache", Console(quiet=True))
         felt = tiny.features(2)
         felt = dataclasses.replace(felt, touch=felt.touch + moved)
-        asked = EncodedContacts(features=felt, label=np.zeros((2, 4), int), noise=np.zeros((1, 4, 2, 8)))
+        asked = EncodedContacts(
+            features=felt, label=np.zeros((2, 4), int), truth=np.zeros((2, 4), int), noise=np.zeros((1, 4, 2, 8))
+        )
         loop = LoopConfig(steps=steps, save_every=1)
         arm = make_arm(policy, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
         made = cached_grpo(policy, arm, asked, params, context, seed=seed, stage="grpo/a/0", train=add_one)

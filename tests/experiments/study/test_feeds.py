@@ -218,12 +218,23 @@ def test_a_feed_must_make_batches(questions):
         Feed.make(questions(), None, np.random.default_rng(0))
 
 
-def test_targets_hide_the_labels_that_are_not_asked(policy, questions, data):
+def test_targets_hold_every_label_with_the_one_that_is_asked(policy, features, data):
+    """Only hardness is asked about; a reward sees the material and all else that is true of the contact."""
+    truth = data.label[data.parts["grpo"]]
+    label = np.where(np.arange(4) == 0, truth, -1)
+    questions = QuestionFeed(policy, features, label, batch_size=4, seed=1, truth=truth)
+    for _, batch in zip(range(5), questions, strict=False):
+        target = jax.tree.map(np.asarray, batch.target)
+        contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
+        assert (target.asked == [True, False, False, False]).all()
+        np.testing.assert_array_equal(target.label, truth[contact])
+
+
+def test_targets_describe_the_question(policy, questions, data):
     label = data.label[data.parts["grpo"]]
     for _, batch in zip(range(5), questions(), strict=False):
         target = jax.tree.map(np.asarray, batch.target)
         assert (target.asked.sum(1) == 1).all()
-        assert (target.label[~target.asked] == -1).all()
         assert (target.label[target.asked] >= 0).all()
         assert (target.levels == [3, 3, 3, 9]).all()
         assert (target.ordinal == [True, True, True, False]).all()
@@ -241,7 +252,7 @@ def test_every_question_comes_once_an_epoch_and_none_without_a_label(policy, fea
     asked = np.asarray(batch.target.asked).argmax(1)
     contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
     assert sorted(zip(contact, asked, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
-    assert (np.asarray(batch.target.label).max(1) == label[contact, asked]).all()
+    np.testing.assert_array_equal(batch.target.label, label[contact])
 
 
 def test_a_question_is_felt_by_the_streams_that_it_says(policy, features, data):

@@ -103,5 +103,21 @@ def test_what_cannot_be_trained_is_not_explained():
         terms_table(branching, {"mine": 1.0}, make_parsed(), iter([("soft", make_target())]))
 
 
+def test_what_can_be_nan_is_not_explained():
+    """The variance of one sensor's report; training would refuse it with the same words."""
+    spread = Reward(lambda p, t: jnp.var(p.perceive[:, 0]) * jnp.sum(t.streams) / (jnp.sum(t.streams) - 1))
+    with pytest.raises(RewardError, match=r"reward 'mine' is nan for .*: must be finite everywhere"):
+        terms_table({"mine": spread}, {"mine": 1.0}, make_parsed(), iter([("soft", make_target())]))
+
+
+def test_the_truth_about_what_is_not_asked_is_seen():
+    """A reward that pays for metal, whatever the question: the same label reaches it in training."""
+    metal = {"mine": Reward(lambda p, t: 1.0 * (t.label[-1] == 1))}
+    rows = list(
+        terms_table(metal, {"mine": 1.0}, make_parsed(), iter([("soft", make_target(label=(0, 0, 1)))])).columns
+    )
+    assert next(iter(rows[2].cells)) == "1.000"
+
+
 def test_the_published_weights_are_those_that_reports_use():
     assert dict(PUBLISHED) == dict(REPORTED)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rewards import Reward, make_rewards
-from touchr1_jax.rl.scoring import check_finite, make_host_score, make_score
+from touchr1_jax.rewards import GroupReward, HostReward, Reward, RewardError, make_rewards
+from touchr1_jax.rewards.base import GROUP
+from touchr1_jax.rl.scoring import make_host_score, make_score
 from touchr1_jax.text.parser import compile_parser
 
 PARSER = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
@@ -46,19 +47,42 @@ def test_faults_of_a_host_reward_are_named(returned, message):
         jax.block_until_ready(batched(make_host_score(PARSER, lambda *_: returned, ("a",))))
 
 
-@pytest.mark.parametrize("name", REWARDS)
-def test_every_reward_is_finite_at_the_corners(name):
-    check_finite(name, REWARDS[name], tiny.S, tiny.A)
+def test_a_reward_that_is_not_finite_somewhere_fails_when_traced():
+    score = make_score(PARSER, {"mine": Reward(lambda p, t: jnp.log(p.length / 20))}, {"mine": 1.0})
+    with pytest.raises(RewardError, match=r"reward 'mine' is -inf for .*: must be finite everywhere"):
+        jax.eval_shape(score, TOKENS[0, 0], jax.tree.map(lambda x: x[0], TARGET))
+
+
+RANK = GroupReward(lambda tokens, parsed, target: jnp.argsort(jnp.argsort(tokens[:, 0])) * 1.0)
+"""Place of a rollout among those of its group, by its first token."""
+ENDS = HostReward(lambda text, parsed, target: float(text.endswith("</conclude>")) + float(target.label[0]))
+"""1 where the text ends well, and the label of the first attribute."""
+
+
+def test_a_reward_may_see_the_tokens_of_the_whole_group():
+    score = make_score(PARSER, {"rank": RANK}, {"rank": 2.0})
+    reward, _, _ = jax.vmap(jax.vmap(score, in_axes=(0, None), axis_name=GROUP))(TOKENS, TARGET)
+    np.testing.assert_allclose(reward, 2.0 * np.argsort(np.argsort(TOKENS[..., 0], 1), 1))
+
+
+def test_a_reward_may_see_the_text_beside_rewards_of_the_program():
+    score = make_score(PARSER, {**REWARDS, "ends": ENDS}, {"ends": 0.5, "format": 0.5}, tiny.TOKENIZER.decode)
+    _, terms, parsed = batched(score)
+    ends = [[tiny.TOKENIZER.decode(np.asarray(row)).endswith("</conclude>") for row in group] for group in TOKENS]
+    np.testing.assert_allclose(terms["ends"], 0.5 * (np.array(ends) + np.asarray(TARGET.label)[:, :1]))
+    np.testing.assert_allclose(terms["format"], 0.5 * np.asarray(parsed.formatted))
 
 
 @pytest.mark.parametrize(
-    "value",
-    [lambda p, t: jnp.log(p.length / 20), lambda p, t: jnp.sum(1.0 * t.label * t.asked) / jnp.sum(t.asked)],
-    ids=["log of no tokens", "mean of nothing asked"],
+    ("reward", "message"),
+    [
+        (RANK, "reward 'mine' compares the rollouts of a group: must be scored along the axis 'group'"),
+        (ENDS, "reward 'mine' sees tokens or text: must be given them"),
+    ],
 )
-def test_a_reward_that_is_not_finite_somewhere_fails_when_traced(value):
-    score = make_score(PARSER, {"mine": Reward(value)}, {"mine": 1.0})
-    with pytest.raises(ValueError, match=r"reward 'mine' is (nan|-inf) for .*: must be finite everywhere"):
+def test_a_reward_without_what_it_sees_is_named(reward, message):
+    score = make_score(PARSER, {"mine": reward}, {"mine": 1.0})
+    with pytest.raises(RewardError, match=message):
         jax.eval_shape(score, TOKENS[0, 0], jax.tree.map(lambda x: x[0], TARGET))
 
 
