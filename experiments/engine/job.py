@@ -21,7 +21,7 @@ from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig, Paper
+from touchr1_jax.rl.config import Advantage, AnyAlgorithm, GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
@@ -61,12 +61,13 @@ class Job:
         learning_rate: float = LEARNING_RATE,
         seed: int = 0,
     ) -> None:
-        if repeated:
+        if repeated:  # a group of one has no mean of its own
             config = dataclasses.replace(
                 config,
                 prompts=size.prompts * size.group,
                 group=1,
                 micro_prompts=config.micro_prompts * size.group,
+                algorithm=dataclasses.replace(config.algorithm, advantage=Advantage.GLOBAL),
             )
         self.fns, optimizer, self._step = engine(size, prefix, config, host, end_share, learning_rate)
         self.batch = make_batch(size, prefix, config.drawn, seed)

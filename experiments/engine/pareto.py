@@ -203,7 +203,6 @@ def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
             }
             for j in judgements
         ],
-        formats={"measured": "d", "on the front": "d"},
         meanings={
             "measured": "rows that have a number on every axis",
             "on the front": "rows that no other row dominates",

@@ -190,7 +190,7 @@ def cost_table(target: float, curves: Curves) -> Table:
     return named_table(
         "Cost and gain",
         rows,
-        formats={"group": "d", "a step": ".1f", "score": ".3f", "steps to the target": ".0f"},
+        formats={"a step": ".1f", "score": ".3f", "steps to the target": ".0f"},
         units={"a step": "ms", "to the target": "s"},
         meanings={
             "group": "rollouts of a prompt",

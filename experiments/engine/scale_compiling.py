@@ -25,9 +25,8 @@ from experiments.engine.processes import in_own_process
 from touchr1_jax.distributed.abstract import AbstractStep, PromptShape, abstract_grpo, compile_grpo
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.lora import LoraConfig
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.types import Parsed, Target
 
@@ -35,16 +34,6 @@ Compiler = Literal["cpu", "h200"]
 
 PAPER_PROMPT = PromptShape(streams=4, stream_tokens=1024, view_tokens=256, text_tokens=128)
 TINY_PROMPT = PromptShape(streams=2, stream_tokens=4, view_tokens=4, text_tokens=8)
-
-TINY = QwenConfig(
-    decoder=DecoderConfig(
-        vocab_size=256, hidden_size=32, num_layers=4, num_heads=4, num_kv_heads=2, head_dim=8, intermediate_size=64,
-        mrope_section=(1, 1, 2), tie_embedding=False,
-    ),
-    vision=QwenVisionConfig(out_size=32, depth=1, hidden_size=32, num_heads=2, intermediate_size=64, full_layers=(0,)),
-    vision_start_id=250, vision_end_id=251, image_id=252, video_id=253,
-)  # fmt: skip
-"""A model of the same kind that compiles in seconds."""
 
 OPTIMIZER = optax.adamw(1e-6)
 

@@ -25,9 +25,9 @@ from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.engine.load_checkpoints import TINY
 from experiments.engine.scale_compiling import (
     PAPER_PROMPT,
-    TINY,
     TINY_PROMPT,
     Compiler,
     Setup,

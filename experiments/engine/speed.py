@@ -1,4 +1,7 @@
-"""Timing of GRPO steps and other workloads: alone in a process, next to variants, over many steps."""
+"""Timing of GRPO steps and other workloads: alone in a process, next to variants, over many steps.
+
+Reports are made in other modules: importing them would add to the memory of the processes that are measured here.
+"""
 
 import dataclasses
 import re
@@ -14,10 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
-from experiments.core.results import Requirement, at_most
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
 from experiments.engine.peers import EngineTimes, JobSize
@@ -37,9 +38,6 @@ SHORT = 1 / 8
 
 RESIDENT_EVERY = 100
 """Steps between two looks at the memory."""
-
-EARLY = 1000
-"""Steps over which time must stay constant; memory must over all."""
 
 GIB, KIB, MIB = 2**30, 2**10, 2**20
 
@@ -268,31 +266,3 @@ def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int,
         lengths=(min(lengths), max(lengths)),
         programs=job.compilations,
     )
-
-
-def steadiness(long: LongRun) -> tuple[Requirement, ...]:
-    """Time and memory of late steps against early ones, and one program for all lengths."""
-    early, n = long.seconds[:EARLY], len(long.seconds)
-    tenth = max(1, len(early) // 10)
-    drift = np.median(early[-tenth:]) / np.median(early[:tenth])
-    lengths = "mean lengths of {:.1f} to {:.1f} tokens in {:,} steps".format(*long.lengths, n)
-    return (
-        at_most(f"time of late steps over early ones, of {len(early):,}", drift, 1.1),
-        at_most(f"memory that {n:,} steps add", long.resident_mb[-1] - long.resident_mb[0], 16, "MB"),
-        at_most("programs for all lengths", long.programs, 1, note=lengths),
-    )
-
-
-def over_steps(run: LongRun) -> bytes:
-    """Draw the time of a step, median and 5th to 95th percentile of every hundred, and the memory held."""
-    bins = run.seconds[: len(run.seconds) // RESIDENT_EVERY * RESIDENT_EVERY].reshape(-1, RESIDENT_EVERY)
-    low, middle, high = 1e3 * np.percentile(bins, (5, 50, 95), axis=1)
-    at = RESIDENT_EVERY * np.arange(1, len(bins) + 1)
-    most_ms, most_mb = 1.3 * float(np.percentile(high, 95)), 1.2 * float(run.resident_mb.max())
-    times = Series(x=at, y=middle, low=low, high=high, band=True, marker="")
-    memory = Series(x=at, y=run.resident_mb, marker="")
-    panels = [
-        Panel([times], x_label="step", y_label="a step, ms", y_limits=(0, most_ms)),
-        Panel([memory], x_label="step", y_label="memory held, MB", y_limits=(0, most_mb)),
-    ]
-    return draw(panels, size=(8.2, 3.0))

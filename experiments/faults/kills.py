@@ -1,49 +1,241 @@
-"""Training killed again and again at random moments, and compared bit by bit with training that was not."""
+"""Training killed again and again at random moments, and compared bit by bit with training that was not.
+
+Sessions are processes that are forked from a server, which has imported everything and computed nothing, so that the
+start of a session costs little; they are observed by the files that they leave, and `kill -9` ends them.
+"""
 
 import dataclasses
+import json
+import multiprocessing
+import os
 import shutil
+import signal
+import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from experiments.core import runs
+from experiments.core.runner import main
 from experiments.faults.digests import digests
-from experiments.faults.sessions import START, Kill, KillableTraining, Session, log_state, only_run
+from experiments.faults.trainings import PACKAGE
 
 UNDISTURBED = "alone"
 """Name of the run that is not killed."""
 
-RECORDS = "scenes-*"
-"""Folders of a cache that hold records."""
+POLL_S = 0.005
+"""Time between two looks at a session's files; a step takes longer."""
+
+PATIENCE_S = 300.0
+"""A session that adds nothing to its run for so long hangs."""
+
+START, BETWEEN, CHECKPOINT = "start-up", "between stages", "writing a checkpoint"
+STEPPING = {"sft": "SFT steps", "grpo": "GRPO steps", "blind": "blind SFT steps", "count": "steps"}
+PHASES = (START, *STEPPING.values(), BETWEEN, CHECKPOINT)
+"""Phases in which a kill can strike; between stages contacts are encoded, policies answer, the report is written."""
 
 _PRIOR_SHARE = 0.05  # share of a run by which the pace of the undisturbed one counts
+_FAST_COMPILATION = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
+_JAX_CONFIG = {
+    "jax_disable_most_optimizations": True,
+    "jax_compilation_cache_max_size": 2**30,  # never reached; but without a bound JAX takes no lock on what it writes
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+
+_SERVER = multiprocessing.get_context("forkserver")
+_SERVER.set_forkserver_preload([f"{PACKAGE}.{name}" for name in ("small_study", "small_grpo", "counting")])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class KillableTraining:
+    """A training to kill: an experiment of `trainings`, its options, and the steps of each of its phases."""
+
+    name: str
+    options: tuple[str, ...]
+    steps: Mapping[str, int]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Kill:
+    """One kill.
+
+    Args:
+      phase: of `PHASES`, in which it struck.
+      after_s: seconds since the session began.
+      done: share of the run's steps done by then.
+      torn: whether it left half a line in the log.
+    """
+
+    phase: str
+    after_s: float
+    done: float
+    torn: bool
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class KillConfig:
-    """Number and moments of the kills.
+    """Number of kills, and the share of them that strikes uniformly within the duration of the last start-up.
 
-    A share of them strikes uniformly within the duration of the last start-up, the others within
-    `KillSchedule.longest_life_s` of the first thing that a session adds to its run.
-
-    Args:
-      kills: how many.
-      startup_share: share that strikes while a session starts.
-      seed: of the moments.
+    The others strike within `KillSchedule.longest_life_s` of the first thing that a session adds to its run.
     """
 
     kills: int = 200
     startup_share: float = 0.25
-    seed: int = 0
 
     def __post_init__(self) -> None:
         if self.kills < 1 or not 0 <= self.startup_share < 1:
-            raise ValueError(
-                f"{self}: needs kills ≥ 1 and 0 ≤ startup_share < 1, else no session gets anywhere; correct what is "
-                "outside"
-            )
+            raise ValueError(f"{self}: needs kills ≥ 1 and 0 ≤ startup_share < 1; correct what is outside")
+
+
+class LogState(NamedTuple):
+    """Number of whole lines in a run's log, stage and step of the last one, whether half a line follows."""
+
+    lines: int
+    last: tuple[str, int] | None
+    torn: bool
+
+
+def log_state(directory: Path) -> LogState:
+    """State of the log of a run."""
+    path = directory / "metrics.jsonl"
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    whole, _, torn = text.rpartition("\n")
+    lines = whole.split("\n") if whole else []
+    row = json.loads(lines[-1]) if lines else None
+    return LogState(lines=len(lines), last=None if row is None else (row["stage"], row["step"]), torn=bool(torn))
+
+
+class RunSize(NamedTuple):
+    """Bytes of a run's log and number of its answers: cheap, for they are read two hundred times a second."""
+
+    log_bytes: int
+    answers: int
+
+
+class Session:
+    """One session of a training, from its start.
+
+    Args:
+      training: to run or continue.
+      home: folder of its run.
+      programs: folder of compiled programs.
+    """
+
+    def __init__(self, training: KillableTraining, home: Path, programs: Path) -> None:
+        self._runs, self._steps, self._printed = home / training.name, training.steps, home / "printed.txt"
+        home.mkdir(parents=True, exist_ok=True)
+        self._directory: Path | None = None
+        self._least = self._size()
+        self._began, self._began_ns = time.monotonic(), time.time_ns()
+        folders = ["--runs-dir", str(home), "--cache-dir", str(home / "cache")]
+        arguments = [training.name, *training.options, *folders]
+        target = (arguments, str(self._printed), str(programs))
+        self._process: BaseProcess = _SERVER.Process(target=_session, args=target, daemon=True)
+        self._process.start()
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it began."""
+        return time.monotonic() - self._began
+
+    def log_state(self) -> LogState:
+        """State of the run's log now."""
+        return LogState(0, None, False) if (found := self._found()) is None else log_state(found)
+
+    def wait_for_work(self) -> bool:
+        """Sleep until it adds something to its run; false if it ended first.
+
+        Raises:
+          RuntimeError: it lives and adds nothing.
+        """
+        while not self._worked():
+            if not self.sleep_until(self.age_s + POLL_S):
+                return False
+            if self.age_s > PATIENCE_S:
+                raise RuntimeError(f"a session did nothing in {PATIENCE_S:g} s: see {self._printed}")
+        return True
+
+    def sleep_until(self, age_s: float) -> bool:
+        """Sleep until it has this age, looking at its run on the way; false if it ended first."""
+        while (left_s := age_s - self.age_s) > 0 and self._process.is_alive():
+            self._process.join(min(left_s, POLL_S))
+            self._worked()
+        return self._process.is_alive()
+
+    def kill(self, lines: int) -> Kill | None:
+        """End it by SIGKILL; `None` if it ended just before.
+
+        Args:
+          lines: of the log of a whole run.
+        """
+        age_s = self.age_s
+        self._process.kill()
+        self._process.join()
+        if self._process.exitcode != -signal.SIGKILL:
+            return None
+        log = self.log_state()
+        return Kill(phase=self._phase(log), after_s=age_s, done=min(log.lines / lines, 1.0), torn=log.torn)
+
+    def finish(self) -> None:
+        """Wait for its end.
+
+        Raises:
+          RuntimeError: its exit code is not 0.
+        """
+        self._process.join()
+        if self._process.exitcode:
+            tail = self._printed.read_text(encoding="utf-8", errors="replace")[-2000:]
+            raise RuntimeError(f"a session ended with exit code {self._process.exitcode}; it printed:\n{tail}")
+
+    def _worked(self) -> bool:
+        """True if it added anything; lines that it first dropped and computes again do not count."""
+        size = self._size()
+        if size.log_bytes < self._least.log_bytes:
+            self._least = self._least._replace(log_bytes=size.log_bytes)
+        return size.log_bytes > self._least.log_bytes or size.answers > self._least.answers
+
+    def _phase(self, log: LogState) -> str:
+        half = self._runs.glob("*/checkpoints/**/*.orbax-checkpoint-tmp*")
+        if any(path.stat().st_mtime_ns >= self._began_ns for path in half):
+            return CHECKPOINT
+        if not self._worked():
+            return START
+        if log.last is None or self._size().log_bytes == self._least.log_bytes:
+            return BETWEEN
+        stage, step = log.last
+        kind = stage.partition("/")[0]
+        return STEPPING[kind] if step + 1 < self._steps[kind] else BETWEEN
+
+    def _size(self) -> RunSize:
+        directory = self._found()
+        if directory is None:
+            return RunSize(0, 0)
+        log = directory / "metrics.jsonl"
+        return RunSize(log.stat().st_size if log.exists() else 0, len(list((directory / "answers").glob("*.npz"))))
+
+    def _found(self) -> Path | None:
+        """The run's directory, once it was started."""
+        if self._directory is None and runs.started(self._runs):
+            (self._directory,) = runs.started(self._runs)
+        return self._directory
+
+
+def _session(arguments: list[str], log: str, programs: str) -> None:
+    """The process: compiled programs are kept however small, and little optimised, for sessions are short."""
+    file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    for stream in (sys.stdout.fileno(), sys.stderr.fileno()):
+        os.dup2(file, stream)
+    # read with the first program: the older of XLA's two ways to write a loop compiles twice as fast
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FAST_COMPILATION}".strip()
+    for name, value in (_JAX_CONFIG | {"jax_compilation_cache_dir": programs}).items():
+        jax.config.update(name, value)
+    sys.exit(main(arguments, package=PACKAGE))
 
 
 class KillSchedule:
@@ -134,11 +326,12 @@ class Campaign:
           keep: called after each kill with all that have struck.
         """
         struck, schedule = tuple(before), KillSchedule(undisturbed.work_s)
-        while not self._ended(number):
+        home = self._home / str(number) / self._training.name
+        while not any((directory / "results.json").exists() for directory in runs.started(home)):
             session = self._session(str(number))
             left = kills - len(struck)
             reached = next((kill.done for kill in reversed(struck) if kill.phase != START), 0.0)
-            lives = left > 0 and self._wait(session, undisturbed, number, left, schedule, reached)
+            lives = left > 0 and self._wait(session, undisturbed.lines, number, left, schedule, reached)
             kill = session.kill(undisturbed.lines) if lives else None
             if kill is None:
                 session.finish()
@@ -149,32 +342,23 @@ class Campaign:
 
     def directory(self, name: str) -> Path:
         """The one run directory of that name."""
-        return only_run(self._home / name / self._training.name)
-
-    def _ended(self, number: int) -> bool:
-        begun = runs.started(self._home / str(number) / self._training.name)
-        return any((directory / "results.json").exists() for directory in begun)
+        (found,) = runs.started(self._home / name / self._training.name)
+        return found
 
     def _session(self, name: str) -> Session:
         own = self._home / name / "cache"
         if not own.exists():
             own.mkdir(parents=True)
-            for records in sorted((self._home / UNDISTURBED / "cache").glob(RECORDS)):
+            for records in sorted((self._home / UNDISTURBED / "cache").glob("scenes-*")):
                 shutil.copytree(records, own / records.name)
         return Session(self._training, self._home / name, self._programs)
 
     def _wait(
-        self,
-        session: Session,
-        undisturbed: UndisturbedRun,
-        number: int,
-        left: int,
-        schedule: KillSchedule,
-        reached: float,
+        self, session: Session, lines: int, number: int, left: int, schedule: KillSchedule, reached: float
     ) -> bool:
         """Sleep until a random moment of the session's life; false if it ended first."""
-        done_now = lambda: min(session.log_state().lines / undisturbed.lines, 1.0)
-        rng = np.random.default_rng((self._config.seed, number, left))
+        done_now = lambda: min(session.log_state().lines / lines, 1.0)
+        rng = np.random.default_rng((0, number, left))
         if rng.random() < self._config.startup_share:
             return session.sleep_until(rng.uniform(0, self._startup_s))
         if not session.wait_for_work():

@@ -111,11 +111,13 @@ def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedR
         home = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         reader = stack.enter_context(Reader(Replay(NoiseFieldCamera(camera=camera))))
         journal = stack.enter_context(JournalWriter(home / "journal"))
-        watching: list[subprocess.Popen[str]] = []
+        watching = []
         if browsers is not None:
             live = stack.enter_context(LiveView(port=0))
             stack.enter_context(Presenter([Channel(reader)], None, live).beside())
-            watching = [_browser(live, seconds) for _ in range(browsers)]
+            host, port = live.address.removeprefix("http://").rstrip("/").split(":")
+            command = [sys.executable, "-c", BROWSER, host, port, str(seconds)]
+            watching = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(browsers)]
         looks, written = _record(reader, journal, seconds)
         counts = reader.counts  # nobody reads on while the browsers end
         ages = [json.loads(browser.communicate()[0])["ages_s"] for browser in watching]
@@ -143,12 +145,6 @@ def _record(reader: Reader, journal: JournalWriter, seconds: float) -> tuple[np.
             time.sleep(_IDLE_S)
         looks.append(time.monotonic())
     return np.diff(looks), written
-
-
-def _browser(live: LiveView, seconds: float) -> subprocess.Popen[str]:
-    host, port = live.address.removeprefix("http://").rstrip("/").split(":")
-    command = [sys.executable, "-c", BROWSER, host, port, str(seconds)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -192,45 +188,43 @@ def requirements(views: Sequence[ViewedRecording], transfer: BridgeTransfer) -> 
 
 
 def viewing_table(views: Sequence[ViewedRecording]) -> Table:
-    """Ages of what browsers show, and times between two looks of the recorder at its device."""
-    rows = [
-        {
-            "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
-            "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
-            "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
-            "recorded": view.written, "lost": view.lost,
-        }
-        for view in views
-    ]  # fmt: skip
-    formats = dict(zip(list(rows[0])[1:], (".1f", ".0f", ".0f", ".1f", ".1f", "d", "d"), strict=True))
+    """Ages of the pictures in browsers, and times between two looks of the recorder at its device."""
+    times = dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms")
     return named_table(
         "A recording that is watched",
-        rows,
-        formats=formats,
-        units={"shown": "Hz"} | dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms"),
+        [
+            {
+                "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
+                "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
+                "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
+                "recorded": view.written, "lost": view.lost,
+            }
+            for view in views
+        ],
+        formats=dict.fromkeys(times, ".1f") | {"shown": ".1f", "age, median": ".0f", "age, p95": ".0f"},
+        units={"shown": "Hz"} | times,
         meanings={
             "shown": "states that one browser shows",
             "age, median": "of all panels when the last is there",
             "look, p99": "between two looks of the recorder",
         },
         note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
-    )
+    )  # fmt: skip
 
 
 def bridge_table(transfer: BridgeTransfer) -> Table:
     """Rate of a bridge and age of its pictures."""
-    bytes_per_picture = float(np.prod(BRIDGE_SHAPE))
     row = {
         "picture": " × ".join(map(str, BRIDGE_SHAPE)),
         "rate": transfer.rate_hz,
-        "carried": transfer.rate_hz * bytes_per_picture / 1e6,
+        "carried": transfer.rate_hz * float(np.prod(BRIDGE_SHAPE)) / 1e6,
         "age when read, median": _quantile_ms(transfer.ages_s, 0.5),
         "age when read, p95": _quantile_ms(transfer.ages_s, 0.95),
     }
     return named_table(
         "Pictures through a bridge",
         [row],
-        formats=dict(zip(list(row)[1:], (".0f", ".0f", ".1f", ".1f"), strict=True)),
+        formats=dict.fromkeys(list(row)[1:3], ".0f") | dict.fromkeys(list(row)[3:], ".1f"),
         units=dict(zip(list(row)[1:], ("Hz", "MB/s", "ms", "ms"), strict=True)),
         note="The adapter gives pictures as fast as they are taken, so the age is that of a full pipe.",
     )

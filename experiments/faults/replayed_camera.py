@@ -4,6 +4,7 @@ import dataclasses
 import threading
 import tracemalloc
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -140,8 +141,7 @@ class _Lateness:
 
     def quantiles_s(self) -> np.ndarray:
         share = np.cumsum(self._histogram) / max(1, self._histogram.sum())
-        at = self._BINS[[int(np.searchsorted(share, q)) for q in (0.5, 0.99, 1.0 - 1e-12)]]
-        return at * self._period_ns / NS_PER_S
+        return self._BINS[np.searchsorted(share, (0.5, 0.99, 1.0 - 1e-12))] * self._period_ns / NS_PER_S
 
 
 class _MemoryLog:
@@ -155,12 +155,11 @@ class _MemoryLog:
             tracemalloc.start()
 
     def look(self, now_s: float) -> bool:
-        """Log the memory if it is time; returns whether it was."""
+        """Log the memory if it is time; return True if it was."""
         if now_s < self._next_s:
             return False
         self._next_s += self._every_s
-        with open("/proc/self/statm") as file:
-            self.resident_mb.append(int(file.read().split()[1]) * _PAGE_MB)
+        self.resident_mb.append(int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MB)
         if self._traced and len(self.resident_mb) == 2:
             self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
         return True

@@ -38,60 +38,59 @@ BY_COUNTER, BY_STAMPS, SLOW = "with a counter", "without a counter", "slow consu
 MOST_GAINED_MB = 5.0
 """Resident memory that an hour's replay may gain."""
 
+RATE_HZ = 120.0
+FAULTS = Faults(drop_share=0.02, duplicate_share=0.005, jitter_s=0.001, skew=5e-5, seed=0)
+AWAY_S = {0.25: 0.4, 0.5: 3.0, 0.75: 20.0}
+"""Share of the replay at which the device is disconnected → duration; shorter replays scale the durations."""
+
+JITTER_SHARES = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
+"""Mean jitters of the sweep, in periods of the camera."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DeviceStabilityConfig:
-    """Length, rate and faults of the replay; sizes of the other measurements.
+    """Length of the replay and sizes of the other measurements.
 
     Args:
-      seconds: of device time; the disconnects lie at a quarter, a half and three quarters.
-      rate_hz: of the camera.
-      size_px: rows and columns of its pictures.
-      drop_share, duplicate_share, jitter_s, skew: see `Faults`.
-      away_s: duration of each disconnect.
+      seconds: of device time.
+      size_px: rows and columns of the camera's pictures.
       traced_seconds: of a shorter replay in which Python's memory is traced.
-      sweep_seconds, jitter_shares: of the replays over jitter, in periods of the camera.
+      sweep_seconds: of each replay over jitter.
       rounds: of timing the decoders.
       watch_seconds: of each recording that is watched.
       browsers: that watch, in turn.
       bridge_frames: that a bridge carries.
       data_dir: holds the folder tac3d; `None` leaves the vendor's recordings out.
-      seed: of the faults.
     """
 
     seconds: float = 3600.0
-    rate_hz: float = 120.0
     size_px: tuple[int, int] = (240, 320)
-    drop_share: float = 0.02
-    duplicate_share: float = 0.005
-    jitter_s: float = 0.001
-    skew: float = 5e-5
-    away_s: tuple[float, float, float] = (0.4, 3.0, 20.0)
     traced_seconds: float = 900.0
     sweep_seconds: float = 300.0
-    jitter_shares: tuple[float, ...] = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
     rounds: int = 25
     watch_seconds: float = 5.0
     browsers: tuple[int, ...] = (0, 1, 3)
     bridge_frames: int = 600
     data_dir: pathlib.Path | None = None
-    seed: int = 0
 
 
 def run(config: DeviceStabilityConfig, context: Context) -> Results:
     """Replay the camera, check the vendor's recordings, time the decoders, watch a recording."""
-    outcomes = {name: _replay(name, config, context) for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))}
-    short = dataclasses.replace(config, seconds=config.traced_seconds)
-    faults = injected(short, hidden=False)
+    camera = NoiseCamera(rate_hz=RATE_HZ, size_px=config.size_px)
+    outcomes = {
+        name: replay_whole(name, camera, config.seconds, context)
+        for name in context.each("replays", (BY_COUNTER, BY_STAMPS, SLOW))
+    }
+    faults = injected(config.traced_seconds)
     with context.progress_callback("device time with Python's memory traced, s") as report:
-        traced = replay_camera(_camera(short), short.seconds, faults, capacity=256, traced=True, report=report)
-    sweep = over_jitter(config, context)
+        traced = replay_camera(camera, config.traced_seconds, faults, capacity=256, traced=True, report=report)
+    sweep = over_jitter(camera, config.sweep_seconds, context)
     paths = tac3d.recordings(config.data_dir)
     checks = [tac3d.check(path) for path in context.each("recordings", paths)]
     rounds = context.rounds("timing decoders", config.rounds)
     decode = tac3d.decode_ms(tac3d.message(paths[0] if paths else None), rounds)
     browsers = context.each("watched recordings", (None, *config.browsers))
-    views = [viewing.viewed(_camera(config), config.watch_seconds, number) for number in browsers]
+    views = [viewing.viewed(camera, config.watch_seconds, number) for number in browsers]
     transfer = viewing.bridged(config.bridge_frames)
     return Results(
         verdict=verdict(outcomes, checks, decode, views, transfer),
@@ -107,12 +106,12 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
             viewing.viewing_table(views),
             viewing.bridge_table(transfer),
         ),
-        pictures=(jitter_picture(sweep, config), memory_picture(outcomes, config)),
+        pictures=(jitter_picture(sweep), memory_picture(outcomes, config.seconds)),
         settings={
-            "samples": round(config.seconds * config.rate_hz),
+            "samples": round(config.seconds * RATE_HZ),
             "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
-            "faults": f"{config.drop_share:.1%} drops, {config.duplicate_share:.1%} duplicates, jitter "
-            f"{1e3 * config.jitter_s:g} ms, {1e6 * config.skew:g} ppm, away {config.away_s} s",
+            "faults": f"{FAULTS.drop_share:.1%} drops, {FAULTS.duplicate_share:.1%} duplicates, jitter "
+            f"{1e3 * FAULTS.jitter_s:g} ms, {1e6 * FAULTS.skew:g} ppm, away {tuple(AWAY_S.values())} s",
             "vendor's recordings": ", ".join(c.name for c in checks) or "no --data-dir",
             "vendor's parser installed": tac3d.YAML,
         },
@@ -120,44 +119,30 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
     )
 
 
-def _replay(name: str, config: DeviceStabilityConfig, context: Context) -> ReplayOutcome:
+def replay_whole(name: str, camera: NoiseCamera, seconds: float, context: Context) -> ReplayOutcome:
+    """One of the long replays by name."""
     capacity, every = (16, 24) if name == SLOW else (256, 1)
-    faults = injected(config, hidden=name == BY_STAMPS)
+    faults = injected(seconds, hidden=name == BY_STAMPS)
     progress = context.progress_callback(f"device time {name}, s")
     with context.timed(name.replace(" ", "_")), progress as report, warnings.catch_warnings():
         warnings.simplefilter("ignore", OverloadWarning)  # intended, and counted
-        return replay_camera(_camera(config), config.seconds, faults, capacity=capacity, every=every, report=report)
+        return replay_camera(camera, seconds, faults, capacity=capacity, every=every, report=report)
 
 
-def _camera(config: DeviceStabilityConfig) -> NoiseCamera:
-    return NoiseCamera(rate_hz=config.rate_hz, size_px=config.size_px)
-
-
-def injected(config: DeviceStabilityConfig, *, hidden: bool) -> Faults:
+def injected(seconds: float, *, hidden: bool = False, jitter_s: float = FAULTS.jitter_s) -> Faults:
     """The faults of a replay; hidden, the device gives neither counter nor clock."""
-    at = [config.seconds * share for share in (0.25, 0.5, 0.75)]
-    scale = min(1.0, config.seconds / 200)  # so that a shrunken run is not away most of its time
-    return Faults(
-        drop_share=config.drop_share,
-        duplicate_share=config.duplicate_share,
-        jitter_s=config.jitter_s,
-        skew=config.skew,
-        disconnects=tuple(Disconnect(at_s=a, for_s=scale * f) for a, f in zip(at, config.away_s, strict=True)),
-        hide_counter=hidden,
-        hide_clock=hidden,
-        seed=config.seed,
-    )
+    scale = min(1.0, seconds / 200)  # so that a shrunken run is not away most of its time
+    away = tuple(Disconnect(at_s=seconds * share, for_s=scale * for_s) for share, for_s in AWAY_S.items())
+    return dataclasses.replace(FAULTS, jitter_s=jitter_s, disconnects=away, hide_counter=hidden, hide_clock=hidden)
 
 
-def over_jitter(config: DeviceStabilityConfig, context: Context) -> dict[str, np.ndarray]:
+def over_jitter(camera: NoiseCamera, seconds: float, context: Context) -> dict[str, np.ndarray]:
     """Error of the count of losses as a share of the losses, with a counter and without one, by jitter, [J] each."""
-    short = dataclasses.replace(config, seconds=config.sweep_seconds)
     found: dict[str, list[float]] = {BY_COUNTER: [], BY_STAMPS: []}
-    for share in context.each("jitter", config.jitter_shares):
-        jittery = dataclasses.replace(short, jitter_s=share / config.rate_hz)
+    for share in context.each("jitter", JITTER_SHARES):
         for name, values in found.items():
-            faults = injected(jittery, hidden=name == BY_STAMPS)
-            o = replay_camera(_camera(short), short.seconds, faults, capacity=256)
+            faults = injected(seconds, hidden=name == BY_STAMPS, jitter_s=share / RATE_HZ)
+            o = replay_camera(camera, seconds, faults, capacity=256)
             values.append(abs(o.wrong["missing"]) / max(1, o.truth.dropped + o.truth.away))
     return {name: np.array(values) for name, values in found.items()}
 
@@ -223,17 +208,17 @@ def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
     return named_table(
         "The books against what was injected",
         rows,
-        formats=dict.fromkeys(rows[0], "d") | dict.fromkeys(late, ".2f"),
+        formats=dict.fromkeys(late, ".2f"),
         units=dict.fromkeys(late, "ms"),
         note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: stamps "
         "after the device's true time; by running minimum where the device gives its clock, else at arrival.",
     )
 
 
-def jitter_picture(sweep: Mapping[str, np.ndarray], config: DeviceStabilityConfig) -> Picture:
+def jitter_picture(sweep: Mapping[str, np.ndarray]) -> Picture:
     """Error of the count of losses over jitter."""
     panel = Panel(
-        [Series(name, x=config.jitter_shares, y=100 * off, marker="o") for name, off in sweep.items()],
+        [Series(name, x=JITTER_SHARES, y=100 * off, marker="o") for name, off in sweep.items()],
         x_label="mean jitter of arrival, periods of the camera",
         y_label="losses miscounted, %",
         y_scale="symlog",
@@ -249,14 +234,13 @@ def jitter_picture(sweep: Mapping[str, np.ndarray], config: DeviceStabilityConfi
     )
 
 
-def memory_picture(outcomes: Mapping[str, ReplayOutcome], config: DeviceStabilityConfig) -> Picture:
+def memory_picture(outcomes: Mapping[str, ReplayOutcome], seconds: float) -> Picture:
     """Resident memory over the time of each replay."""
-    series = [
-        Series(name, x=np.linspace(0, config.seconds / 60, len(o.memory_mb)), y=o.memory_mb - o.memory_mb[0])
-        for name, o in outcomes.items()
-    ]
     panel = Panel(
-        series,
+        [
+            Series(name, x=np.linspace(0, seconds / 60, len(o.memory_mb)), y=o.memory_mb - o.memory_mb[0])
+            for name, o in outcomes.items()
+        ],
         x_label="device time, minutes",
         y_label="resident memory gained, MB",
         y_limits=(-1, 1.2 * MOST_GAINED_MB),
@@ -274,13 +258,8 @@ def memory_picture(outcomes: Mapping[str, ReplayOutcome], config: DeviceStabilit
 
 DEFAULT = DeviceStabilityConfig()
 SMOKE = DeviceStabilityConfig(
-    seconds=60.0,
-    size_px=(24, 32),
-    traced_seconds=20.0,
-    sweep_seconds=10.0,
-    rounds=5,
-    watch_seconds=1.0,
+    seconds=60.0, size_px=(24, 32), traced_seconds=20.0, sweep_seconds=10.0, rounds=5, watch_seconds=1.0,
     bridge_frames=100,
-)
+)  # fmt: skip
 
 EXPERIMENT = Experiment(name="stability_devices", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -26,18 +26,32 @@ import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.progress import Advance
+from experiments.core.loops import STEPPING, WAITING
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.encoder.pretrain import PretrainConfig, pretrain
 from experiments.faults.bad_inputs import cases, provoke
 from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
-from experiments.faults.data_waits import WaitingConfig, Waits, waits
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import unfinished_run
-from experiments.faults.kills import UNDISTURBED, Campaign, KillConfig, UndisturbedRun
-from experiments.faults.sessions import PHASES, START, Kill, KillableTraining
+from experiments.faults.kills import (
+    PHASES,
+    START,
+    UNDISTURBED,
+    Campaign,
+    Kill,
+    KillableTraining,
+    KillConfig,
+    UndisturbedRun,
+)
 from experiments.faults.trainings.small_grpo import EXPERIMENT as SMALL_GRPO
 from experiments.faults.trainings.small_study import EXPERIMENT as SMALL_STUDY
+from experiments.study import stages
+from experiments.study.scores import PUBLISHED
+from experiments.study.study import StudyConfig, open_study_data
+from sensors_io.scenes.config import SceneConfig
+from touchr1_jax.models.touch_policy import build_policy
+from touchr1_jax.training.loop import LoopConfig
 
 MOST_WAITING = 0.02
 """Share of a step that may wait for data."""
@@ -51,8 +65,23 @@ GRPO = "GRPO run"
 CELL = 110
 """Characters of a message in a table."""
 
+BLIND = 4
+"""Steps without touch for each with it: they take a quarter of the time."""
+
 InputRow = Mapping[str, Any]
 """Row of a bad input: input, kind, exit code, answer, faults (empty if there are none)."""
+
+Waits = Mapping[str, tuple[float, float]]
+"""Stage → seconds in steps, and those of them that waited for data."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WaitingConfig:
+    """Steps of each stage, of which the first is not timed, and the objects that they are about."""
+
+    steps: int = 16
+    study: StudyConfig = StudyConfig(scenes=SceneConfig(objects=60, sites=1))
+    dynamics: PretrainConfig = PretrainConfig()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,7 +106,7 @@ class FaultsConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class KilledRuns:
-    """Kills of one training, the number of runs that they were spread over, and what differed at their ends."""
+    """Kills of one training, the number of runs that they were spread over, and the differences at their ends."""
 
     kills: tuple[Kill, ...]
     runs: int
@@ -92,8 +121,8 @@ def run(config: FaultsConfig, context: Context) -> Results:
     grpo = KillableTraining(name=SMALL_GRPO.name, options=grpo_options, steps={"grpo": config.grpo_steps})
     whole = KillableTraining(name=SMALL_STUDY.name, options=("--scale", config.study_scale), steps=steps)
     killed = {
-        name: kill_training(name, training, kills, context)
-        for name, training, kills in ((GRPO, grpo, config.grpo), ("study", whole, config.study))
+        GRPO: kill_training(GRPO, grpo, config.grpo, context),
+        "study": kill_training("study", whole, config.study, context),
     }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
         damage = damage_files(config.damaged_files, context, Path(scratch))
@@ -112,52 +141,37 @@ def kill_training(name: str, training: KillableTraining, config: KillConfig, con
     """Runs of a training until all kills have struck; every run and every kill of an earlier session counts."""
     stage = f"kill/{training.name}"
     campaign = Campaign(context.directory / "killed" / training.name, context.cache_dir / "programs", training, config)
+    if not context.done(f"{stage}/{UNDISTURBED}"):
+        context.save_stage(f"{stage}/{UNDISTURBED}", campaign.run_undisturbed()._asdict())
+    undisturbed = UndisturbedRun(**context.load_stage(f"{stage}/{UNDISTURBED}"))
     kills: list[Kill] = []
     differs: list[str] = []
     number = 0
-    with context.progress(f"killing the {name}", config.kills, _struck_before(stage, context)) as advance:
-        if not context.done(f"{stage}/{UNDISTURBED}"):
-            context.save_stage(f"{stage}/{UNDISTURBED}", campaign.run_undisturbed()._asdict())
-        undisturbed = UndisturbedRun(**context.load_stage(f"{stage}/{UNDISTURBED}"))
-        while len(kills) < config.kills:
-            here = f"{stage}/{number}"
-            if not context.done(here):
-                struck = _one_run(campaign, here, number, config.kills - len(kills), undisturbed, context, advance)
-                found = differences(undisturbed.digests, digests(campaign.directory(str(number))))
-                context.save_stage(here, {"kills": struck, "differs": found})
-            kept = context.load_stage(here)
-            kills += [Kill(**kill) for kill in kept["kills"]]
-            differs += [f"run {number}: {what}" for what in kept["differs"]]
-            number += 1
+    while len(kills) < config.kills:
+        here, left = f"{stage}/{number}", config.kills - len(kills)
+        if not context.done(here):
+            struck = _strike(f"{here}-struck", f"killing the {name}", campaign, number, left, undisturbed, context)
+            found = differences(undisturbed.digests, digests(campaign.directory(str(number))))
+            context.save_stage(here, {"kills": struck, "differs": found})
+        kept = context.load_stage(here)
+        kills += [Kill(**kill) for kill in kept["kills"]]
+        differs += [f"run {number}: {what}" for what in kept["differs"]]
+        number += 1
     return KilledRuns(kills=tuple(kills), runs=number, differs=tuple(differs))
 
 
-def _struck_before(stage: str, context: Context) -> int:
-    """Kills that struck a training's runs in earlier sessions of this experiment."""
-    number, before = 0, 0
-    while context.done(here := f"{stage}/{number}"):
-        before, number = before + len(context.load_stage(here)["kills"]), number + 1
-    return before + (len(context.load_stage(f"{here}-struck")) if context.done(f"{here}-struck") else 0)
-
-
-def _one_run(
-    campaign: Campaign,
-    here: str,
-    number: int,
-    kills: int,
-    undisturbed: UndisturbedRun,
-    context: Context,
-    advance: Advance,
+def _strike(
+    stage: str, title: str, campaign: Campaign, number: int, kills: int, undisturbed: UndisturbedRun, context: Context
 ) -> tuple[Kill, ...]:
     """Kills of one run, each of which is saved at once."""
-    stage = f"{here}-struck"
     before = [Kill(**kill) for kill in context.load_stage(stage)] if context.done(stage) else []
+    with context.progress(title, kills, len(before)) as advance:
 
-    def keep(struck: tuple[Kill, ...]) -> None:
-        context.save_stage(stage, struck)
-        advance()
+        def keep(struck: tuple[Kill, ...]) -> None:
+            context.save_stage(stage, struck)
+            advance()
 
-    return campaign.run_killed(number, kills, undisturbed, before=before, keep=keep)
+        return campaign.run_killed(number, kills, undisturbed, before=before, keep=keep)
 
 
 def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
@@ -185,6 +199,29 @@ def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputR
             rows.append({"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)})
         context.save_stage("inputs", rows)
     return context.load_stage("inputs")
+
+
+def waits(config: WaitingConfig, context: Context) -> Waits:
+    """Train each stage for some steps from where it is; a stage that is done is not timed again."""
+    study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
+    sft, grpo, blind, dynamics = names = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")
+    data = open_study_data(study, context)
+    policy = build_policy(study.model, data.clip.sensors)
+    evidence = stages.gather_evidence(data, stages.probe_features(data, context), study.probe, context)
+    sft_config = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
+    params = stages.run_sft(policy, data, evidence, sft_config, context, seed=0, stage=sft)
+    features = stages.encode_rows(policy, params, data, data.parts["grpo"], context)
+    noise = stages.noise_bank(policy, params, data, seed=0)
+    label = data.label[data.parts["grpo"]]
+    contacts = stages.EncodedContacts(features=features, label=label, truth=label, noise=noise)
+    arm = stages.make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
+    stages.run_grpo(policy, arm, contacts, params, context, seed=0, stage=grpo)
+    blind_config = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)
+    stages.run_sft(policy, data, evidence, blind_config, context, seed=0, stage=blind, blind=True)
+    pretraining = dataclasses.replace(config.dynamics, steps=config.steps, probe_every=config.steps)
+    pretrain(pretraining, data.store, data.parts["sft"], data.clip, context, stage=dynamics, seed=0)
+    times = context.timing()
+    return {stage: (times[f"{STEPPING}/{stage}"], times[f"{WAITING}/{stage}"]) for stage in names}
 
 
 def requirements(

@@ -131,20 +131,15 @@ def decode_ms(packets: list[bytes], rounds: Iterable[object]) -> dict[str, np.nd
     """Milliseconds to decode one message by every method, [rounds]."""
     layout, data = _joined(packets)
     decoder = tac3d_messages.Tac3dDecoder()
+    whole = lambda: tac3d_messages.to_schema(decoder.decode(*_joined(packets)).matrices)
     calls: dict[str, Callable[[], Any]] = {
         CACHED: lambda: decoder.decode(layout, data),
-        f"{CACHED}, packets joined, schema's arrays": lambda: tac3d_messages.to_schema(
-            decoder.decode(*_joined(packets)).matrices
-        ),
-        "layout parsed each time": lambda: tac3d_messages.Tac3dDecoder().decode(layout, data),
+        f"{CACHED}, packets joined, schema's arrays": whole,
+        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(layout, data),
     }
     if YAML:
         calls[BY_YAML] = functools.partial(_decode_by_yaml, layout, data)
-
-    def repeated(call: Callable[[], Any]) -> None:
-        for _ in range(_REPEATS):
-            call()
-
+    repeated = lambda call: [call() for _ in range(_REPEATS)]
     ready = {name: functools.partial(repeated, call) for name, call in calls.items()}
     for call in ready.values():
         call()
@@ -190,34 +185,34 @@ def requirements(checks: Sequence[RecordingCheck], decode: Mapping[str, np.ndarr
 def recording_table(checks: Sequence[RecordingCheck]) -> Table:
     """Gaps and lateness of the vendor's recordings."""
     late = lambda seconds: None if np.isnan(seconds) else 1e3 * float(seconds)
-    rows = [
-        {
-            "recording": c.name, "frames": c.frames, "missing": c.missing, "counted": c.counts.missing,
-            "largest gap": 1e3 * c.gap_s, "as seen": 1e3 * c.read_gap_s, "late, median": late(c.late_s[0]),
-            "late, worst": late(c.late_s[1]),
-        }
-        for c in checks
-    ]  # fmt: skip
-    counts, gaps, lates = (list(rows[0])[i:j] for i, j in ((1, 4), (4, 6), (6, 8)))
+    gaps, lates = ("largest gap", "as seen"), ("late, median", "late, worst")
     return named_table(
         "The vendor's Tac3D recordings",
-        rows,
-        formats=dict.fromkeys(counts, "d") | dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
+        [
+            {
+                "recording": c.name, "frames": c.frames, "missing": c.missing, "counted": c.counts.missing,
+                "largest gap": 1e3 * c.gap_s, "as seen": 1e3 * c.read_gap_s, "late, median": late(c.late_s[0]),
+                "late, worst": late(c.late_s[1]),
+            }
+            for c in checks
+        ],
+        formats=dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
         units=dict.fromkeys([*gaps, *lates], "ms"),
         meanings={
             "missing": "by the arrays",
             "counted": "by the reader",
             "late, median": "arrival after the stamp by running minimum",
         },
-    )
+    )  # fmt: skip
 
 
 def decoder_table(decode: Mapping[str, np.ndarray]) -> Table:
     """Time of one message by every method."""
-    median = {name: float(np.median(ms)) for name, ms in decode.items()}
+    cached = np.median(decode[CACHED])
     rows = [
-        {"way": name, "median": m, "p95": float(np.quantile(decode[name], 0.95)), "against cached": m / median[CACHED]}
-        for name, m in median.items()
+        {"way": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": float(m / cached)}
+        for name, ms in decode.items()
+        if (m := float(np.median(ms)))
     ]
     formats = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}
     return named_table("Time to decode one Tac3D message", rows, formats=formats, units={"median": "ms", "p95": "ms"})

@@ -10,7 +10,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import load_weights
-from experiments.engine.load_weights import READERS, SHAPES, measure, random_checkpoint, shards
+from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint, shards
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.load import peak_memory
 

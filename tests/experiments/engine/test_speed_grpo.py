@@ -12,7 +12,8 @@ from experiments.engine import speed_grpo
 from experiments.engine.job import Job, config_of, init_decoder, make_batch, make_fns
 from experiments.engine.peers import JobSize, PeerFailed, PeerTimes
 from experiments.engine.processes import in_own_process
-from experiments.engine.speed import LongRun, Option, many_steps, options, steadiness, time_alone
+from experiments.engine.speed import LongRun, Option, many_steps, options, time_alone
+from experiments.engine.speed_report import steadiness
 from tests.experiments.shrunk import run_shrunk
 
 TINY = speed_grpo.SMOKE.size

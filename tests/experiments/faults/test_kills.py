@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from experiments.faults.digests import differences, digests
-from experiments.faults.kills import UNDISTURBED, Campaign, KillConfig, KillSchedule
-from experiments.faults.sessions import PHASES, KillableTraining, log_state
+from experiments.faults.kills import (
+    PHASES,
+    UNDISTURBED,
+    Campaign,
+    KillableTraining,
+    KillConfig,
+    KillSchedule,
+    log_state,
+)
 
 LINE = json.dumps({"stage": "sft/0", "step": 3, "loss": 1.0}) + "\n"
 

@@ -1,0 +1,167 @@
+"""Checkpoints of random weights in the published layout, and readers of them, each measured in a process of its own.
+
+This module imports little, since what it imports adds to the memory of the process that is measured.
+"""
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.core.progress import ProgressCallback
+from experiments.engine.processes import in_own_process
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.load import peak_memory
+from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.names import published, read, sources
+from touchr1_jax.models.qwen.safetensors import read_tensor, write_file
+from touchr1_jax.models.qwen.weights import INDEX, find_tensors, load_params
+
+TINY = QwenConfig(
+    decoder=DecoderConfig(
+        vocab_size=256, hidden_size=32, num_layers=4, num_heads=4, num_kv_heads=2, head_dim=8, intermediate_size=64,
+        mrope_section=(1, 1, 2), tie_embedding=False,
+    ),
+    vision=QwenVisionConfig(out_size=32, depth=1, hidden_size=32, num_heads=2, intermediate_size=64, full_layers=(0,)),
+    vision_start_id=250, vision_end_id=251, image_id=252, video_id=253,
+)  # fmt: skip
+"""A model of the same kind that compiles in seconds."""
+
+
+def _with_released_tower(**changes: Any) -> QwenConfig:
+    """The 3B's decoder with changes, and the released vision tower."""
+    decoder = dataclasses.replace(RELEASED["3B"], **changes)
+    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
+
+
+SHAPES: Mapping[str, QwenConfig] = {
+    "tiny": TINY,
+    "0.5B": _with_released_tower(
+        hidden_size=896, num_layers=24, num_heads=14, head_dim=64, intermediate_size=4864, mrope_section=(8, 12, 12)
+    ),
+    "1.5B": _with_released_tower(hidden_size=1536, num_layers=28, num_heads=12, intermediate_size=8960),
+    "3B": released("3B"),
+    "7B": released("7B"),
+}
+"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LoadMeasurement:
+    """Seconds of one reading, bytes of parameters, largest resident size, and that of the process before it."""
+
+    seconds: float
+    held: int
+    peak: int
+    before: int
+
+
+Reader = Callable[[Path, QwenConfig, ProgressCallback], list[jax.Array]]
+"""(folder, shape, progress callback of bytes) → parameters."""
+
+
+def streamed(directory: Path, config: QwenConfig, tell: ProgressCallback) -> list[jax.Array]:
+    """The library's reader, tensor by tensor."""
+    return jax.tree.leaves(load_params(directory, config, jnp.bfloat16, progress=tell))
+
+
+def whole_first(directory: Path, config: QwenConfig, tell: ProgressCallback) -> list[jax.Array]:
+    """Read all tensors into memory, then make the parameters from them."""
+    entries = find_tensors(directory)
+    done, size, tensors = 0, sum(entry.size for entry in entries.values()), {}
+    for key, entry in entries.items():
+        tensors[key] = read_tensor(entry)
+        done += entry.size
+        tell(done, size)
+    return [jnp.array(read(jnp.array(tensors[s.key]), s.turned)) for s in sources(config).values()]
+
+
+OURS, PLAIN = "streamed", "whole first"
+READERS: Mapping[str, Reader] = {OURS: streamed, PLAIN: whole_first}
+
+
+SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
+"""Random bits of a bfloat16, and its fixed exponent: numbers of a trained weight's size, ±2⁻⁷ … ±2⁻⁶."""
+
+
+def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, tell: ProgressCallback) -> int:
+    """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes.
+
+    Args:
+      directory: filled with shards and the index.
+      config: shape.
+      shard_bytes: a shard is closed before it would exceed this, unless a single tensor does.
+      tell: progress callback; drawing and writing a tensor count half of its bytes each.
+    """
+    rng = np.random.default_rng(0)
+    place: dict[str, str] = {}
+    cut = list(shards(config, shard_bytes))
+    size, every = 0, sum(2 * math.prod(shape) for shapes in cut for shape in shapes.values())
+    for i, shapes in enumerate(cut):
+        name, tensors, drawn = f"model-{i + 1:05}.safetensors", {}, 0
+        for key, shape in shapes.items():
+            bits = np.frombuffer(rng.bytes(2 * math.prod(shape)), np.uint16)
+            tensors[key] = ((bits & SIGN_AND_FRACTION) | SMALL).view(jnp.bfloat16).reshape(shape)
+            drawn += tensors[key].nbytes
+            tell(size + drawn // 2, every)
+        write_file(directory / name, tensors, _after(size + drawn // 2, every, tell))
+        place |= dict.fromkeys(tensors, name)
+        size += drawn
+    index = {"metadata": {"total_size": size}, "weight_map": place}
+    (directory / INDEX).write_text(json.dumps(index), encoding="utf-8")
+    return size
+
+
+def _after(begun: int, every: int, tell: ProgressCallback) -> ProgressCallback:
+    return lambda done, _: tell(begun + done // 2, every)
+
+
+def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int, ...]]]:
+    """Published keys and shapes, cut into shards in the order of the parameters."""
+    shard: dict[str, tuple[int, ...]] = {}
+    filled = 0
+    for s in sources(config).values():
+        size = 2 * math.prod(s.shape)
+        if shard and filled + size > shard_bytes:
+            yield shard
+            shard, filled = {}, 0
+        shard[published(s.key)] = s.shape
+        filled += size
+    yield shard
+
+
+def measure(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressCallback) -> LoadMeasurement:
+    """Read once in a fresh process, whose largest size is then that of the reading.
+
+    Args:
+      reader: a function of a module.
+      directory: of the checkpoint.
+      config: its shape.
+      tell: progress callback of the bytes read.
+
+    Raises:
+      RuntimeError: the process ended without an answer, as one that the system stops for its memory does.
+    """
+    try:
+        return in_own_process(_measure_here, reader, directory, config, tell=tell)
+    except BrokenProcessPool:
+        raise RuntimeError(
+            f"reader {reader.__name__!r} of {directory} ended without an answer: probably too little memory; choose "
+            "smaller sizes"
+        ) from None
+
+
+def _measure_here(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressCallback) -> LoadMeasurement:
+    jax.block_until_ready(jnp.zeros(1))  # the runtime's own memory
+    before, began = peak_memory(), time.perf_counter()
+    leaves = jax.block_until_ready(reader(directory, config, tell))
+    seconds = time.perf_counter() - began
+    return LoadMeasurement(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)
