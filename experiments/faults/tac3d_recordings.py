@@ -135,7 +135,7 @@ def decode_ms(packets: list[bytes], rounds: Iterable[object]) -> dict[str, np.nd
     calls: dict[str, Callable[[], Any]] = {
         CACHED: lambda: decoder.decode(layout, data),
         f"{CACHED}, packets joined, schema's arrays": whole,
-        "layout parsed each time": lambda: tac3d_messages.Decoder().decode(layout, data),
+        "layout parsed each time": lambda: tac3d_messages.Tac3dDecoder().decode(layout, data),
     }
     if YAML:
         calls[BY_YAML] = functools.partial(_decode_by_yaml, layout, data)
