@@ -16,7 +16,6 @@ give the right answer to about half of the questions, material least.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from experiments.bench import card
 from experiments.bench.draw import Quota
@@ -27,21 +26,17 @@ from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.study.sources import Source, SourceConfig, prepare_records
-from sensors_io.importers.physiclear import PhysiclearConfig
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.items import KINDS, Item, write_items
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DatasetCardConfig:
+class DatasetCardConfig(SourceConfig):
     """The records, the number of questions, and `faulty`, the number of items in which errors are planted."""
 
-    data: Source = "generated"
-    data_dir: Path | None = None
     scenes: SceneConfig = SceneConfig(objects=1000, sites=2)
-    physiclear: PhysiclearConfig = PhysiclearConfig()
     quota: Quota = Quota()
     seed: int = 0
     faulty: int = 700
@@ -49,10 +44,7 @@ class DatasetCardConfig:
 
 def run(config: DatasetCardConfig, context: Context) -> Results:
     """Make the bench, check it, report."""
-    records = SourceConfig(
-        kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
-    )
-    store = RecordStore(prepare_records(records, context))
+    store = RecordStore(prepare_records(config, context))
     contacts = sum(len(store.contacts_of_split(split)) for split in ("test", "train"))
     with context.timed("measure"), context.progress("measuring contacts", contacts) as advance:
         source = read_source(store, advance)

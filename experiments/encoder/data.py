@@ -1,15 +1,13 @@
 """Recordings for encoders: other scenes than those of the later stages, split by object."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
 from experiments.core.context import Context
 from experiments.encoder.held_out import HeldOutContacts
 from experiments.study.dataset import Dataset, open_dataset
-from experiments.study.sources import Source, SourceConfig, prepare_records
-from sensors_io.importers.physiclear import PhysiclearConfig
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
@@ -20,26 +18,18 @@ STAGE_ONE_SEED = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StageOneDataConfig:
+class StageOneDataConfig(SourceConfig):
     """The recordings, and the largest number of labelled contacts to fit the probes on."""
 
-    data: Source = "generated"
-    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
-    data_dir: Path | None = None
-    """Folder of the videos or records."""
     scenes: SceneConfig = SceneConfig(objects=2400, sites=1, seed=STAGE_ONE_SEED)
-    physiclear: PhysiclearConfig = PhysiclearConfig()
     probe_fit: int = 1680
     probe: ProbeConfig = ProbeConfig()
 
 
 def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
     """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
-    source = SourceConfig(
-        kind=config.data, directory=config.data_dir, scenes=config.scenes, physiclear=config.physiclear
-    )
     clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
-    return open_dataset(prepare_records(source, context), clip, grpo_share=0.5)
+    return open_dataset(prepare_records(config, context), clip, grpo_share=0.5)
 
 
 def training_rows(data: Dataset) -> np.ndarray:

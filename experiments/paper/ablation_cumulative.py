@@ -17,26 +17,28 @@ reward makes slots agree and raises CSC little or not at all; format adds nothin
 
 import collections
 import dataclasses
+from collections.abc import Mapping
 
 from experiments.core.context import Context
-from experiments.core.results import Requirement, Results
+from experiments.core.results import Cell, Estimate, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.paper import presets
 from experiments.paper.bench_scores import pooled_table
 from experiments.paper.component_effects import (
     FOUR,
     LADDER_METRICS,
     ComponentComparison,
-    ComponentEffect,
     ComponentStep,
     compare_components,
-    find_effect,
+    effects_picture,
+    effects_table,
+    estimate_cell,
 )
-from experiments.paper.component_report import attribute_table, effects_picture, effects_table, ladder_table
-from experiments.paper.components import BASE, COMPONENTS, published_steps, reinforced
-from experiments.paper.eval_variants import untrained
+from experiments.paper.components import BASE, BASE_ROW, COMPONENTS, published_steps, reinforced
+from experiments.study import paper_numbers as paper
 from experiments.study.ablation import Ablation, run_ablation
-from experiments.study.paper_numbers import differences_table
-from experiments.study.study import SFT, EvalVariant, StudyConfig
+from experiments.study.stages import encode_rows, untrained
+from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy
+from touchr1_jax.training.evaluation import Evaluation
 
 UNTRAINED = "untrained"
 
@@ -50,11 +52,19 @@ STEPS = tuple(
 
 WEIGHTS, ALGORITHMS = reinforced(c.added for c in COMPONENTS)
 
+
+def without_training(trained: TrainedPolicy) -> Evaluation:
+    """The policy as it is before SFT."""
+    params = untrained(trained.policy, trained.data, trained.seed)
+    rows = trained.data.parts["test"]
+    return trained.ask(params, encode_rows(trained.policy, params, trained.data, rows, trained.context))
+
+
 ABLATION = Ablation(
     arms=WEIGHTS,
     algorithms=ALGORITHMS,
     pairs=tuple((arm, BELOW[arm]) for arm in WEIGHTS),
-    variants={UNTRAINED: EvalVariant(of=SFT, evaluate=untrained)},
+    variants={UNTRAINED: EvalVariant(of=SFT, evaluate=without_training)},
     curves=presets.GRPO_CURVES,
     example="grounding",
 )
@@ -66,6 +76,14 @@ NOTE = (
     "interval, over objects by p. OMAE should fall, CSC and Avg rise."
 )
 
+ROWS: tuple[tuple[str, str | None, str], ...] = (
+    (BASE, BASE_ROW, "–"),
+    *((c.added.name, c.row, f"+ {c.name}") for c in COMPONENTS),
+)
+"""Of the ladder: arm, the paper's row, the component that the arm adds to the one above it."""
+
+PER_ATTRIBUTE = {"h_acc": "H-Acc", "r_acc": "R-Acc", "p_acc": "P-Acc", "mat_acc": "Mat-Acc"}
+
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train the arms, compare each with the one below it, diagnose the signs that do not come out."""
@@ -76,47 +94,72 @@ def run(config: StudyConfig, context: Context) -> Results:
         results,
         baselines={**results.baselines, UNTRAINED: found.reported(UNTRAINED)},
         verdict=verdict(found),
-        requirements=requirements(found.effects),
+        requirements=requirements(found),
         tables=(
             ladder_table(found.estimates),
             effects_table(found, TITLE, NOTE),
             attribute_table(found.estimates),
             *pooled_table(results.arms, SFT),
             *results.tables,
-            differences_table(presets.DIFFERENCES),
+            paper.differences_table(presets.DIFFERENCES),
         ),
         pictures=(*effects_picture(found.effects, TITLE), *results.pictures),
     )
 
 
-def requirements(effects: tuple[ComponentEffect, ...]) -> tuple[Requirement, ...]:
+def ladder_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
+    """OMAE, CSC and the four-attribute mean of every arm of the ladder, and of the paper's rows."""
+    rows: list[dict[str, Cell]] = []
+    for arm, published, adds in ROWS:
+        row: dict[str, Cell] = {"arm": arm, "adds": adds}
+        for metric in LADDER_METRICS:
+            row[metric.title] = estimate_cell(estimates[arm].get(metric.metric), metric.format.lstrip("+"))
+            row[f"{metric.title}, paper"] = None if published is None else paper.LADDER[published][metric.column]
+        rows.append(row)
+    return named_table(
+        "The ladder",
+        rows,
+        formats={f"{m.title}, paper": m.format.lstrip("+") for m in LADDER_METRICS},
+        note="Means over seeds with 95 % intervals over objects. Avg is the mean of the four accuracies, which is what "
+        "the paper's ladder prints under that name.",
+    )
+
+
+def attribute_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
+    """Accuracy on each attribute of every arm of the ladder, and of the paper's table (b)."""
+    rows: list[dict[str, Cell]] = []
+    for arm, published, _ in ROWS:
+        row: dict[str, Cell] = {"arm": arm}
+        of_paper = paper.PER_ATTRIBUTE.get(published or "")
+        for i, (metric, title) in enumerate(PER_ATTRIBUTE.items()):
+            row[title] = estimate_cell(estimates[arm].get(metric), ".1f")
+            row[f"{title}, paper"] = None if of_paper is None else of_paper[0][i]
+        rows.append(row)
+    return named_table(
+        "Accuracy on each attribute",
+        rows,
+        formats={f"{title}, paper": ".1f" for title in PER_ATTRIBUTE.values()},
+        units={column: "%" for title in PER_ATTRIBUTE.values() for column in (title, f"{title}, paper")},
+        note="GRPO asks about hardness, roughness and protrusion; material is asked in the evaluation alone.",
+    )
+
+
+def requirements(found: ComponentComparison) -> tuple[Requirement, ...]:
     """The three signs that the paper rests on; none where a single seed leaves no interval."""
-    if not effects:
+    if not found.effects:
         return ()
     bounds = []
-    ordinal, consistency = find_effect(effects, "ordinal", "omae"), find_effect(effects, "consistency", "csc")
-    if ordinal is not None:
-        name, change = "ordinal credit: change of OMAE", ordinal.seeds.mean
-        bounds.append(Requirement(name=name, measured=change, bound=0.0, better="lower", note=str(ordinal)))
-    if consistency is not None:
-        name, change = "consistency: change of CSC", consistency.seeds.mean
-        bounds.append(Requirement(name=name, measured=change, bound=0.0, better="higher", note=str(consistency)))
-    return (*bounds, _sft_is_largest(effects))
-
-
-def _sft_is_largest(effects: tuple[ComponentEffect, ...]) -> Requirement:
-    """In how many metrics SFT changes more than any step above it."""
-    count = 0
+    if (ordinal := found.effect("ordinal", "omae")) is not None:
+        bounds.append(at_most("ordinal credit: change of OMAE", ordinal.seeds.mean, 0.0, note=str(ordinal)))
+    if (consistency := found.effect("consistency", "csc")) is not None:
+        bounds.append(at_least("consistency: change of CSC", consistency.seeds.mean, 0.0, note=str(consistency)))
+    largest = 0
     for metric in LADDER_METRICS:
-        sizes = {e.step.arm: abs(e.seeds.mean) for e in effects if e.metric == metric}
-        count += sizes.get(SFT, 0.0) >= max(sizes.values())
-    return Requirement(
-        name="measures in which SFT is the largest step",
-        measured=count,
-        bound=len(LADDER_METRICS),
-        better="higher",
-        note="from the commonest levels, which stand for the paper's untrained base",
-    )
+        sizes = {e.step.arm: abs(e.seeds.mean) for e in found.effects if e.metric == metric}
+        largest += sizes.get(SFT, 0.0) >= max(sizes.values())
+    note = "from the commonest levels, which stand for the paper's untrained base"
+    name = "measures in which SFT is the largest step"
+    return (*bounds, at_least(name, largest, len(LADDER_METRICS), note=note))
 
 
 def verdict(found: ComponentComparison) -> tuple[str, ...]:
@@ -131,7 +174,7 @@ def verdict(found: ComponentComparison) -> tuple[str, ...]:
         ("format", FOUR, "The format reward"),
         ("grounding", FOUR, "Tactile grounding"),
     ):
-        effect = find_effect(found.effects, arm, metric)
+        effect = found.effect(arm, metric)
         if effect is not None:
             reasons = found.failures.get(effect, ())
             sentences.append(f"{subject}: {effect}" + (f". {'; '.join(reasons)}." if reasons else "."))

@@ -22,43 +22,59 @@ from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.paper import presets
 from experiments.paper.bench_scores import pooled_table
-from experiments.paper.component_effects import FOUR, ComponentComparison, ComponentStep, compare_components
-from experiments.paper.component_report import effects_picture, effects_table
+from experiments.paper.component_effects import (
+    FOUR,
+    ComponentComparison,
+    ComponentStep,
+    compare_components,
+    effects_picture,
+    effects_table,
+)
 from experiments.paper.components import (
     COMPONENTS,
     FULL,
     NO_SFT,
     WITH_TACTILE_USE,
-    ComponentArm,
+    omitted,
     published_steps,
     reinforced,
 )
-from experiments.paper.eval_variants import without_sft
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
-from experiments.study.study import SFT, EvalVariant, StudyConfig
+from experiments.study.stages import encode_rows, noise_bank, run_grpo, untrained
+from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy, grpo_contacts, make_study_arm
+from touchr1_jax.training.evaluation import Evaluation
 
 STEPS = tuple(
     ComponentStep(
-        arm=FULL,
-        against=c.omitted.name,
-        component=c.name,
-        published=published_steps()[c.name],
-        diagnosed=c.omitted.name,
+        arm=FULL, against=c.omitted.name, component=c.name, published=published_steps()[c.name], omission=True
     )
     for c in COMPONENTS
 )
 
 FROM_SFT = [c.omitted for c in COMPONENTS if c.omitted.name != NO_SFT]
 
-WEIGHTS, ALGORITHMS = reinforced([ComponentArm(name=FULL, weights=PUBLISHED, algorithm=WITH_TACTILE_USE), *FROM_SFT])
+WEIGHTS, ALGORITHMS = reinforced([omitted(FULL), *FROM_SFT])
+
+
+def without_sft(trained: TrainedPolicy) -> Evaluation:
+    """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
+    policy, data, seed = trained.policy, trained.data, trained.seed
+    params = untrained(policy, data, seed)
+    encode = functools.partial(encode_rows, policy, params, data, context=trained.context)
+    arm = make_study_arm(trained.config, policy, PUBLISHED, data.prior(), WITH_TACTILE_USE)
+    noise = noise_bank(policy, params, data, seed=seed)
+    contacts = grpo_contacts(data, encode(rows=data.parts["grpo"]), noise)
+    tuned = run_grpo(policy, arm, contacts, params, trained.context, seed=seed, stage=f"grpo/{NO_SFT}/{seed}")
+    return trained.ask(tuned, encode(rows=data.parts["test"]))
+
 
 ABLATION = Ablation(
     arms=WEIGHTS,
     algorithms=ALGORITHMS,
     pairs=tuple((FULL, arm.name) for arm in FROM_SFT),
-    variants={NO_SFT: EvalVariant(of=SFT, evaluate=functools.partial(without_sft, PUBLISHED, WITH_TACTILE_USE))},
+    variants={NO_SFT: EvalVariant(of=SFT, evaluate=without_sft)},
     curves=presets.GRPO_CURVES,
     example=FULL,
 )

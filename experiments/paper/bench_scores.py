@@ -6,7 +6,6 @@ mean of the levels from single sensors; if these are equal too, the touch that i
 a constant answer has exactly the chance accuracy of a question that comes in all orders.
 """
 
-import collections
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -17,9 +16,9 @@ from experiments.bench.contacts import measure_split
 from experiments.bench.draw import Quota, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Estimate, Table, named_table
-from experiments.core.text import bounds, number
+from experiments.core.text import ABSENT, bounds, number
 from experiments.study.dataset import Dataset
-from experiments.study.estimates import estimate
+from experiments.study.estimates import RESAMPLES, estimate
 from experiments.study.paper_numbers import Row as PaperRow
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.averages import AVERAGED, WORST_OMAE, touch_average
@@ -37,9 +36,6 @@ from touchr1_jax.training.evaluation import Evaluation
 
 ORDINAL_LEVELS = 3
 """K of ordinal levels: means of levels over K stay below one level."""
-
-RESAMPLES = 2_000
-"""Of the average's interval: its ends are then good to a tenth of its width."""
 
 AVERAGE_MEANING = "mean of the nine columns, OMAE as 100(1 − OMAE/2), ρ as 100ρ"
 
@@ -103,14 +99,7 @@ def touch_rows(data: Dataset) -> dict[Touch, int]:
 def answer_all(
     asks: Iterable[Ask], single: SingleTouchAnswers, rows: Mapping[Touch, int], sensors: Sequence[str]
 ) -> dict[str, tuple[int, ...]]:
-    """The levels that answer each question, keyed by its id, −1 for ⊥.
-
-    Args:
-      asks: questions about contacts in `rows`.
-      single: answers about each of them.
-      rows: place of each contact in `single`.
-      sensors: names of the streams, in their order.
-    """
+    """The levels that answer each question, keyed by its id, −1 for ⊥; `rows` are the places of touches in `single`."""
     return {ask.id: _answer(ask, single, [rows[t] for t in ask.touches], sensors) for ask in asks}
 
 
@@ -137,8 +126,7 @@ def bench_row(
 
     Args:
       asks: the questions.
-      answers: those of every seed.
-      by_picture: answers from pictures alone, for every seed.
+      answers, by_picture: those of every seed, and those from pictures alone.
     """
     priors: Sequence[ItemAnswers | None] = [None] * len(answers) if by_picture is None else by_picture
     tables = [score(asks, given, prior) for given, prior in zip(answers, priors, strict=True)]
@@ -150,12 +138,7 @@ def bench_row(
 
 
 def average(tables: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> Estimate:
-    """`touch_average` of every seed, and its interval: one resample of the objects serves all metrics and seeds.
-
-    Args:
-      tables: metric → scores of every seed, `AVERAGED` among them.
-      objects: [N], the object of each question.
-    """
+    """`touch_average` of every seed, and its interval: one resample of the objects serves all metrics and seeds."""
     cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
 
     def drawn(table: Mapping[str, Scores]) -> np.ndarray:
@@ -174,28 +157,27 @@ def comparison_table(
     """Our rows, then the paper's, in the columns of its main table; the last columns are averages.
 
     Args:
-      title: heading.
+      title, note: heading, and a sentence above the table.
       ours: row → metric.
       theirs: row → the paper's figures and its printed average; `None` where it prints none.
-      note: a sentence above the table.
     """
-    titles = [REPORTED[m].title for m in AVERAGED]
+    titles = {m: REPORTED[m].title for m in AVERAGED}
     rows: list[dict[str, Cell]] = []
     for name, row in ours.items():
-        cells = [row[m].mean if m in row else None for m in (*AVERAGED, "avg")]
-        rows.append({"row": name, **dict(zip((*titles, "Avg"), cells, strict=True)), "Avg as printed": None})
+        means = {heading: row[m].mean if m in row else None for m, heading in (titles | {"avg": "Avg"}).items()}
+        rows.append({"row": name, **means, "Avg as printed": None})
     for name, printed in theirs.items():
-        if printed is None:
-            rows.append({"row": f"{name} (paper)"})
-            continue
-        values, average = printed
-        of_paper = {"Avg": touch_average(dict(zip(AVERAGED, values, strict=True))), "Avg as printed": average}
-        rows.append({"row": f"{name} (paper)", **dict(zip(titles, values, strict=True)), **of_paper})
+        cells: dict[str, Cell] = {"row": f"{name} (paper)"}
+        if printed is not None:
+            values = dict(zip(AVERAGED, printed[0], strict=True))
+            cells |= {titles[m]: value for m, value in values.items()}
+            cells |= {"Avg": touch_average(values), "Avg as printed": printed[1]}
+        rows.append(cells)
     return named_table(
         title,
         rows,
-        formats={REPORTED[m].title: REPORTED[m].format for m in AVERAGED} | {"Avg": ".1f", "Avg as printed": ".1f"},
-        units={REPORTED[m].title: REPORTED[m].unit for m in AVERAGED},
+        formats={titles[m]: REPORTED[m].format for m in AVERAGED} | {"Avg": ".1f", "Avg as printed": ".1f"},
+        units={titles[m]: REPORTED[m].unit for m in AVERAGED},
         meanings={"Avg": AVERAGE_MEANING, "Avg as printed": "the paper's own, whose formula is not given"},
         note=note,
     )
@@ -203,17 +185,17 @@ def comparison_table(
 
 def question_table(asks: Sequence[Ask]) -> Table:
     """Number of questions of each kind, and of the objects that they are about."""
-    counts = collections.Counter(ask.kind for ask in asks)
+    kinds = {kind: [ask for ask in asks if ask.kind == kind] for kind in KINDS}
     rows: list[dict[str, Cell]] = [
         {
             "kind": kind,
-            "tier": about.tier,
-            "questions": counts[kind],
-            "objects": len({touch.object for ask in asks if ask.kind == kind for touch in ask.touches}),
-            "asks for": about.meaning,
+            "tier": KINDS[kind].tier,
+            "questions": len(of),
+            "objects": len({touch.object for ask in of for touch in ask.touches}),
+            "asks for": KINDS[kind].meaning,
         }
-        for kind, about in KINDS.items()
-        if counts[kind]
+        for kind, of in kinds.items()
+        if of
     ]
     return named_table("Questions", rows, formats=dict.fromkeys(("tier", "questions", "objects"), "d"))
 
@@ -221,12 +203,8 @@ def question_table(asks: Sequence[Ask]) -> Table:
 def pooled_table(rows: Mapping[str, Estimates], against: str) -> tuple[Table, ...]:
     """Every row of two seeds or more, pooled over its columns: interquartile mean and probability of improvement.
 
-    Args:
-      rows: row → metric; rows of one seed, baselines, are left out.
-      against: the row that the others are compared with.
-
-    Returns:
-      The table; none where `against` has a single seed.
+    Rows of one seed, baselines, are left out; there is no table where `against`, which others are compared with, has
+    one.
     """
     trained = {name: row for name, row in rows.items() if all(len(e.per_seed) > 1 for e in row.values())}
     if against not in trained:
@@ -237,16 +215,11 @@ def pooled_table(rows: Mapping[str, Estimates], against: str) -> tuple[Table, ..
     better = f"P(better than {against})"
     for name, values in scores.items():
         iqm, gain = stratified_bootstrap_iqm(values), improvement_interval(values, scores[against])
-        compared = name != against
-        lines.append(
-            {
-                "row": name,
-                "IQM": number(iqm.mean, ".1f"),
-                "95 % of the IQM": bounds(iqm.low, iqm.high, ".1f"),
-                better: number(gain.mean, ".2f") if compared else "–",
-                "95 % of P": bounds(gain.low, gain.high, ".2f") if compared else "–",
-            }
-        )
+        compared: dict[str, Cell] = {better: ABSENT, "95 % of P": ABSENT}
+        if name != against:
+            compared = {better: number(gain.mean, ".2f"), "95 % of P": bounds(gain.low, gain.high, ".2f")}
+        span = bounds(iqm.low, iqm.high, ".1f")
+        lines.append({"row": name, "IQM": number(iqm.mean, ".1f"), "95 % of the IQM": span, **compared})
     titles = ", ".join(REPORTED[m].title for m in columns)
     table = named_table(
         "Pooled over seeds and columns",

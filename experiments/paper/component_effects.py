@@ -2,16 +2,18 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context, read_metrics
-from experiments.core.results import Estimate
-from experiments.core.text import bounds, number
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Estimate, Picture, Table, named_table
+from experiments.core.text import bounds, interval, number
 from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
 from experiments.study.baselines import baselines
-from experiments.study.estimates import estimate
+from experiments.study.estimates import RESAMPLES, estimate, pooled
 from experiments.study.scores import Scored, score
 from experiments.study.study import Study
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
@@ -23,9 +25,6 @@ from touchr1_jax.bench.statistics import (
     sign_flip_test,
     student_interval,
 )
-
-RESAMPLES = 2_000
-"""Of each interval over objects: its ends are then good to a tenth of its width."""
 
 FOUR = "four_acc"
 """Mean accuracy over hardness, roughness, protrusion and material: what the paper's ladder prints as Avg."""
@@ -61,7 +60,7 @@ class ComponentStep:
       arm, against: `arm` has the component, `against` does not.
       component: its name.
       published: the paper's change in the columns of `LADDER_METRICS`; `None` where it has no such row.
-      diagnosed: the arm whose run is searched for failures whatever comes out; `None` for `arm`, and only where the
+      omission: search the run of `against` for failures whatever comes out; else that of `arm`, and only where the
         paper's sign does not come out.
     """
 
@@ -69,7 +68,7 @@ class ComponentStep:
     against: str
     component: str
     published: tuple[float, ...] | None
-    diagnosed: str | None = None
+    omission: bool = False
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,7 +114,7 @@ def component_effects(
     """Every step in every metric of the ladder that both of its arms have.
 
     Args:
-      steps: what to compare.
+      steps: comparisons.
       rows: arm → seeds; an arm of one seed, a baseline, is compared with every seed of the other.
       objects: [N], the object of each question.
 
@@ -135,16 +134,6 @@ def component_effects(
     )
 
 
-def pooled(seeds: Sequence[Scores]) -> Scores:
-    """The mean over seeds of each value; all seeds were scored on the same questions."""
-    return dataclasses.replace(seeds[0], values=np.mean([s.values for s in seeds], axis=0))
-
-
-def find_effect(effects: Sequence[ComponentEffect], arm: str, metric: str) -> ComponentEffect | None:
-    """The effect of a step's arm on a metric."""
-    return next((e for e in effects if e.step.arm == arm and e.metric.metric == metric), None)
-
-
 def _paired(step: ComponentStep, metric: str, rows: Mapping[str, SeedScores]) -> tuple[list[Scores], list[Scores]]:
     a, b = ([seed[metric] for seed in rows[name]] for name in (step.arm, step.against))
     count = max(len(a), len(b))
@@ -153,8 +142,7 @@ def _paired(step: ComponentStep, metric: str, rows: Mapping[str, SeedScores]) ->
             f"{step.arm} and {step.against} have {len(a)} and {len(b)} seeds: must have the same number, two at least, "
             "or one of a baseline; train the missing ones"
         )
-    a, b = (side * count if len(side) == 1 else side for side in (a, b))
-    return a, b
+    return a * (count // len(a)), b * (count // len(b))
 
 
 def _effect(
@@ -191,6 +179,10 @@ class ComponentComparison:
         """The metrics of a row that `Results` knows; `FOUR` stands in the ladder's own tables."""
         return {metric: value for metric, value in self.estimates[row].items() if metric != FOUR}
 
+    def effect(self, arm: str, metric: str) -> ComponentEffect | None:
+        """The effect of a step's arm on a metric."""
+        return next((e for e in self.effects if e.step.arm == arm and e.metric.metric == metric), None)
+
 
 def compare_components(
     study: Study, scored: Scored, steps: Sequence[ComponentStep], context: Context
@@ -205,7 +197,7 @@ def compare_components(
         ]
         for name, seeds in plain.items()
     }
-    estimates = {
+    found = {
         name: {
             metric: scored.estimates.get(name, {}).get(metric) or estimate([s[metric] for s in seeds], scored.objects)
             for metric in seeds[0]
@@ -213,24 +205,20 @@ def compare_components(
         for name, seeds in rows.items()
     }
     effects = component_effects(steps, rows, scored.objects) if study.config.seeds > 1 else ()
-    means = {name: {metric: e.mean for metric, e in row.items()} for name, row in estimates.items()}
-    lines = read_metrics(context.directory)
-    failures = {}
+    means = {name: {metric: e.mean for metric, e in row.items()} for name, row in found.items()}
+    lines, failures = read_metrics(context.directory), {}
     for effect in effects:
         step = effect.step
-        if step.diagnosed is None and effect.sign not in ("opposite", "undecided"):
+        if not step.omission and effect.sign not in ("opposite", "undecided"):
             continue
-        arm, other = (step.against, step.arm) if step.diagnosed == step.against else (step.arm, step.against)
-        found = diagnose(
-            ArmMeasurements(
-                history=training_history(lines, arm),
-                after=means[arm],
-                before=means[other],
-                consistency="consistency" in study.arms.get(arm, {}),
-            )
+        arm, other = (step.against, step.arm) if step.omission else (step.arm, step.against)
+        consistency = "consistency" in study.arms.get(arm, {})
+        history = training_history(lines, arm)
+        shown = diagnose(
+            ArmMeasurements(history=history, after=means[arm], before=means[other], consistency=consistency)
         )
-        failures[effect] = found or (() if effect.sign == "reproduced" else (_no_failure(effect),))
-    return ComponentComparison(estimates=estimates, effects=effects, failures=failures)
+        failures[effect] = shown or (() if effect.sign == "reproduced" else (_no_failure(effect),))
+    return ComponentComparison(estimates=found, effects=effects, failures=failures)
 
 
 def _no_failure(effect: ComponentEffect) -> str:
@@ -238,3 +226,71 @@ def _no_failure(effect: ComponentEffect) -> str:
     half = (effect.seeds.high - effect.seeds.low) / 2
     published = "" if effect.published is None else f", the paper prints {number(effect.published, '+.2g')}"
     return f"no known failure shows; these seeds detect changes beyond {half:.2g}{published}"
+
+
+def effects_table(found: ComponentComparison, title: str, note: str) -> Table:
+    """The change that each component makes, its sign compared with the paper's, and the failures behind it."""
+    return named_table(
+        title,
+        [
+            {
+                "component and metric": f"{e.step.component}: {e.metric.title}",
+                "change": number(e.seeds.mean, e.metric.format),
+                "95 % over seeds": bounds(e.seeds.low, e.seeds.high, e.metric.format),
+                "p": e.p_seeds,
+                "95 % over objects": bounds(e.objects.low, e.objects.high, e.metric.format),
+                "p over objects": e.p_objects,
+                "paper": number(e.published, e.metric.format),
+                "sign": e.sign,
+                "failures": "; ".join(found.failures.get(e, ())),
+            }
+            for e in found.effects
+        ],
+        formats={"p": ".3f", "p over objects": ".3f"},
+        meanings={
+            "95 % over seeds": "Student's t over paired seeds",
+            "p": "of sign flips over seeds, corrected over the table (Holm)",
+            "95 % over objects": "whole objects resampled, seeds pooled",
+            "p over objects": "of sign flips of whole objects, corrected likewise",
+            "paper": "difference of the rows of its ladder",
+            "sign": "reproduced or opposite where the interval over seeds excludes 0, else undecided",
+            "failures": "known failures that the run shows",
+        },
+        note=note,
+    )
+
+
+def effects_picture(effects: Sequence[ComponentEffect], title: str) -> tuple[Picture, ...]:
+    """The chart of all effects, one panel for each metric; none with a single seed."""
+    if not effects:
+        return ()
+    components = list(dict.fromkeys(e.step.component for e in effects))
+
+    def panel(metric: LadderMetric) -> Panel:
+        of = [e for e in effects if e.metric == metric]
+        at = [float(components.index(e.step.component)) for e in of]
+        known = [(e.published, place) for e, place in zip(of, at, strict=True) if e.published is not None]
+        seeds = estimates("here, 95 % over seeds", [e.seeds for e in of], colour=PALETTE[0], marker="o", width=2.4)
+        low, high = ([getattr(e.objects, end) for e in of] for end in ("low", "high"))
+        look: dict[str, Any] = {"colour": PALETTE[0], "marker": "", "width": 1.0, "alpha": 0.5, "shift": 0.12}
+        objects = Series("95 % over objects", x=[e.seeds.mean for e in of], y=at, low=low, high=high, **look)
+        x, y = ([pair[i] for pair in known] for i in (0, 1))
+        published = Series("paper", x=x, y=y, colour=PALETTE[1], marker="D", hollow=True, shift=-0.2)
+        return Panel(
+            [dataclasses.replace(seeds, y=at), objects, published],
+            rows=[f"+ {component}" for component in components],
+            x_label=f"change of {metric.title}",
+            rules=[Rule(x=0, line="-", colour=SHARED)],
+        )
+
+    caption = (
+        "Change that each component makes. The paper prints single numbers; its Avg of the ladder is the mean of four "
+        "accuracies, and so is ours here."
+    )
+    panels = [panel(metric) for metric in dict.fromkeys(e.metric for e in effects)]
+    return (Picture(name="changes", title=title, caption=caption, content=draw(panels, share_y=True)),)
+
+
+def estimate_cell(found: Estimate | None, spec: str) -> str | None:
+    """A cell with an estimate and its interval; empty where the metric is not measured."""
+    return None if found is None else interval(found, spec)

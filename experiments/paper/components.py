@@ -35,7 +35,7 @@ WITH_TACTILE_USE = Paper(tactile_use=TactileUse.RECOMMENDED)
 """The published objective with credit for the use of touch, which the paper's abstract names and no equation holds."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class ComponentArm:
     """An arm of GRPO: its name, its reward weights and its algorithm; `weights` is `None` where GRPO does not run."""
 
@@ -44,7 +44,7 @@ class ComponentArm:
     algorithm: AnyAlgorithm = UNGROUNDED
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True)
 class Component:
     """One component of the objective.
 
@@ -61,47 +61,48 @@ class Component:
     omitted: ComponentArm
 
 
-def _omitted(name: str, weights: Weights = PUBLISHED, algorithm: AnyAlgorithm = WITH_TACTILE_USE) -> ComponentArm:
-    return ComponentArm(name=name, weights=weights, algorithm=algorithm)
+def omitted(name: str, weights: Weights = PUBLISHED, algorithm: AnyAlgorithm = WITH_TACTILE_USE) -> ComponentArm:
+    """The full objective with other weights or another algorithm."""
+    return ComponentArm(name, weights, algorithm)
 
 
 COMPONENTS: tuple[Component, ...] = (
-    Component(name="SFT", row="+ Cold-start SFT", added=ComponentArm(name=SFT), omitted=_omitted(NO_SFT)),
+    Component("SFT", "+ Cold-start SFT", added=ComponentArm(SFT), omitted=omitted(NO_SFT)),
     Component(
-        name="accuracy reward",
-        row="+ GRPO (0/1)",
-        added=ComponentArm(name="zero_one", weights={"exact": ZERO_ONE["exact"]}),
-        omitted=_omitted("no_accuracy", published_without("accuracy")),
+        "accuracy reward",
+        "+ GRPO (0/1)",
+        added=ComponentArm("zero_one", {"exact": ZERO_ONE["exact"]}),
+        omitted=omitted("no_accuracy", published_without("accuracy")),
     ),
     Component(
-        name="ordinal credit",
-        row="+ Ordinal Reward",
-        added=ComponentArm(name="ordinal", weights=published_without("consistency", "format")),
-        omitted=_omitted("no_ordinal", ZERO_ONE),
+        "ordinal credit",
+        "+ Ordinal Reward",
+        added=ComponentArm("ordinal", published_without("consistency", "format")),
+        omitted=omitted("no_ordinal", ZERO_ONE),
     ),
     Component(
-        name="consistency",
-        row="+ Consistency Reward",
-        added=ComponentArm(name="consistency", weights=published_without("format")),
-        omitted=_omitted("no_consistency", published_without("consistency")),
+        "consistency",
+        "+ Consistency Reward",
+        added=ComponentArm("consistency", published_without("format")),
+        omitted=omitted("no_consistency", published_without("consistency")),
     ),
     Component(
-        name="format",
-        row="+ Format Reward",
-        added=ComponentArm(name="format", weights=PUBLISHED),
-        omitted=_omitted("no_format", published_without("format")),
+        "format",
+        "+ Format Reward",
+        added=ComponentArm("format", PUBLISHED),
+        omitted=omitted("no_format", published_without("format")),
     ),
     Component(
-        name="grounding G_tg",
-        row="Touch-R1",
-        added=ComponentArm(name="grounding", weights=PUBLISHED, algorithm=Paper()),
-        omitted=_omitted("no_grounding", algorithm=dataclasses.replace(WITH_TACTILE_USE, gamma=0.0)),
+        "grounding G_tg",
+        "Touch-R1",
+        added=ComponentArm("grounding", PUBLISHED, Paper()),
+        omitted=omitted("no_grounding", algorithm=dataclasses.replace(WITH_TACTILE_USE, gamma=0.0)),
     ),
     Component(
-        name="tactile use R_tu",
-        row=None,
-        added=ComponentArm(name="tactile_use", weights=PUBLISHED, algorithm=WITH_TACTILE_USE),
-        omitted=_omitted("no_tactile_use", algorithm=Paper()),
+        "tactile use R_tu",
+        None,
+        added=ComponentArm("tactile_use", PUBLISHED, WITH_TACTILE_USE),
+        omitted=omitted("no_tactile_use", algorithm=Paper()),
     ),
 )
 """In the order of the paper's ladder; the last is named in its abstract alone."""

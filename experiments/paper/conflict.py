@@ -4,9 +4,11 @@
 
 Three of ten generated objects look like a material that differs from theirs in at least two of the levels that are
 typical of it; nothing else in their pictures depends on the object.  A question about one of them is deceptive where
-the answer that pictures suggest, by the vote of policies without touch of other seeds, is wrong.  The full model
-(published rewards and grounding) and SFT are compared with the policy without touch, and evaluated again under each
-control of touch: no touch, noise of the sensors' statistics, another object's touch, the same touch in another order.
+the picture suggests a wrong answer.  The picture's suggestion to one seed is the majority answer of the policies
+without touch of the other seeds, so that the policy without touch in the table does not decide by its own mistakes
+which questions are deceptive.  The full model (published rewards and grounding) and SFT are compared with the policy
+without touch, and evaluated again under each control of touch: no touch, noise of the sensors' statistics, another
+object's touch, the same touch in another order.
 
 Cost: two minutes of one core after `main_table`, whose policies it evaluates, some 36 without; `--scale smoke` under
 two.
@@ -16,38 +18,38 @@ its fellows; the full model is right in more than half of them.  Touch is worth 
 but the order of the frames of a press, which carries next to no information.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool, Int
 
-from experiments.core.charts import Panel, Rule, Series, draw
+from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Picture, Requirement, Results
+from experiments.core.results import Picture, Requirement, Results, Table, at_least, named_table
 from experiments.core.text import bounds, interval
 from experiments.paper import presets
 from experiments.paper.components import FULL
-from experiments.paper.conflict_metrics import (
-    AccuracyContrast,
+from experiments.paper.touch_gain import (
     TouchGain,
     TouchQuestions,
     concluded,
-    contrast,
-    contrast_table,
-    deceptive,
-    picture_prior,
-    revision_share,
+    control_answers,
+    control_variants,
     study_touch_gain,
     touch_gain_table,
     touch_questions,
 )
-from experiments.paper.eval_variants import control_name, control_variants
+from experiments.study.estimates import RESAMPLES
 from experiments.study.examples import rollout_examples
 from experiments.study.paper_numbers import differences_table
-from experiments.study.scores import PUBLISHED, score_study, study_settings
-from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
+from experiments.study.scores import PUBLISHED, score_study, study_results
+from experiments.study.study import BLIND, SFT, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE
+from touchr1_jax.bench.grounding import SHUFFLE, revision_rate
+from touchr1_jax.bench.metrics import BOTTOM, accuracy
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, student_interval
 from touchr1_jax.rl.config import Paper
 
 POLICIES = (FULL, SFT)
@@ -64,6 +66,21 @@ DIFFERENCES = (
     ("vision-only", "–", "the same policy, trained without touch for as many steps as SFT"),
 )
 
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AccuracyContrast:
+    """Accuracy of one policy and of another on some questions, percent, and the lead with its intervals.
+
+    `questions` is the mean number of questions over seeds.
+    """
+
+    questions: float
+    ours: float
+    theirs: float
+    seeds: Interval
+    objects: Interval
+
+
 Contrasts = Mapping[str, AccuracyContrast]
 """Group of questions → a policy against the one without touch."""
 
@@ -73,20 +90,18 @@ def run(config: StudyConfig, context: Context) -> Results:
     variants = {**control_variants(FULL), **control_variants(SFT)}
     study = run_study(config, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)
     questions = touch_questions(study, study.answers[SFT][0])
-    priors = picture_prior([concluded(answers) for answers in study.answers[BLIND]])
+    levels = {name: [concluded(answers) for answers in study.answers[name]] for name in (*POLICIES, BLIND)}
+    priors = picture_prior(levels[BLIND])
     misled = [deceptive(questions, prior) for prior in priors]
-    contrasts = {name: contrasts_of(study, questions, misled, name) for name in POLICIES}
+    contrasts = {name: contrasts_of(questions, misled, levels[name], levels[BLIND]) for name in POLICIES}
     groups = {"all": questions.label >= 0, DECEPTIVE: np.mean(misled, axis=0) > 0.5}
     gains = {f"{name}, {g}": study_touch_gain(study, name, mask) for name in POLICIES for g, mask in groups.items()}
-    gain, scored = gains[f"{FULL}, all"], score_study(study)
-    revised = {}
+    gain, revised = gains[f"{FULL}, all"], {}
     if DECEPTIVE in contrasts[FULL]:
-        levels = {name: [concluded(answers) for answers in study.answers[name]] for name in (FULL, BLIND)}
-        revised = {name: revision_share(questions, seeds, priors) for name, seeds in levels.items()}
-    return Results(
-        arms=scored.arms,
-        baselines=scored.baselines,
-        settings=study_settings(config),
+        revised = {name: revision_share(questions, levels[name], priors) for name in (FULL, BLIND)}
+    return study_results(
+        study,
+        score_study(study),
         verdict=verdict(contrasts[FULL], revised, gain),
         requirements=requirements(contrasts[FULL], gain),
         tables=(
@@ -103,17 +118,48 @@ def run(config: StudyConfig, context: Context) -> Results:
                 content=conflict_chart(contrasts[FULL], gain),
             ),
         ),
-        data=study.data.summary(),
         curves=presets.CURVES,
-        examples=rollout_examples(
-            study, FULL, PUBLISHED, {c: study.variants[control_name(FULL, c)][0] for c in CONTROLS}
-        ),
+        examples=rollout_examples(study, FULL, PUBLISHED, {c: a[0] for c, a in control_answers(study, FULL).items()}),
     )
 
 
-def contrasts_of(study: Study, questions: TouchQuestions, misled: Sequence[np.ndarray], name: str) -> Contrasts:
-    """A policy against the one without touch on groups of questions, those that have two objects for every seed."""
-    ours, theirs = ([concluded(answers) for answers in study.answers[who]] for who in (name, BLIND))
+def picture_prior(blind: Sequence[np.ndarray]) -> list[Int[np.ndarray, "N"]]:
+    """For every seed the majority answer of the other seeds' policies without touch, the lower level on a tie.
+
+    Args:
+      blind: int [N] of every seed.
+
+    Raises:
+      ValueError: fewer than two seeds.
+    """
+    if len(blind) < 2:
+        raise ValueError(f"blind holds {len(blind)} seeds: the prior from pictures needs two; train more")
+    levels = max(1, *(int(answers.max()) + 1 for answers in blind))
+    votes = np.stack([(answers[:, None] == np.arange(levels)).astype(int) for answers in blind])
+    return [np.where(v.sum(1) > 0, v.argmax(1), BOTTOM) for v in votes.sum(0) - votes]
+
+
+def deceptive(questions: TouchQuestions, prior: np.ndarray) -> Bool[np.ndarray, "N"]:
+    """Questions about objects that look like others where the prior from pictures is not the label."""
+    return questions.looks_like_another & (prior != BOTTOM) & (prior != questions.label)
+
+
+def revision_share(questions: TouchQuestions, levels: Sequence[np.ndarray], priors: Sequence[np.ndarray]) -> float:
+    """Share of answers to deceptive questions that differ from the prior from pictures: percent, mean over seeds."""
+    rates = []
+    for answered, prior in zip(levels, priors, strict=True):
+        label = np.where(deceptive(questions, prior), questions.label, BOTTOM)
+        rates.append(revision_rate(answered, label, prior).mean())
+    return float(np.mean(rates))
+
+
+def contrasts_of(
+    questions: TouchQuestions,
+    misled: Sequence[np.ndarray],
+    ours: Sequence[np.ndarray],
+    theirs: Sequence[np.ndarray],
+) -> Contrasts:
+    """`contrast` on groups of questions, those that have two objects for every seed; `misled` are each seed's."""
     each = lambda mask: [mask] * len(misled)
     groups = {
         "all questions": each(questions.label >= 0),
@@ -130,6 +176,35 @@ def contrasts_of(study: Study, questions: TouchQuestions, misled: Sequence[np.nd
     }
 
 
+def contrast(
+    questions: TouchQuestions, ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], masks: Sequence[np.ndarray]
+) -> AccuracyContrast:
+    """Compare two policies, paired by question and seed, on the questions of each seed's mask.
+
+    Args:
+      questions: the questions.
+      ours, theirs: levels int [N] of every seed.
+      masks: bool [N] of every seed.
+
+    Raises:
+      ValueError: a mask without a question, or fewer than two seeds or objects.
+    """
+    for seed, mask in enumerate(masks):
+        if not mask.any():
+            raise ValueError(f"masks[{seed}] holds no question: a contrast needs one; ask about more objects")
+    score = lambda levels, mask: accuracy(levels, np.where(mask, questions.label, BOTTOM))
+    a, b = ([score(levels, mask) for levels, mask in zip(side, masks, strict=True)] for side in (ours, theirs))
+    gaps = [x.values - y.values for x, y in zip(a, b, strict=True)]
+    objects = np.concatenate([questions.objects[x.items] for x in a])
+    return AccuracyContrast(
+        questions=float(np.mean([mask.sum() for mask in masks])),
+        ours=float(np.mean([x.mean() for x in a])),
+        theirs=float(np.mean([y.mean() for y in b])),
+        seeds=student_interval(np.array([gap.mean() for gap in gaps])),
+        objects=clustered_bootstrap(np.concatenate(gaps), objects, resamples=RESAMPLES),
+    )
+
+
 def requirements(contrasts: Contrasts, gain: TouchGain | None) -> tuple[Requirement, ...]:
     """The full model's lead on deceptive questions, and its least gain from touch."""
     found = []
@@ -137,16 +212,13 @@ def requirements(contrasts: Contrasts, gain: TouchGain | None) -> tuple[Requirem
         lead = contrasts[DECEPTIVE]
         span = bounds(lead.seeds.low, lead.seeds.high, ".1f")
         note = f"95 % over seeds {span}; {lead.questions:.0f} questions a seed"
-        found.append(_points("full model over vision-only, deceptive questions", lead.seeds.mean, GAP, note))
+        name = "full model over vision-only, deceptive questions"
+        found.append(at_least(name, lead.seeds.mean, GAP, "points", note))
     if gain is not None:
         least = gain.least.gain
         note = f"over {gain.least.control}; 95 % over objects {bounds(least.low, least.high, '.1f')}"
-        found.append(_points("least gain from touch, all questions", least.mean, GAIN, note))
+        found.append(at_least("least gain from touch, all questions", least.mean, GAIN, "points", note))
     return tuple(found)
-
-
-def _points(name: str, measured: float, bound: float, note: str) -> Requirement:
-    return Requirement(name=name, measured=measured, bound=bound, better="higher", unit="points", note=note)
 
 
 def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain | None) -> tuple[str, ...]:
@@ -175,30 +247,47 @@ def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain 
     return tuple(sentences) or ("Too few objects look like others for a contrast; use more.",)
 
 
+def contrast_table(full: Contrasts, sft: Contrasts) -> Table:
+    """Accuracy of the policy without touch, SFT and the full model on every group, and the lead of the full model."""
+    shares = ("vision-only", "SFT", "full model")
+    return named_table(
+        "Accuracy where the picture helps and where it deceives",
+        [
+            {
+                "questions": group,
+                "number": c.questions,
+                "vision-only": c.theirs,
+                "SFT": sft[group].ours,
+                "full model": c.ours,
+                "lead": interval(c.seeds, "+.1f"),
+                "over objects": bounds(c.objects.low, c.objects.high, ".1f"),
+            }
+            for group, c in full.items()
+        ],
+        formats={"number": ".0f", **dict.fromkeys(shares, ".1f")},
+        units={**dict.fromkeys(shares, "%"), "lead": "points"},
+        meanings={
+            "number": "mean over seeds",
+            "vision-only": "the policy without touch",
+            "lead": "full model minus vision-only, with its 95 % interval over seeds",
+            "over objects": "95 % interval of the lead when whole objects are resampled",
+        },
+        note="All four attributes. Deceptive: the object looks like another one, and most policies without touch of "
+        "other seeds answer another level than the label.",
+    )
+
+
 def conflict_chart(contrasts: Contrasts, gain: TouchGain | None) -> bytes:
     """Left: accuracy of two policies on groups of questions; right: the points lost under each control of touch."""
     found = list(contrasts.values())
-    ours = Series(
-        "full model",
-        x=[c.ours for c in found],
-        low=[c.theirs + c.objects.low for c in found],
-        high=[c.theirs + c.objects.high for c in found],
-        bar=True,
-        colour=PALETTE[0],
-    )
+    low, high = ([c.theirs + getattr(c.objects, end) for c in found] for end in ("low", "high"))
+    ours = Series("full model", x=[c.ours for c in found], low=low, high=high, bar=True, colour=PALETTE[0])
     theirs = Series("without touch", x=[c.theirs for c in found], bar=True, colour=PALETTE[1])
     panels = [Panel([theirs, ours], rows=list(contrasts), x_label="accuracy (%)")]
     if gain is not None:
-        spans = list(gain.over.values())
-        low, high, mean = ([getattr(s, end) for s in spans] for end in ("low", "high", "mean"))
-        panels.append(
-            Panel(
-                [Series(x=mean, low=low, high=high, marker="o", width=2.4)],
-                rows=list(gain.over),
-                x_label="gain from touch over it (points)",
-                rules=[Rule(x=0, line="-", colour=SHARED)],
-            )
-        )
+        points = [estimates("", list(gain.over.values()), marker="o", width=2.4)]
+        zero = Rule(x=0, line="-", colour=SHARED)
+        panels.append(Panel(points, rows=list(gain.over), x_label="gain from touch over it (points)", rules=[zero]))
     return draw(panels)
 
 

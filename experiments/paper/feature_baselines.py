@@ -1,10 +1,11 @@
 """Baselines without a policy, on fixed features of a contact: nearest neighbours and a linear probe.
 
-The features are the recorded fields at the strongest press, the picture of the object, or what an encoder makes of
-touch.  Every baseline answers from all streams together and from each alone, as the policies do.
+The features are the recorded fields at the strongest press, the picture of the object, or the encoded touch.  Every
+baseline answers from all streams together and from each alone, as the policies do.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import cv2
@@ -12,9 +13,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import DataError
+from experiments.study.baselines import level_answers
+from experiments.study.stages import encode_rows
+from experiments.study.study import TrainedPolicy
 from sensors_io.records import RecordStore
 from sensors_io.schema import Sequence as Recording
 from touchr1_jax.bench.metrics import BOTTOM
+from touchr1_jax.models.policy import Features
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 
 NEIGHBOURS = 15
@@ -63,11 +69,7 @@ class PredictedLevels:
 
 
 def other_objects(objects: np.ndarray, seed: int) -> Int[np.ndarray, "n"]:
-    """For every contact the position of a random contact of another object.
-
-    Args:
-      objects: [n], the object of each contact.
-      seed: of the draw.
+    """For every contact the position of a random contact of another object; `objects` [n] is that of each contact.
 
     Raises:
       DataError: there is only one object.
@@ -87,13 +89,7 @@ def field_features(
 ) -> ContactFeatures:
     """Depth and size of the displacement, averaged over 8 × 8 cells, at the strongest press of every stream, in mm.
 
-    A stream without fields counts as not recorded.
-
-    Args:
-      store: the records.
-      rows: contacts to read.
-      sensors: names of the S streams.
-      progress: called after every contact.
+    A stream without fields counts as not recorded; `progress` is called after every contact.
     """
     x = np.zeros((len(rows), len(sensors), 2 * CELLS**2), np.float32)
     present = np.zeros((len(rows), len(sensors)), bool)
@@ -108,11 +104,7 @@ def field_features(
 
 
 def picture_features(views: Sequence[np.ndarray | None]) -> ContactFeatures:
-    """Mean colours of 8 × 8 cells and the texture of each picture, as one stream.
-
-    Args:
-      views: uint8 [H, W, 3] of every contact's object, `None` where there is no picture.
-    """
+    """Mean colours of 8 × 8 cells and the texture of each uint8 picture [H, W, 3], as one stream."""
     empty = np.zeros(3 * CELLS**2 + 2 * 3, np.float32)
     x = np.stack([empty if view is None else _colour_and_texture(view) for view in views])
     return ContactFeatures(x=x[:, None], present=np.array([[view is not None] for view in views]))
@@ -121,12 +113,9 @@ def picture_features(views: Sequence[np.ndarray | None]) -> ContactFeatures:
 def _strongest_fields(recording: Recording) -> Float[np.ndarray, "D"]:
     """The fields of the frame with the greatest force, of the last frame where no force was measured."""
     t = -1 if recording.force_n is None else int(np.argmin(recording.force_n[:, 2]))
-    depth, moved = recording.depth_mm, recording.deformation_mm
-    parts = [
-        np.zeros(CELLS**2, np.float32) if depth is None else _cells(depth[t]),
-        np.zeros(CELLS**2, np.float32) if moved is None else _cells(np.linalg.norm(moved[t], axis=-1)),
-    ]
-    return np.concatenate(parts)
+    depth, moved, absent = recording.depth_mm, recording.deformation_mm, np.zeros(CELLS**2, np.float32)
+    moved_mm = absent if moved is None else _cells(np.linalg.norm(moved[t], axis=-1))
+    return np.concatenate([absent if depth is None else _cells(depth[t]), moved_mm])
 
 
 def _colour_and_texture(view: np.ndarray) -> Float[np.ndarray, "D"]:
@@ -143,12 +132,7 @@ def _cells(image: np.ndarray) -> Float[np.ndarray, "D"]:
 def together_and_alone(
     predict: Callable[[LabelledFeatures, ContactFeatures], np.ndarray], known: LabelledFeatures, asked: ContactFeatures
 ) -> PredictedLevels:
-    """Predictions from all streams and from each alone; ⊥ where none of them was recorded.
-
-    Args:
-      predict: levels int [m, A] from training contacts and the contacts to answer for, `nearest` or `linear_probe`.
-      known, asked: its arguments.
-    """
+    """Predictions from all streams and from each alone, by `nearest` or `linear_probe`; ⊥ where none was recorded."""
 
     def levels(k: LabelledFeatures, a: ContactFeatures) -> np.ndarray:
         return np.where(np.any(a.present, axis=1, keepdims=True), predict(k, a), BOTTOM)
@@ -162,13 +146,12 @@ def together_and_alone(
 def nearest(
     known: LabelledFeatures, asked: ContactFeatures, *, levels: tuple[int, ...], neighbours: int = NEIGHBOURS
 ) -> Int[np.ndarray, "m A"]:
-    """The vote of the k nearest training contacts, each weighing 1/d.
+    """The vote of the k nearest training contacts, each weighing 1/d; features without spread do not count.
 
         d² = mean over streams that both have of mean_D ((x − x′)/σ)²
 
     Args:
-      known: training contacts; features without spread among them do not count.
-      asked: contacts to answer for.
+      known, asked: training contacts, and those to answer for.
       levels: K of each attribute.
       neighbours: k; fewer where fewer are annotated.
 
@@ -189,17 +172,7 @@ def nearest(
 def linear_probe(
     known: LabelledFeatures, asked: ContactFeatures, *, levels: tuple[int, ...], config: ProbeConfig
 ) -> Int[np.ndarray, "m A"]:
-    """The likeliest level by a multinomial probe on the concatenated streams.
-
-    Args:
-      known: training contacts.
-      asked: contacts to answer for.
-      levels: K of each attribute.
-      config: penalty and iterations of the probe.
-
-    Raises:
-      ValueError: an attribute that no training contact is annotated for.
-    """
+    """The likeliest level by a multinomial probe on the concatenated streams; arguments and error as of `nearest`."""
     n = len(known.label)
     x = np.concatenate([features.x.reshape(len(features.x), -1) for features in (known.features, asked)])
     columns = []
@@ -209,6 +182,28 @@ def linear_probe(
         label = np.concatenate([known.label[:, a], np.full(len(asked.x), -1)])
         columns.append(probe_log_probs(x, label, weight, count, config)[0, n:].argmax(-1))
     return np.stack(columns, 1)
+
+
+def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False) -> Evaluation:
+    """Levels by a linear probe on the encoded touch; `swapped` gives every contact the touch of another object."""
+    data = trained.data
+    rows = np.concatenate([data.parts["sft"], data.parts["grpo"]])
+    known = mean_tokens(encode_rows(trained.policy, trained.params, data, rows, trained.context))
+    asked = mean_tokens(trained.test)
+    if swapped:
+        known = known.rows(other_objects(data.object_ids[rows], trained.seed))
+        asked = asked.rows(other_objects(data.object_ids[data.parts["test"]], trained.seed))
+    probe = functools.partial(linear_probe, levels=trained.policy.levels, config=trained.config.probe)
+    levels = together_and_alone(probe, LabelledFeatures(features=known, label=data.label[rows]), asked)
+    return level_answers(trained.policy, trained.evaluation, levels.together, levels.alone)
+
+
+def mean_tokens(features: Features) -> ContactFeatures:
+    """Mean over the tokens of each stream."""
+    there = (np.asarray(features.touch_time) >= 0) & np.asarray(features.stream_mask)[..., None]
+    total = (np.asarray(features.touch) * there[..., None]).sum(-2)
+    x = total / np.maximum(there.sum(-1), 1)[..., None]
+    return ContactFeatures(x=x.astype(np.float32), present=there.any(-1))
 
 
 def _distances(known: ContactFeatures, asked: ContactFeatures) -> Float[np.ndarray, "m n"]:

@@ -24,36 +24,20 @@ import numpy as np
 
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
-from experiments.core.results import Comparison, Estimate, Requirement, Results
+from experiments.core.results import Comparison, Estimate, Results, at_most
 from experiments.core.text import bounds
+from experiments.paper import bench_scores as bench
+from experiments.paper import feature_baselines as features
 from experiments.paper import presets
-from experiments.paper.bench_scores import (
-    bench_answers,
-    bench_questions,
-    bench_row,
-    comparison_table,
-    pooled_table,
-    question_table,
-)
 from experiments.paper.components import FULL
-from experiments.paper.eval_variants import encoder_probe
-from experiments.paper.feature_baselines import (
-    LabelledFeatures,
-    PredictedLevels,
-    field_features,
-    linear_probe,
-    nearest,
-    picture_features,
-    together_and_alone,
-)
 from experiments.study import paper_numbers as paper
 from experiments.study.baselines import baselines, level_answers
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
+from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.rl.config import Paper
 from touchr1_jax.training.evaluation import Evaluation
 
@@ -63,8 +47,6 @@ PICTURE, NEAREST = "vision_only", "nearest_fields"
 TOUCHLESS = ("constant", "constant_joint", "constant_middle", "force_only", PICTURE, BLIND, SWAPPED)
 """Baselines without touch of the object, or with that of another one."""
 
-COMPARED = ("h_acc", "r_acc", "p_acc", "mat_acc", "omae", "l2_em", "sfd", "soi_rho", "csc", "avg")
-
 PAPER_ROWS = ("Qwen2.5-VL-7B", "GPT-4o", "Octopi-13B", "SToLa", "Touch-R1-7B")
 """Rows of the paper that stand below ours."""
 
@@ -73,8 +55,6 @@ DIFFERENCES = (
     ("several properties", "asked in one prompt", "asked one by one"),
     ("Avg", "of a formula that is not given", "mean of the nine columns, OMAE and ρ as shares"),
 )
-
-MainTableRow = Mapping[str, Estimate]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -88,40 +68,41 @@ class MainConfig:
 def run(config: MainConfig, context: Context) -> Results:
     """Train, answer, score."""
     variants = {
-        ENCODER_PROBE: EvalVariant(of=SFT, evaluate=functools.partial(encoder_probe, False)),
-        SWAPPED: EvalVariant(of=SFT, evaluate=functools.partial(encoder_probe, True)),
+        ENCODER_PROBE: EvalVariant(of=SFT, evaluate=features.encoder_probe),
+        SWAPPED: EvalVariant(of=SFT, evaluate=functools.partial(features.encoder_probe, swapped=True)),
     }
     study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)
     with context.timed("baselines"):
         untrained = {name: [answers] for name, answers in without_policy(study, context).items()}
     with context.timed("score"):
-        asks = bench_questions(study.data, config.quota, context)
+        asks = bench.bench_questions(study.data, config.quota, context)
         rows = {}
         for name, seeds in context.each("scoring", {**study.answers, **study.variants, **untrained}.items()):
-            by_picture = bench_answers(study.data, asks, study.answers[BLIND][: len(seeds)])
-            rows[name] = bench_row(asks, bench_answers(study.data, asks, seeds), by_picture)
+            by_picture = bench.bench_answers(study.data, asks, study.answers[BLIND][: len(seeds)])
+            rows[name] = bench.bench_row(asks, bench.bench_answers(study.data, asks, seeds), by_picture)
     trained = {name: rows[name] for name in (SFT, FULL)}
     pictures, reliability = level_report(study)
     comparisons = against_sft(trained, config.study.seeds)
+    note = "policies that another study trained before cost nothing here"
     return Results(
         arms=trained,
         baselines={name: row for name, row in rows.items() if name not in trained},
         settings=study_settings(config.study),
         comparisons=tuple(comparisons),
         verdict=verdict(rows, comparisons),
-        requirements=(minutes(context),),
+        requirements=(at_most("minutes", context.elapsed_s / 60, 45.0, "min", note),),
         tables=(
-            comparison_table(
+            bench.comparison_table(
                 "Comparison with the paper's main table",
                 rows,
                 {name: paper.MAIN[name] for name in PAPER_ROWS},
                 "Direction, not parity: other objects, other sizes, no pretrained model. The table above has the "
                 "intervals.",
             ),
-            *pooled_table(rows, SFT),
+            *bench.pooled_table(rows, SFT),
             *reliability,
-            question_table(asks),
-            differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
+            bench.question_table(asks),
+            paper.differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
         ),
         pictures=pictures,
         data=study.data.summary() | {"questions": len(asks)},
@@ -135,25 +116,27 @@ def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
     data, levels = study.data, study.policy.levels
     train, test = np.concatenate([data.parts["sft"], data.parts["grpo"]]), data.parts["test"]
     with context.progress("reading fields", len(train) + len(test)) as advance:
-        fields = [field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
+        fields = [features.field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
     view = lambda row: data.store.objects[data.store.contacts[int(row)].object_id].view
-    pictures = [picture_features([view(row) for row in rows]) for rows in (train, test)]
-    known = lambda features: LabelledFeatures(features=features, label=data.label[train])
+    pictures = [features.picture_features([view(row) for row in rows]) for rows in (train, test)]
+    known = lambda found: features.LabelledFeatures(features=found, label=data.label[train])
 
-    def by_picture() -> PredictedLevels:
+    def by_picture() -> features.PredictedLevels:
         """A baseline without touch gives the same answer whichever sensor is shown."""
-        probe = functools.partial(linear_probe, levels=levels, config=study.config.probe)
-        found = together_and_alone(probe, known(pictures[0]), pictures[1])
-        alone = np.repeat(found.together[:, None], fields[1].x.shape[1], 1)
-        return PredictedLevels(together=found.together, alone=alone)
+        probe = functools.partial(features.linear_probe, levels=levels, config=study.config.probe)
+        together = features.together_and_alone(probe, known(pictures[0]), pictures[1]).together
+        alone = np.repeat(together[:, None], fields[1].x.shape[1], 1)
+        return features.PredictedLevels(together=together, alone=alone)
 
-    predictions: dict[str, Callable[[], PredictedLevels]] = {}
+    def by_fields() -> features.PredictedLevels:
+        vote = functools.partial(features.nearest, levels=levels)
+        return features.together_and_alone(vote, known(fields[0]), fields[1])
+
+    predictions: dict[str, Callable[[], features.PredictedLevels]] = {}
     if pictures[0].present.any():
         predictions[PICTURE] = by_picture
     if fields[0].present.any():
-        predictions[NEAREST] = lambda: together_and_alone(
-            functools.partial(nearest, levels=levels), known(fields[0]), fields[1]
-        )
+        predictions[NEAREST] = by_fields
     answers = {}
     for name, predict in context.each("baselines", predictions.items()):
         found = predict()
@@ -161,23 +144,14 @@ def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
     return baselines(study) | answers
 
 
-def against_sft(rows: Mapping[str, MainTableRow], seeds: int) -> list[Comparison]:
+def against_sft(rows: Mapping[str, Mapping[str, Estimate]], seeds: int) -> list[Comparison]:
     """The full model against SFT, paired by seed; needs two seeds at least."""
-    if seeds < 2:
-        return []
     a, b = rows[FULL], rows[SFT]
-    return [compare_over_seeds(m, FULL, SFT, a[m], b[m]) for m in COMPARED if m in a and m in b]
+    compared = [m for m in (*AVERAGED, "avg") if m in a and m in b] if seeds > 1 else []
+    return [compare_over_seeds(m, FULL, SFT, a[m], b[m]) for m in compared]
 
 
-def minutes(context: Context) -> Requirement:
-    """Minutes of the run, and the most that the whole table may take on two cores."""
-    note = "policies that another study trained before cost nothing here"
-    return Requirement(
-        name="minutes", measured=context.elapsed_s / 60, bound=45.0, better="lower", unit="min", note=note
-    )
-
-
-def verdict(rows: Mapping[str, MainTableRow], comparisons: Sequence[Comparison]) -> tuple[str, ...]:
+def verdict(rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison]) -> tuple[str, ...]:
     """Touch against the best baseline without it, reinforcement against SFT, the policy against its own encoder."""
     single = [m for m in ("h_acc", "r_acc", "p_acc") if m in rows[FULL]]
     mean = lambda name: float(np.mean([rows[name][m].mean for m in single])) if single else float("nan")

@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, Series, draw, estimates
 from experiments.core.context import Context, read_metrics
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.loops import STEPPING
-from experiments.core.results import Cell, Estimate, Table, named_table
+from experiments.core.results import Estimate, Table, named_table
 from experiments.core.text import bounds, number
 from experiments.paper.components import FULL
 from experiments.study.scores import PUBLISHED
@@ -69,12 +69,7 @@ class SizeCost:
 
 
 def study_of_size(config: StudyConfig, name: str, context: Context) -> tuple[Study, Mapping[str, float]]:
-    """SFT and the full model of every seed in a folder of the run; the run's log holds the curves as arms `name`.
-
-    Args:
-      config: of the study.
-      name: of the folder.
-      context: the run.
+    """SFT and the full model of every seed in folder `name` of the run, whose log holds the curves as those of an arm.
 
     Returns:
       The study, and the wall seconds of its stages.
@@ -117,9 +112,8 @@ def timed_programs(study: Study) -> TimedPrograms:
     data, policy = study.data, study.policy
     rows = data.parts["test"][:ENCODE_BATCH]
     clips = data.batches(rows, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
-    touch = touch_batch(next(iter(clips)))
+    touch, label = touch_batch(next(iter(clips))), data.label[rows]
     params = policy.init(0, touch)
-    label = data.label[rows]
     contact, attribute = labelled_questions(label)
     encode, ask = encode_program(policy.fns, False), answer_program(policy)
 
@@ -171,45 +165,39 @@ class SizeTrend:
 def size_trends(rows: SizeRows, costs: Mapping[str, SizeCost], metrics: Sequence[str]) -> tuple[SizeTrend, ...]:
     """Slopes of every policy and metric: for every seed a line m = a + b·log₂ N through its sizes, b over seeds.
 
+    By least squares b = Σ (x − x̄)(m − m₀) / Σ (x − x̄)² with x = log₂ N, exactly 0 where m does not change.
+
     Args:
       rows: policy → size → metric; every policy and size has the same seeds, two at least.
       costs: size → parameters N.
       metrics: those to look at; one that some size lacks is left out.
     """
     doublings = np.log2([costs[name].parameters for name in costs])
-    found = []
+    away, found = doublings - doublings.mean(), []
     for policy, sizes in rows.items():
         for metric in metrics:
             if all(metric in sizes[name] for name in costs):
                 values = np.array([sizes[name][metric].per_seed for name in costs])
-                slope = student_interval(_slopes(doublings, values))
+                slope = student_interval(np.asarray(away @ (values - values[:1]) / (away @ away)))
                 found.append(SizeTrend(policy=policy, metric=metric, slope=slope))
     return tuple(found)
 
 
-def _slopes(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Least squares, Σ (x − x̄)(y − y₀) / Σ (x − x̄)²: exactly 0 where y [n, seeds] does not change with x [n]."""
-    away = x - x.mean()
-    return np.asarray(away @ (y - y[:1]) / (away @ away))
-
-
 def trend_table(trends: Sequence[SizeTrend]) -> Table:
     """Every slope, and the paper's claim about the metric."""
-    rows: list[dict[str, Cell]] = []
-    for trend in trends:
-        metric, spec = REPORTED[trend.metric], f"+{REPORTED[trend.metric].format}"
-        rows.append(
-            {
-                "policy and metric": f"{trend.policy}: {metric.title}",
-                "change": number(trend.slope.mean, spec),
-                "95 % over seeds": bounds(trend.slope.low, trend.slope.high, spec),
-                "larger is": trend.larger_is,
-                "paper": "grows clearly" if trend.metric in CLAIMED else "grows, if it is among most",
-            }
-        )
+    spec = lambda trend: f"+{REPORTED[trend.metric].format}"
     return named_table(
         "Change for each doubling of the parameters",
-        rows,
+        [
+            {
+                "policy and metric": f"{t.policy}: {REPORTED[t.metric].title}",
+                "change": number(t.slope.mean, spec(t)),
+                "95 % over seeds": bounds(t.slope.low, t.slope.high, spec(t)),
+                "larger is": t.larger_is,
+                "paper": "grows clearly" if t.metric in CLAIMED else "grows, if it is among most",
+            }
+            for t in trends
+        ],
         meanings={
             "95 % over seeds": "Student's t over the slopes of single seeds",
             "larger is": "better or worse where the interval excludes 0",
@@ -220,28 +208,23 @@ def trend_table(trends: Sequence[SizeTrend]) -> Table:
 
 
 def size_table(models: Mapping[str, ModelConfig], costs: Mapping[str, SizeCost], config: StudyConfig) -> Table:
-    """Shape, parameters and times of each size.
-
-    Args:
-      models: size → its model.
-      costs: size → its cost.
-      config: of the studies.
-    """
-    rows: list[dict[str, Cell]] = [
-        {
-            "size": name,
-            "parameters": cost.parameters,
-            "shape": _shape(models[name]),
-            "SFT step": 1e3 * cost.sft_s,
-            "GRPO step": 1e3 * cost.grpo_s,
-            "question": 1e3 * cost.question_s,
-            "training": cost.training_s(config),
-        }
-        for name, cost in costs.items()
-    ]
+    """Shape, parameters and times of each size."""
+    towers = lambda m: ((m.tactile.num_layers, m.tactile.width), (m.vision.num_layers, m.vision.width))
+    decoder = lambda m: (m.decoder.num_layers, m.decoder.hidden_size)
     return named_table(
         "Sizes",
-        rows,
+        [
+            {
+                "size": name,
+                "parameters": cost.parameters,
+                "shape": ", ".join(f"{n}×{width}" for n, width in (*towers(models[name]), decoder(models[name]))),
+                "SFT step": 1e3 * cost.sft_s,
+                "GRPO step": 1e3 * cost.grpo_s,
+                "question": 1e3 * cost.question_s,
+                "training": cost.training_s(config),
+            }
+            for name, cost in costs.items()
+        ],
         formats={"SFT step": ".0f", "GRPO step": ".0f", "question": ".1f", "training": ".0f"},
         units={"SFT step": "ms", "GRPO step": "ms", "question": "ms", "training": "s"},
         meanings={
@@ -254,21 +237,8 @@ def size_table(models: Mapping[str, ModelConfig], costs: Mapping[str, SizeCost],
     )
 
 
-def _shape(model: ModelConfig) -> str:
-    """Layers × width of the three towers."""
-    towers = ((x.num_layers, x.width) for x in (model.tactile, model.vision))
-    return ", ".join(f"{n}×{w}" for n, w in (*towers, (model.decoder.num_layers, model.decoder.hidden_size)))
-
-
 def size_chart(rows: SizeRows, costs: Mapping[str, SizeCost], config: StudyConfig, metrics: Sequence[str]) -> bytes:
-    """One row of panels for each metric, against parameters and against seconds of training.
-
-    Args:
-      rows: policy → size → metric.
-      costs: size → its cost.
-      config: of the studies.
-      metrics: those to draw.
-    """
+    """One row of panels for each metric, against parameters and against seconds of training."""
     positions = {
         "parameters (million)": [cost.parameters / 1e6 for cost in costs.values()],
         "training of a seed (s)": [cost.training_s(config) for cost in costs.values()],
@@ -280,8 +250,7 @@ def size_chart(rows: SizeRows, costs: Mapping[str, SizeCost], config: StudyConfi
             series: list[Series] = []
             for (policy, sizes), colour in zip(rows.items(), (*PALETTE[:2], SHARED), strict=False):
                 found = [sizes[name][metric] for name in costs]
-                mean, low, high = ([getattr(e, end) for e in found] for end in ("mean", "low", "high"))
-                series.append(Series(policy, x=x, y=mean, low=low, high=high, colour=colour, marker="o"))
+                series.append(estimates(policy, found, at=x, colour=colour, marker="o"))
                 dots = [(at, value) for at, e in zip(x, found, strict=True) for value in e.per_seed]
                 at, values = zip(*dots, strict=True)
                 series.append(Series(x=at, y=values, line="", marker="o", size=9, alpha=0.35, colour=colour))

@@ -13,7 +13,7 @@ are ours, the paper gives none.  Neither scale has been run: no machine of that 
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from experiments.bench.draw import Quota
 from experiments.core.context import Context
@@ -46,21 +46,28 @@ NEEDS: Mapping[str, Accelerators] = {
 """An H100 or H200; sixteen H200, on which `scale_paper` counts 47 to 53 GB of a step on each."""
 
 
-def _sft(steps: int, contacts: int, lr_scale: float) -> StudySFT:
-    """SFT by whole batches: micro-batches serve a processor's cache."""
-    optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale)
-    return StudySFT(steps=steps, batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
+def _study(
+    steps: tuple[int, int], batch: tuple[int, int, int], lr_scale: tuple[float, float], **other: Any
+) -> StudyConfig:
+    """A study on accelerators, by whole batches: micro-batches of SFT serve a processor's cache.
 
-
-def _grpo(prompts: int, micro_prompts: int, lr_scale: float) -> GRPOConfig:
-    return dataclasses.replace(
+    Args:
+      steps, lr_scale: of SFT and of GRPO.
+      batch: contacts of SFT; prompts of GRPO, and those of a micro-batch.
+      other: further settings.
+    """
+    contacts, prompts, micro_prompts = batch
+    optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale[0])
+    sft = StudySFT(steps=steps[0], batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
+    grpo = dataclasses.replace(
         GRPOConfig.paper(),
         prompts=prompts,
         micro_prompts=micro_prompts,
-        lr_scale=lr_scale,
+        lr_scale=lr_scale[1],
         bfloat16=True,
         remat=True,
     )
+    return StudyConfig(sft=sft, blind=sft, grpo=grpo, grpo_steps=steps[1], read_threads=12, **other)
 
 
 GPU_MODEL = ModelConfig(
@@ -101,15 +108,13 @@ def _resized(width: int, layers: int) -> ModelConfig:
 GPU_SMALL, GPU_LARGE = _resized(512, 10), _resized(1024, 16)
 """Less and more than `GPU_MODEL`, about as 3 and 14 billion are to 7."""
 
-GPU = StudyConfig(
+GPU = _study(
+    steps=(4_000, 2_000),
+    batch=(64, 64, 32),
+    lr_scale=(30.0, 50.0),
     scenes=SceneConfig(objects=10_000, sites=1, image_px=224, view_px=224),
     clip_memory_gib=40.0,
-    read_threads=12,
     model=GPU_MODEL,
-    sft=_sft(4_000, 64, 30.0),
-    blind=_sft(4_000, 64, 30.0),
-    grpo=_grpo(64, 32, 50.0),
-    grpo_steps=2_000,
 )
 
 PAPER_MODEL = ModelConfig(
@@ -123,31 +128,20 @@ PAPER_MODEL = ModelConfig(
 PAPER_CONTACTS, PAPER_PROMPTS = 128, 128
 """Contacts of a batch of SFT, with two questions each, and prompts of a step of GRPO: ours."""
 
-PAPER = StudyConfig(
+PAPER = _study(
+    steps=(paper.SFT_QA // (2 * PAPER_CONTACTS), paper.RL_QA // PAPER_PROMPTS),
+    batch=(PAPER_CONTACTS, PAPER_PROMPTS, 16),
+    lr_scale=(10.0, 10.0),
     seeds=3,
     scenes=SceneConfig(objects=paper.OBJECTS, sequences=paper.SEQUENCES, image_px=448, view_px=448),
     clip_memory_gib=0.0,
-    read_threads=12,
     model=PAPER_MODEL,
-    sft=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),
-    blind=_sft(paper.SFT_QA // (2 * PAPER_CONTACTS), PAPER_CONTACTS, 10.0),
-    grpo=_grpo(PAPER_PROMPTS, 16, 10.0),
-    grpo_steps=paper.RL_QA // PAPER_PROMPTS,
 )
 
 SCALES: Mapping[str, StudyConfig] = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}
 
-GRPO_CURVES = (
-    "reward",
-    "accuracy",
-    "middle_rate",
-    "echo_share",
-    "entropy",
-    "grounding",
-    "degenerate_share",
-    "parse_rate",
-    "kl",
-)
+_REWARDED = ("reward", "accuracy", "middle_rate", "echo_share")
+GRPO_CURVES = (*_REWARDED, "entropy", "grounding", "degenerate_share", "parse_rate", "kl")
 CURVES: Mapping[str, tuple[str, ...]] = {"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": GRPO_CURVES}
 """Of each phase the scalars that are drawn."""
 
@@ -172,13 +166,5 @@ def paper_experiment(
 ) -> Experiment[C]:
     """`Experiment` with `CURVES`, the machine that each scale needs, and a quick `smoke`; arguments of `Experiment`."""
     needs = {scale: NEEDS[scale] for scale in scales if scale in NEEDS}
-    return Experiment(
-        name=name,
-        config=config,
-        scales=scales,
-        run=run,
-        curves=CURVES,
-        needs=needs,
-        quick=("smoke",),
-        spreads=spreads,
-    )
+    options: dict[str, Any] = {"curves": CURVES, "needs": needs, "quick": ("smoke",), "spreads": spreads}
+    return Experiment(name=name, config=config, scales=scales, run=run, **options)

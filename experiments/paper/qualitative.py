@@ -23,18 +23,23 @@ from jaxtyping import Bool, Int
 from experiments.bench.draw import Quota
 from experiments.bench.wording import answer_words, question
 from experiments.core.context import Context
-from experiments.core.results import Cell, Results, RolloutExample, Table, named_table
+from experiments.core.results import Results, RolloutExample, Table, named_table
 from experiments.paper import presets
 from experiments.paper.bench_scores import bench_answers, bench_questions, touch_rows
 from experiments.paper.components import FULL
-from experiments.paper.conflict_metrics import TouchQuestions, concluded, touch_questions
-from experiments.paper.eval_variants import control_name, control_variants
+from experiments.paper.touch_gain import (
+    TouchQuestions,
+    concluded,
+    control_answers,
+    control_name,
+    control_variants,
+    touch_questions,
+)
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
-from experiments.study.scores import PUBLISHED, score_study, study_settings
+from experiments.study.scores import PUBLISHED, score_study, study_results
 from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
-from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM
 from touchr1_jax.rl.config import Paper
@@ -49,7 +54,7 @@ REPLACEMENTS = {
     SWAPPED: "another object's touch",
     "shuffle": "its frames in another order",
 }
-"""Controls, as the browser names what stands in place of the touch."""
+"""Control → the replacement of the touch, as the browser names it."""
 
 OTHER_POLICIES = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
 """In the same table."""
@@ -96,13 +101,13 @@ class AnswerCase:
       title: what happens.
       rows: bool [N], the answers of this kind.
       among: bool [N], the questions that could have been of this kind.
-      paper: what the paper's figure of examples shows of it; empty where it shows none.
+      paper: the paper's example of it, if any.
     """
 
     title: str
     rows: Bool[np.ndarray, "N"]
     among: Bool[np.ndarray, "N"]
-    paper: str = ""
+    paper: str = "–"
 
     @property
     def share(self) -> float:
@@ -113,7 +118,6 @@ class AnswerCase:
 def run(config: QualitativeConfig, context: Context) -> Results:
     """Train one seed, evaluate every variant, choose, show."""
     study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, control_variants(FULL))
-    scored = score_study(study)
     first = {name: seeds[0] for name, seeds in {**study.answers, **study.variants}.items()}
     full, questions = first[FULL], touch_questions(study, first[SFT])
     slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
@@ -130,10 +134,9 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     asks = bench_questions(study.data, config.quota, context)
     chosen = [(case.title, first_of(case.rows, questions.objects, config.shown)) for case in cases]
     chosen += item_examples(asks, bench_answers(study.data, asks, [full])[0], touch_rows(study.data), full)
-    return Results(
-        arms=scored.arms,
-        baselines=scored.baselines,
-        settings=study_settings(config.study),
+    return study_results(
+        study,
+        score_study(study),
         verdict=verdict(cases),
         tables=(case_table(cases), differences_table((*presets.DIFFERENCES[:3], *DIFFERENCES))),
         data=study.data.summary() | {"items of the bench": len(asks)},
@@ -151,12 +154,12 @@ def answer_cases(questions: TouchQuestions, answers: Conclusions) -> tuple[Answe
     least = np.where(known, answers.perceived, np.iinfo(answers.perceived.dtype).max).min(1)
     split = questions.ordinal & (known.sum(1) > 1) & (least < answers.perceived.max(1))
     two_off = read & (np.abs(answers.full - questions.label) > 1)
-    case = lambda title, rows, among, paper="": AnswerCase(title=title, rows=rows & among, among=among, paper=paper)
+    case = lambda title, rows, among, **paper: AnswerCase(title=title, rows=rows & among, among=among, **paper)
     return (
         case("Hardness is right, and wrong with another object's touch", right & (answers.swapped != questions.label),
-             questions.of("hardness"), "hardness, estimated from touch"),
+             questions.of("hardness"), paper="hardness, estimated from touch"),
         case("The picture deceives about the material, touch overrules it", right, misled & material,
-             "a conflict about the material, resolved"),
+             paper="a conflict about the material, resolved"),
         case("The picture deceives about a level, touch overrules it", right, misled & ~material),
         case("The picture deceives and is followed", answers.full == answers.blind, misled),
         case("Sensors disagree, the conclusion is right", right, split),
@@ -169,13 +172,7 @@ def answer_cases(questions: TouchQuestions, answers: Conclusions) -> tuple[Answe
 
 
 def first_of(rows: Bool[np.ndarray, "N"], objects: np.ndarray, count: int) -> list[int]:
-    """Indices of the first answers, one of each object.
-
-    Args:
-      rows: which answers fit.
-      objects: [N], the object of each answer.
-      count: how many at most.
-    """
+    """Indices of the first `count` answers that fit, one of each object; `objects` [N] is that of each answer."""
     numbers = np.flatnonzero(rows)
     _, first = np.unique(objects[numbers], return_index=True)
     return [int(n) for n in numbers[np.sort(first)[:count]]]
@@ -187,8 +184,7 @@ def item_examples(
     """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`.
 
     Args:
-      asks: the bench's items.
-      answers: id → the full model's answer.
+      asks, answers: the bench's items, and id → the full model's answer.
       places: touch → contact, as `full.contact` counts.
       full: answers about single touches.
     """
@@ -198,32 +194,30 @@ def item_examples(
             ask = next((x for x in asks if x.kind == kind and (answers[x.id] == x.answer) == wanted), None)
             if ask is not None:
                 pairs = [(places[t], ATTRIBUTES.index(a)) for t in ask.touches for a in ask.attributes]
-                yield _heading(ask, answers[ask.id]), [index[pair] for pair in pairs]
-
-
-def _heading(ask: Ask, answer: tuple[int, ...]) -> str:
-    words = "an answer that cannot be read"
-    if BOTTOM not in answer:
-        words = answer_words(dataclasses.replace(ask, answer=answer))
-    outcome = "right" if answer == ask.answer else f"wrong, it is {answer_words(ask)}"
-    return f"Tier {KINDS[ask.kind].tier}, {ask.kind}: {question(ask)} – {words} ({outcome})"
+                words, outcome = (
+                    "an answer that cannot be read",
+                    "right" if wanted else f"wrong, it is {answer_words(ask)}",
+                )
+                if BOTTOM not in answers[ask.id]:
+                    words = answer_words(dataclasses.replace(ask, answer=answers[ask.id]))
+                heading = f"Tier {KINDS[kind].tier}, {kind}: {question(ask)} – {words} ({outcome})"
+                yield heading, [index[pair] for pair in pairs]
 
 
 def case_table(cases: Sequence[AnswerCase]) -> Table:
     """Number and share of each kind of answer."""
-    rows: list[dict[str, Cell]] = [
-        {
-            "case": case.title,
-            "answers": int(case.rows.sum()),
-            "of": int(case.among.sum()),
-            "share": case.share,
-            "paper's examples": case.paper or "–",
-        }
-        for case in cases
-    ]
     return named_table(
         "How common each case is",
-        rows,
+        [
+            {
+                "case": case.title,
+                "answers": int(case.rows.sum()),
+                "of": int(case.among.sum()),
+                "share": case.share,
+                "paper's examples": case.paper,
+            }
+            for case in cases
+        ],
         formats={"answers": "d", "of": "d", "share": ".1f"},
         units={"share": "%"},
         meanings={
@@ -237,7 +231,7 @@ def case_table(cases: Sequence[AnswerCase]) -> Table:
 
 def browser(study: Study, chosen: Sequence[tuple[str, Sequence[int]]]) -> Iterator[RolloutExample]:
     """The cards of each group of answers: its heading, and indices in the full model's answers."""
-    instead: dict[str, Evaluation] = {REPLACEMENTS[c]: study.variants[control_name(FULL, c)][0] for c in CONTROLS}
+    instead = {REPLACEMENTS[control]: seeds[0] for control, seeds in control_answers(study, FULL).items()}
     instead |= {title: study.answers[policy][0] for policy, title in OTHER_POLICIES.items()}
     for group, rows in chosen:
         yield from rollouts_of(study, FULL, PUBLISHED, rows, instead, group)

@@ -1,23 +1,43 @@
-"""A policy on released weights: its towers, prompts and parameters, and the memory that its training needs."""
+"""A policy on released weights: its towers, prompts and parameters, its files, and the memory that its training needs.
+
+A written policy is a folder of the released format with one more file:
+
+    DIR/model.safetensors, config.json, tokenizer.json, …    the released folder with the merged weights
+    DIR/touch.npz                                            tactile encoder and the projection of its tokens
+"""
 
 import dataclasses
 import functools
+import io
+import shutil
+import zlib
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import traverse_util
 
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
+from experiments.core.loops import KEPT
+from experiments.core.progress import in_megabytes
 from experiments.core.results import Table, named_table
 from experiments.study.dataset import Dataset
+from experiments.study.stages import encode_rows, untrained
+from experiments.study.study import BLIND, SFT, TrainedPolicy
 from experiments.study.training import TrainingConfig
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.layers import SizeError, check_sizes
-from touchr1_jax.models.load import Checkpoint
+from touchr1_jax.models.load import Checkpoint, WeightsError
+from touchr1_jax.models.qwen.config import read_config
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
+from touchr1_jax.models.qwen.safetensors import Tell
+from touchr1_jax.models.qwen.weights import INDEX, SINGLE, load_params, save_params
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy, language_of
 from touchr1_jax.text.chat import build_chat_layout
@@ -25,8 +45,16 @@ from touchr1_jax.text.language import Language
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import answer_text
 from touchr1_jax.text.tokenizer import Tokenizer
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, TouchBatch
+
+TOUCH_FILE = "touch.npz"
+
+COPIED = (".json", ".jinja", ".txt", ".md")
+"""Endings of the small files of a released folder, which are copied."""
+
+STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encoded contacts, on the host"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,7 +78,7 @@ class ReleasedModel(TouchConfig):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class ReleasedPolicy(TouchPolicy):
-    """An policy whose vision tower and decoder are a checkpoint's."""
+    """A policy whose vision tower and decoder are a checkpoint's."""
 
     checkpoint: Checkpoint
 
@@ -61,10 +89,19 @@ class ReleasedPolicy(TouchPolicy):
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """The released towers as they are, and a fresh tactile encoder."""
-        fns, layout = self.fns, self.layout
-        key = jax.random.key(seed)
-        prompt = layout.ids[0], layout.mask[0], fns.slots
-        return init_on_pretrained(fns.module, key, batch, *prompt, self.checkpoint.params)
+        prompt = self.layout.ids[0], self.layout.mask[0], self.fns.slots
+        return init_on_pretrained(self.fns.module, jax.random.key(seed), batch, *prompt, self.checkpoint.params)
+
+    def check(self, batch: TouchBatch) -> None:
+        """Build the parameters of a batch's shapes abstractly, so that contradicting sizes show before data are made.
+
+        Raises:
+          SizeError: sizes contradict each other.
+        """
+        try:
+            jax.eval_shape(functools.partial(self.init, 0), batch)
+        except (ValueError, TypeError) as error:
+            raise SizeError(f"no policy can be built of these sizes: {error}") from error
 
 
 def instruction(language: Language) -> str:
@@ -116,18 +153,6 @@ def build_released_policy(model: ReleasedModel, found: Checkpoint, sensors: tupl
     )
 
 
-def check_released(policy: ReleasedPolicy, batch: TouchBatch) -> None:
-    """Build the parameters of a batch's shapes abstractly, so that contradicting sizes show before data are made.
-
-    Raises:
-      SizeError: sizes contradict each other.
-    """
-    try:
-        jax.eval_shape(functools.partial(policy.init, 0), batch)
-    except (ValueError, TypeError) as error:
-        raise SizeError(f"no policy can be built of these sizes: {error}") from error
-
-
 def longest_answer(language: Language, tokenizer: Tokenizer) -> int:
     """Tokens of the longest answer to a question for one attribute, the end token included."""
     return max(len(tokenizer.encode(text)) + 1 for text in plain_answers(language))
@@ -148,22 +173,14 @@ def plain_answers(language: Language) -> Iterator[str]:
             )
 
 
-STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encoded contacts, on the host"
-
-
 def memory_bytes(
     config: TrainingConfig, policy: ReleasedPolicy, data: Dataset, mesh: tuple[int, ...]
 ) -> dict[str, int]:
     """Bytes of training, counted from shapes: the first two on each device, or on the first one of each process.
 
     The step holds the decoder that SFT left; the released towers, from which other seeds and the baseline without touch
-    start, are kept in addition.  SFT needs less than GRPO, since it samples nothing.
-
-    Args:
-      config: of the training.
-      policy: the policy.
-      data: its contacts are encoded once for GRPO, once for the test.
-      mesh: devices along its axes.
+    start, are kept in addition.  SFT needs less than GRPO, since it samples nothing.  Contacts are encoded once for
+    GRPO, once for the test.
 
     Raises:
       SizeError: as `grpo_shape`.
@@ -207,4 +224,113 @@ def memory_table(lines: Mapping[str, int]) -> Table:
         units={"memory": "GB"},
         note="On each device, except the encoded contacts; the compiler's own buffers and the pictures of a batch are "
         "not counted. `scale_paper` compares the count with XLA's figures; no run of this size has.",
+    )
+
+
+def require_same(source: Path, context: Context) -> None:
+    """Refuse to continue a run with other weights than it began with, by the fingerprints of their files.
+
+    Raises:
+      WeightsError: a file changed, came or went.
+    """
+    marks = {path.name: file_fingerprint(path) for path in sorted(source.iterdir()) if path.is_file()}
+    if not context.done("weights"):
+        context.save_stage("weights", marks)
+    began = context.load_stage("weights")
+    changed = sorted(name for name in {*began, *marks} if began.get(name) != marks.get(name))
+    if changed:
+        raise WeightsError(
+            f"{source} is not what this run began with: {', '.join(changed)} changed; put it back, or say --fresh"
+        )
+
+
+def file_fingerprint(path: Path) -> list[int]:
+    """Size of a file and the CRC-32 of its first and of its last mebibyte: shards of gigabytes are not read twice."""
+    size, ends = path.stat().st_size, []
+    with path.open("rb") as file:
+        for start in (0, max(0, size - 2**20)):
+            file.seek(start)
+            ends.append(zlib.crc32(file.read(2**20)))
+    return [size, *ends]
+
+
+def write_policy(
+    directory: Path, source: Path, params: Params, progress: Tell = lambda done_bytes, all_bytes: None
+) -> None:
+    """Publish a policy in one move, so that `directory` is never half written; one that exists is replaced.
+
+    Args:
+      directory: to write.
+      source: the released folder that the policy started from.
+      params: of the policy, adapters merged.
+      progress: called as the released weights are written.
+    """
+    unfinished = directory.with_name(f"{directory.name}.unfinished")
+    for folder in (unfinished, directory):
+        shutil.rmtree(folder, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    for path in sorted(source.iterdir()):
+        if path.is_file() and path.suffix in COPIED and path.name != INDEX:
+            shutil.copy(path, unfinished)
+    released = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
+    save_params(unfinished / SINGLE, released, read_config(source), progress)
+    buffer = io.BytesIO()
+    added = {name: x for name, x in params.items() if name not in released}
+    np.savez(buffer, allow_pickle=False, **traverse_util.flatten_dict(added, sep="/"))
+    write_bytes(unfinished / TOUCH_FILE, buffer.getvalue())
+    unfinished.rename(directory)
+
+
+def read_policy(
+    directory: Path, dtype: jnp.dtype | type, progress: Tell = lambda done_bytes, all_bytes: None
+) -> Params:
+    """The parameters that `write_policy` wrote, those of the released towers as `dtype`.
+
+    Raises:
+      FileNotFoundError, ValueError: as `read_config` and `load_params`, or no tactile encoder.
+    """
+    if not (directory / TOUCH_FILE).is_file():
+        raise FileNotFoundError(
+            f"{directory} holds no {TOUCH_FILE}: must be a folder that `touch_r1` wrote; correct it"
+        )
+    released = load_params(directory, read_config(directory), dtype, progress=progress)
+    with np.load(directory / TOUCH_FILE) as file:
+        touch = traverse_util.unflatten_dict({name: jnp.asarray(file[name]) for name in file.files}, sep="/")
+    return {**touch, "vision": {"tower": released["vision"]}, "decoder": released["decoder"]}
+
+
+def zero_shot(trained: TrainedPolicy) -> Evaluation:
+    """The released model before any training: it sees the object's picture and no touch, which it never learned to
+    read; the system prompt describes the form of an answer."""
+    policy, data = trained.policy, trained.data
+    params = untrained(policy, data, trained.seed)
+    return trained.ask(params, encode_rows(policy, params, data, data.parts["test"], trained.context, blind=True))
+
+
+def written(source: Path, trained: TrainedPolicy) -> Evaluation:
+    """The policy written to `weights/SEED` of the run, read from there, and evaluated again with all streams."""
+    policy, data, context = trained.policy, trained.data, trained.context
+    folder = context.directory / "weights" / str(trained.seed)
+    with context.progress_callback("writing weights, MB") as report:
+        context.processes.write_once(lambda: write_policy(folder, source, trained.params, in_megabytes(report)))
+    with context.progress_callback("reading weights, MB") as report:
+        params = read_policy(folder, policy.fns.cache_dtype, in_megabytes(report))
+    return trained.ask(params, encode_rows(policy, params, data, data.parts["test"], context), alone=False)
+
+
+def merged_shares(arm: str, seeds: int, context: Context) -> dict[str, float]:
+    """Policy → share of its last stage's adapters that merging kept, the least of all seeds."""
+    shares = lambda stage: (context.load_stage(f"{KEPT}/{stage}/{seed}") for seed in range(seeds))
+    return {name: min(shares(stage)) for stage, name in {"sft": SFT, f"grpo/{arm}": arm, "blind": BLIND}.items()}
+
+
+def merged_table(kept: Mapping[str, float]) -> Table:
+    """The share of each policy."""
+    return named_table(
+        "Share of the adapters that merging keeps",
+        [{"policy": name, "kept": 100 * share} for name, share in kept.items()],
+        units={"kept": "%"},
+        formats={"kept": ".1f"},
+        note="Projection of the change of the weights, rounded to their type, on the adapters' change; the least "
+        "of all seeds.",
     )

@@ -25,34 +25,12 @@ from experiments.core.context import Context
 from experiments.core.results import Estimate, Picture, Results, RolloutExample
 from experiments.core.text import bounds
 from experiments.core.timing import interleaved
+from experiments.paper import bench_scores as bench
+from experiments.paper import model_sizes as sizes
 from experiments.paper import presets
-from experiments.paper.bench_scores import (
-    bench_answers,
-    bench_questions,
-    bench_row,
-    comparison_table,
-    question_table,
-)
 from experiments.paper.components import FULL
-from experiments.paper.model_sizes import (
-    CLAIMED,
-    LARGE,
-    SMALL,
-    SizeCost,
-    SizeRows,
-    SizeTrend,
-    TimedPrograms,
-    grpo_step_s,
-    size_chart,
-    size_table,
-    size_trends,
-    study_of_size,
-    timed_programs,
-    trend_table,
-)
 from experiments.study import paper_numbers as paper
 from experiments.study.examples import rollout_examples
-from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, StudyConfig
 from touchr1_jax.bench.items import Ask
@@ -66,7 +44,7 @@ POLICIES = {FULL: "full model", SFT: "SFT", BLIND: "without touch"}
 """Policies that are drawn, and their names in the report."""
 
 DRAWN = ("acc", "omae")
-TRENDS = (*DRAWN, "mat_acc", "sfd", *CLAIMED)
+TRENDS = (*DRAWN, "mat_acc", "sfd", *sizes.CLAIMED)
 
 DIFFERENCES = (
     ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million"),
@@ -79,8 +57,8 @@ class ScalingConfig:
     """The study, the sizes that replace its model, the bench's questions, and how often steps are timed."""
 
     study: StudyConfig = StudyConfig(seeds=3, grpo_steps=300)
-    small: ModelConfig = SMALL
-    large: ModelConfig = LARGE
+    small: ModelConfig = sizes.SMALL
+    large: ModelConfig = sizes.LARGE
     quota: Quota = Quota()
     rounds: int = 12
 
@@ -99,7 +77,7 @@ class SizeResult:
 
     rows: Mapping[str, Mapping[str, Estimate]]
     baselines: Mapping[str, Mapping[str, Estimate]]
-    programs: TimedPrograms
+    programs: sizes.TimedPrograms
     grpo_s: float
     asks: tuple[Ask, ...]
     data: Mapping[str, Any]
@@ -110,8 +88,8 @@ def run(config: ScalingConfig, context: Context) -> Results:
     """Train every size, ask, time, fit lines."""
     found = {name: one_size(config, name, context) for name in context.each("sizes", config.sizes)}
     costs = measured_costs(found, config.rounds, context)
-    rows: SizeRows = {title: {name: s.rows[policy] for name, s in found.items()} for policy, title in POLICIES.items()}
-    trends = size_trends(rows, costs, TRENDS) if config.study.seeds > 1 else ()
+    rows = {title: {name: s.rows[policy] for name, s in found.items()} for policy, title in POLICIES.items()}
+    trends = sizes.size_trends(rows, costs, TRENDS) if config.study.seeds > 1 else ()
     full, default = rows[POLICIES[FULL]], found["default"]
     return Results(
         arms=full,
@@ -127,21 +105,21 @@ def run(config: ScalingConfig, context: Context) -> Results:
                 title="Accuracy and ordinal error against size",
                 caption="Means over seeds with 95 % intervals over objects; small dots are single seeds. Accuracy over "
                 "hardness, roughness and protrusion. Seconds of both stages of a seed, by the time of a step.",
-                content=size_chart(rows, costs, config.study, DRAWN),
+                content=sizes.size_chart(rows, costs, config.study, DRAWN),
             ),
         ),
         tables=(
-            size_table(config.sizes, costs, config.study),
-            *((trend_table(trends),) if trends else ()),
-            comparison_table(
+            sizes.size_table(config.sizes, costs, config.study),
+            *((sizes.trend_table(trends),) if trends else ()),
+            bench.comparison_table(
                 "Comparison with the paper's sizes",
                 full,
                 {f"Touch-R1-{n}B": paper.MAIN["Touch-R1-7B"] if n == 7 else None for n in paper.BACKBONES},
                 "The paper draws 3 and 14 billion as bars without numbers, and leaves OMAE out; there is no Qwen2.5-VL "
                 "of 14 billion.",
             ),
-            question_table(default.asks),
-            differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
+            bench.question_table(default.asks),
+            paper.differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
         ),
         data={**default.data, "questions": len(default.asks)},
         curves=presets.CURVES,
@@ -151,32 +129,32 @@ def run(config: ScalingConfig, context: Context) -> Results:
 
 def one_size(config: ScalingConfig, name: str, context: Context) -> SizeResult:
     """Train and ask one size; the study itself, which keeps its clips in memory, is dropped."""
-    study, timing = study_of_size(dataclasses.replace(config.study, model=config.sizes[name]), name, context)
-    asks, scored = bench_questions(study.data, config.quota, context), score_study(study)
+    study, timing = sizes.study_of_size(dataclasses.replace(config.study, model=config.sizes[name]), name, context)
+    asks, scored = bench.bench_questions(study.data, config.quota, context), score_study(study)
 
     def row(policy: str) -> dict[str, Estimate]:
         single = {m: scored.estimates[policy][m] for m in ("acc", "parse_rate", "middle_rate", "reward")}
-        return single | bench_row(asks, bench_answers(study.data, asks, study.answers[policy]))
+        return single | bench.bench_row(asks, bench.bench_answers(study.data, asks, study.answers[policy]))
 
     return SizeResult(
         rows={policy: row(policy) for policy in POLICIES},
         baselines={title: line for title, line in scored.baselines.items() if title not in POLICIES},
-        programs=timed_programs(study),
-        grpo_s=grpo_step_s(config.study, timing),
+        programs=sizes.timed_programs(study),
+        grpo_s=sizes.grpo_step_s(config.study, timing),
         asks=asks,
         data=study.data.summary(),
         examples=tuple(dataclasses.replace(e, arm=name) for e in rollout_examples(study, FULL, PUBLISHED)),
     )
 
 
-def measured_costs(found: Mapping[str, SizeResult], rounds: int, context: Context) -> dict[str, SizeCost]:
+def measured_costs(found: Mapping[str, SizeResult], rounds: int, context: Context) -> dict[str, sizes.SizeCost]:
     """Parameters and seconds of every size, each program in turns with those of the others."""
     calls = {f"{name}/{call}": getattr(s.programs, call) for name, s in found.items() for call in ("train", "answer")}
     with context.timed("timing"):
         measured = interleaved(calls, context.rounds("timing sizes", rounds))
     seconds = {name: float(np.median(s)) for name, s in measured.items()}
     return {
-        name: SizeCost(
+        name: sizes.SizeCost(
             parameters=s.programs.parameters,
             sft_s=seconds[f"{name}/train"],
             grpo_s=s.grpo_s,
@@ -187,16 +165,16 @@ def measured_costs(found: Mapping[str, SizeResult], rounds: int, context: Contex
 
 
 def verdict(
-    full: Mapping[str, Mapping[str, Estimate]], costs: Mapping[str, SizeCost], trends: tuple[SizeTrend, ...]
+    full: Mapping[str, Mapping[str, Estimate]], costs: Mapping[str, sizes.SizeCost], trends: tuple[sizes.SizeTrend, ...]
 ) -> tuple[str, ...]:
     """The sizes in one sentence, the change for a doubling, and which of the paper's claims come out."""
-    sizes = ", ".join(
+    shares = ", ".join(
         f"{row['acc'].mean:.1f} % with {costs[name].parameters / 1e6:.2f} million parameters"
         for name, row in full.items()
     )
     times = costs["large"].sft_s / costs["small"].sft_s
     sentences = [
-        f"The full model answers {sizes} right; a step of SFT of the largest takes {times:.1f} times the smallest's."
+        f"The full model answers {shares} right; a step of SFT of the largest takes {times:.1f} times the smallest's."
     ]
     by = {t.metric: t for t in trends if t.policy == POLICIES[FULL]}
     for metric in DRAWN:
@@ -206,7 +184,7 @@ def verdict(
                 f"A doubling of the parameters changes its {REPORTED[metric].title} by {slope.mean:+.2g} "
                 f"{bounds(slope.low, slope.high, '.2g')} ({by[metric].larger_is})."
             )
-    claimed = [by[metric] for metric in CLAIMED if metric in by]
+    claimed = [by[metric] for metric in sizes.CLAIMED if metric in by]
     if claimed:
         count = sum(trend.larger_is == "better" for trend in claimed)
         sentences.append(

@@ -37,7 +37,6 @@ from touchr1_jax.training.feeds import random_streams
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import TouchBatch
-from touchr1_jax.validation import at_least, within
 
 TEMPLATE = Path(__file__).parent / "chat_template.jinja"
 
@@ -60,16 +59,45 @@ SMALLEST = DecoderConfig(
 """0.1 million parameters with a vision tower."""
 
 
-def write_tiny(
-    directory: Path, language: Language, system: str = SYSTEM, seed: int = 0, decoder: DecoderConfig = SMALLEST
-) -> None:
-    """Write config, tokenizer, template, picture settings and weights in bfloat16.
+VISION_MARKS = {
+    "vision_start": "vision_start",
+    "vision_end": "vision_end",
+    "image": "image_pad",
+    "video": "video_pad",
+}
+"""Token of `QwenConfig` → its name in the vocabulary."""
+
+DECODER_FIELDS = {
+    "hidden_size": "hidden_size",
+    "intermediate_size": "intermediate_size",
+    "num_layers": "num_hidden_layers",
+    "num_heads": "num_attention_heads",
+    "num_kv_heads": "num_key_value_heads",
+    "norm_epsilon": "rms_norm_eps",
+    "rope_theta": "rope_theta",
+    "tie_embedding": "tie_word_embeddings",
+    "vocab_size": "vocab_size",
+}
+VISION_FIELDS = {
+    "depth": "depth",
+    "hidden_size": "hidden_size",
+    "intermediate_size": "intermediate_size",
+    "num_heads": "num_heads",
+    "out_size": "out_hidden_size",
+    "patch_px": "patch_size",
+    "merge": "spatial_merge_size",
+    "patch_frames": "temporal_patch_size",
+    "window_px": "window_size",
+}
+"""Field of our shapes → its name in a published `config.json`."""
+
+
+def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decoder: DecoderConfig = SMALLEST) -> None:
+    """Write config, tokenizer, template, picture settings and drawn weights in bfloat16.
 
     Args:
       directory: created if missing.
-      language: the tokenizer is trained on its answers, so that they are short.
-      system: text that the tokenizer is trained on too.
-      seed: of the weights.
+      language, system: answers and text that the tokenizer is trained on, so that they are short.
       decoder: shape of the decoder; its vocabulary is `ROWS`.
     """
     directory.mkdir(parents=True, exist_ok=True)
@@ -87,7 +115,7 @@ def write_tiny(
     }
     (directory / PREPROCESSOR_FILE).write_text(json.dumps(pictures), encoding="utf-8")
     shutil.copy(TEMPLATE, directory)
-    params = jax.jit(lambda key: init_params(config, key))(jax.random.key(seed))
+    params = jax.jit(lambda key: init_params(config, key))(jax.random.key(0))
     save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), config)
 
 
@@ -109,23 +137,18 @@ def trained_tokenizer(language: Language, system: str) -> tokenizers.Tokenizer:
 def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST) -> QwenConfig:
     """A decoder and the smallest vision tower; the ids are the tokenizer's."""
     ids = library.get_vocab(with_added_tokens=True)
-    return QwenConfig(
-        decoder=decoder,
-        vision=QwenVisionConfig(
-            out_size=decoder.hidden_size,
-            depth=1,
-            hidden_size=32,
-            num_heads=2,
-            intermediate_size=44,
-            patch_px=8,
-            window_px=32,
-            full_layers=(0,),
-        ),
-        vision_start_id=ids["<|vision_start|>"],
-        vision_end_id=ids["<|vision_end|>"],
-        image_id=ids["<|image_pad|>"],
-        video_id=ids["<|video_pad|>"],
+    vision = QwenVisionConfig(
+        out_size=decoder.hidden_size,
+        depth=1,
+        hidden_size=32,
+        num_heads=2,
+        intermediate_size=44,
+        patch_px=8,
+        window_px=32,
+        full_layers=(0,),
     )
+    marks = {f"{name}_id": ids[f"<|{word}|>"] for name, word in VISION_MARKS.items()}
+    return QwenConfig(decoder=decoder, vision=vision, **marks)
 
 
 def published_config(config: QwenConfig) -> dict[str, Any]:
@@ -136,35 +159,16 @@ def published_config(config: QwenConfig) -> dict[str, Any]:
         "model_type": "qwen2_5_vl",
         "torch_dtype": "bfloat16",
         "hidden_act": "silu",
-        "hidden_size": d.hidden_size,
-        "intermediate_size": d.intermediate_size,
-        "num_hidden_layers": d.num_layers,
-        "num_attention_heads": d.num_heads,
-        "num_key_value_heads": d.num_kv_heads,
-        "rms_norm_eps": d.norm_epsilon,
-        "rope_theta": d.rope_theta,
         "rope_scaling": {"type": "mrope", "mrope_section": list(d.mrope_section)},
-        "tie_word_embeddings": d.tie_embedding,
         "use_sliding_window": False,
-        "vocab_size": d.vocab_size,
-        "vision_start_token_id": config.vision_start_id,
-        "vision_end_token_id": config.vision_end_id,
-        "image_token_id": config.image_id,
-        "video_token_id": config.video_id,
+        **{published: getattr(d, ours) for ours, published in DECODER_FIELDS.items()},
+        **{f"{name}_token_id": getattr(config, f"{name}_id") for name in VISION_MARKS},
         "vision_config": {
-            "depth": v.depth,
             "hidden_act": "silu",
-            "hidden_size": v.hidden_size,
-            "intermediate_size": v.intermediate_size,
-            "num_heads": v.num_heads,
             "in_chans": 3,
-            "out_hidden_size": v.out_size,
-            "patch_size": v.patch_px,
-            "spatial_merge_size": v.merge,
-            "temporal_patch_size": v.patch_frames,
-            "window_size": v.window_px,
             "fullatt_block_indexes": list(v.full_layers),
             "tokens_per_second": 2,
+            **{published: getattr(v, ours) for ours, published in VISION_FIELDS.items()},
         },
     }
 
@@ -182,58 +186,44 @@ UNUSED_TOUCH = ReleasedModel(
 """Smallest encoder of touch and picture: it is shown nothing, learns nothing, and is dropped."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TeachingConfig:
-    """Training of a tiny checkpoint to write answers; 0 steps leave its weights as they were drawn."""
+AGREEMENT = 0.7
+"""Probability that a sensor of a drawn answer perceives the answer's level; else it perceives any."""
 
-    steps: int = 0
-    batch_size: int = 32
-    agreement: float = 0.7
-    """Probability that a sensor of a drawn answer perceives the answer's level; else it perceives any."""
-    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0)
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, "steps")
-        at_least(self, 1, "batch_size")
-        within(self, 0, 1, "agreement")
+TEACHING_BATCH = 32
+TEACHING_OPTIMIZER = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0)
 
 
-def teach(directory: Path, config: TeachingConfig, context: Context, seed: int = 0) -> None:
+def teach(directory: Path, steps: int, context: Context, batch_size: int = TEACHING_BATCH) -> None:
     """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16.
 
     Args:
-      directory: as `write_tiny` makes it; its weights are replaced.
-      config: steps, batches, learning rate.
-      context: the run, which logs the steps under `STAGE`.
-      seed: of the drawn answers.
+      directory: as `write_tiny` makes it; its weights are replaced, if there are any steps.
+      steps, batch_size: of training, logged under `STAGE`.
+      context: the run.
     """
-    if not config.steps:
+    if not steps:
         return
     found = load_checkpoint(directory, jnp.float32)
     policy = build_released_policy(UNUSED_TOUCH, found, SENSORS)
-    shown = empty_touch(config.batch_size)
-    params = policy.init(seed, shown)
-    optimizer = make_optimizer(config.optimizer, config.steps)
+    shown = empty_touch(batch_size)
+    params = policy.init(0, shown)
+    optimizer = make_optimizer(TEACHING_OPTIMIZER, steps)
     step = make_sft_step(policy.fns, optimizer)
     state = SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     with context.timed(STAGE):
-        for t in context.each(STAGE, range(config.steps)):
-            state, metrics = step(state, drawn_batch(policy, shown, config, np.random.default_rng((seed, t))))
+        for t in context.each(STAGE, range(steps)):
+            state, metrics = step(state, drawn_batch(policy, shown, np.random.default_rng((0, t))))
             context.log(STAGE, t, **jax.device_get(metrics))
     taught = {"vision": state.params["vision"]["tower"], "decoder": state.params["decoder"]}
     save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), taught), found.config)
 
 
-def drawn_batch(
-    policy: ReleasedPolicy, shown: TouchBatch, config: TeachingConfig, rng: np.random.Generator
-) -> SFTBatch:
+def drawn_batch(policy: ReleasedPolicy, shown: TouchBatch, rng: np.random.Generator) -> SFTBatch:
     """One question with a drawn answer for each contact of a batch without touch."""
     layout, (p, s) = policy.layout, shown.stream_mask.shape
     asked = rng.integers(len(layout.asked), size=p)
     streams = random_streams(np.ones((p, s), bool), 0.5, rng)
-    pairs = [
-        _answer(policy, layout.asked[q], shown_by, config, rng) for q, shown_by in zip(asked, streams, strict=True)
-    ]
+    pairs = [_answer(policy, layout.asked[q], present, rng) for q, present in zip(asked, streams, strict=True)]
     tokens, masks = (np.stack(x)[:, None] for x in zip(*pairs, strict=True))
     written: dict[str, Any] = {
         "ids": layout.ids[asked][:, None],
@@ -246,16 +236,12 @@ def drawn_batch(
 
 
 def _answer(
-    policy: ReleasedPolicy,
-    asked: np.ndarray,
-    streams: np.ndarray,
-    config: TeachingConfig,
-    rng: np.random.Generator,
+    policy: ReleasedPolicy, asked: np.ndarray, streams: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """An answer whose sensors mostly agree: it compares to what most of them perceive, and concludes the same."""
     levels = np.array(policy.levels)
     drawn_for, other = rng.integers(levels), rng.integers(levels, size=(len(streams), len(levels)))
-    perceive = np.where(rng.random(other.shape) < config.agreement, drawn_for, other)
+    perceive = np.where(rng.random(other.shape) < AGREEMENT, drawn_for, other)
     most = np.array([np.bincount(perceive[streams, a]).argmax() for a in range(len(levels))])
     text = answer_text(policy.language, asked=asked, streams=streams, perceive=perceive, compare=most, conclude=most)
     return encode_answer(policy.tokenizer, text, policy.model.completion_tokens)

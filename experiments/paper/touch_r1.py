@@ -42,42 +42,30 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.progress import in_megabytes
-from experiments.core.results import Comparison, Estimate, Requirement, Results
+from experiments.core.results import Comparison, Estimate, Results, at_least, at_most
 from experiments.core.runner import Experiment
 from experiments.core.text import interval
-from experiments.paper.conflict_metrics import TouchGain, study_touch_gain, touch_gain_table
-from experiments.paper.eval_variants import control_name, control_variants
+from experiments.paper import released_policy as released
 from experiments.paper.presets import CURVES
-from experiments.paper.released_policy import (
-    ReleasedModel,
-    ReleasedPolicy,
-    build_released_policy,
-    check_released,
-    grpo_shape,
-    instruction,
-    memory_bytes,
-    memory_table,
+from experiments.paper.released_policy import ReleasedModel, ReleasedPolicy
+from experiments.paper.tiny_checkpoint import SMALLEST, teach, write_tiny
+from experiments.paper.touch_gain import (
+    TouchGain,
+    control_answers,
+    control_variants,
+    study_touch_gain,
+    touch_gain_table,
 )
-from experiments.paper.released_weights import (
-    least_merged,
-    merged_shares,
-    merged_table,
-    require_same,
-    written,
-    zero_shot,
-)
-from experiments.paper.tiny_checkpoint import SMALLEST, TeachingConfig, teach, write_tiny
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import PUBLISHED, score, score_study, study_settings
+from experiments.study.scores import PUBLISHED, score, score_study, study_results, study_settings
 from experiments.study.stages import StudySFT
-from experiments.study.study import BLIND, SFT, EvalVariant, Study, check_arms, check_variants, train_study
+from experiments.study.study import BLIND, SFT, EvalVariant, check_arms, check_variants, train_study
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
-from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import WeightsError, load_checkpoint
@@ -99,6 +87,9 @@ TAUGHT = (
 )
 
 COMPARED = ("acc", "omae", "csc", "mat_acc")
+
+LEAST_KEPT = 0.9
+"""Share of the adapters' change that the weights must keep that are scored and written."""
 
 GRPO = dataclasses.replace(
     GRPOConfig.paper(), prompts=16, micro_prompts=2, length=96, lr_scale=10.0, bfloat16=True, remat=True
@@ -134,8 +125,8 @@ class TouchR1Config(TrainingConfig):
     """Make a tiny checkpoint of that format where no weights are given, to try the code."""
     tiny_decoder: DecoderConfig = SMALLEST
     """Shape of its decoder."""
-    teaching: TeachingConfig = TeachingConfig()
-    """Its training to write answers, before anything else."""
+    teaching_steps: int = 0
+    """Steps of its training to write answers, before anything else; 0 leaves its weights as they were drawn."""
     seeds: int = 1
     scenes: SceneConfig = SceneConfig(objects=2400, sites=1, image_px=224, view_px=224)
     clip_memory_gib: float = 8.0
@@ -150,13 +141,10 @@ class TouchR1Config(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field, rank in {
-            "sft.lora_rank": self.sft.lora_rank,
-            "blind.lora_rank": self.blind.lora_rank,
-            "grpo_lora_rank": self.grpo_lora_rank,
-        }.items():
+        ranks = {f"{stage}.lora_rank": getattr(self, stage).lora_rank for stage in ("sft", "blind")}
+        for field, rank in (ranks | {"grpo_lora_rank": self.grpo_lora_rank}).items():
             if not rank:
-                raise ValueError(f"{field} is 0: must be at least 1, released towers stand still; raise it")
+                raise ValueError(f"{field} is 0: must be at least 1, released towers are frozen; raise it")
         if self.grpo.bfloat16 != (self.model.dtype == "bfloat16"):
             raise ValueError(
                 f"grpo.bfloat16 is {self.grpo.bfloat16}: must be {not self.grpo.bfloat16} for weights in "
@@ -170,34 +158,48 @@ def run(config: TouchR1Config, context: Context) -> Results:
     check_arms(arms)
     source = released_folder(config, context)
     variants = {
-        ZERO: EvalVariant(of=SFT, evaluate=zero_shot),
-        WRITTEN: EvalVariant(of=ARM, evaluate=functools.partial(written, source)),
+        ZERO: EvalVariant(of=SFT, evaluate=released.zero_shot),
+        WRITTEN: EvalVariant(of=ARM, evaluate=functools.partial(released.written, source)),
         **control_variants(ARM),
     }
     check_variants(variants, arms)
     policy, data, tactile = begin(config, source, context)
-    memory = memory_bytes(config, policy, data, context.devices.shape)
+    memory = released.memory_bytes(config, policy, data, context.devices.shape)
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
     study = train_study(config, data, policy, arms, context, variants=variants, tactile=tactile)
     scored = score_study(study)
     zero = [score(study, answers) for answers in study.variants[ZERO]]
-    baselines = {ZERO: estimates(zero, scored.objects), **scored.baselines}
+    zero_shot = {metric: estimate([seed[metric] for seed in zero], scored.objects) for metric in zero[0]}
+    baselines = {ZERO: zero_shot, **scored.baselines}
     pictures, tables = level_report(study)
-    gain, kept = study_touch_gain(study, ARM), merged_shares(ARM, config.seeds, context)
-    return Results(
-        arms=scored.arms,
+    gain, kept = study_touch_gain(study, ARM), released.merged_shares(ARM, config.seeds, context)
+    both = zip(study.answers[ARM], study.variants[WRITTEN], strict=True)
+    differing = sum(int((a.tokens != b.tokens).any(-1).sum()) for a, b in both)
+    of, coarse = f"of {len(study.answers[ARM][0].tokens)} a seed", "below, train faster or in --model.dtype float32"
+    return study_results(
+        study,
+        scored,
         baselines=baselines,
-        settings=settings(config, source),
+        settings={
+            **study_settings(config),
+            "weights": f"{source.name}, {config.model.dtype}",
+            "adapters": f"rank {config.sft.lora_rank} in SFT, {config.grpo_lora_rank} in GRPO",
+        },
         comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
         verdict=verdict(config, {**scored.arms, **baselines}, gain),
-        requirements=(differing(study), least_merged(kept)),
-        tables=(touch_gain_table({f"{ARM}, all": gain}), merged_table(kept), memory_table(memory), *tables),
-        pictures=pictures,
-        data=study.data.summary(),
-        curves=CURVES,
-        examples=rollout_examples(
-            study, ARM, PUBLISHED, {c: study.variants[control_name(ARM, c)][0] for c in CONTROLS}
+        requirements=(
+            at_most("answers of the written weights that differ", differing, 0, note=of),
+            at_least("least share of the adapters that merging keeps", min(kept.values()), LEAST_KEPT, note=coarse),
         ),
+        tables=(
+            touch_gain_table({f"{ARM}, all": gain}),
+            released.merged_table(kept),
+            released.memory_table(memory),
+            *tables,
+        ),
+        pictures=pictures,
+        curves=CURVES,
+        examples=rollout_examples(study, ARM, PUBLISHED, {c: a[0] for c, a in control_answers(study, ARM).items()}),
     )
 
 
@@ -205,22 +207,20 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     """The policy, its data, and its pretrained tactile encoder; weights and sizes are checked before data are made.
 
     Raises:
-      WeightsError, SizeError: as `load_checkpoint`, `require_same`, `build_released_policy`, `check_released` and
-        `grpo_shape`.
+      WeightsError, SizeError: as `load_checkpoint` and the checks of `released_policy`.
     """
     model = config.model
-    with context.progress_callback("reading weights, MB") as tell:
-        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(tell))
-    require_same(source, context)
-    ahead = build_released_policy(model, found, SENSORS)
-    check_released(ahead, touch_shapes(model, model.view_px, SENSORS))
-    grpo_shape(config, ahead, context.devices.shape)
+    with context.progress_callback("reading weights, MB") as report:
+        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(report))
+    released.require_same(source, context)
+    ahead = released.build_released_policy(model, found, SENSORS)
+    ahead.check(touch_shapes(model, model.view_px, SENSORS))
+    released.grpo_shape(config, ahead, context.devices.shape)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)
     model, tactile = starting_model(model, config.encoder, data.clip.sensors)
-    policy = build_released_policy(model, found, data.clip.sensors)
-    return policy, data, tactile
+    return released.build_released_policy(model, found, data.clip.sensors), data, tactile
 
 
 def released_folder(config: TouchR1Config, context: Context) -> Path:
@@ -234,33 +234,18 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
     if not config.tiny:
         raise WeightsError(
             "weights is None: must be the folder of a released Qwen2.5-VL (config, tokenizer, chat template, picture "
-            "settings, safetensors); say --weights DIR, or --scale smoke to try the code on a tiny one"
+            "settings, safetensors); pass --weights DIR, or --scale smoke to try the code on a tiny one"
         )
     made = context.directory / "tiny"
+
+    def make() -> None:
+        write_tiny(made, TOUCH_LANGUAGE, released.instruction(TOUCH_LANGUAGE), config.tiny_decoder)
+        teach(made, config.teaching_steps, context)
+
     if not context.done("tiny"):
-        context.processes.write_once(lambda: make_tiny(made, config, context))
+        context.processes.write_once(make)
         context.save_stage("tiny", {})
     return made
-
-
-def make_tiny(made: Path, config: TouchR1Config, context: Context) -> None:
-    """Write the tiny checkpoint of a trial, and teach it to write where that is wanted."""
-    write_tiny(made, TOUCH_LANGUAGE, instruction(TOUCH_LANGUAGE), decoder=config.tiny_decoder)
-    teach(made, config.teaching, context)
-
-
-def estimates(seeds: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> dict[str, Estimate]:
-    """Those of answers that were got in another way."""
-    return {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-
-
-def settings(config: TouchR1Config, source: Path) -> dict[str, str | float]:
-    """Those of a study, the weights and the adapters."""
-    return {
-        **study_settings(config),
-        "weights": f"{source.name}, {config.model.dtype}",
-        "adapters": f"rank {config.sft.lora_rank} in SFT, {config.grpo_lora_rank} in GRPO",
-    }
 
 
 def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.ndarray, seeds: int) -> list[Comparison]:
@@ -278,14 +263,6 @@ def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.nda
     return found
 
 
-def differing(study: Study) -> Requirement:
-    """Answers that the written folder gives and the trained policy does not."""
-    pairs = zip(study.answers[ARM], study.variants[WRITTEN], strict=True)
-    count = sum(int((a.tokens != b.tokens).any(-1).sum()) for a, b in pairs)
-    name, note = "answers of the written weights that differ", f"of {len(study.answers[ARM][0].tokens)} a seed"
-    return Requirement(name=name, measured=count, bound=0, better="lower", note=note)
-
-
 def verdict(
     config: TouchR1Config, rows: Mapping[str, Mapping[str, Estimate]], gain: TouchGain | None
 ) -> tuple[str, ...]:
@@ -301,7 +278,7 @@ def verdict(
             f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}."
         )
     if config.weights is None:
-        sentences.insert(0, TAUGHT if config.teaching.steps else DRAWN)
+        sentences.insert(0, TAUGHT if config.teaching_steps else DRAWN)
     return tuple(sentences)
 
 
@@ -340,7 +317,7 @@ SMALL = dataclasses.replace(
         intermediate_size=192,
         mrope_section=(4, 6, 6),
     ),
-    teaching=TeachingConfig(steps=500),
+    teaching_steps=500,
     scenes=SceneConfig(objects=900, sites=1),
     read_threads=1,
     clip_memory_gib=1.5,

@@ -127,7 +127,7 @@ def describe_scenes(config: SceneConfig, context: Context) -> DescribedScenes:
     """Generate and describe presses as a GelSight Mini sees them."""
 
     def make() -> dict[str, np.ndarray]:
-        source = SourceConfig(kind="generated", directory=None, scenes=config, physiclear=PhysiclearConfig())
+        source = SourceConfig(scenes=config)
         store = RecordStore(prepare_records(source, context))
         x, target = [], []
         with context.timed("scenes"):

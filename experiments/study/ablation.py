@@ -12,9 +12,10 @@ from experiments.core.text import bounds
 from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import Scored, score_study, study_settings
+from experiments.study.scores import Scored, score_study, study_results, study_settings
 from experiments.study.stages import Weights
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
+from experiments.study.training import GRPO_ATTRIBUTES
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
@@ -75,29 +76,22 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
     comparisons = (*over_seeds(ablation, study, scored), *over_objects(study, scored))
     shown = ablation.example or list(ablation.arms)[-1]
     pictures, tables = level_report(study)
-    return (
+    presets = {
+        f"preset of {arm}": preset_name(dataclasses.replace(config.grpo, algorithm=algorithm))
+        for arm, algorithm in ablation.algorithms.items()
+    }
+    results = study_results(
         study,
         scored,
-        Results(
-            arms=scored.arms,
-            baselines=scored.baselines,
-            settings=settings(ablation, config),
-            comparisons=comparisons,
-            verdict=verdict(ablation, comparisons, scored.estimates),
-            tables=tables,
-            pictures=pictures,
-            data=study.data.summary(),
-            curves=ablation.drawn,
-            examples=rollout_examples(study, shown, ablation.arms[shown]),
-        ),
+        settings={**study_settings(config), **presets},
+        comparisons=comparisons,
+        verdict=verdict(ablation, comparisons, scored.estimates),
+        tables=tables,
+        pictures=pictures,
+        curves=ablation.drawn,
+        examples=rollout_examples(study, shown, ablation.arms[shown]),
     )
-
-
-def settings(ablation: Ablation, config: StudyConfig) -> dict[str, str | float]:
-    """Those of the study, and the preset of every arm that has its own."""
-    of_arm = lambda arm: dataclasses.replace(config.grpo, algorithm=ablation.algorithms.get(arm, config.grpo.algorithm))
-    presets = {f"preset of {arm}": preset_name(of_arm(arm)) for arm in ablation.algorithms}
-    return {**study_settings(config), **presets}
+    return study, scored, results
 
 
 def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Comparison]:
@@ -119,26 +113,24 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
 
 def own_reward(study: Study, seeds: Sequence[Evaluation], weights: Weights) -> Estimate:
     """Mean reward under an arm's own weights of greedy answers to what GRPO asks, of every seed; without interval."""
-    asked = [i for i, name in enumerate(ATTRIBUTES) if name in study.config.grpo_attributes]
-    each = []
-    for answers in seeds:
-        reward = rewards_of(study.policy, answers, weights, study.prior)
-        each.append(float(reward[np.isin(answers.attribute, asked)].mean()))
+    asked = [i for i, name in enumerate(ATTRIBUTES) if name in GRPO_ATTRIBUTES]
+    each = tuple(
+        float(rewards_of(study.policy, answers, weights, study.prior)[np.isin(answers.attribute, asked)].mean())
+        for answers in seeds
+    )
     mean = float(np.mean(each))
-    return Estimate(mean=mean, ci95=(mean, mean), per_seed=tuple(each))
+    return Estimate(mean=mean, ci95=(mean, mean), per_seed=each)
 
 
 def over_objects(study: Study, scored: Scored) -> list[Comparison]:
     """SFT against the baselines, paired by object: the gain from touch before any reinforcement."""
-    rows, seeds = scored.rows, study.config.seeds
-    repeated = {name: rows[name] if len(rows[name]) > 1 else rows[name] * seeds for name in rows}
-    return [
-        compare_over_objects(
-            metric, SFT, name, [s[metric] for s in rows[SFT]], [s[metric] for s in repeated[name]], scored.objects
-        )
-        for name in scored.baselines
-        for metric in ("acc", "omae")
-    ]
+    found = []
+    for name in scored.baselines:
+        theirs = scored.rows[name] * (1 if len(scored.rows[name]) > 1 else study.config.seeds)
+        for metric in ("acc", "omae"):
+            a, b = ([seed[metric] for seed in seeds] for seeds in (scored.rows[SFT], theirs))
+            found.append(compare_over_objects(metric, SFT, name, a, b, scored.objects))
+    return found
 
 
 def verdict(
@@ -146,12 +138,9 @@ def verdict(
 ) -> tuple[str, ...]:
     """One sentence for SFT, one for each pair, and one for each arm against SFT, whichever way the figures fall."""
     by = {(c.metric, c.arm, c.against): c for c in comparisons}
-    touch = [by["acc", SFT, name] for name in ("constant", BLIND)]
-    sentences = [
-        f"SFT answers {rows[SFT]['acc'].mean:.1f} % of ordinal questions about unseen objects right: "
-        + ", ".join(f"{c.difference:+.1f} points {_interval(c)} against {c.against}" for c in touch)
-        + "."
-    ]
+    touch = (by["acc", SFT, name] for name in ("constant", BLIND))
+    gains = ", ".join(f"{c.difference:+.1f} points {_interval(c)} against {c.against}" for c in touch)
+    sentences = [f"SFT answers {rows[SFT]['acc'].mean:.1f} % of ordinal questions about unseen objects right: {gains}."]
     for a, b in ablation.pairs:
         found = [by[m, a, b] for m in COMPARED if (m, a, b) in by]
         if found:

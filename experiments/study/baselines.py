@@ -8,17 +8,16 @@ import numpy as np
 from experiments.study.stages import force_only
 from experiments.study.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.types import Parsed
-
-ORDINAL = tuple(a for a in ATTRIBUTES if LEVELS[a] == 3)
 
 
 def baselines(study: Study) -> dict[str, Evaluation]:
     """Answers of every baseline to the questions that the policies were asked."""
     train = study.data.label[np.concatenate([study.data.parts["sft"], study.data.parts["grpo"]])]
-    n = len(study.test_label)
+    n = len(study.data.parts["test"])
     constants = {
         "constant": study.prior.argmax(-1),
         "constant_joint": joint_mode(train),
@@ -58,11 +57,11 @@ def level_answers(
     Args:
       policy: of the study.
       asked: answers of any policy; its questions and labels are taken.
-      level: int [contact, A], what `compare` and `conclude` say.
-      alone: int [contact, S, A], what each sensor says in `perceive` and by itself; `level` where it is `None`.
+      level: int [contact, A], the levels in `compare` and `conclude`.
+      alone: int [contact, S, A], those in `perceive` and by each sensor alone; `level` where it is `None`.
     """
     wanted = policy.layout.asked[asked.attribute]
-    said = np.where(wanted, level[asked.contact], -1).astype(np.int32)
+    concluded = np.where(wanted, level[asked.contact], -1).astype(np.int32)
     n, sensors = asked.streams.shape
     single = np.repeat(level[:, None], sensors, 1) if alone is None else alone
     single = np.where(wanted[:, None], single[asked.contact], -1).astype(np.int32)
@@ -74,8 +73,8 @@ def level_answers(
         tokens=np.zeros((n, 0), np.int32),
         parsed=Parsed(
             perceive=jnp.asarray(perceive),
-            compare=jnp.asarray(said),
-            conclude=jnp.asarray(said),
+            compare=jnp.asarray(concluded),
+            conclude=jnp.asarray(concluded),
             formatted=jnp.ones(n, bool),
             truncated=jnp.zeros(n, bool),
             length=jnp.zeros(n, jnp.int32),

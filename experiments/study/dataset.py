@@ -37,6 +37,10 @@ class Dataset:
         """Clips of some contacts, as `clip_batches` takes the other arguments, through the memory and the threads."""
         return clip_batches(self.store, rows, self.clip, memory=self.memory, threads=self.threads, **order)
 
+    def labels(self, part: str) -> np.ndarray:
+        """Labels of the contacts of a part, int32 [n, A]."""
+        return self.label[self.parts[part]]
+
     def prior(self) -> np.ndarray:
         """Frequency of each level among the labels of training contacts, float32 [A, K]; padding levels have 0.
 

@@ -11,8 +11,16 @@ from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.scoring import REPORTED
 
+RESAMPLES = 2_000
+"""Of each interval over objects: its ends are then good to a tenth of its width."""
 
-def estimate(per_seed: Sequence[Scores], objects: np.ndarray, *, resamples: int = 2_000, seed: int = 0) -> Estimate:
+
+def pooled(seeds: Sequence[Scores]) -> Scores:
+    """The mean over seeds of each value; all seeds were scored on the same questions."""
+    return dataclasses.replace(seeds[0], values=np.mean([s.values for s in seeds], axis=0))
+
+
+def estimate(per_seed: Sequence[Scores], objects: np.ndarray) -> Estimate:
     """Mean over seeds, and its object-clustered bootstrap interval: the seeds' values pooled, whole objects resampled.
 
     Args:
@@ -24,8 +32,7 @@ def estimate(per_seed: Sequence[Scores], objects: np.ndarray, *, resamples: int 
         np.concatenate([s.values for s in per_seed]),
         np.concatenate([objects[s.items] for s in per_seed]),
         strata=np.concatenate([s.strata for s in per_seed]),
-        resamples=resamples,
-        seed=seed,
+        resamples=RESAMPLES,
     )
     return Estimate(mean=float(np.mean(means)), ci95=(interval.low, interval.high), per_seed=means)
 
@@ -55,15 +62,7 @@ def compare_over_seeds(metric: str, arm: str, against: str, a: Estimate, b: Esti
 
 
 def compare_over_objects(
-    metric: str,
-    arm: str,
-    against: str,
-    a: Sequence[Scores],
-    b: Sequence[Scores],
-    objects: np.ndarray,
-    *,
-    resamples: int = 2_000,
-    seed: int = 0,
+    metric: str, arm: str, against: str, a: Sequence[Scores], b: Sequence[Scores], objects: np.ndarray
 ) -> Comparison:
     """`arm` minus `against`, paired by question and seed: object-clustered bootstrap interval.
 
@@ -75,7 +74,7 @@ def compare_over_objects(
         same = np.array_equal(x.items, y.items) and np.array_equal(x.strata, y.strata)
         require(same, metric, f"{arm} and {against}", "must be scored on the same answers", "align the questions")
     paired = [dataclasses.replace(x, values=x.values - y.values) for x, y in zip(a, b, strict=True)]
-    difference = estimate(paired, objects, resamples=resamples, seed=seed)
+    difference = estimate(paired, objects)
     return Comparison(
         metric=metric,
         arm=arm,

@@ -11,6 +11,7 @@ from experiments.study.stages import Weights
 from experiments.study.study import Study
 from sensors_io.pipeline import make_clip
 from sensors_io.schema import Sequence
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
 from touchr1_jax.training.evaluation import Evaluation, reward_terms
@@ -26,23 +27,22 @@ ARROW_PX = 14.0
 
 
 def rollout_examples(
-    study: Study, arm: str, weights: Weights, instead: Mapping[str, Evaluation] | None = None
+    study: Study, arm: str, weights: Weights, instead: Mapping[str, Evaluation] = {}
 ) -> tuple[RolloutExample, ...]:
     """For each attribute, the first test question that the arm's first seed got right and the first it got wrong.
 
     Args:
-      study: whose answers they are.
-      arm: who answers.
+      study, arm: the policy that answers.
       weights: of the rewards that are shown.
       instead: answers of the same policy and seed with something else in the place of the touch.
     """
-    said = study.answers[arm][0]
-    asked = said.label[np.arange(len(said.attribute)), said.attribute]
-    right = said.parsed.conclude[np.arange(len(said.attribute)), said.attribute] == asked
+    answers = study.answers[arm][0]
+    n = np.arange(len(answers.attribute))
+    right = answers.parsed.conclude[n, answers.attribute] == answers.label[n, answers.attribute]
     rows = []
     for a in range(len(study.policy.language.attributes)):
         for outcome in (True, False):
-            rows += np.flatnonzero((said.attribute == a) & (right == outcome))[:1].tolist()
+            rows += np.flatnonzero((answers.attribute == a) & (right == outcome))[:1].tolist()
     return rollouts_of(study, arm, weights, rows, instead)
 
 
@@ -51,7 +51,7 @@ def rollouts_of(
     arm: str,
     weights: Weights,
     rows: Iterable[int],
-    instead: Mapping[str, Evaluation] | None = None,
+    instead: Mapping[str, Evaluation] = {},
     group: str = "",
 ) -> tuple[RolloutExample, ...]:
     """Chosen answers of the arm's first seed.
@@ -61,47 +61,35 @@ def rollouts_of(
       rows: numbers of the answers.
       group: heading under which they stand.
     """
-    said = study.answers[arm][0]
-    terms = reward_terms(study.policy, said, weights, study.prior)
-    return tuple(
-        _example(study, arm, said, row, {name: float(v[row]) for name, v in terms.items()}, instead or {}, group)
-        for row in rows
-    )
+    data, policy, answers = study.data, study.policy, study.answers[arm][0]
+    terms = reward_terms(policy, answers, weights, study.prior)
 
+    def example(row: int) -> RolloutExample:
+        contact = int(data.parts["test"][answers.contact[row]])
+        card = data.store.objects[data.store.contacts[contact].object_id]
+        recorded = data.store.contact(contact, fields=True)
+        clip = make_clip(recorded, card, data.clip)
+        attribute = policy.language.attributes[answers.attribute[row]]
+        shown = [(s, name) for s, name in enumerate(data.clip.sensors) if clip.stream_mask[s]]
+        trace, reward = _trace(policy, answers, row), {name: float(values[row]) for name, values in terms.items()}
+        return RolloutExample(
+            arm=arm,
+            object_id=card.object_id,
+            question=f"{QUESTIONS[attribute.name]}?",
+            label=f"{attribute.name}: {attribute.levels[answers.label[row, answers.attribute[row]]][0]}",
+            trace=trace.text,
+            slots=trace.slots,
+            reward=reward,
+            total=sum(reward.values()),
+            frames={name: clip.frames[s][clip.frame_mask[s]] for s, name in shown},
+            force_n={name: clip.force_n[s][clip.frame_mask[s]] for s, name in shown},
+            view=card.view,
+            fields={name: drawn for _, name in shown if (drawn := field_picture(recorded[name])) is not None},
+            instead={name: _trace(policy, other, row) for name, other in instead.items()},
+            group=group,
+        )
 
-def _example(
-    study: Study,
-    arm: str,
-    said: Evaluation,
-    row: int,
-    terms: dict[str, float],
-    instead: Mapping[str, Evaluation],
-    group: str,
-) -> RolloutExample:
-    data, policy = study.data, study.policy
-    contact = int(data.parts["test"][said.contact[row]])
-    card = data.store.objects[data.store.contacts[contact].object_id]
-    recorded = data.store.contact(contact, fields=True)
-    clip = make_clip(recorded, card, data.clip)
-    attribute = policy.language.attributes[said.attribute[row]]
-    felt = [(s, name) for s, name in enumerate(data.clip.sensors) if clip.stream_mask[s]]
-    trace = policy.tokenizer.decode(said.tokens[row])
-    return RolloutExample(
-        arm=arm,
-        object_id=card.object_id,
-        question=f"{QUESTIONS[attribute.name]}?",
-        label=f"{attribute.name}: {attribute.levels[said.label[row, said.attribute[row]]][0]}",
-        trace=trace,
-        slots=bodies(trace),
-        reward=terms,
-        total=sum(terms.values()),
-        frames={name: clip.frames[s][clip.frame_mask[s]] for s, name in felt},
-        force_n={name: clip.force_n[s][clip.frame_mask[s]] for s, name in felt},
-        view=card.view,
-        fields={name: drawn for _, name in felt if (drawn := field_picture(recorded[name])) is not None},
-        instead={name: traced(policy.tokenizer.decode(other.tokens[row])) for name, other in instead.items()},
-        group=group,
-    )
+    return tuple(map(example, rows))
 
 
 def field_picture(recording: Sequence) -> np.ndarray | None:
@@ -117,36 +105,24 @@ def field_picture(recording: Sequence) -> np.ndarray | None:
     ground = np.zeros((1, 1), np.float32) if depth is None else depth[t].astype(np.float32)
     grey = cv2.normalize(cv2.resize(ground, size), np.zeros(size, np.uint8), 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
     picture = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
+    moves = np.zeros((ARROWS, ARROWS, 2), np.float32)
     if moved is not None:
-        _draw_arrows(picture, cv2.resize(moved[t].astype(np.float32), (ARROWS, ARROWS), interpolation=cv2.INTER_AREA))
+        moves = cv2.resize(moved[t].astype(np.float32), (ARROWS, ARROWS), interpolation=cv2.INTER_AREA)
+    longest = float(np.linalg.norm(moves, axis=-1).max())
+    for y, x in np.ndindex(ARROWS, ARROWS) if longest else ():
+        start = (np.array([x, y]) + 0.5) * FIELD_PX / ARROWS
+        end = start + ARROW_PX * moves[y, x] / longest
+        tips = [tuple(round(float(v)) for v in point) for point in (start, end)]
+        cv2.arrowedLine(picture, tips[0], tips[1], (255, 255, 255), 1, cv2.LINE_AA, tipLength=0.3)
     return np.ascontiguousarray(picture[..., ::-1])
 
 
-def _draw_arrows(picture: np.ndarray, moved: np.ndarray) -> None:
-    """White arrows from the centres of the cells of `moved` [h, w, 2], drawn in place."""
-    longest = float(np.linalg.norm(moved, axis=-1).max())
-    if longest == 0:
-        return
-    cell = FIELD_PX / ARROWS
-    for y, x in np.ndindex(ARROWS, ARROWS):
-        start = (np.array([x, y]) + 0.5) * cell
-        end = start + ARROW_PX * moved[y, x] / longest
-        tips = [tuple(round(float(v)) for v in point) for point in (start, end)]
-        cv2.arrowedLine(picture, tips[0], tips[1], (255, 255, 255), 1, cv2.LINE_AA, tipLength=0.3)
-
-
-def traced(text: str) -> Trace:
-    """A trace with the bodies of its segments."""
-    return Trace(text=text, slots=bodies(text))
-
-
-def bodies(trace: str) -> tuple[Slot, ...]:
-    """Start, end and name of the body of each segment of a trace, in order of the text."""
-    found = [
-        (m.start(1), m.end(1), tag) for tag in SEGMENTS for m in re.finditer(rf"<{tag}>\s*(.*?)\s*</{tag}>", trace)
-    ]
+def _trace(policy: TouchPolicy, answers: Evaluation, row: int) -> Trace:
+    """An answer with start, end and name of the body of each segment, in order of the text."""
+    text = policy.tokenizer.decode(answers.tokens[row])
+    found = [(m.start(1), m.end(1), tag) for tag in SEGMENTS for m in re.finditer(rf"<{tag}>\s*(.*?)\s*</{tag}>", text)]
     slots: list[Slot] = []
     for start, end, tag in sorted(found):
         if not slots or start >= slots[-1][1]:
             slots.append((start, end, tag))
-    return tuple(slots)
+    return Trace(text=text, slots=tuple(slots))

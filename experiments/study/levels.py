@@ -49,56 +49,45 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     rows = {name: _level_answers(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
     language = study.policy.language
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
+    confusions = Picture(
+        name="confusions",
+        title="Which level is taken for which",
+        caption="Share of each answer among the test questions with one label, and their number; seeds pooled.",
+        content=confusion_chart(rows, words),
+    )
+    tables = (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words),)
     with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
+    if not with_agreement:
+        return (confusions,), tables
     if len(with_agreement) > len(PALETTE):  # more lines than colours: keep where training begins and where it ends
         with_agreement = {name: rows[name] for name in (SFT, list(study.arms)[-1]) if name in with_agreement}
-    pictures = [
-        Picture(
-            name="confusions",
-            title="Which level is taken for which",
-            caption="Share of each answer among the test questions with one label, and their number; seeds pooled.",
-            content=confusion_chart(rows, words),
-        )
-    ]
-    if with_agreement:
-        pictures.append(
-            Picture(
-                name="trust",
-                title="How far an answer can be trusted",
-                caption="Right answers by the number of sensors that, given alone, lead to the same answer as all "
-                "together; areas are shares of the answers, lines 95 % over objects; hardness, roughness, protrusion "
-                "and all seeds pooled.",
-                content=agreement_chart(with_agreement),
-            )
-        )
-    return tuple(pictures), (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words),)
+    trust = Picture(
+        name="trust",
+        title="How far an answer can be trusted",
+        caption="Right answers by the number of sensors that, given alone, lead to the same answer as all together; "
+        "areas are shares of the answers, lines 95 % over objects; hardness, roughness, protrusion and all seeds "
+        "pooled.",
+        content=agreement_chart(with_agreement),
+    )
+    return (confusions, trust), tables
 
 
 def _level_answers(seeds: Sequence[Evaluation], objects: np.ndarray) -> LevelAnswers:
-    agree = [_agree(answers) for answers in seeds]
+    agree = []
+    for answers in seeds:
+        if answers.alone is not None:
+            same = (answers.alone == np.asarray(answers.parsed.conclude)[:, None]) & (answers.alone != BOTTOM)
+            agree.append((same & answers.streams[:, :, None]).sum(1)[:, _COLUMNS])
     return LevelAnswers(
         answer=np.concatenate([np.asarray(answers.parsed.conclude)[:, _COLUMNS] for answers in seeds]),
         label=np.concatenate([answers.label[:, _COLUMNS] for answers in seeds]),
         objects=np.concatenate([objects[answers.contact] for answers in seeds]),
-        agree=np.concatenate([x for x in agree if x is not None]) if all(x is not None for x in agree) else None,
+        agree=np.concatenate(agree) if len(agree) == len(seeds) else None,
     )
 
 
-def _agree(answers: Evaluation) -> np.ndarray | None:
-    if answers.alone is None:
-        return None
-    together = np.asarray(answers.parsed.conclude)
-    same = (answers.alone == together[:, None]) & (answers.alone != BOTTOM) & answers.streams[:, :, None]
-    return same.sum(1)[:, _COLUMNS]
-
-
 def confusion_chart(rows: Mapping[str, LevelAnswers], words: Words) -> bytes:
-    """Draw one confusion matrix per policy and attribute.
-
-    Args:
-      rows: policy → answers; attribute a of them is the a-th of `words`.
-      words: attribute → levels.
-    """
+    """Draw one confusion matrix for each policy and attribute; attribute a of the answers is the a-th of `words`."""
     maps = [
         confusion_map(answers.answer[:, a], answers.label[:, a], levels, f"{name}: {attribute}")
         for name, answers in rows.items()
@@ -108,13 +97,7 @@ def confusion_chart(rows: Mapping[str, LevelAnswers], words: Words) -> bytes:
 
 
 def confusion_map(answer: np.ndarray, label: np.ndarray, levels: Sequence[str], title: str) -> Heatmap:
-    """Labels down, answers across, shares of a row; a last column if some answer could not be parsed.
-
-    Args:
-      answer, label: int [N].
-      levels: their names.
-      title: of the matrix.
-    """
+    """Labels down, answers [N] across, shares of a row; a last column if some answer could not be parsed."""
     asked = label != BOTTOM
     columns = [*levels, "unread"] if np.any(answer[asked] == BOTTOM) else list(levels)
     count = np.zeros((len(levels), len(levels) + 1), int)
@@ -146,21 +129,14 @@ def reliability_table(rows: Mapping[str, LevelAnswers], words: Words) -> Table:
         lines,
         formats={"answered": ".1f"},
         units=dict.fromkeys(("answered", "right when answered", "found where true"), "%"),
-        meanings={
-            "answered": "of all questions about the attribute",
-            "right when answered": "95 % over objects",
-            "found where true": "95 % over objects",
-        },
+        meanings={"answered": "of all questions about the attribute"}
+        | dict.fromkeys(("right when answered", "found where true"), "95 % over objects"),
         note="An answer that favours a level finds it often and is right about it seldom.",
     )
 
 
 def agreement_chart(rows: Mapping[str, LevelAnswers]) -> bytes:
-    """Draw the share of right answers over the number of agreeing sensors; areas are shares of answers.
-
-    Args:
-      rows: policy → answers whose `agree` is known.
-    """
+    """Draw the share of right answers over the number of agreeing sensors; areas are shares of answers."""
     series = []
     for i, (name, answers) in enumerate(rows.items()):
         counts, right, weight = accuracy_by_agreement(answers)

@@ -2,10 +2,11 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from experiments.core.results import Estimate
+from experiments.core.results import Estimate, Results
 from experiments.study.baselines import baselines
 from experiments.study.estimates import estimate
 from experiments.study.stages import Weights
@@ -19,18 +20,15 @@ from touchr1_jax.training.evaluation import Evaluation, rewards_of
 PUBLISHED: Weights = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
 """The reward of the paper, by which `reward` is reported for every row, whatever an arm was trained on."""
 
-Table = Mapping[str, list[dict[str, Scores]]]
-"""Row → seed → metric; a baseline has one seed."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Scored:
     """Scores of every policy and baseline, and their estimates: SFT and the arms, and all others.
 
-    `objects` is the object of each question, [N].
+    `rows` maps a row to the scores of its seeds, of which a baseline has one; `objects` is the object of each question.
     """
 
-    rows: Table
+    rows: Mapping[str, list[dict[str, Scores]]]
     objects: np.ndarray
     arms: Mapping[str, Mapping[str, Estimate]]
     baselines: Mapping[str, Mapping[str, Estimate]]
@@ -43,26 +41,40 @@ class Scored:
 
 def score_study(study: Study) -> Scored:
     """Every metric of every policy's and every baseline's answers about the test contacts."""
-    rows = {name: [score(study, said) for said in seeds] for name, seeds in study.answers.items()}
-    rows |= {name: [score(study, said)] for name, said in baselines(study).items()}
+    answers = {**study.answers, **{name: [answers] for name, answers in baselines(study).items()}}
+    rows = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     objects = study.data.object_ids[study.data.parts["test"]][study.answers[SFT][0].contact]
     estimates = {
         name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
         for name, seeds in rows.items()
     }
-    arms = (SFT, *study.arms)
-    return Scored(
-        rows=rows,
-        objects=objects,
-        arms={name: estimates[name] for name in arms},
-        baselines={name: row for name, row in estimates.items() if name not in arms},
-    )
+    arms = {name: estimates.pop(name) for name in (SFT, *study.arms)}
+    return Scored(rows=rows, objects=objects, arms=arms, baselines=estimates)
 
 
-def score(study: Study, said: Evaluation) -> dict[str, Scores]:
+def score(study: Study, answers: Evaluation) -> dict[str, Scores]:
     """Every metric of one policy's answers."""
-    reward = rewards_of(study.policy, said, PUBLISHED, study.prior)
-    return evaluate(bench_answers(said, reward), ATTRIBUTES, study.policy.levels)
+    read = Answers(
+        conclude=np.asarray(answers.parsed.conclude),
+        label=answers.label,
+        formatted=np.asarray(answers.parsed.formatted),
+        reward=rewards_of(study.policy, answers, PUBLISHED, study.prior),
+        streams=answers.streams,
+        perceive=np.asarray(answers.parsed.perceive),
+        alone=answers.alone,
+    )
+    return evaluate(read, ATTRIBUTES, study.policy.levels)
+
+
+def study_results(study: Study, scored: Scored, **further: Any) -> Results:
+    """Results of a study: its rows, settings and data; `further` fields are added or take the place of these."""
+    made = {
+        "arms": scored.arms,
+        "baselines": scored.baselines,
+        "settings": study_settings(study.config),
+        "data": study.data.summary(),
+    }
+    return Results(**(made | further))
 
 
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:
@@ -72,16 +84,3 @@ def study_settings(config: TrainingConfig) -> dict[str, str | float]:
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,
     }
-
-
-def bench_answers(evaluation: Evaluation, reward: np.ndarray) -> Answers:
-    """The input of `bench.metrics.evaluate`: answers with the reward of each."""
-    return Answers(
-        conclude=np.asarray(evaluation.parsed.conclude),
-        label=evaluation.label,
-        formatted=np.asarray(evaluation.parsed.formatted),
-        reward=reward,
-        streams=evaluation.streams,
-        perceive=np.asarray(evaluation.parsed.perceive),
-        alone=evaluation.alone,
-    )

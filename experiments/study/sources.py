@@ -1,4 +1,4 @@
-"""Where the data of an experiment comes from: generated scenes, imported recordings, or existing records."""
+"""The data of an experiment: generated scenes, imported recordings, or existing records."""
 
 import dataclasses
 import hashlib
@@ -18,43 +18,40 @@ Source = Literal["generated", "physiclear", "records"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SourceConfig:
-    """Which data; `directory` holds the recordings or records, and is not used for generated scenes.
+    """Where the data come from; the configuration of every experiment on data begins with it.
 
     Raises:
-      ValueError: recordings or records without a directory, or a directory given for generated scenes.
+      ValueError: recordings or records without a folder, or a folder for generated scenes.
     """
 
-    kind: Source
-    directory: Path | None
-    scenes: SceneConfig
-    physiclear: PhysiclearConfig
+    data: Source = "generated"
+    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
+    data_dir: Path | None = None
+    """Folder of the videos or records."""
+    scenes: SceneConfig = SceneConfig()
+    physiclear: PhysiclearConfig = PhysiclearConfig()
 
     def __post_init__(self) -> None:
-        if (self.directory is None) != (self.kind == "generated"):
-            need = "takes no data_dir: drop it" if self.kind == "generated" else "needs data_dir: the folder to read"
-            raise ValueError(f"data_dir is {self.directory}: data {self.kind!r} {need}")
+        if (self.data_dir is None) != (self.data == "generated"):
+            need = "takes no data_dir: drop it" if self.data == "generated" else "needs data_dir: the folder to read"
+            raise ValueError(f"data_dir is {self.data_dir}: data {self.data!r} {need}")
 
 
 def prepare_records(config: SourceConfig, context: Context) -> Path:
     """Directory of the records, made or imported first where the cache lacks them; an interrupted making goes on."""
-    if config.directory is None:
+    if config.data_dir is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
-        _make(context, "making scenes", lambda tell: generate_records(config.scenes, path, progress=tell))
+        _make(context, "making scenes", lambda report: generate_records(config.scenes, path, progress=report))
         return path
-    if config.kind == "records":
-        return config.directory
-    source = config.directory.resolve()
-    identity = json.dumps([str(source), dataclasses.asdict(config.physiclear)], sort_keys=True)
+    if config.data == "records":
+        return config.data_dir
+    source, settings = config.data_dir.resolve(), config.physiclear
+    identity = json.dumps([str(source), dataclasses.asdict(settings)], sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
-    _make(
-        context,
-        "importing videos",
-        lambda tell: import_physiclear(source, path, config=config.physiclear, progress=tell),
-    )
+    _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))
     return path
 
 
 def _make(context: Context, title: str, make: Callable[[ProgressCallback], object]) -> None:
-    """Run `make` under a progress bar."""
     with context.timed("data"), context.progress_callback(title) as report:
         context.processes.write_once(lambda: make(report))

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import stage_hooks
+from experiments.study.cache import cached
 from experiments.study.dataset import Dataset
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
@@ -63,18 +64,19 @@ class ProbeFeatures:
 
 def probe_features(data: Dataset, context: Context) -> ProbeFeatures:
     """Summarise all contacts once; every seed shares it, and every process does its part."""
-    found = context.processes.split_work(np.arange(len(data.store)), lambda rows: _features(data, rows, context))
-    return ProbeFeatures(**found)
 
+    def summarise(rows: np.ndarray) -> dict[str, np.ndarray]:
+        parts = [
+            {
+                "streams": np.asarray(stream_features(clip["frames"], clip["force_n"])),
+                "present": clip["stream_mask"],
+                "force": clip["force_n"].reshape(len(clip["force_n"]), -1),
+            }
+            for clip in _clips(data, rows, context, "reading touch", batch_size=32)
+        ]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-def _features(data: Dataset, rows: np.ndarray, context: Context) -> dict[str, np.ndarray]:
-    streams, present, force = [], [], []
-    for clip in _clips(data, rows, context, "reading touch", batch_size=32):
-        streams.append(np.asarray(stream_features(clip["frames"], clip["force_n"])))
-        present.append(clip["stream_mask"])
-        force.append(clip["force_n"].reshape(len(clip["force_n"]), -1))
-    parts = {"streams": streams, "present": present, "force": force}
-    return {name: np.concatenate(part) for name, part in parts.items()}
+    return ProbeFeatures(**context.processes.split_work(np.arange(len(data.store)), summarise))
 
 
 def _clips(data: Dataset, rows: np.ndarray, context: Context, title: str, **order: Any) -> Iterator[dict[str, Any]]:
@@ -112,15 +114,26 @@ def run_sft(
     stage: str,
     blind: bool = False,
     tactile: Params | None = None,
+    share: bool = False,
 ) -> Params:
-    """SFT of fresh parameters, or of a pretrained tactile encoder; a blind policy is never shown any touch."""
-    own, shared_by = context.devices.local_rows(config.batch_size), math.prod(context.devices.shape[:2])
-    feed = answer_feed(policy, data, evidence, config, seed=seed, blind=blind, own=own, devices=shared_by)
-    params = untrained(policy, data, seed)
-    if tactile is not None:
-        params = {**params, "tactile": tactile}
-    with stage_hooks(context, stage, config.steps) as hooks:
-        return train_sft(policy, params, feed, config, hooks, seed=seed, blind=blind)
+    """SFT of fresh parameters, or of a pretrained tactile encoder; a blind policy is never shown any touch.
+
+    With `share` the policy comes from the cache where an experiment trained it before.
+    """
+
+    def train() -> Params:
+        own, devices = context.devices.local_rows(config.batch_size), math.prod(context.devices.shape[:2])
+        feed = answer_feed(policy, data, evidence, config, seed=seed, blind=blind, own=own, devices=devices)
+        params = untrained(policy, data, seed) | ({} if tactile is None else {"tactile": tactile})
+        with stage_hooks(context, stage, config.steps) as hooks:
+            return train_sft(policy, params, feed, config, hooks, seed=seed, blind=blind)
+
+    if not share:
+        return train()
+    values = {"records": data.store.digest, "config": config, "model": policy.model, "clip": data.clip}
+    values |= {"seed": seed, "blind": blind, "mesh": context.devices.shape}
+    arrays = {"evidence": evidence, "rows": data.parts["sft"], "tactile": tactile or {}}
+    return cached("sft", values, arrays, train, context, stage)
 
 
 def answer_feed(
@@ -134,7 +147,7 @@ def answer_feed(
     own: np.ndarray | None = None,
     devices: int = 1,
 ) -> AnswerFeed:
-    """Batches of SFT, of which this process reads the rows `own` and so many devices share a micro-batch."""
+    """Batches of SFT, of which this process reads the rows `own`; `devices` share a micro-batch."""
     order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed, "own": own}
     return AnswerFeed(
         policy,
@@ -169,7 +182,7 @@ def encode_rows(
 def noise_bank(
     policy: TouchPolicy, params: Params, data: Dataset, *, seed: int, contacts: int = 64
 ) -> Float[Array, "K S N D"]:
-    """Encoded noise with the statistics of so many SFT contacts."""
+    """Encoded noise with the statistics of some SFT contacts."""
     clips = data.batches(data.parts["sft"], batch_size=contacts, seed=seed, repeat=False)
     return encoding.noise_bank(policy.fns, params, host_touch(next(iter(clips))), seed=seed)
 
@@ -234,33 +247,36 @@ def run_grpo(
     *,
     seed: int,
     stage: str,
+    share: bool = False,
 ) -> Params:
-    """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed."""
-    own = context.devices.local_rows(arm.config.drawn)
-    size = arm.config.drawn
-    feed = QuestionFeed(
-        policy, contacts.features, contacts.label, batch_size=size, seed=seed, own=own, truth=contacts.truth
-    )
-    with stage_hooks(context, stage, arm.loop.steps, make_log=alarm_log) as hooks:
-        return train_grpo(
-            policy, params, feed, arm.score, arm.config, arm.loop, hooks, noise=contacts.noise, lora=arm.lora, seed=seed
-        )
+    """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed; `share` as in `run_sft`."""
+    config, loop, lora = arm.config, arm.loop, arm.lora
+
+    def train() -> Params:
+        order: dict[str, Any] = {"batch_size": config.drawn, "seed": seed}
+        order |= {"own": context.devices.local_rows(config.drawn), "truth": contacts.truth}
+        feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
+        with stage_hooks(context, stage, loop.steps, make_log=alarm_log) as hooks:
+            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, lora=lora, seed=seed)
+
+    if not share:
+        return train()
+    values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps, "lora": lora}
+    values |= {"model": policy.model, "seed": seed, "mesh": context.devices.shape}
+    inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
+    inputs |= {"label": contacts.label, "truth": contacts.truth}
+    return cached("grpo", values, {**params, "input": inputs}, train, context, stage)
 
 
-_FIELDS = ("stage", "step")
-_ALARM = "alarm_"
+ALARM = "alarm_"
+"""Prefix of the logged metrics that hold alarms, followed by their code."""
 
 
 def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[str, float]], None]:
     """A function that logs the metrics of each step and the alarms they raise, `alarm_F7` with the number that fired.
 
-    Each alarm of a stage is also printed once.  A resumed stage first looks at the steps that it logged before, so that
-    its lines are those of an uninterrupted run.
-
-    Args:
-      context: the run.
-      stage: name of the stage.
-      start: first step that is computed.
+    Each alarm of a stage is also printed once.  A stage that resumes at step `start` first looks at the steps that it
+    logged before, so that its lines are those of an uninterrupted run.
     """
     monitor, printed = AlarmMonitor(), set[str]()
 
@@ -272,11 +288,11 @@ def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[s
             if aloud and alarm.code not in printed:
                 context.print(f"{stage}, step {t}: {alarm}")
             printed.add(alarm.code)
-        return {f"{_ALARM}{alarm.code}": alarm.value for alarm in alarms}
+        return {f"{ALARM}{alarm.code}": alarm.value for alarm in alarms}
 
     for line in read_metrics(context.directory):
         if line["stage"] == stage and line["step"] < start:
-            metrics = {n: x for n, x in line.items() if n not in _FIELDS and not n.startswith(_ALARM)}
+            metrics = {n: x for n, x in line.items() if n not in ("stage", "step") and not n.startswith(ALARM)}
             alarms_of(metrics, line["step"], aloud=False)
 
     def log(t: int, metrics: dict[str, float]) -> None:

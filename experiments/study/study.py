@@ -15,7 +15,6 @@ from jaxtyping import Array
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.study.cache import cached_grpo, cached_sft
 from experiments.study.dataset import Dataset
 from experiments.study.stages import (
     EncodedContacts,
@@ -31,9 +30,9 @@ from experiments.study.stages import (
     run_grpo,
     run_sft,
 )
-from experiments.study.training import TrainingConfig, open_data, starting_model
+from experiments.study.training import GRPO_ATTRIBUTES, TrainingConfig, open_data, require_derived, starting_model
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import SENSORS, UNKNOWN
+from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
@@ -57,7 +56,7 @@ class StudyConfig(TrainingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_derived("decoder.vocab_size", self.model.decoder.vocab_size)
+        require_derived("decoder.vocab_size", self.model.decoder.vocab_size)
 
 
 SMOKE = StudyConfig(
@@ -80,7 +79,6 @@ class TrainedPolicy:
       params: its parameters.
       test: encoded test contacts; `noise` is the noise bank of its encoder.
       evaluation: its answers about them.
-      grpo_label: labels that GRPO may ask about, int32 [contact of the GRPO part, A].
     """
 
     policy: TouchPolicy
@@ -92,12 +90,10 @@ class TrainedPolicy:
     test: Features
     noise: Array
     evaluation: Evaluation
-    grpo_label: np.ndarray
 
-    @property
-    def label(self) -> np.ndarray:
-        """Labels of the test contacts, int32 [contact, A]."""
-        return self.data.label[self.data.parts["test"]]
+    def ask(self, params: Params, features: Features, *, alone: bool = True) -> Evaluation:
+        """Answers with other parameters or other encoded test contacts; arguments of `evaluate_policy`."""
+        return ask_policy(self.policy, params, features, self.data.labels("test"), self.context, alone=alone)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -124,18 +120,13 @@ class Study:
     answers: Mapping[str, Sequence[Evaluation]]
     variants: Mapping[str, Sequence[Evaluation]] = dataclasses.field(default_factory=dict)
 
-    @property
-    def test_label(self) -> np.ndarray:
-        """Labels of the test contacts, int32 [contact, A]."""
-        return self.data.label[self.data.parts["test"]]
-
 
 def run_study(
     config: StudyConfig,
     arms: Mapping[str, Weights],
     context: Context,
-    algorithms: Mapping[str, AnyAlgorithm] | None = None,
-    variants: Mapping[str, EvalVariant] | None = None,
+    algorithms: Mapping[str, AnyAlgorithm] = {},
+    variants: Mapping[str, EvalVariant] = {},
 ) -> Study:
     """Make the data, train every arm of every seed, evaluate every policy.
 
@@ -154,7 +145,7 @@ def run_study(
     check_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
-    check_variants(variants or {}, arms)
+    check_variants(variants, arms)
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
     policy = build_policy(model, data.clip.sensors)
@@ -202,27 +193,26 @@ def train_study(
     policy: TouchPolicy,
     arms: Mapping[str, Weights],
     context: Context,
-    algorithms: Mapping[str, AnyAlgorithm] | None = None,
-    variants: Mapping[str, EvalVariant] | None = None,
+    algorithms: Mapping[str, AnyAlgorithm] = {},
+    variants: Mapping[str, EvalVariant] = {},
     *,
     tactile: Params | None = None,
     share: bool = False,
 ) -> Study:
-    """Train every arm of every seed, evaluate every policy; arms and variants as in `run_study`, which checks them.
+    """Train every arm of every seed and evaluate every policy, with data and policy at hand.
 
     Args:
-      config, data, policy, arms, context, algorithms, variants: of the study.
+      config, data, policy, arms, context, algorithms, variants: as in `run_study`, which checks them.
       tactile: parameters of the tactile encoder that SFT starts from; `None` starts from fresh ones.
       share: take policies from the cache.
     """
-    algorithms, variants = algorithms or {}, variants or {}
     probed = probe_features(data, context)
     evidence = gather_evidence(data, probed, config.probe, context)
     prior = data.prior()
-    made = {}
-    for arm, weights in arms.items():
-        grpo = dataclasses.replace(config.grpo, algorithm=algorithms.get(arm, config.grpo.algorithm))
-        made[arm] = make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
+    made = {
+        arm: make_study_arm(config, policy, weights, prior, algorithms.get(arm, config.grpo.algorithm))
+        for arm, weights in arms.items()
+    }
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, *arms, BLIND, *variants)}
     for seed in context.each("seeds", range(config.seeds)):
         of_seed = _Seed(config, data, policy, tactile, share, evidence, made, variants, context, seed)
@@ -239,6 +229,21 @@ def train_study(
         answers=answers,
         variants=further,
     )
+
+
+def make_study_arm(
+    config: TrainingConfig, policy: TouchPolicy, weights: Weights, prior: np.ndarray, algorithm: AnyAlgorithm
+) -> GRPOArm:
+    """An arm with a study's steps and adapters."""
+    grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
+    return make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
+
+
+def grpo_contacts(data: Dataset, features: Features, noise: Array) -> EncodedContacts:
+    """The GRPO contacts, encoded; labels of attributes that GRPO does not ask about are hidden from questions."""
+    truth = data.labels("grpo")
+    label = np.where(np.isin(ATTRIBUTES, GRPO_ATTRIBUTES), truth, UNKNOWN)
+    return EncodedContacts(features=features, label=label, truth=truth, noise=noise)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -271,30 +276,25 @@ class _Seed:
         encode = functools.partial(encode_rows, policy, params, data, context=context)
         test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
         noise = noise_bank(policy, params, data, seed=self.seed, contacts=self.config.noise_contacts)
-        contacts = EncodedContacts(features=train, label=self._grpo_label(), truth=self._label("grpo"), noise=noise)
+        contacts = grpo_contacts(data, train, noise)
         self._evaluate_all(SFT, params, test, noise)
-        make_grpo = cached_grpo if self.share else run_grpo
         for name, arm in self.arms.items():
-            stage = f"grpo/{name}/{self.seed}"
-            tuned = make_grpo(policy, arm, contacts, params, context, seed=self.seed, stage=stage)
-            self._evaluate_all(name, tuned, test, noise)
+            order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{name}/{self.seed}", "share": self.share}
+            self._evaluate_all(name, run_grpo(policy, arm, contacts, params, context, **order), test, noise)
 
     def _blind(self) -> Evaluation:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
         features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return ask_policy(self.policy, params, features, self._label("test"), self.context)
+        return ask_policy(self.policy, params, features, self.data.labels("test"), self.context)
 
-    def _sft(self, config: StudySFT, stage: str, *, blind: bool = False, tactile: Params | None = None) -> Params:
-        make = cached_sft if self.share else run_sft
-        return make(
-            self.policy, self.data, self.evidence, config, self.context,
-            seed=self.seed, stage=stage, blind=blind, tactile=tactile,
-        )  # fmt: skip
+    def _sft(self, config: StudySFT, stage: str, **options: Any) -> Params:
+        order: dict[str, Any] = {"seed": self.seed, "stage": stage, "share": self.share}
+        return run_sft(self.policy, self.data, self.evidence, config, self.context, **order, **options)
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Evaluate a policy, then all variants of it."""
         policy, context = self.policy, self.context
-        self._evaluate(name, lambda: ask_policy(policy, params, test, self._label("test"), context))
+        self._evaluate(name, lambda: ask_policy(policy, params, test, self.data.labels("test"), context))
         for title, variant in self.variants.items():
             if variant.of == name:
                 trained = TrainedPolicy(
@@ -307,7 +307,6 @@ class _Seed:
                     test=test,
                     noise=noise,
                     evaluation=load_answers(self._path(name)),
-                    grpo_label=self._grpo_label(),
                 )
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
@@ -316,14 +315,6 @@ class _Seed:
             with self.context.timed(f"ask/{name}/{self.seed}"):
                 evaluation = evaluate()
                 self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
-
-    def _label(self, part: str) -> np.ndarray:
-        return self.data.label[self.data.parts[part]]
-
-    def _grpo_label(self) -> np.ndarray:
-        """Labels of the GRPO contacts, with those of attributes that GRPO does not ask about hidden."""
-        names = [a.name for a in self.policy.language.attributes]
-        return np.where(np.isin(names, self.config.grpo_attributes), self._label("grpo"), UNKNOWN)
 
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"

@@ -6,37 +6,35 @@ from typing import TypeVar
 
 from experiments.core.context import Context
 from experiments.study.dataset import Dataset, open_dataset
-from experiments.study.sources import Source, SourceConfig, prepare_records
+from experiments.study.sources import SourceConfig, prepare_records
 from experiments.study.stages import StudySFT
-from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
+from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
+GRPO_SHARE = 0.35
+"""Share of the training objects that SFT never sees."""
+
+GRPO_ATTRIBUTES = ORDINAL
+"""Attributes that GRPO asks about; the arms may differ in how they pay for the answers."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainingConfig:
+class TrainingConfig(SourceConfig):
     """Data, their tactile input, SFT and GRPO."""
 
     seeds: int = 5
     """Training seeds, paired between arms."""
-    data: Source = "generated"
-    """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
-    data_dir: Path | None = None
-    """Folder of the videos or records."""
     scenes: SceneConfig = SceneConfig(objects=2400, sites=1)
-    physiclear: PhysiclearConfig = PhysiclearConfig()
-    grpo_share: float = 0.35
-    """Share of the training objects that SFT never sees."""
     clip_memory_gib: float = 1.5
     """Clips that stay in memory once they were read; all of a study's default."""
     read_threads: int = 1
@@ -51,14 +49,10 @@ class TrainingConfig:
     blind: StudySFT = StudySFT(micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
     grpo: GRPOConfig = GRPOConfig.paper()
-    grpo_attributes: tuple[str, ...] = ("hardness", "roughness", "protrusion")
-    """What GRPO asks about; the arms may differ in how they pay for it."""
     grpo_steps: int = 900
     grpo_save_every: int = 200
     grpo_lora_rank: int = 0
     """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
-    grpo_lora_alpha: float = 32.0
-    """The adapters' change is multiplied by grpo_lora_alpha / grpo_lora_rank."""
 
     @property
     def grpo_loop(self) -> LoopConfig:
@@ -68,68 +62,43 @@ class TrainingConfig:
     @property
     def grpo_lora(self) -> LoraConfig | None:
         """Adapters that GRPO trains, or none."""
-        return LoraConfig(rank=self.grpo_lora_rank, alpha=self.grpo_lora_alpha) if self.grpo_lora_rank else None
+        return LoraConfig(rank=self.grpo_lora_rank) if self.grpo_lora_rank else None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
         at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank")
-        if not 0 < self.grpo_share < 1:
-            raise ValueError(
-                f"grpo_share is {self.grpo_share}: must lie between 0 and 1: SFT and GRPO both need objects; change it"
-            )
-        self.source()
-        known = [attribute.name for attribute in TOUCH_LANGUAGE.attributes]
-        unknown = sorted(set(self.grpo_attributes) - set(known))
-        if unknown or not self.grpo_attributes:
-            raise ValueError(
-                f"grpo_attributes is {self.grpo_attributes}: must be some of {', '.join(known)}; correct it"
-            )
-        self.check_derived("tactile.sensors", self.model.tactile.sensors)
+        require_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(
                 f"grpo.length is {self.grpo.length}: must be model.completion_tokens = {self.model.completion_tokens}, "
                 "the length that SFT teaches; set both"
             )
 
-    def source(self) -> SourceConfig:
-        """Where its data come from.
 
-        Raises:
-          ValueError: recordings or records without a folder, or a folder for generated scenes.
-        """
-        return SourceConfig(kind=self.data, directory=self.data_dir, scenes=self.scenes, physiclear=self.physiclear)
+def require_derived(field: str, value: int) -> None:
+    """Refuse a number of the model that the data or the language determine.
 
-    @staticmethod
-    def check_derived(field: str, value: int) -> None:
-        """Refuse a number of the model that the data or the language determine.
-
-        Raises:
-          ValueError: it is not 0.
-        """
-        if value:
-            raise ValueError(
-                f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out"
-            )
+    Raises:
+      ValueError: it is not 0.
+    """
+    if value:
+        raise ValueError(f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out")
 
 
 def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset:
-    """Records of the configured source, with clips of the model's size.
+    """Records of the configured source, with clips of the model's size and pictures of `view_px` rows and columns.
 
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
-
-    Args:
-      config: source and sizes.
-      view_px: rows and columns of the object's picture.
-      context: the run.
     """
-    path = prepare_records(config.source(), context)
     clip = ClipConfig(
         frames=config.model.frames,
         image_px=config.model.image_px,
         view_px=view_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
     )
-    return open_dataset(path, clip, config.grpo_share, config.clip_memory_gib, config.read_threads)
+    path = prepare_records(config, context)
+    return open_dataset(path, clip, GRPO_SHARE, config.clip_memory_gib, config.read_threads)
 
 
 M = TypeVar("M", bound=TouchConfig)

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-
 from experiments.paper.conflict_metrics import (
     TouchQuestions,
     concluded,
@@ -14,6 +13,7 @@ from experiments.paper.conflict_metrics import (
     revision_share,
     touch_gain,
 )
+
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments.study.test_study import TEST, answers_about
 from touchr1_jax.bench.grounding import CONTROLS

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from experiments.paper.eval_variants import mean_tokens, swap_objects
+
 from experiments.paper.feature_baselines import (
     CELLS,
     ContactFeatures,

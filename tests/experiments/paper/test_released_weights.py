@@ -4,8 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-from experiments.core.loops import KEPT
 from experiments.paper.released_weights import (
     TOUCH_FILE,
     file_fingerprint,
@@ -15,6 +13,8 @@ from experiments.paper.released_weights import (
     require_same,
     write_policy,
 )
+
+from experiments.core.loops import KEPT
 from experiments.paper.tiny_checkpoint import published_config
 from experiments.paper.touch_r1 import ARM
 from experiments.study.study import BLIND, SFT
