@@ -1,4 +1,7 @@
-"""Measurements of an encoder on held-out contacts: skill of its predictions, linear probes, rank; with intervals."""
+"""Recordings for encoders, and measurements on held-out contacts: skill, linear probes, rank; with intervals.
+
+The scenes differ from those of the later stages, and are split by object.
+"""
 
 import dataclasses
 import functools
@@ -10,8 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
+from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
-from sensors_io.schema import ATTRIBUTES
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import ATTRIBUTES, Flag
 from touchr1_jax import masked
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
@@ -41,12 +47,35 @@ RANK_ROWS = 4096
 RESAMPLES = 2000
 """Resamples of each interval: the error of its ends is about a tenth of its width."""
 
+STAGE_ONE_SEED = 1
+"""Seed of the scenes of stage 1: its objects differ from those of seed 0, on which later stages train and test."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StageOneDataConfig(SourceConfig):
+    """The recordings, and the largest number of labelled contacts to fit the probes on."""
+
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1, seed=STAGE_ONE_SEED)
+    probe_fit: int = 1680
+    probe: ProbeConfig = ProbeConfig()
+
+
+def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
+    """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
+    clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
+    return open_dataset(prepare_records(config, context), clip, grpo_share=0.5)
+
+
+def training_rows(data: Dataset) -> np.ndarray:
+    """Contacts of all training objects, ascending; all are used, since no later stage shares these scenes."""
+    return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HeldOutContacts:
     """Contacts to measure on: probes are fitted on `fit_rows`, everything is measured on `read_rows`.
 
-    `label` int32 [contact, A] and `objects` [contact] are of the whole store.
+    `label` int32 [contact, A] is of the whole store.
     """
 
     store: Contacts
@@ -54,8 +83,7 @@ class HeldOutContacts:
     fit_rows: np.ndarray
     read_rows: np.ndarray
     label: np.ndarray
-    objects: np.ndarray
-    probe: ProbeConfig = ProbeConfig()
+    probe: ProbeConfig
 
     @property
     def rows(self) -> np.ndarray:
@@ -67,10 +95,36 @@ class HeldOutContacts:
         """True for the rows to fit on, bool [fit + read]."""
         return np.arange(len(self.rows)) < len(self.fit_rows)
 
-    def probe_right(self, features: np.ndarray) -> np.ndarray:
-        """True where a linear probe on features [fit + read, D] is right, bool [read, 3]."""
+    def probe_right(self, latent: np.ndarray, exists: np.ndarray) -> np.ndarray:
+        """True where a linear probe on the latents of all contacts is right, bool [read, 3]."""
         label = self.label[self.rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
-        return probe_right(features, label, self.fitted, self.probe)
+        return probe_right(np.asarray(contact_features(latent, exists)), label, self.fitted, self.probe)
+
+    def encode(self, encode: Callable[[TouchBatch], dict[str, Any]], context: Context) -> dict[str, np.ndarray]:
+        """Results of all rows on the host, in their order; every call has the same number of contacts."""
+        rows, parts = self.rows, []
+        padded = rows[np.minimum(np.arange(-(-len(rows) // BATCH) * BATCH), len(rows) - 1)]
+        order: dict[str, Any] = {"batch_size": BATCH, "seed": 0, "shuffle": False, "repeat": False}
+        with context.progress("encoding", len(padded)) as advance:
+            for element in clip_batches(self.store, padded, self.clip, **order):
+                parts.append(jax.device_get(encode(touch_batch(element))))
+                advance(BATCH)
+        return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
+
+
+def held_out_contacts(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
+    """Contacts of a part ("val" for choosing, "test" for reporting) to measure on, and training contacts to fit on.
+
+    `fit` is another number of contacts to fit on than the configured one.
+    """
+    return HeldOutContacts(
+        store=data.store,
+        clip=data.clip,
+        fit_rows=training_rows(data)[: config.probe_fit if fit is None else fit],
+        read_rows=data.parts[part],
+        label=data.label,
+        probe=config.probe,
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,7 +133,7 @@ class EncoderAssessment:
 
     Args:
       error, copied, constant: [n] mean error of the prediction, of the last latent, of each step's mean latent.
-      right: [n, 3] whether the probe is right about hardness, roughness, protrusion.
+      right: [n, 3], true where the probe is right about hardness, roughness, protrusion.
       told_apart: spread between contacts over the size of the latents.
       flat_share: share of latent dimensions that hardly vary between contacts.
       rank_share: effective rank over width.
@@ -106,9 +160,7 @@ class EncoderAssessment:
             "skill_over_mean": skill_over(self.constant),
             **{f"probe_{name}": float(100 * self.right[:, a].mean()) for a, name in enumerate(ORDINAL)},
             "probe": self.accuracy,
-            "told_apart": self.told_apart,
-            "flat_share": self.flat_share,
-            "rank_share": self.rank_share,
+            **{name: getattr(self, name) for name in ("told_apart", "flat_share", "rank_share")},
         }
 
 
@@ -117,8 +169,7 @@ def assess(
 ) -> EncoderAssessment:
     """Measure the averaged encoder and the predictor; all streams that exist are shown."""
     compiled, fitted = _predict(networks), held_out.fitted
-    encode = lambda batch: compiled(state.params, state.target, batch)
-    found = encode_rows(encode, held_out.store, held_out.rows, held_out.clip, context)
+    found = held_out.encode(lambda batch: compiled(state.params, state.target, batch), context)
     goal, latent, exists = found["goal"], found["latent"], found["exists"]
     both = (exists[:, :, 1:] & exists[:, :, :-1])[..., None, None]
     mean = np.asarray(masked.mean(goal[fitted], exists[fitted][..., None, None], 0))
@@ -130,7 +181,7 @@ def assess(
         error=found["error"][~fitted],
         copied=found["copied"][~fitted],
         constant=np.asarray(constant),
-        right=held_out.probe_right(np.asarray(contact_features(latent, exists))),
+        right=held_out.probe_right(latent, exists),
         told_apart=float(told_apart(latent, exists)),
         flat_share=float(jnp.mean(spread < FLAT)),
         rank_share=float(rank_me(jnp.asarray(rows[chosen]))) / rows.shape[1],
@@ -164,25 +215,7 @@ def probe_encoder(networks: DynamicsConfig, encoder: Params, held_out: HeldOutCo
         exists = steps_of(batch, networks.encoder.frames_per_step).exists
         return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
 
-    found = encode_rows(jax.jit(encode), held_out.store, held_out.rows, held_out.clip, context)
-    return held_out.probe_right(np.asarray(contact_features(found["latent"], found["exists"])))
-
-
-def encode_rows(
-    encode: Callable[[TouchBatch], dict[str, Any]],
-    store: Contacts,
-    rows: np.ndarray,
-    clip: ClipConfig,
-    context: Context,
-) -> dict[str, np.ndarray]:
-    """Results of all rows on the host, in their order; every call has the same number of contacts."""
-    padded = rows[np.minimum(np.arange(-(-len(rows) // BATCH) * BATCH), len(rows) - 1)]
-    parts = []
-    with context.progress("encoding", len(padded)) as advance:
-        for element in clip_batches(store, padded, clip, batch_size=BATCH, seed=0, shuffle=False, repeat=False):
-            parts.append(jax.device_get(encode(touch_batch(element))))
-            advance(BATCH)
-    return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
+    return held_out.probe_right(**held_out.encode(jax.jit(encode), context))
 
 
 def points(values: np.ndarray, objects: np.ndarray) -> Interval:

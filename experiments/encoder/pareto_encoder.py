@@ -24,11 +24,17 @@ import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
-from experiments.encoder.data import StageOneDataConfig, held_out_contacts, open_touch, training_rows
-from experiments.encoder.held_out import points, probe_encoder
+from experiments.encoder.held_out import (
+    StageOneDataConfig,
+    held_out_contacts,
+    open_touch,
+    points,
+    probe_encoder,
+    training_rows,
+)
 from experiments.encoder.pretrain import PretrainConfig, clip_of, pretrain
 from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
@@ -63,7 +69,7 @@ class MeasuredVariant:
 
     Args:
       variant: the encoder.
-      choosing: whether its probes are right about the validation contacts, bool [m, 3].
+      choosing: true where its probes are right about the validation contacts, bool [m, 3].
       right: the same about the test contacts, bool [n, 3].
       seconds: of a batch of `TIMED` prompts.
       gflop: of it.
@@ -180,21 +186,19 @@ def report(
             f"Its arithmetic runs at {share:.0%} of the {peak:.0f} Gflop/s of a matrix product on the same cores.",
         ),
         requirements=(
-            Requirement(
-                name=f"forward, '{best.variant.name}'",
-                measured=best.rate,
-                bound=LEAST_RATE,
-                better="higher",
-                unit="prompts/s",
-                note=f"8 frames × 4 sensors at 112², batches of {TIMED}; matrix products at {peak:.0f} Gflop/s",
+            at_least(
+                f"forward, '{best.variant.name}'",
+                best.rate,
+                LEAST_RATE,
+                "prompts/s",
+                f"8 frames × 4 sensors at 112², batches of {TIMED}; matrix products at {peak:.0f} Gflop/s",
             ),
-            Requirement(
-                name="probes below 256 tokens a stream",
-                measured=lost.mean,
-                bound=MOST_LOSS,
-                better="lower",
-                unit="points",
-                note=f"paired interval over objects {bounds(lost.low, lost.high, '.1f')}",
+            at_most(
+                "probes below 256 tokens a stream",
+                lost.mean,
+                MOST_LOSS,
+                "points",
+                f"paired interval over objects {bounds(lost.low, lost.high, '.1f')}",
             ),
         ),
         tables=(variant_table(measured, losses, peak), where),
@@ -253,14 +257,7 @@ def variant_table(measured: Mapping[str, MeasuredVariant], losses: Mapping[str, 
 def part_table(
     best: MeasuredVariant, pieces: Mapping[str, CompiledProgram], spent: Mapping[str, float], peak: float
 ) -> Table:
-    """Time and arithmetic that each part adds to those before it.
-
-    Args:
-      best: the encoder.
-      pieces: programs that each do one thing more than the one before.
-      spent: their seconds.
-      peak: Gflop/s of a matrix product.
-    """
+    """Time and arithmetic that each part adds to those before it; `spent` are seconds of `pieces`."""
     rows: list[dict[str, Cell]] = []
     before_s = before_gflop = 0.0
     total = list(spent.values())[-1]

@@ -11,7 +11,6 @@ import optax
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.encoder.held_out import HeldOutContacts, assess
-from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.pretrained import PretrainedEncoder
@@ -41,44 +40,23 @@ class PretrainConfig:
     frames_kept: int | None = None
     """Number of these frames that are read, the most salient ones; all by default."""
     image_px: int = 112
-    full_share: float = 0.5
-    """Share of contacts that are predicted from all their streams; the others from a random subset."""
-    variance: float = 1.0
-    covariance: float = 0.04
-    ema: float = 0.99
     steps: int = 450
     batch_size: int = 32
     probe_every: int = 150
     """Steps between held-out measurements, and between checkpoints."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
-    augment: AugmentConfig = AugmentConfig()
 
     def dynamics(self, sensors: int) -> DynamicsConfig:
         """The networks for this number of streams."""
         encoder = dataclasses.replace(self.encoder, sensors=sensors)
-        return DynamicsConfig(
-            encoder=encoder, predictor=self.predictor, full_share=self.full_share, frames_kept=self.frames_kept
-        )
-
-    def guards(self) -> Guards:
-        """The terms that keep the latents from collapsing."""
-        return Guards(variance=self.variance, covariance=self.covariance, ema=self.ema)
+        return DynamicsConfig(encoder=encoder, predictor=self.predictor, frames_kept=self.frames_kept)
 
 
 class ClipFeed(Feed):
     """Clips in random order, without end."""
 
-    def __init__(
-        self,
-        store: Contacts,
-        rows: np.ndarray,
-        clip: ClipConfig,
-        *,
-        batch_size: int,
-        seed: int,
-        augment: AugmentConfig | None = None,
-    ) -> None:
-        super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed, augment=augment), seed)
+    def __init__(self, store: Contacts, rows: np.ndarray, clip: ClipConfig, *, batch_size: int, seed: int) -> None:
+        super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed), seed)
 
     def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch:
         """The clips unchanged."""
@@ -106,18 +84,16 @@ def pretrain(
 
     Args:
       config: networks and training.
-      store: source of the contacts.
-      rows: contacts to train on.
+      store, rows: the contacts to train on.
       clip: sensors and flags; number and size of the frames are the config's.
-      context: the run.
-      stage: name of the stage, `PHASE/SEED`.
+      context, stage: the run, and the name of the stage, `PHASE/SEED`.
       seed: of parameters and order.
       held_out: contacts to measure on every `probe_every` steps; nothing is measured by default.
     """
     clip = clip_of(config, clip)
-    feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed, augment=config.augment)
+    feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed)
     networks = config.dynamics(len(clip.sensors))
-    _, step = dynamics_program(networks, config.optimizer, config.steps, config.guards())
+    _, step = dynamics_program(networks, config.optimizer, config.steps)
     state = untrained(config, store, rows, clip, seed)
     measure = functools.partial(_measure, networks, context, f"probe/{stage.rpartition('/')[2]}", held_out)
     measure(state, 0)
@@ -139,7 +115,7 @@ def encoder_of(
 def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: ClipConfig, seed: int) -> DynamicsState:
     """The state before training; its target is an untrained encoder."""
     networks = config.dynamics(len(clip.sensors))
-    optimizer, _ = dynamics_program(networks, config.optimizer, config.steps, config.guards())
+    optimizer, _ = dynamics_program(networks, config.optimizer, config.steps)
     one = next(iter(clip_batches(store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
     start = jax.jit(lambda key, batch: start_dynamics(networks, optimizer, key, batch))
     # committed to the device, as a restored state is: otherwise the step would be compiled twice
@@ -149,11 +125,11 @@ def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: C
 
 @functools.cache
 def dynamics_program(
-    networks: DynamicsConfig, optimizer: OptimizerConfig, steps: int, guards: Guards
+    networks: DynamicsConfig, optimizer: OptimizerConfig, steps: int
 ) -> tuple[optax.GradientTransformation, DynamicsStep]:
-    """Optimizer and compiled step, made once for all seeds."""
+    """Optimizer and compiled step with all guards against collapse, made once for all seeds."""
     made = make_optimizer(optimizer, steps)
-    return made, make_dynamics_step(networks, made, guards)
+    return made, make_dynamics_step(networks, made, Guards())
 
 
 def _measure(

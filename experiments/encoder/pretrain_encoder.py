@@ -27,11 +27,19 @@ import numpy as np
 from experiments.core.artifacts import write_bytes
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context, read_metrics
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.data import StageOneDataConfig, held_out_contacts, open_touch, training_rows
-from experiments.encoder.held_out import EncoderAssessment, assess, points, skill
+from experiments.encoder.held_out import (
+    EncoderAssessment,
+    StageOneDataConfig,
+    assess,
+    held_out_contacts,
+    open_touch,
+    points,
+    skill,
+    training_rows,
+)
 from experiments.encoder.pretrain import PretrainConfig, clip_of, encoder_of, pretrain, untrained
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
@@ -73,6 +81,7 @@ def run(config: PretrainEncoderConfig, context: Context) -> Results:
     objects = data.object_ids[data.parts["test"]]
     copied, constant = (skill(after.error, reference, objects) for reference in (after.copied, after.constant))
     lead = points(after.right.astype(float) - before.right, objects)
+    span = bounds(lead.low, lead.high, ".1f")
     return Results(
         verdict=(
             f"On unseen objects the predicted latents have a skill of {interval(copied, '.2f')} over the last ones, "
@@ -81,21 +90,10 @@ def run(config: PretrainEncoderConfig, context: Context) -> Results:
             f"{interval(lead, '+.1f')} points.",
         ),
         requirements=(
-            Requirement(
-                name="skill over copy-last",
-                measured=copied.low,
-                bound=LEAST_SKILL,
-                better="higher",
-                note="lower end of the 95 % interval over objects",
+            at_least(
+                "skill over copy-last", copied.low, LEAST_SKILL, note="lower end of the 95 % interval over objects"
             ),
-            Requirement(
-                name="probes over a random encoder",
-                measured=lead.mean,
-                bound=LEAST_LEAD,
-                better="higher",
-                unit="points",
-                note=f"interval over objects {bounds(lead.low, lead.high, '.1f')}",
-            ),
+            at_least("probes over a random encoder", lead.mean, LEAST_LEAD, "points", f"interval over objects {span}"),
         ),
         tables=(probe_table(before, after, objects),),
         pictures=(

@@ -25,11 +25,10 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.core.pictures import image_grid
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.data import StageOneDataConfig, open_touch, training_rows
-from experiments.encoder.held_out import skill
+from experiments.encoder.held_out import StageOneDataConfig, open_touch, skill, training_rows
 from experiments.encoder.pretrain import ClipFeed
 from experiments.encoder.video_scoring import (
     COPY,
@@ -194,10 +193,7 @@ def report(
             f"The picture of the object reduces the error {longest} frames ahead by {vision.mean:.1%} "
             f"{bounds(vision.low, vision.high, '.3f')}.",
         ),
-        requirements=tuple(
-            Requirement(name=name, measured=found.low, bound=0.0, better="higher", note=note)
-            for name, found in required.items()
-        ),
+        requirements=tuple(at_least(name, found.low, 0.0, note=note) for name, found in required.items()),
         tables=(score_table(config, scores, skills), paper_table(config, scores), sensor_table(config, data, scores)),
         pictures=(
             Picture(

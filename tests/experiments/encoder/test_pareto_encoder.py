@@ -7,7 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import pareto_encoder
-from experiments.encoder.data import StageOneDataConfig
+from experiments.encoder.held_out import StageOneDataConfig
 from experiments.encoder.pareto_encoder import MeasuredVariant, choose, loss, part_table
 from experiments.encoder.pretrain import PretrainConfig
 from experiments.encoder.speed import CompiledProgram

@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain_encoder
-from experiments.encoder.data import StageOneDataConfig, held_out_contacts
+from experiments.encoder.held_out import StageOneDataConfig, held_out_contacts
 from experiments.encoder.pretrain import PretrainConfig, pretrain
 from experiments.study.stages import run_sft
 from experiments.study.training import starting_model

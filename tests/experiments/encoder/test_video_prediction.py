@@ -7,7 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import video_prediction
-from experiments.encoder.data import StageOneDataConfig
+from experiments.encoder.held_out import StageOneDataConfig
 from experiments.encoder.video_prediction import TOUCH, VISION, VideoTrainingConfig
 from experiments.encoder.video_scoring import COPY, MEAN, FrameScores, mean_frames
 from sensors_io.pipeline import clip_batches

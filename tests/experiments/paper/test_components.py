@@ -8,13 +8,13 @@ import pytest
 from experiments.paper.component_effects import (
     FOUR,
     LADDER_METRICS,
+    ComponentComparison,
     ComponentStep,
     component_effects,
-    find_effect,
-    pooled,
 )
 from experiments.paper.components import COMPONENTS, PUBLISHED, published_steps
 from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
+from experiments.study.estimates import pooled
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.rewards import make_rewards, uniform_prior
 
@@ -43,8 +43,9 @@ def test_an_effect_is_the_mean_difference_of_paired_seeds():
     assert omae.seeds.high - omae.seeds.mean == pytest.approx(4.302653 * 0.2 / np.sqrt(3), rel=1e-5)
     assert [e.published for e in found] == [-0.1, 5.0, 2.0]
     assert [e.metric.metric for e in found] == ["omae", "csc", FOUR]
-    assert find_effect(found, "b", "csc") is csc
-    assert find_effect(found, "c", "csc") is None
+    comparison = ComponentComparison(estimates={}, effects=found, failures={})
+    assert comparison.effect("b", "csc") is csc
+    assert comparison.effect("c", "csc") is None
     assert four is not csc
 
 

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from experiments.paper.eval_variants import mean_tokens, swap_objects
 
 from experiments.paper.feature_baselines import (
     CELLS,
@@ -14,6 +13,7 @@ from experiments.paper.feature_baselines import (
     LabelledFeatures,
     field_features,
     linear_probe,
+    mean_tokens,
     nearest,
     other_objects,
     picture_features,
@@ -154,13 +154,3 @@ def test_absent_tokens_do_not_count():
     assert np.allclose(found.x[0, 0], encoded.touch[0, 0, 0], atol=1e-6)
     assert np.allclose(found.x[1, 2], encoded.touch[1, 2].mean(0), atol=1e-6)
     assert found.present.tolist() == [[True] * 4, [True] * 4, [False] * 4]
-
-
-def test_swapped_touch_is_whole_and_of_another_object():
-    encoded = tiny.features(4)
-    objects = np.array(["a", "a", "b", "c"])
-    swapped = swap_objects(encoded, objects, 0)
-    for i in range(4):
-        (source,) = (j for j in range(4) if np.array_equal(swapped.touch[i], encoded.touch[j]))
-        assert objects[source] != objects[i]
-    assert np.array_equal(swapped.view, encoded.view)

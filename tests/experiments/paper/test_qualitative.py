@@ -1,9 +1,9 @@
 """The cases of answers and the bench's items that are shown, by hand."""
 
 import numpy as np
-from experiments.paper.conflict_metrics import TouchQuestions
 
 from experiments.paper.qualitative import Conclusions, answer_cases, first_of, item_examples
+from experiments.paper.touch_gain import TouchQuestions
 from touchr1_jax.bench.items import Ask, Touch
 from touchr1_jax.training.evaluation import Evaluation
 

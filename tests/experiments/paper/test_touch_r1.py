@@ -27,7 +27,7 @@ from touchr1_jax.models.load import Load
     [
         ({"sft": StudySFT()}, r"sft\.lora_rank is 0: must be at least 1"),
         ({"blind": StudySFT()}, r"blind\.lora_rank is 0: must be at least 1"),
-        ({"grpo_lora_rank": 0}, "grpo_lora_rank is 0: must be at least 1, released towers stand still"),
+        ({"grpo_lora_rank": 0}, "grpo_lora_rank is 0: must be at least 1, released towers are frozen"),
         (
             {"model": dataclasses.replace(DEFAULT.model, dtype="float32")},
             r"grpo\.bfloat16 is True: must be False for weights in float32; set both alike",
@@ -52,7 +52,7 @@ def test_without_weights_there_is_nothing_to_train(tmp_path, capsys):
     assert refused(tmp_path) == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "WeightsError: weights is None: must be the folder of a released Qwen2.5-VL" in said
-    assert "say --weights DIR, or --scale smoke" in said
+    assert "pass --weights DIR, or --scale smoke" in said
     assert not (tmp_path / "data" / "scenes").exists()
 
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.study.scores import bench_answers
 from tests.experiments import tiny
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.rollout import GreedyAnswers
@@ -133,12 +132,3 @@ def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(policy
 def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(policy):
     features = dataclasses.replace(tiny.features(1), stream_mask=np.zeros((1, 4), bool))
     assert evaluate_policy(policy, {"decoder": {}}, features, LABEL[:1], answer=felt_sum).alone is None
-
-
-def test_the_answers_are_what_the_metrics_read(said):
-    reward = np.arange(len(said.contact), dtype=float)
-    read = bench_answers(said, reward)
-    assert read.reward is reward
-    assert np.array_equal(read.conclude, said.parsed.conclude)
-    assert np.array_equal(read.perceive, said.parsed.perceive)
-    assert np.array_equal(read.label, said.label)

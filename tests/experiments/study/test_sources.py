@@ -9,11 +9,10 @@ from experiments.core.context import Context
 from experiments.study import sources
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
-from sensors_io.records import RecordsExistError
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 
-GENERATED = SourceConfig(kind="generated", directory=None, scenes=tiny.SCENES, physiclear=PhysiclearConfig())
+GENERATED = SourceConfig(scenes=tiny.SCENES)
 
 
 @pytest.fixture
@@ -32,17 +31,17 @@ def imported(monkeypatch):
 
 def test_generated_scenes_take_no_directory(tmp_path):
     with pytest.raises(ValueError, match=f"data_dir is {tmp_path}: data 'generated' takes no data_dir: drop it"):
-        dataclasses.replace(GENERATED, directory=tmp_path)
+        dataclasses.replace(GENERATED, data_dir=tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["physiclear", "records"])
 def test_recordings_need_a_directory(kind):
     with pytest.raises(ValueError, match=f"data_dir is None: data '{kind}' needs data_dir"):
-        dataclasses.replace(GENERATED, kind=kind)
+        dataclasses.replace(GENERATED, data=kind)
 
 
 def test_records_are_taken_as_they_are(records, context):
-    config = dataclasses.replace(GENERATED, kind="records", directory=records)
+    config = dataclasses.replace(GENERATED, data="records", data_dir=records)
     assert prepare_records(config, context) == records
     assert context.timing() == {}
 
@@ -66,20 +65,11 @@ def test_other_scenes_lie_elsewhere(monkeypatch, context):
     assert len(set(made)) == 3
 
 
-def test_a_directory_of_other_records_is_not_mixed_with(monkeypatch, cache_dir, tmp_path):
-    monkeypatch.setattr(sources, "config_hash", lambda config: config_hash(tiny.SCENES))
-    other = dataclasses.replace(GENERATED, scenes=dataclasses.replace(tiny.SCENES, seed=1))
-    context = Context(tmp_path, cache_dir, Console(quiet=True))
-    with pytest.raises(RecordsExistError, match="made by config"):
-        prepare_records(other, context)
-    context.close()
-
-
 def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, console, imported):
-    first = dataclasses.replace(GENERATED, kind="physiclear", directory=tmp_path / "a")
+    first = dataclasses.replace(GENERATED, data="physiclear", data_dir=tmp_path / "a")
     other = dataclasses.replace(first, physiclear=PhysiclearConfig(height=60))
-    elsewhere = dataclasses.replace(first, directory=tmp_path / "b")
-    roundabout = dataclasses.replace(first, directory=tmp_path / "b" / ".." / "a")
+    elsewhere = dataclasses.replace(first, data_dir=tmp_path / "b")
+    roundabout = dataclasses.replace(first, data_dir=tmp_path / "b" / ".." / "a")
     paths = [prepare_records(config, context) for config in (first, other, elsewhere, roundabout)]
     assert len(set(paths)) == 3
     assert paths[3] == paths[0]

@@ -1,15 +1,21 @@
-"""Evidence of the contacts of a study."""
+"""Evidence of the contacts of a study; SFT in rows and by adapters: the same policy, or a change of low rank."""
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
-from experiments.study.stages import ProbeFeatures, gather_evidence
+from experiments.core.context import Context, read_metrics
+from experiments.study.stages import ProbeFeatures, StudySFT, gather_evidence, run_sft
 from sensors_io.schema import LEVELS
+from tests.experiments import tiny
 from touchr1_jax.training.linear_probe import ProbeConfig
 
 PROBE = ProbeConfig(folds=2, iterations=4)
+CONFIG = StudySFT(steps=3, batch_size=4)
+WIDTH = 128
 
 
 @pytest.fixture(scope="module")
@@ -24,17 +30,17 @@ def probed(data):
     return ProbeFeatures(streams=streams, present=present, force=np.zeros((n, 1), np.float32))
 
 
-def test_evidence_of_what_was_felt_is_a_distribution_and_of_the_rest_nothing(data, probed, context):
+def test_evidence_of_recorded_touch_is_a_distribution_and_of_the_rest_nothing(data, probed, context):
     evidence = gather_evidence(data, probed, PROBE, context)
     sft = np.isin(np.arange(len(data.store)), data.parts["sft"])
     for a, levels in enumerate(LEVELS.values()):
         assert (evidence[:, :, a, levels:] == -np.inf).all()
         for s in (0, 1):
-            felt = sft & probed.present[:, s]
+            recorded = sft & probed.present[:, s]
             known = evidence[:, s, a, :levels]
-            np.testing.assert_allclose(np.exp(known[felt]).sum(-1), 1, atol=1e-5)
-            assert np.ptp(known[felt], axis=-1).min() > 0
-            assert (known[~felt] == 0).all()
+            np.testing.assert_allclose(np.exp(known[recorded]).sum(-1), 1, atol=1e-5)
+            assert np.ptp(known[recorded], axis=-1).min() > 0
+            assert (known[~recorded] == 0).all()
         assert (evidence[:, 3, a, :levels] == 0).all()  # sensor 3 was never there
         assert (evidence[:, 2, a, :levels] == 0).all()  # one object cannot be held out
 
@@ -44,3 +50,80 @@ def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed, contex
     evidence = gather_evidence(dataclasses.replace(data, label=label), probed, PROBE, context)
     assert (evidence[:, :, 0, :3] == 0).all()
     assert (evidence[data.parts["sft"][1:], 0, 1, :3] != 0).all()
+
+
+@pytest.fixture(scope="module")
+def train(policy, data, tmp_path_factory):
+    """Parameters after SFT with some settings changed, on equal evidence for all levels, and its losses."""
+    evidence = np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
+
+    def run(**changes):
+        context = Context(tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("cache"), Console(quiet=True))
+        try:
+            config = dataclasses.replace(CONFIG, **changes)
+            params = run_sft(policy, data, evidence, config, context, seed=0, stage="sft/0")
+            return params, [line["loss"] for line in read_metrics(context.directory)]
+        finally:
+            context.close()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def padded(train):
+    return train()
+
+
+def same(found, expected) -> None:
+    """Losses of all steps; Adam makes steps of the rounding of gradients that are zero, so parameters differ."""
+    assert len(expected) == CONFIG.steps
+    assert np.ptp(expected) > 1e-3
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_rows_train_the_policy_that_padding_trains(train, padded):
+    found, losses = train(pack=WIDTH)
+    same(losses, padded[1])
+    assert jax.tree.structure(found) == jax.tree.structure(padded[0])
+
+
+def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest_also_from_rows(train, padded, policy, data):
+    found, losses = train(lora_rank=2)
+    assert jax.tree.structure(found) == jax.tree.structure(padded[0])
+    first = policy.init(0, tiny.one_batch(data))
+    before, after = first["decoder"], found["decoder"]
+    np.testing.assert_array_equal(after["embedding"]["embedding"], before["embedding"]["embedding"])
+    for name in ("q_proj", "o_proj"):
+        change = np.asarray(after["layers_0"][name]["kernel"] - before["layers_0"][name]["kernel"])
+        sizes = np.linalg.svd(change, compute_uv=False)
+        assert sizes[0] > 0
+        assert sizes[2] < 1e-2 * sizes[0]  # the remainder is the rounding of their sum
+    assert (np.asarray(found["tactile_out"]["kernel"]) != np.asarray(first["tactile_out"]["kernel"])).any()
+    same(train(lora_rank=2, pack=WIDTH)[1], losses)
+
+
+def test_a_curriculum_is_a_share_of_the_steps(train, padded):
+    """Here of all of them: it learns from other questions."""
+    assert train(curriculum=1.0)[1][0] != padded[1][0]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("pack", -1, "pack is -1: must be at least 0"),
+        ("lora_rank", -1, "lora_rank is -1: must be at least 0"),
+        ("curriculum", 1.5, r"curriculum is 1\.5: must lie in 0 … 1"),
+    ],
+)
+def test_options_of_sft_keep_their_ranges(field, value, message):
+    with pytest.raises(ValueError, match=message):
+        StudySFT(**{field: value})
+
+
+def test_devices_share_a_micro_batch():
+    config = StudySFT(batch_size=16, micro_contacts=8, pack=WIDTH)
+    packing = config.packing(4)
+    assert (packing.width, packing.contacts, packing.micro_batches) == (WIDTH, 2, 2)
+    assert StudySFT().packing(3) is None
+    with pytest.raises(ValueError, match="micro_contacts is 8: must be a multiple of the 3 devices"):
+        config.packing(3)

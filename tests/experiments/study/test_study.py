@@ -1,4 +1,4 @@
-"""Answers on disk, and the answers that need no policy."""
+"""Answers on disk, answers that need no policy, and settings, rewards and sizes that are refused before any data."""
 
 import dataclasses
 
@@ -6,16 +6,27 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.core.runner import main
 from experiments.study.baselines import baselines, constant_answers, joint_mode, level_answers
-from experiments.study.scores import bench_answers, score, score_study
+from experiments.study.scores import PUBLISHED, score, score_study
 from experiments.study.stages import ProbeFeatures
-from experiments.study.study import SFT, EvalVariant, Study, StudyConfig, load_answers, run_study, save_answers
-from sensors_io.schema import ATTRIBUTES
+from experiments.study.study import (
+    SFT,
+    EvalVariant,
+    Study,
+    StudyConfig,
+    check_arms,
+    load_answers,
+    run_study,
+    save_answers,
+)
+from sensors_io.schema import SENSORS
 from tests.experiments import tiny
-from touchr1_jax.bench.metrics import evaluate
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import ModelConfig
+from touchr1_jax.models.touch_policy import ModelConfig, check_model
+from touchr1_jax.rewards import Reward, RewardError
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Parsed
@@ -68,9 +79,8 @@ def study(data, policy):
     )
 
 
-def table(study: Study, said: Evaluation) -> dict[str, float]:
-    scores = evaluate(bench_answers(said, np.zeros(len(said.contact))), ATTRIBUTES, study.policy.levels)
-    return {name: value.mean() for name, value in scores.items()}
+def table(study: Study, answers: Evaluation) -> dict[str, float]:
+    return {name: value.mean() for name, value in score(study, answers).items()}
 
 
 @pytest.mark.parametrize("alone", [True, False])
@@ -121,6 +131,7 @@ def test_a_constant_agrees_with_itself_and_is_right_where_its_pairs_are(study):
 def test_levels_are_given_contact_by_contact(study):
     scores = table(study, constant_answers(study, TEST))
     assert (scores["acc"], scores["mat_acc"], scores["omae"], scores["csc"]) == (100, 100, 0, 100)
+    assert scores["reward"] == pytest.approx(1)  # the whole published reward
 
 
 def test_every_baseline_answers_the_questions_of_the_policies(study):
@@ -143,10 +154,6 @@ def test_force_that_gives_hardness_away_is_found_out(study):
 def test_data_without_forces_has_no_force_baseline(study):
     silent = dataclasses.replace(study, data=dataclasses.replace(study.data, has_force=False))
     assert "force_only" not in baselines(silent)
-
-
-def test_a_right_answer_earns_the_whole_published_reward(study):
-    assert score(study, constant_answers(study, TEST))["reward"].mean() == pytest.approx(1)
 
 
 def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
@@ -180,15 +187,91 @@ def test_answers_by_single_sensors_are_their_own(study):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("model", "message"),
     [
-        ({"seeds": 0}, "seeds is 0: must be at least 1"),
-        ({"grpo_attributes": ("hardnes",)}, r"grpo_attributes is \('hardnes',\): must be some of hardness, roughness"),
-        ({"grpo_attributes": ()}, r"grpo_attributes is \(\): must be some of"),
-        ({"model": ModelConfig(decoder=DecoderConfig(vocab_size=50))}, r"model\.decoder\.vocab_size is 50: must be 0"),
-        ({"model": ModelConfig(tactile=TactileViTConfig(sensors=2))}, r"model\.tactile\.sensors is 2: must be 0"),
+        (ModelConfig(decoder=DecoderConfig(vocab_size=50)), r"model\.decoder\.vocab_size is 50: must be 0"),
+        (ModelConfig(tactile=TactileViTConfig(sensors=2)), r"model\.tactile\.sensors is 2: must be 0"),
     ],
 )
-def test_a_study_that_makes_no_sense_is_refused(change, message):
+def test_sizes_that_the_data_determine_are_not_set(model, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(StudyConfig(), **change)
+        StudyConfig(model=model)
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [
+        (Reward(lambda p, t: p.conclude * 1.0), r"reward 'mine': value has type float32\[4\]"),
+        (Reward(lambda p, t: 1.0 / p.length), r"reward 'mine' is inf .*must be finite everywhere"),
+    ],
+)
+def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
+    check_arms({"published": PUBLISHED})
+    with pytest.raises(RewardError, match=rf"{message}.* \(in the weights of arm 'good', {{'mine': 0.5}}\)"):
+        check_arms({"good": {"mine": 0.5}}, {"mine": reward})
+    with pytest.raises(RewardError, match=r"no reward is called 'brevty'; choose from accuracy.* of arm 'mine'"):
+        check_arms({"published": PUBLISHED, "mine": {"brevty": 1.0}})
+
+
+@pytest.mark.parametrize(
+    ("part", "changes", "message"),
+    [
+        ("decoder", {"head_dim": 34}, r"no model can be built .* must be three that sum to head_dim/2 = 17"),
+        ("tactile", {"frames_per_step": 3}, r"no model can be built .*4 per stream must divide into .* steps of 3"),
+        ("tactile", {"patches_kept": 99}, r"no model can be built .* patches_kept is 99: must lie in 1\.\.16"),
+    ],
+)
+def test_sizes_that_contradict_each_other_are_named_without_data(part, changes, message):
+    model = ModelConfig()
+    check_model(dataclasses.replace(model, frames=3), SENSORS)
+    with pytest.raises(SizeError, match=message):
+        check_model(dataclasses.replace(model, **{part: dataclasses.replace(getattr(model, part), **changes)}), SENSORS)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("seeds", "0"),
+        ("grpo-steps", "-1"),
+        ("grpo.group", "1"),
+        ("grpo.micro-prompts", "0"),
+        ("grpo.learning-rate", "-1"),
+        ("grpo.final-share", "nan"),
+        ("sft.steps", "-1"),
+        ("sft.batch-size", "0"),
+        ("sft.optimizer.lr-scale", "-1"),
+        ("sft.optimizer.b2", "1"),
+        ("sft.optimizer.learning-rate", "inf"),
+        ("probe.folds", "1"),
+        ("model.tactile.num-layers", "-1"),
+        ("model.decoder.rope-theta", "0"),
+        ("scenes.seed", "-1"),
+        ("scenes.ramp-s", "0"),
+        ("scenes.solver-max-iterations", "0"),
+        ("data-dir", "somewhere"),
+    ],
+)
+def test_values_out_of_range_are_refused_before_anything_is_made(field, value, tmp_path, capsys):
+    try:
+        status = main(["ablation_ordinal", f"--{field}={value}", *places(tmp_path)])
+    except SystemExit as end:
+        status = end.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert f"{field.rpartition('.')[2].replace('-', '_')} is {value}" in error
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no archive"])
+def test_a_file_that_is_no_encoder_is_named_before_data_are_made(content, tmp_path, capsys):
+    path = tmp_path / "encoder.npz"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["ablation_ordinal", "--scale", "smoke", "--encoder", str(path), *places(tmp_path)]) == 1
+    assert f"EncoderError: encoder is {path}: " in capsys.readouterr().err
+    assert not list(tmp_path.glob("cache/scenes-*"))
+
+
+def places(home) -> list[str]:
+    return ["--runs-dir", str(home / "runs"), "--cache-dir", str(home / "cache")]

@@ -4,17 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from experiments.paper.conflict_metrics import (
-    TouchQuestions,
-    concluded,
-    contrast,
-    deceptive,
-    picture_prior,
-    revision_share,
-    touch_gain,
-)
 
+from experiments.paper.conflict import contrast, deceptive, picture_prior, revision_share
+from experiments.paper.touch_gain import TouchQuestions, concluded, swap_objects, touch_gain
 from sensors_io.schema import ATTRIBUTES
+from tests.experiments import tiny
 from tests.experiments.study.test_study import TEST, answers_about
 from touchr1_jax.bench.grounding import CONTROLS
 
@@ -56,18 +50,24 @@ def test_right_answers_revise_the_prior_and_its_copies_do_not():
     assert revision_share(QUESTIONS, [PRIOR], [PRIOR]) == 0
 
 
-@pytest.fixture(scope="module")
-def answers():
-    return answers_about(TEST)
-
-
 def with_levels(answers, level):
     conclude = np.full_like(answers.parsed.conclude, -1)
     conclude[np.arange(len(level)), answers.attribute] = level
     return dataclasses.replace(answers, parsed=dataclasses.replace(answers.parsed, conclude=conclude))
 
 
-def test_the_gain_from_touch_is_what_its_absence_costs(answers):
+def test_swapped_touch_is_whole_and_of_another_object():
+    encoded = tiny.features(4)
+    objects = np.array(["a", "a", "b", "c"])
+    swapped = swap_objects(encoded, objects, 0)
+    for i in range(4):
+        (source,) = (j for j in range(4) if np.array_equal(swapped.touch[i], encoded.touch[j]))
+        assert objects[source] != objects[i]
+    assert np.array_equal(swapped.view, encoded.view)
+
+
+def test_the_gain_from_touch_is_what_its_absence_costs():
+    answers = answers_about(TEST)
     n = np.arange(len(answers.contact))
     questions = TouchQuestions(
         attribute=answers.attribute,
