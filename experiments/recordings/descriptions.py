@@ -17,7 +17,7 @@ from experiments.recordings.descriptors import describe, families
 from experiments.recordings.touches import read_touch, touch_of_scene
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.importers.keep import ImportSourceError, Skip
-from sensors_io.importers.physiclear import PhysiclearConfig, read_labels
+from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash

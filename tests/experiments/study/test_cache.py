@@ -84,8 +84,8 @@ def grpo(policy, params, data, tmp_path):
     def run(name, weights=(("accuracy", 1.0),), moved=0.0, steps=0, seed=0):
         features = tiny.features(2)
         features = dataclasses.replace(features, touch=features.touch + moved)
-        noise = jnp.asarray(tiny.features(1, seed=1).touch)
-        contacts = EncodedContacts(features=features, label=np.zeros((2, 4), np.int32), noise=noise)
+        noise, label = jnp.asarray(tiny.features(1, seed=1).touch), np.zeros((2, 4), np.int32)
+        contacts = EncodedContacts(features=features, label=label, truth=label, noise=noise)
         loop = LoopConfig(steps=steps, save_every=1)
         arm = make_arm(policy, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
         order = {"seed": seed, "stage": "grpo/a/0", "share": True}
