@@ -23,7 +23,7 @@ from experiments.core.runner import Experiment
 from experiments.core.runs import PastRun, read_run, started
 from experiments.encoder.variants import STUDIED
 from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
-from experiments.mechanics.tangential_report import MAIN as FRICTION
+from experiments.mechanics.tangential_methods import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
 Axes = Mapping[str, Literal["lower", "higher"]]

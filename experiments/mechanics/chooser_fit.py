@@ -1,4 +1,4 @@
-"""The chooser's law, fitted: least squares of the logarithm of the error, then the margins that make it a promise."""
+"""Fit of the chooser's law: least squares of the logarithm of the error, then the margins of its promise."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ from sensors_io.scenes.chooser_law import EASY_ABOVE, SLACK, Law, Setting, log_e
 from sensors_io.scenes.chooser_survey import FEATURES
 
 RANGE = (2e-3, 0.6)
-"""Errors that the law is fitted to: what anyone asks for, and some more; the reference is good to about 1e-3."""
+"""Errors that the law is fitted to: those that anyone requests and some more; the reference is good to about 1e-3."""
 
 KEPT = 0.975
-"""Share of the scenes that keep the promise at every error asked for, when the margins are chosen: more than the 95 %
-of the promise itself, for scenes not seen yet."""
+"""Share of the scenes that keep the promise at every requested error when the margins are chosen: more than the 95 % of
+the promise itself, for unseen scenes."""
 
 _MARGINS = np.geomspace(0.5, 20, 300)
 _EASES = np.linspace(0, 0.3, 31)
@@ -27,7 +27,7 @@ _OUTLIER = 0.3  # residual, in ln ê, from which on it counts linearly
 
 
 def start() -> Law:
-    """Where a fit begins: every part falls with the grid as Hertz's slope does, whatever the scene."""
+    """The initial law of a fit: every part falls with the grid as Hertz's slope does, whatever the scene."""
     first = np.eye(len(FEATURES))[0]
     return Law(
         grid=-2 * first,
@@ -41,15 +41,15 @@ def start() -> Law:
     )
 
 
-def fit(outcomes: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
+def fit(measured: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
     """Fit the law's coefficients to measured errors; its margins are left at 1."""
-    counts = (outcomes.errors > RANGE[0]) & (outcomes.errors < RANGE[1])
+    counts = (measured.errors > RANGE[0]) & (measured.errors < RANGE[1])
     theta, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start()))
-    where, measured = np.nonzero(counts.ravel())[0], np.log(outcomes.errors[counts])
+    where, logs = np.nonzero(counts.ravel())[0], np.log(measured.errors[counts])
 
     def residual(theta: jax.Array) -> jax.Array:
-        predicted = log_error(outcomes.survey, unravel(theta), menu)
-        return jnp.concatenate([predicted.ravel()[where] - measured, _RIDGE * (theta - begin)])
+        predicted = log_error(measured.survey, unravel(theta), menu)
+        return jnp.concatenate([predicted.ravel()[where] - logs, _RIDGE * (theta - begin)])
 
     begin, jacobian = theta, jax.jit(jax.jacfwd(residual))
     residual = jax.jit(residual)
@@ -63,48 +63,47 @@ def fit(outcomes: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
     return jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
 
 
-def predict(law: Law, outcomes: MenuMeasurements, menu: tuple[Setting, ...]) -> np.ndarray:
+def predict(law: Law, measured: MenuMeasurements, menu: tuple[Setting, ...]) -> np.ndarray:
     """ê of every scene and setting, [S, T]."""
-    return np.exp(np.asarray(log_error(outcomes.survey, law, menu)))
+    return np.exp(np.asarray(log_error(measured.survey, law, menu)))
 
 
 def promised(law: Law, predicted: np.ndarray, errors: np.ndarray, asked: Sequence[float]) -> Law:
-    """The law with the least margins that keep enough promises at every error asked for.
+    """The law with the least margins that keep enough promises at every requested error.
 
     The margin is that of the smallest errors, the ease the greatest that still keeps enough, the doubt the greatest
-    that flags no more scenes than no setting meets, over all errors asked for.
+    that flags no more scenes than no setting meets, over all requested errors.
 
     Raises:
       ValueError: no margin keeps the promise.
     """
 
     def keeps(law: Law, asked: Sequence[float]) -> bool:
-        return all(kept_share(law, predicted, errors, a) >= KEPT for a in asked)
+        return all(_kept_share(law, predicted, errors, a) >= KEPT for a in asked)
 
     def flags(law: Law) -> int:
         return int(sum((~chosen(law, predicted, a)[1]).sum() for a in asked))
 
+    with_margin = lambda law, **parts: dataclasses.replace(law, **{k: np.asarray(v) for k, v in parts.items()})
     hard = [a for a in asked if a <= EASY_ABOVE] or list(asked)
-    sure = [dataclasses.replace(law, margin=np.asarray(m), doubt=np.asarray(m)) for m in _MARGINS]
-    sure = [each for each in sure if keeps(each, hard)]
-    if not sure:
+    sure = next((each for m in _MARGINS if keeps(each := with_margin(law, margin=m, doubt=m), hard)), None)
+    if sure is None:
         raise ValueError(f"no margin up to {_MARGINS[-1]} keeps {KEPT:.1%} of the promises: the law does not fit")
-    eased = [dataclasses.replace(sure[0], ease=np.asarray(e)) for e in _EASES]
-    law = next((each for each in reversed(eased) if keeps(each, asked)), sure[0])
+    law = next((each for e in _EASES[::-1] if keeps(each := with_margin(sure, ease=e), asked)), sure)
     unreachable = sum(int((errors > a).all(1).sum()) for a in asked)
-    doubted = [dataclasses.replace(law, doubt=np.asarray(d)) for d in _MARGINS if d <= law.margin]
-    return next((each for each in reversed(doubted) if flags(each) <= unreachable), doubted[0])
+    doubted = [with_margin(law, doubt=d) for d in _MARGINS[::-1] if d <= law.margin]
+    return next((each for each in doubted if flags(each) <= unreachable), doubted[-1])
 
 
-def kept_share(law: Law, predicted: np.ndarray, errors: np.ndarray, asked: float) -> float:
-    """Share of the scenes promised to be met whose chosen setting errs by at most 1.5 times the error asked for."""
+def _kept_share(law: Law, predicted: np.ndarray, errors: np.ndarray, asked: float) -> float:
+    """Share of the scenes promised to be met whose chosen setting errs by at most 1.5 times the requested error."""
     index, met = chosen(law, predicted, asked)
     kept = errors[np.arange(len(errors)), index] <= SLACK * asked
     return float(kept[met].mean()) if met.any() else 1.0
 
 
 def chosen(law: Law, predicted: np.ndarray, asked: float) -> tuple[np.ndarray, np.ndarray]:
-    """`chooser_law.pick` of every scene, on the host."""
+    """Index of the setting and whether it is promised for every scene: `chooser_law.pick` on the host."""
     enough = float(margin_at(asked, law)) * predicted <= SLACK * asked
     index = np.where(enough.any(1), enough.argmax(1), predicted.argmin(1))
     return index, np.asarray(law.doubt * predicted.min(1) <= SLACK * asked)

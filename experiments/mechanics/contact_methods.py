@@ -4,8 +4,8 @@ Every method maps one scene (gap [N, N] mm, force N, gel and total compliance [M
 the gel's displacement [N, N] mm and the number of padded convolutions that it took.
 """
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,11 +21,9 @@ _MOST_ITERATIONS = 200
 ContactSolver = Callable[[Array, Array, Array, Array, float], tuple[Array, Array]]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ContactMethod:
-    """A solver and its name; `kind` is its group in the chart."""
+class ContactMethod(NamedTuple):
+    """A solver; `kind` is its group in the chart."""
 
-    name: str
     kind: str
     solve: ContactSolver
 
@@ -64,7 +62,7 @@ def blur(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> 
 
 
 def spg_plain(tolerance: float, published: bool) -> ContactSolver:
-    """Projected Barzilai–Borwein steps from a bed of springs, on the finest grid alone, without preconditioner.
+    """Projected Barzilai–Borwein steps from a bed of springs, on the finest grid only, without preconditioner.
 
     Args:
       tolerance: to stop at.
@@ -132,19 +130,18 @@ def polonsky_keer(iterations: int) -> ContactSolver:
     return solve
 
 
-def contact_methods() -> tuple[ContactMethod, ...]:
-    """The methods of the comparison, cheapest first within each kind."""
-    tolerances = ("1e-2", "1e-3", "1e-4", "1e-5")
-    method = lambda name, kind, solve: ContactMethod(name=name, kind=kind, solve=solve)
-    return (
-        method("Winkler", "no iteration", winkler_only),
-        method("blur", "no iteration", blur),
-        method("Winkler + response", "no iteration", winkler_and_response),
-        *(method(f"nested {t}", "nested SPG", spg_nested(float(t))) for t in tolerances),
-        *(method(f"plain {t}", "plain SPG", spg_plain(float(t), False)) for t in tolerances),
-        method("plain 1e-3 as published", "published stop", spg_plain(1e-3, True)),
-        method("PK-25", "Polonsky–Keer", polonsky_keer(25)),
-    )
+_TOLERANCES = ("1e-2", "1e-3", "1e-4", "1e-5")
+
+METHODS: Mapping[str, ContactMethod] = {
+    "Winkler": ContactMethod("no iteration", winkler_only),
+    "blur": ContactMethod("no iteration", blur),
+    "Winkler + response": ContactMethod("no iteration", winkler_and_response),
+    **{f"nested {t}": ContactMethod("nested SPG", spg_nested(float(t))) for t in _TOLERANCES},
+    **{f"plain {t}": ContactMethod("plain SPG", spg_plain(float(t), False)) for t in _TOLERANCES},
+    "plain 1e-3 as published": ContactMethod("published stop", spg_plain(1e-3, True)),
+    "PK-25": ContactMethod("Polonsky–Keer", polonsky_keer(25)),
+}
+"""Name → method, cheapest first within each kind."""
 
 
 def _convolve(field: Array, spectrum: Array) -> Array:

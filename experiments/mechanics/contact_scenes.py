@@ -58,12 +58,17 @@ class FailureCase:
         return GelKernels(gel=gel, body=np.zeros_like(gel), spacing_mm=spacing, thickness_mm=self.gel.thickness_mm)
 
 
+def normal_compliances(sensor: SensorModel, padded: int, spacing_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Spectra [M, M//2 + 1] of a sensor's gel and of an object of 1 MPa, mm/MPa."""
+    q = np.hypot(*layer.wave_numbers(padded, spacing_mm))
+    return layer.normal_compliance(q, sensor.gel), layer.normal_compliance(q, BODY)
+
+
 def gel_kernels(sensor: SensorModel, grid: int) -> GelKernels:
     """Kernels of a sensor on its padded grid."""
-    spacing = sensor.window_mm / grid
-    q = np.hypot(*layer.wave_numbers(press.padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm), spacing))
-    gel, body = (layer.normal_compliance(q, material) for material in (sensor.gel, BODY))
-    return GelKernels(gel=gel, body=body, spacing_mm=spacing, thickness_mm=sensor.gel.thickness_mm)
+    spacing, thickness = sensor.window_mm / grid, sensor.gel.thickness_mm
+    gel, body = normal_compliances(sensor, press.padded_size(grid, sensor.window_mm, thickness), spacing)
+    return GelKernels(gel=gel, body=body, spacing_mm=spacing, thickness_mm=thickness)
 
 
 def draw_press(rng: np.random.Generator, solid: objects.Solid) -> tuple[surface.Skin, surface.SensorPose, float]:
@@ -81,11 +86,12 @@ def sample_scenes(sensor: SensorModel, count: int, grid: int, seed: int) -> Cont
     """Draw presses of procedural objects; the same seed gives the same scenes on every grid."""
     rng = np.random.default_rng(seed)
     x = jnp.asarray((np.arange(grid) + 0.5) * sensor.window_mm / grid - sensor.window_mm / 2, jnp.float32)
+    gap_of = jax.jit(surface.gap)
     gaps, forces, moduli = [], [], []
     for _ in range(count):
         solid = objects.sample(rng, 0.0, SHORTEST_WAVE_MM)
         skin, pose, force = draw_press(rng, solid)
-        gaps.append(np.asarray(_gap(skin, pose, x)))
+        gaps.append(np.asarray(gap_of(skin, pose, x)))
         forces.append(force)
         moduli.append(solid.modulus_mpa)
     return ContactScenes(np.stack(gaps), np.array(forces, np.float32), np.array(moduli, np.float32))
@@ -123,29 +129,28 @@ def batch_solver(solve: Callable[..., Any], scenes: ContactScenes, kernels: GelK
 
 def displacement_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Relative L₂ error of each scene's displacement, [S]."""
-    return _relative(np.asarray(found, np.float64), np.asarray(true, np.float64))
+    norm = lambda field: np.linalg.norm(field.reshape(len(field), -1), axis=1)
+    found, true = np.asarray(found, np.float64), np.asarray(true, np.float64)
+    return norm(found - true) / norm(true)
 
 
 def slope_error(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Relative L₂ error of each scene's surface slope, which a photometric sensor sees, [S]."""
     slopes = lambda field: np.stack([np.gradient(np.asarray(field, np.float64), axis=axis) for axis in (1, 2)], -1)
-    return _relative(slopes(found), slopes(true))
-
-
-def _relative(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    norm = lambda field: np.linalg.norm(field.reshape(len(field), -1), axis=1)
-    return norm(found - true) / norm(true)
-
-
-_gap = jax.jit(surface.gap)
+    return displacement_error(slopes(found), slopes(true))
 
 
 # Shapes on the 16 mm window ------------------------------------------------------------------------------------------
 
 
+def pixel_centres(grid: int) -> np.ndarray:
+    """Coordinates of the pixels along one side of the window, [N] mm."""
+    return (np.arange(grid) + 0.5) * SIDE_MM / grid - SIDE_MM / 2
+
+
 def rough_sphere(rng: np.random.Generator, grid: int) -> np.ndarray:
     """Gap of a sphere with self-affine roughness, [N, N] mm."""
-    x = (np.arange(grid) + 0.5) * SIDE_MM / grid - SIDE_MM / 2
+    x = pixel_centres(grid)
     k, a, phase = (v.astype(np.float64) for v in objects.rough_waves(rng, rng.uniform(0.01, 0.06), 5 * SIDE_MM / grid))
     angle = k[:, 0, None, None] * x[None] + k[:, 1, None, None] * x[:, None] + phase[:, None, None]
     return (x[None] ** 2 + x[:, None] ** 2) / rng.uniform(20, 60) + np.sum(a[:, None, None] * np.cos(angle), 0)
@@ -159,17 +164,22 @@ def failure_suite(grid: int) -> tuple[FailureCase, ...]:
     Args:
       grid: side of the grid, a multiple of 4.
     """
-    x = (np.arange(grid) + 0.5) * SIDE_MM / grid - SIDE_MM / 2
+    x, half = pixel_centres(grid), grid // 2
     r2 = x[None] ** 2 + x[:, None] ** 2
     noise = np.random.default_rng(0).standard_normal((grid, grid))
-    gel = lambda **changes: dataclasses.replace(GEL, **changes)
     dimple = r2 / (2 * 1e3 * (2 * SIDE_MM / grid) ** 3)  # a dozen pixels at 1 mN, so flat that the gel hardly dents
+    needle = np.full((grid, grid), 5.0)  # of 2 × 2 pixels, next to a flat shoulder 0.6 mm higher up, which just touches
+    needle[:, : half - 4] = 0.6
+    needle[half - 1 : half + 1, half + 4 : half + 6] = 0.0
+    cap = 0.5 - np.sqrt(np.maximum(0.5**2 - r2, 0))
+    pin = np.where(r2 < 0.5**2, cap, 0.5 + 3 * (np.sqrt(r2) - 0.5))  # a hemisphere on a steep cone
+    gel = lambda **changes: dataclasses.replace(GEL, **changes)
     case = lambda name, gap_mm, force_n, **rest: FailureCase(name=name, gap_mm=gap_mm, force_n=force_n, **rest)
     return (
         case("kernel overflow: h = 40 mm", r2 / 16, 5.0, gel=gel(thickness_mm=40.0)),
         case("a few pixels at 1 mN", r2 / 16, 1e-3, must_flag=True),
         case("a dozen pixels at 1 mN", dimple, 1e-3),
-        case("needle beside a shoulder", _needle(grid), 2.0),
+        case("needle beside a shoulder", needle, 2.0),
         case("rough flat, 75 % contact", _waves(x, 0.03), 15.0),
         case("full pad", np.zeros((grid, grid)), 5.0),
         case("white noise", 0.1 * noise, 5.0),
@@ -179,16 +189,8 @@ def failure_suite(grid: int) -> tuple[FailureCase, ...]:
         case("tilt", r2 / 60 + 0.2 * x[None], 5.0),
         case("E = 0.01 MPa", r2 / 16, 1.0, gel=gel(modulus_mpa=0.01), must_flag=True),
         case("sphere at 20 N, strain > 0.3", r2 / 8, 20.0, must_flag=True),
-        case("pin R 0.5 mm at 5 N", _pin(r2, 0.5), 5.0, must_flag=True),
+        case("pin R 0.5 mm at 5 N", pin, 5.0, must_flag=True),
     )
-
-
-def _needle(grid: int) -> np.ndarray:
-    """A needle of 2 × 2 pixels next to a flat shoulder 0.6 mm higher up, which just touches."""
-    gap, half = np.full((grid, grid), 5.0), grid // 2
-    gap[:, : half - 4] = 0.6
-    gap[half - 1 : half + 1, half + 4 : half + 6] = 0.0
-    return gap
 
 
 def _waves(x: np.ndarray, rms_mm: float) -> np.ndarray:
@@ -198,9 +200,3 @@ def _waves(x: np.ndarray, rms_mm: float) -> np.ndarray:
     along = np.cos(angle)[:, None, None] * x[None, None] + np.sin(angle)[:, None, None] * x[None, :, None]
     height = np.cos(q[:, None, None] * along + phase[:, None, None]).sum(0)
     return height / height.std() * rms_mm
-
-
-def _pin(r2: np.ndarray, radius: float) -> np.ndarray:
-    """A hemisphere on a steep cone."""
-    cap = radius - np.sqrt(np.maximum(radius**2 - r2, 0))
-    return np.where(r2 < radius**2, cap, radius + 3 * (np.sqrt(r2) - radius))

@@ -1,14 +1,15 @@
 """Fixed features of touch and force, statistics of the true shape, and threads to compute them in.
 
 The statistics of shape set the line that touch has to exceed.  The material ties the properties of an object together,
-so its shape tells something about its hardness; roughness and protrusion are shape, so here the line is a ceiling.
+so its shape predicts its hardness in part; roughness and protrusion are shape, so for them the line is a ceiling.
 """
 
 import concurrent.futures
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Seq
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from sensors_io.scenes import surface
+from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.schedule import Slot
 from sensors_io.selection import FIELD_MM_PER_COUNT
 from touchr1_jax.models.tactile_vit import force_features
 from touchr1_jax.training.linear_probe import stream_features
@@ -37,6 +41,26 @@ HEIGHTS_MM = (0.01, 0.03, 0.1, 0.3, 1.0)
 _TINY = 1e-6  # mm; keeps logarithms of a perfectly smooth skin finite
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ContactData:
+    """n contacts: force features [n, S, E], true shape [n, G], levels [n] by property, objects [n]."""
+
+    force: np.ndarray
+    shape: np.ndarray
+    levels: dict[str, np.ndarray]
+    objects: np.ndarray
+
+
+def truth(config: SceneConfig, slots: Seq[Slot], skins: Seq[surface.Skin]) -> dict[str, Any]:
+    """The fields of `ContactData` that are known without touch."""
+    levels = [solid_of(config, slot.object_index).levels() for slot in slots]
+    return {
+        "shape": statistics(skins),
+        "levels": {name: np.array([level[name] for level in levels]) for name in levels[0]},
+        "objects": np.array([slot.object_index for slot in slots]),
+    }
+
+
 def in_threads(work: Callable[[Item], Result], items: Iterable[Item], advance: Callable[[], object]) -> list[Result]:
     """Results of all items, in their order; `advance` is called in this thread after each."""
     pool = concurrent.futures.ThreadPoolExecutor(WORKERS)
@@ -50,17 +74,20 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item], advance: C
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def features_of(pictures: UInt8[Array, "*n F H W 3"] | None, fields: UInt8[Array, "*n F h w 3"]) -> Array:
-    """Fixed summary [*n, D] of what a sensor saw, without its force: of its pictures, if any, and of its fields."""
+def features_of(
+    pictures: UInt8[Array, "*n F H W 3"] | None,
+    deformation_mm: Float[Array, "*n F h w 2"],
+    depth_mm: Float[Array, "*n F h w"],
+) -> Array:
+    """Fixed features [*n, D] of a sensor's pictures, if any, and of its fields, without its force.
+
+    Displacement and depth become a picture, 128 for none, on the scale of the clips that policies see.
+    """
+    mm = jnp.concatenate([deformation_mm, depth_mm[..., None]], -1)
+    fields = jnp.clip(jnp.round(128 + mm / FIELD_MM_PER_COUNT), 0, 255).astype(jnp.uint8)
     unknown = jnp.zeros((*fields.shape[:-3], 3))
     parts = [fields] if pictures is None else [pictures, fields]
     return jnp.concatenate([stream_features(part, unknown) for part in parts], -1)
-
-
-def field_counts(deformation_mm: Float[Array, "*n h w 2"], depth_mm: Float[Array, "*n h w"]) -> Array:
-    """Displacement and depth as a picture [*n, h, w, 3], 128 for none, on the scale of the clips that policies see."""
-    mm = jnp.concatenate([deformation_mm, depth_mm[..., None]], -1)
-    return jnp.clip(jnp.round(128 + mm / FIELD_MM_PER_COUNT), 0, 255).astype(jnp.uint8)
 
 
 def force_of(force_n: np.ndarray) -> np.ndarray:
@@ -77,42 +104,27 @@ def statistics(skins: Seq[surface.Skin]) -> np.ndarray:
     """
     spacing = WINDOW_MM / POINTS
     x = (np.arange(POINTS) + 0.5) * spacing - WINDOW_MM / 2
-    basis = _paraboloids(x)
-    inverse = np.linalg.pinv(basis)
-    bands = _bands(spacing)
-    return np.stack([_summary(gap, basis, inverse, bands) for gap in _gaps(skins, x)]).astype(np.float32)
-
-
-def _gaps(skins: Seq[surface.Skin], x: np.ndarray) -> np.ndarray:
-    """Gaps of all skins under a level sensor over the site, [n, N, N] mm."""
-    zero = jnp.zeros(())
-    level = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=zero, tilt=jnp.zeros(2))
-    stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *jax.device_get(list(skins)))
-    gap_of = lambda skin: surface.gap(skin, level, jnp.asarray(x, jnp.float32))
-    return np.asarray(jax.jit(lambda s: jax.lax.map(gap_of, s))(stacked), np.float64)
-
-
-def _summary(gap: np.ndarray, basis: np.ndarray, inverse: np.ndarray, bands: np.ndarray) -> np.ndarray:
-    coefficients = inverse @ gap.ravel()
-    xx, xy, yy = coefficients[3:]
-    curvature = np.linalg.eigvalsh(np.array([[2 * xx, xy], [xy, 2 * yy]]))
-    left = (gap.ravel() - basis @ coefficients).reshape(gap.shape)
-    taper = np.hanning(POINTS)
-    power = np.abs(np.fft.fft2(left * np.outer(taper, taper))).ravel() ** 2 / gap.size**2
-    rms = np.sqrt(bands @ power)
-    below = np.mean(gap.ravel()[:, None] <= np.array(HEIGHTS_MM), axis=0)
-    return np.log(np.concatenate([np.maximum(curvature, 0) + _TINY, rms + _TINY, below + 1 / gap.size]))
-
-
-def _paraboloids(x: np.ndarray) -> np.ndarray:
-    """1, x, y, x², xy, y² at all points, [N², 6]."""
     columns, rows = (a.ravel() for a in np.meshgrid(x, x))
-    return np.stack([np.ones_like(columns), columns, rows, columns**2, columns * rows, rows**2], -1)
-
-
-def _bands(spacing: float) -> np.ndarray:
-    """Which wave numbers belong to each band, [bands, N²] of 0 and 1."""
+    basis = np.stack([np.ones_like(columns), columns, rows, columns**2, columns * rows, rows**2], -1)  # [N², 6]
+    inverse = np.linalg.pinv(basis)
     frequency = np.fft.fftfreq(POINTS, spacing)
     per_mm = np.hypot(frequency[:, None], frequency[None]).ravel()
-    edges = 1 / np.array(WAVES_MM)
-    return np.array([(per_mm >= low) & (per_mm < high) for low, high in itertools.pairwise(edges)], float)
+    edges = itertools.pairwise(1 / np.array(WAVES_MM))
+    bands = np.array([(per_mm >= low) & (per_mm < high) for low, high in edges], float)  # [bands, N²]
+    taper = np.hanning(POINTS)
+
+    def summary(gap: np.ndarray) -> np.ndarray:
+        coefficients = inverse @ gap.ravel()
+        xx, xy, yy = coefficients[3:]
+        curvature = np.linalg.eigvalsh(np.array([[2 * xx, xy], [xy, 2 * yy]]))
+        left = (gap.ravel() - basis @ coefficients).reshape(gap.shape)
+        power = np.abs(np.fft.fft2(left * np.outer(taper, taper))).ravel() ** 2 / gap.size**2
+        rms = np.sqrt(bands @ power)
+        below = np.mean(gap.ravel()[:, None] <= np.array(HEIGHTS_MM), axis=0)
+        return np.log(np.concatenate([np.maximum(curvature, 0) + _TINY, rms + _TINY, below + 1 / gap.size]))
+
+    level = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
+    stacked = jax.tree.map(lambda *leaf: np.stack(leaf), *jax.device_get(list(skins)))
+    gap_of = lambda skin: surface.gap(skin, level, jnp.asarray(x, jnp.float32))
+    gaps = np.asarray(jax.jit(lambda s: jax.lax.map(gap_of, s))(stacked), np.float64)
+    return np.stack([summary(gap) for gap in gaps]).astype(np.float32)

@@ -9,9 +9,8 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from experiments.mechanics.identify_features import features_of, field_counts, force_of, in_threads, statistics
+from experiments.mechanics.identify_features import ContactData, features_of, force_of, in_threads, truth
 from sensors_io.live import LiveScenes
-from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import slot
@@ -20,21 +19,12 @@ from sensors_io.schema import SENSORS, Phase, Sequence
 MOTIONS = ("slide_x", "hold")
 """A slide shows friction; a press that is released shows how much work the object returns."""
 
-_QUIET = (Phase.APPROACH, Phase.HOLD)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class MotionData:
-    """n contacts of one motion: features of each sensor [n, D], force [n, S, E], true shape [n, G].
-
-    `levels` [n] by property; `objects` [n].
-    """
+class MotionData(ContactData):
+    """n contacts of one motion; `touch` holds the features of each sensor, [n, D]."""
 
     touch: tuple[np.ndarray, ...]
-    force: np.ndarray
-    shape: np.ndarray
-    levels: dict[str, np.ndarray]
-    objects: np.ndarray
 
 
 def motion_data(
@@ -47,20 +37,26 @@ def motion_data(
       motion: one of `MOTIONS`.
       moments: frames of a sequence that are looked at.
       advance: called after each contact.
-      rows: which contacts; all of the motion by default.
+      rows: indices of the contacts; all of the motion by default.
     """
     scenes = LiveScenes(config)
     rows = contacts_of(scenes, motion) if rows is None else rows
-    felt = in_threads(lambda row: _contact(scenes, row, moments), rows, advance)
+
+    def summarise(row: int) -> tuple[list[np.ndarray], np.ndarray, int]:
+        by_sensor = scenes.contact(row)
+        made = [by_sensor[name] for name in SENSORS]
+        chosen = look_at(made[0].phase, moments)
+        touch = [_touch(sequence, chosen) for sequence in made]
+        force = np.stack([force_of(_known(sequence.force_n)[chosen]) for sequence in made])
+        return touch, force, made[0].key.trial
+
+    touch, force, trials = zip(*in_threads(summarise, rows, advance), strict=True)
     slots = [slot(config, row) for row in rows]
-    sites = [site_of(config, s.object_index, s.site, one.trial) for s, one in zip(slots, felt, strict=True)]
-    levels = [solid_of(config, s.object_index).levels() for s in slots]
+    sites = [site_of(config, s.object_index, s.site, trial) for s, trial in zip(slots, trials, strict=True)]
     return MotionData(
-        touch=tuple(np.stack([one.touch[order] for one in felt]) for order in range(len(SENSORS))),
-        force=np.stack([one.force for one in felt]),
-        shape=statistics([s.skin for s in sites]),
-        levels={name: np.array([level[name] for level in levels]) for name in levels[0]},
-        objects=np.array([s.object_index for s in slots]),
+        touch=tuple(np.stack(of_sensor) for of_sensor in zip(*touch, strict=True)),
+        force=np.stack(force),
+        **truth(config, slots, [s.skin for s in sites]),
     )
 
 
@@ -74,35 +70,15 @@ def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
 
     Args:
       phase: `Phase` of every frame [F].
-      moments: how many.
+      moments: number of frames.
 
     Raises:
       ValueError: fewer frames than that.
     """
-    busy = np.flatnonzero(~np.isin(phase, _QUIET))
+    busy = np.flatnonzero(~np.isin(phase, (Phase.APPROACH, Phase.HOLD)))
     if moments - 1 > len(busy):
         raise ValueError(f"moments is {moments}: only {1 + len(busy)} frames are there to be looked at; lower moments")
     return np.concatenate([[0], busy[np.round(np.linspace(0, len(busy) - 1, moments - 1)).astype(int)]])
-
-
-@dataclasses.dataclass(frozen=True)
-class _ContactFeatures:
-    """Features of one contact by sensor, force, and number of the trial."""
-
-    touch: tuple[np.ndarray, ...]
-    force: np.ndarray
-    trial: int
-
-
-def _contact(scenes: LiveScenes, row: int, moments: int) -> _ContactFeatures:
-    by_sensor = scenes.contact(row)
-    made = [by_sensor[name] for name in SENSORS]
-    chosen = look_at(made[0].phase, moments)
-    return _ContactFeatures(
-        touch=tuple(_touch(sequence, chosen) for sequence in made),
-        force=np.stack([force_of(_known(sequence.force_n)[chosen]) for sequence in made]),
-        trial=made[0].key.trial,
-    )
 
 
 def _touch(sequence: Sequence, chosen: np.ndarray) -> np.ndarray:
@@ -110,12 +86,10 @@ def _touch(sequence: Sequence, chosen: np.ndarray) -> np.ndarray:
     still = np.zeros((*depth.shape, 2), np.float32)
     moved = still if sequence.deformation_mm is None else sequence.deformation_mm[chosen]
     pictures = None if sequence.frames is None else sequence.frames[chosen]
-    return np.asarray(_summarised(pictures, moved, depth))
+    return np.asarray(_compiled(pictures, moved, depth))
 
 
-@jax.jit
-def _summarised(pictures: jax.Array | None, deformation_mm: jax.Array, depth_mm: jax.Array) -> jax.Array:
-    return features_of(pictures, field_counts(deformation_mm, depth_mm))
+_compiled = jax.jit(features_of)
 
 
 def _known(array: np.ndarray | None) -> np.ndarray:

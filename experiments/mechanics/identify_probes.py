@@ -2,14 +2,14 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Seq
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.mechanics.identify_features import in_threads
-from experiments.mechanics.identify_motions import MotionData
+from experiments.mechanics.identify_features import ContactData, in_threads
 from experiments.mechanics.identify_presses import ContactTier, PressData
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
@@ -18,24 +18,24 @@ from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_lo
 LEVELS = 3
 
 RESAMPLES = 2000
-"""Of each interval: its ends are then good to a tenth of its width."""
-
+"""Bootstrap resamples of each interval: its ends are then good to a tenth of its width."""
 
 STATIC = ("hardness", "roughness", "protrusion")
-"""Properties that a press can tell."""
+"""Properties that a press determines."""
 
 DYNAMIC = ("elasticity", "friction")
-"""Properties that take unloading or sliding."""
+"""Properties that require unloading or sliding."""
 
 FUSED, SHAPE, FORCE = "all four", "shape alone", "force alone"
 SOURCES = (*SENSORS, FUSED)
 
 Advance = Callable[[], object]
+Answer = TypeVar("Answer")
 
 
 @dataclasses.dataclass(frozen=True)
 class ProbePredictions:
-    """Log-probabilities [n, K] that a probe gives n held-out contacts, and the true levels [n]."""
+    """Log-probabilities [n, K] of a probe for n held-out contacts, and the true levels [n]."""
 
     log_probs: np.ndarray
     labels: np.ndarray
@@ -43,21 +43,16 @@ class ProbePredictions:
     @property
     def right(self) -> np.ndarray:
         """1 where the likeliest level is the true one, float [n]."""
-        return (self._predicted == self.labels).astype(float)
+        return (self.log_probs.argmax(-1) == self.labels).astype(float)
 
     @property
     def far_off(self) -> float:
         """Share of contacts in % that are placed two levels away."""
-        return 100 * float(np.mean(np.abs(self._predicted - self.labels) > 1))
-
-    @property
-    def _predicted(self) -> np.ndarray:
-        level: np.ndarray = self.log_probs.argmax(-1)
-        return level
+        return 100 * float(np.mean(np.abs(self.log_probs.argmax(-1) - self.labels) > 1))
 
 
 def fuse(answers: Seq[ProbePredictions]) -> ProbePredictions:
-    """All sensors together as if they erred independently: the product of their probabilities."""
+    """All sensors together as if their errors were independent: the product of their probabilities."""
     return ProbePredictions(np.sum([a.log_probs for a in answers], axis=0), answers[0].labels)
 
 
@@ -70,8 +65,8 @@ def transfer(
 ) -> list[ProbePredictions]:
     """Predictions for the training records themselves, held out by object, and for the same contacts in other records.
 
-    Contact i is read by the probe that no contact of its object trained, from `train` and from each of `tests`.  The
-    folds are those of `evidence.cross_fit`.
+    The probe that predicts contact i, from `train` and from each of `tests`, was trained on no contact of its object.
+    The folds are those of `linear_probe.cross_fit`.
 
     Args:
       train: features of n contacts.
@@ -92,11 +87,6 @@ def transfer(
     return [ProbePredictions(blocks[fold, copy, np.arange(len(fold))], labels) for copy in range(copies)]
 
 
-def accuracy(answers: ProbePredictions, objects: np.ndarray) -> Interval:
-    """Share of right answers in %, with the interval over objects."""
-    return points(answers.right, objects)
-
-
 def points(values: np.ndarray, objects: np.ndarray) -> Interval:
     """Mean of values [n] or [n, S] in points, with the interval over objects [n]."""
     clusters = np.repeat(objects, values[0].size)
@@ -115,17 +105,14 @@ def over_noise(
     pressed: PressData, exact: ContactTier, levels: int, config: ProbeConfig, advance: Advance
 ) -> dict[tuple[str, str, int], ProbePredictions]:
     """Answers by property, source and level of noise, each from probes that were trained at that level."""
-    jobs = list(itertools.product(STATIC, range(levels), range(len(SENSORS))))
 
-    def work(job: tuple[str, int, int]) -> ProbePredictions:
-        name, level, order = job
-        return _held_out(pressed.features(exact, order, level), pressed.levels[name], pressed.objects, config)
+    def work(job: tuple[str, str, int]) -> ProbePredictions:
+        name, sensor, level = job
+        return held_out(pressed.features(exact, SENSORS.index(sensor), level), name, pressed, config)
 
-    found = dict(zip(jobs, in_threads(work, jobs, advance), strict=True))
-    answers = {(name, SENSORS[order], level): answer for (name, level, order), answer in found.items()}
-    for name, level in itertools.product(STATIC, range(levels)):
-        answers[name, FUSED, level] = fuse([found[name, level, order] for order in range(len(SENSORS))])
-    return answers
+    found = _by_job(work, itertools.product(STATIC, SENSORS, range(levels)), advance)
+    keys = itertools.product(STATIC, range(levels))
+    return found | {(n, FUSED, level): fuse([found[n, sensor, level] for sensor in SENSORS]) for n, level in keys}
 
 
 def from_tiers(
@@ -137,35 +124,31 @@ def from_tiers(
     advance: Advance,
 ) -> dict[tuple[str, str, str], TransferPredictions]:
     """Answers by tier, property and source; the exact records are taken at `noise_level`, the tiers' at their only."""
-    jobs = list(itertools.product(tiers, STATIC, range(len(SENSORS))))
+    by_name = {tier.name: tier for tier in tiers}
 
-    def work(job: tuple[ContactTier, str, int]) -> TransferPredictions:
-        tier, name, order = job
-        train, test = pressed.features(tier, order), pressed.features(exact, order, noise_level)
+    def work(job: tuple[str, str, str]) -> TransferPredictions:
+        tier, name, sensor = job
+        order = SENSORS.index(sensor)
+        train, test = pressed.features(by_name[tier], order), pressed.features(exact, order, noise_level)
         return TransferPredictions(*transfer(train, [test], pressed.levels[name], pressed.objects, config))
 
-    found = dict(zip(jobs, in_threads(work, jobs, advance), strict=True))
-    answers = {(tier.name, name, SENSORS[order]): answer for (tier, name, order), answer in found.items()}
-    for tier, name in itertools.product(tiers, STATIC):
-        each = [found[tier, name, order] for order in range(len(SENSORS))]
-        answers[tier.name, name, FUSED] = TransferPredictions(
-            fuse([t.own for t in each]), fuse([t.exact for t in each])
-        )
-    return answers
+    found = _by_job(work, itertools.product(by_name, STATIC, SENSORS), advance)
+    for tier, name in itertools.product(by_name, STATIC):
+        each = [found[tier, name, sensor] for sensor in SENSORS]
+        found[tier, name, FUSED] = TransferPredictions(fuse([t.own for t in each]), fuse([t.exact for t in each]))
+    return found
 
 
 def without_touch(
-    pressed: PressData | MotionData, names: Seq[str], config: ProbeConfig, advance: Advance
+    data: ContactData, names: Seq[str], config: ProbeConfig, advance: Advance
 ) -> dict[tuple[str, str], ProbePredictions]:
     """Answers by property from the true shape alone and from the measured forces alone."""
-    blind = {SHAPE: pressed.shape, FORCE: pressed.force.reshape(len(pressed.force), -1)}
-    jobs = list(itertools.product(names, blind))
-    work = lambda job: _held_out(blind[job[1]], pressed.levels[job[0]], pressed.objects, config)
-    return dict(zip(jobs, in_threads(work, jobs, advance), strict=True))
+    blind = {SHAPE: data.shape, FORCE: data.force.reshape(len(data.force), -1)}
+    return _by_job(lambda job: held_out(blind[job[1]], job[0], data, config), itertools.product(names, blind), advance)
 
 
 def by_motion(
-    touch: Seq[np.ndarray], moved: PressData | MotionData, config: ProbeConfig, advance: Advance
+    touch: Seq[np.ndarray], moved: ContactData, config: ProbeConfig, advance: Advance
 ) -> dict[tuple[str, str], ProbePredictions]:
     """Answers about the dynamic properties by property and source, of touch without force.
 
@@ -173,15 +156,17 @@ def by_motion(
       touch: features of each sensor, [n, D].
       moved: the contacts.
     """
-    jobs = list(itertools.product(DYNAMIC, range(len(SENSORS))))
-    work = lambda job: _held_out(touch[job[1]], moved.levels[job[0]], moved.objects, config)
-    found = dict(zip(jobs, in_threads(work, jobs, advance), strict=True))
-    answers = {(name, SENSORS[order]): answer for (name, order), answer in found.items()}
-    for name in DYNAMIC:
-        answers[name, FUSED] = fuse([found[name, order] for order in range(len(SENSORS))])
+    work = lambda job: held_out(touch[SENSORS.index(job[1])], job[0], moved, config)
+    found = _by_job(work, itertools.product(DYNAMIC, SENSORS), advance)
+    return found | {(name, FUSED): fuse([found[name, sensor] for sensor in SENSORS]) for name in DYNAMIC}
+
+
+def held_out(features: np.ndarray, name: str, data: ContactData, config: ProbeConfig) -> ProbePredictions:
+    """Answers about one property of objects that no probe was trained on."""
+    (answers,) = transfer(features, [], data.levels[name], data.objects, config)
     return answers
 
 
-def _held_out(features: np.ndarray, labels: np.ndarray, objects: np.ndarray, config: ProbeConfig) -> ProbePredictions:
-    (answers,) = transfer(features, [], labels, objects, config)
-    return answers
+def _by_job(work: Callable[[Any], Answer], jobs: Iterable[Any], advance: Advance) -> dict[Any, Answer]:
+    listed = list(jobs)
+    return dict(zip(listed, in_threads(work, listed, advance), strict=True))

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Cell, Column, Picture, Table, named_table
+from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.mechanics.identify_motions import MotionData
 from experiments.mechanics.identify_presses import PressData
 from experiments.mechanics.identify_probes import (
@@ -21,7 +21,6 @@ from experiments.mechanics.identify_probes import (
     STATIC,
     ProbePredictions,
     TransferPredictions,
-    accuracy,
     points,
 )
 from sensors_io.schema import SENSORS
@@ -32,9 +31,10 @@ MAY_LOSE = 2.0
 
 CHANCE = 100 / LEVELS
 
-TICKS = (-5, -2, 0, 2, 5, 10, 20, 50)
 LINEAR_POINTS = 5.0
 """The axis of lost points is linear up to here and logarithmic beyond: springs lose ten times what tiers lose."""
+
+ENDS = {"from": "lower end of the 95 % interval over objects", "to": "upper end"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,10 +61,6 @@ class StudyPredictions:
         """Level of the sensors' own noise."""
         return self.noise.index(1.0)
 
-    def objects(self, motion: str) -> np.ndarray:
-        """Object of each contact of a motion, [n]."""
-        return self.pressed.objects if motion == "press" else self.moved[motion].objects
-
     def losses(self, tier: str, name: str, sources: tuple[str, ...]) -> np.ndarray:
         """Right answers about exact records less those by training at a tier instead, paired, [n, sources]."""
         exact = [self.touch[name, source, self.own].right for source in sources]
@@ -76,12 +72,12 @@ class StudyPredictions:
 class ProbeFigures:
     """Accuracies in % and losses in points, with intervals over objects.
 
-    `told` by property, source and level of noise; `blind` by property and source; `lost` by tier and property, mean
+    `touch` by property, source and level of noise; `blind` by property and source; `lost` by tier and property, mean
     over sensors; `lost_by` by tier, property and source, without interval; `moved` by property and motion, of all
     sensors without force.
     """
 
-    told: dict[tuple[str, str, int], Interval]
+    touch: dict[tuple[str, str, int], Interval]
     blind: dict[tuple[str, str], Interval]
     lost: dict[tuple[str, str], Interval]
     lost_by: dict[tuple[str, str, str], float]
@@ -89,19 +85,19 @@ class ProbeFigures:
 
 
 def figures(studied: StudyPredictions) -> ProbeFigures:
-    """Every figure that tables, pictures and sentences share."""
+    """All figures of tables, pictures and sentences."""
     objects = studied.pressed.objects
     keys = [(tier, name) for tier in (*studied.solved, studied.springs) for name in STATIC]
+    moved = {"press": objects} | {motion: data.objects for motion, data in studied.moved.items()}
     return ProbeFigures(
-        told={key: accuracy(answers, objects) for key, answers in studied.touch.items()},
-        blind={key: accuracy(answers, objects) for key, answers in studied.blind.items()},
+        touch={key: points(answers.right, objects) for key, answers in studied.touch.items()},
+        blind={key: points(answers.right, objects) for key, answers in studied.blind.items()},
         lost={key: points(studied.losses(*key, SENSORS), objects) for key in keys},
         lost_by={(*key, s): 100 * float(studied.losses(*key, (s,)).mean()) for key in keys for s in SOURCES},
         moved={
-            (name, motion): accuracy(found, studied.objects(motion))
+            (name, motion): points(answers[name, FUSED].right, moved[motion])
             for motion, answers in studied.motion.items()
-            for (name, source), found in answers.items()
-            if source == FUSED
+            for name in DYNAMIC
         },
     )
 
@@ -110,23 +106,22 @@ def touch_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     """Accuracy of every property by every source over the noise."""
     rows: list[dict[str, Cell]] = []
     for name, source in itertools.product(STATIC, SOURCES):
-        told = [found.told[name, source, level] for level in range(len(studied.noise))]
+        own = found.touch[name, source, studied.own]
         rows.append(
             {
                 "property, sensor": f"{name}, {source}",
-                **{f"noise ×{f:g}": one.mean for f, one in zip(studied.noise, told, strict=True)},
-                "×1 from": told[studied.own].low,
-                "×1 to": told[studied.own].high,
+                **{f"noise ×{f:g}": found.touch[name, source, i].mean for i, f in enumerate(studied.noise)},
+                "×1 from": own.low,
+                "×1 to": own.high,
                 "two levels off": studied.touch[name, source, studied.own].far_off,
             }
         )
     return _percent_table(
-        "What touch and force tell of unseen objects",
+        "Accuracy of touch and force on unseen objects",
         rows,
         {
             **{f"noise ×{f:g}": "right answers" for f in studied.noise},
-            "×1 from": "lower end of the 95 % interval over objects",
-            "×1 to": "upper end",
+            **{f"×1 {end}": meaning for end, meaning in ENDS.items()},
             "two levels off": "at the sensors' own noise",
         },
         f"Probes are trained and tested at the same noise, on {studied.exact}; guessing gives {CHANCE:.0f} %. "
@@ -136,25 +131,25 @@ def touch_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
 
 def blind_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     """Accuracy without touch."""
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[dict[str, Cell]] = []
     for name in STATIC:
-        shape, force = found.blind[name, SHAPE], found.blind[name, FORCE]
-        commonest = 100 * float(np.bincount(studied.pressed.levels[name]).max()) / len(studied.pressed.objects)
-        rows.append((name, shape.mean, shape.low, shape.high, force.mean, force.low, force.high, commonest))
-    percent = lambda name, meaning: Column(name=name, unit="%", format=".1f", meaning=meaning)
-    interval = [percent(end, "end of the 95 % interval over objects") for end in ("from", "to")]
-    return Table(
-        title="What is told without touch",
-        columns=(
-            Column(name="property"),
-            percent(SHAPE, "statistics of the true gap, noiseless"),
-            *interval,
-            percent(FORCE, "the forces measured by all four sensors"),
-            *interval,
-            percent("commonest level", "its share of the objects"),
-        ),
-        rows=tuple(rows),
-        note="Roughness and protrusion are shape, so true shape is their ceiling. Materials tie hardness to shape.",
+        row: dict[str, Cell] = {"property": name}
+        for source in (SHAPE, FORCE):
+            one = found.blind[name, source]
+            row |= {source: one.mean, f"{source}, from": one.low, f"{source}, to": one.high}
+        counts = np.bincount(studied.pressed.levels[name])
+        rows.append(row | {"commonest level": 100 * float(counts.max()) / len(studied.pressed.objects)})
+    return _percent_table(
+        "Accuracy without touch",
+        rows,
+        {
+            SHAPE: "statistics of the true gap, noiseless",
+            **{f"{SHAPE}, {end}": meaning for end, meaning in ENDS.items()},
+            FORCE: "the forces measured by all four sensors",
+            **{f"{FORCE}, {end}": meaning for end, meaning in ENDS.items()},
+            "commonest level": "its share of the objects",
+        },
+        "Roughness and protrusion are shape, so true shape is their ceiling. Materials tie hardness to shape.",
     )
 
 
@@ -175,14 +170,13 @@ def tier_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
             }
         )
     return _percent_table(
-        "Trained at a tier, asked about exact records",
+        "Trained at a tier, tested on exact records",
         rows,
         {
             "own records": "right about unseen objects at the same tier",
             "exact records": f"right about them at {studied.exact}",
             "lost": "compared with training on exact records, mean over sensors",
-            "from": "lower end of the 95 % interval over objects",
-            "to": "upper end",
+            **ENDS,
             **dict.fromkeys(SOURCES, "lost by it"),
         },
         "The same presses with the same noise at every tier; a coarse grid leaves out short waves of the skin.",
@@ -194,7 +188,8 @@ def motion_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     """Friction and elasticity by motion, by touch without force and without touch."""
     percent = lambda answers: 100 * float(answers.right.mean())
     rows: list[dict[str, Cell]] = []
-    for (name, motion), fused in sorted(found.moved.items(), key=lambda item: DYNAMIC.index(item[0][0])):
+    for name, motion in itertools.product(DYNAMIC, studied.motion):
+        fused = found.moved[name, motion]
         rows.append(
             {
                 "property by motion": f"{name} by {motion}",
@@ -211,23 +206,22 @@ def motion_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
         {
             **dict.fromkeys(SENSORS, "right answers of touch without force"),
             FUSED: "their product",
-            "from": "lower end of the 95 % interval over objects",
-            "to": "upper end",
+            **ENDS,
             SHAPE: "statistics of the true gap",
             FORCE: "forces along three axes: in a slide they are friction itself",
         },
-        "A press neither slides nor unloads: what it tells about the two comes from the material.",
+        "A press neither slides nor unloads: its accuracy on the two properties comes from the material.",
     )
 
 
 def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
-    """Accuracy over noise."""
+    """Accuracy of every source over the noise."""
     at = range(len(studied.noise))
     shifts = dict(zip(SOURCES, np.linspace(-0.12, 0.12, len(SOURCES)), strict=True))
     panels = [
         Panel(
             [
-                estimates(s, [found.told[name, s, level] for level in at], at=at, shift=float(shift))
+                estimates(s, [found.touch[name, s, level] for level in at], at=at, shift=float(shift))
                 for s, shift in shifts.items()
             ],
             title=name,
@@ -245,8 +239,8 @@ def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
     ]
     return Picture(
         name="identifiability",
-        title="What touch tells, over noise",
-        caption="Right answers about unseen objects, with 95 % intervals over objects. The lines take no touch; shape "
+        title="Accuracy of touch over noise",
+        caption="Right answers about unseen objects, with 95 % intervals over objects. The lines use no touch; shape "
         "is the ceiling for roughness and protrusion.",
         content=draw(panels, share_y=True, size=(9.3, 3.5)),
     )
@@ -271,14 +265,14 @@ def tier_picture(found: ProbeFigures) -> Picture:
                 x_label="points lost",
                 x_scale="symlog",
                 linear_to=LINEAR_POINTS,
-                x_ticks={float(tick): f"{tick:g}" for tick in TICKS},
+                x_ticks={float(tick): f"{tick:g}" for tick in (-5, -2, 0, 2, 5, 10, 20, 50)},
                 rows=tiers,
                 rules=[Rule(x=0, line="-", colour=SHARED, width=0.8), Rule(x=MAY_LOSE, colour=SHARED)],
             )
         )
     return Picture(
         name="label_transfer",
-        title="What a cheaper contact costs",
+        title="Loss by a cheaper contact",
         caption="Points lost about exact records by training at a tier, mean over sensors with 95 % interval; dots are "
         f"single sensors, the dotted line is what may be lost, {MAY_LOSE:g} points.",
         content=draw(panels, share_x=True, share_y=True, size=(9.7, 0.9 + 0.36 * len(tiers))),

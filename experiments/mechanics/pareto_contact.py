@@ -2,11 +2,10 @@
 
     python -m experiments pareto_contact [--scale smoke]
 
-Every method on the same random scenes: time per frame against the error of displacement and slope, compared with the
+Measures time per frame and error of displacement and slope of every method on the same random scenes, compared with the
 float64 solution on the same grid; the package's solver on grids of 24² to 256² against the finest; closed forms (Hertz)
-and published solvers (Tamaas, ContactMechanics) where they are installed.  Times are medians over rounds that visit
-every method in turn, so that other load on the machine affects all alike; the ratio to the plain solver is taken within
-each round.
+and published solvers (Tamaas, ContactMechanics) where they are installed.  Times are medians over interleaved rounds,
+so that other load on the machine affects all methods alike; the ratio to the plain solver is taken within each round.
 
 Cost: one minute on two cores (`smoke` half a minute).
 
@@ -25,19 +24,22 @@ from scipy.ndimage import zoom
 
 from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.core.timing import interleaved
+from experiments.core.timing import interleaved, median_ms
 from experiments.mechanics import contact_oracles, contact_scenes
-from experiments.mechanics.contact_methods import ContactMethod, ContactSolver, contact_methods, spg_nested
+from experiments.mechanics.contact_methods import METHODS, ContactSolver
 from experiments.mechanics.contact_scenes import ContactScenes, GelKernels, displacement_error, slope_error
 from sensors_io.scenes.contact import convolve
-from sensors_io.scenes.sensors import GELSIGHT_MINI, SensorModel
+from sensors_io.scenes.sensors import GELSIGHT_MINI
 
-SENSOR: SensorModel = GELSIGHT_MINI
+SENSOR = GELSIGHT_MINI
 """The sensor whose gel needs the widest padding."""
 
 MAIN, BASELINE, PUBLISHED_STOP = "nested 1e-3", "plain 1e-3", "plain 1e-3 as published"
+
+Rows = Mapping[str, Mapping[str, float]]
+"""Method → its figures."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,15 +60,24 @@ def run(config: ParetoContactConfig, context: Context) -> Results:
     context.print(f"{config.scenes} scenes at {config.grid}², float64 solutions first")
     kernels = contact_scenes.gel_kernels(SENSOR, config.grid)
     scenes = contact_scenes.sample_scenes(SENSOR, config.scenes, config.grid, config.seed)
-    rows = measure(contact_methods(), scenes, kernels, config.rounds, context)
+    rows = measure(scenes, kernels, config.rounds, context)
     ladder = grid_ladder(config, context)
     oracles = contact_oracles.oracle_errors(config.oracle_scenes, config.grid // 2, config.seed, context)
     published = contact_oracles.solver_table(config.oracle_scenes, config.grid, config.seed, context)
     hertz = contact_oracles.hertz(config.grid, context)
-    convolutions, baseline = (rows[name]["convolutions"] for name in (MAIN, BASELINE))
+    main, base = rows[MAIN], rows[BASELINE]
+    ratio = main["time"] / rows[PUBLISHED_STOP]["time"]
+    note = f"both stop on the same residual; {ratio:.2f} of the plain solver with its looser published stop"
     return Results(
-        verdict=_verdict(rows, hertz),
-        requirements=_requirements(rows, oracles, hertz),
+        verdict=_verdict(main, base, rows["Winkler"], hertz),
+        requirements=(
+            at_most(f"{MAIN}: time a frame", main["time"], 2.5, "ms"),
+            at_most(f"{MAIN}: time against {BASELINE}", main[f"against {BASELINE}"], 0.65, note=note),
+            at_most(f"{MAIN}: slope error, 95th percentile", main["slope p95"], 0.05),
+            at_most("Hertz exponent, off 1.5 by", hertz["exponent"], 0.002),
+            at_most("Hertz peak pressure, a/dx ≥ 4", hertz["peak"], 0.01),
+            *(at_most(f"pressure against {name}", error, 1e-3) for name, error in oracles.items()),
+        ),
         tables=(_method_table(rows, config), _grid_table(ladder), contact_oracles.oracle_table(oracles), published),
         pictures=(_method_picture(rows), _grid_picture(ladder)),
         settings={
@@ -74,55 +85,51 @@ def run(config: ParetoContactConfig, context: Context) -> Results:
             "grid": config.grid,
             "padded grid": kernels.gel.shape[0],
             "oracles installed": ", ".join(s.package for s in contact_oracles.installed().values()) or "none",
-            "convolutions a frame": f"{convolutions:.1f} of {MAIN}, {baseline:.1f} of {BASELINE}",
-            "floor": f"{convolutions:.1f} pruned convolutions of {convolution_ms(kernels, config.grid):.3f} ms",
+            "convolutions a frame": f"{main['convolutions']:.1f} of {MAIN}, {base['convolutions']:.1f} of {BASELINE}",
+            "floor": f"{main['convolutions']:.1f} pruned convolutions of {convolution_ms(kernels, config.grid):.3f} ms",
         },
     )
 
 
-def measure(
-    methods: tuple[ContactMethod, ...], scenes: ContactScenes, kernels: GelKernels, rounds: int, context: Context
-) -> dict[str, dict[str, Any]]:
-    """Kind, time (ms per frame), ratio to the baseline, convolutions and relative errors of every method, by name."""
+def measure(scenes: ContactScenes, kernels: GelKernels, rounds: int, context: Context) -> dict[str, dict[str, float]]:
+    """Time (ms per frame), ratio to the baseline, convolutions and relative errors of every method."""
     true = contact_scenes.exact(context.each("exact scenes", zip(*scenes, strict=True)), kernels)
-    calls = {m.name: _solve_all(m.solve, scenes, kernels) for m in methods}
+    calls = {name: _solve_all(method.solve, scenes, kernels) for name, method in METHODS.items()}
     found = {name: jax.device_get(call()) for name, call in context.each("compiling methods", calls.items())}
     seconds = interleaved(calls, context.rounds("timing methods", rounds))
-    rows: dict[str, dict[str, Any]] = {}
-    for method in methods:
-        u, convolutions = found[method.name]
-        errors = {"u": displacement_error(u, true), "slope": slope_error(u, true)}
-        rows[method.name] = {
-            "kind": method.kind,
-            "time": 1e3 * float(np.median(seconds[method.name])) / len(scenes.force_n),
-            f"against {BASELINE}": float(np.median(seconds[method.name] / seconds[BASELINE])),
+    return {
+        name: {
+            "time": 1e3 * float(np.median(seconds[name])) / len(scenes.force_n),
+            f"against {BASELINE}": float(np.median(seconds[name] / seconds[BASELINE])),
             "convolutions": float(np.mean(convolutions)),
+            **_median_and_p95("u", displacement_error(u, true)),
+            **_median_and_p95("slope", slope_error(u, true)),
         }
-        for name, error in errors.items():
-            rows[method.name] |= {f"{name} median": float(np.median(error))}
-            rows[method.name] |= {f"{name} p95": float(np.quantile(error, 0.95))}
-    return rows
+        for name, (u, convolutions) in found.items()
+    }
+
+
+def _median_and_p95(name: str, errors: np.ndarray) -> dict[str, float]:
+    return {f"{name} median": float(np.median(errors)), f"{name} p95": float(np.quantile(errors, 0.95))}
 
 
 def grid_ladder(config: ParetoContactConfig, context: Context) -> dict[int, dict[str, float]]:
     """Time and error of the package's solver on every grid, compared with its solution at 1e-4 on the finest one."""
     finest = max(config.ladder)
-    tiers = {n: (1e-3, n) for n in config.ladder} | {0: (1e-4, finest)}
+    tiers = {n: ("nested 1e-3", n) for n in config.ladder} | {0: ("nested 1e-4", finest)}
     calls, found = {}, {}
-    for key, (tolerance, n) in context.each("compiling grids", tiers.items()):
+    for key, (method, n) in context.each("compiling grids", tiers.items()):
         scenes = contact_scenes.sample_scenes(SENSOR, config.ladder_scenes, n, config.seed + 1)
-        calls[key] = _solve_all(spg_nested(tolerance), scenes, contact_scenes.gel_kernels(SENSOR, n))
+        calls[key] = _solve_all(METHODS[method].solve, scenes, contact_scenes.gel_kernels(SENSOR, n))
         found[key] = np.asarray(calls[key]()[0], np.float64)
-    true = found[0]
-    timed = {str(n): calls[n] for n in config.ladder}
-    seconds = interleaved(timed, context.rounds("timing grids", config.rounds))
+    seconds = interleaved({str(n): calls[n] for n in config.ladder}, context.rounds("timing grids", config.rounds))
     ladder = {}
     for n in context.each("comparing grids", config.ladder):
         up = np.stack([zoom(u, finest / n, order=3, mode="nearest", grid_mode=True) for u in found[n]])
-        slope = slope_error(up, true)
+        slope = slope_error(up, found[0])
         ladder[n] = {
             "time": 1e3 * float(np.median(seconds[str(n)])) / config.ladder_scenes,
-            "u": float(np.median(displacement_error(up, true))),
+            "u": float(np.median(displacement_error(up, found[0]))),
             "slope": float(np.median(slope)),
             "slope p95": float(np.quantile(slope, 0.95)),
         }
@@ -134,8 +141,7 @@ def convolution_ms(kernels: GelKernels, grid: int, repeats: int = 50) -> float:
     spectrum = jnp.asarray(kernels.gel / kernels.gel.max(), jnp.float32)
     field = jnp.ones((grid, grid), jnp.float32)
     chain = jax.jit(lambda p: jax.lax.fori_loop(0, repeats, lambda _, q: convolve(q, spectrum), p))
-    jax.block_until_ready(chain(field))
-    return 1e3 / repeats * float(np.median(interleaved({"": lambda: chain(field)}, range(7))[""]))
+    return median_ms({"": lambda: chain(field)}, range(7))[""] / repeats
 
 
 def _solve_all(solve: ContactSolver, scenes: ContactScenes, kernels: GelKernels) -> Callable[[], Any]:
@@ -146,54 +152,31 @@ def _solve_all(solve: ContactSolver, scenes: ContactScenes, kernels: GelKernels)
 # Report --------------------------------------------------------------------------------------------------------------
 
 
-def _requirements(
-    rows: Mapping[str, Mapping[str, Any]], oracles: Mapping[str, float], hertz: Mapping[str, float]
-) -> tuple[Requirement, ...]:
-    main = rows[MAIN]
-    ratio = main["time"] / rows[PUBLISHED_STOP]["time"]
-    lower = lambda name, measured, bound, **more: Requirement(
-        name=name, measured=measured, bound=bound, better="lower", **more
-    )
-    return (
-        lower(f"{MAIN}: time a frame", main["time"], 2.5, unit="ms"),
-        lower(
-            f"{MAIN}: time against {BASELINE}",
-            main[f"against {BASELINE}"],
-            0.65,
-            note=f"both stop on the same residual; {ratio:.2f} of the plain solver with its looser published stop",
-        ),
-        lower(f"{MAIN}: slope error, 95th percentile", main["slope p95"], 0.05),
-        lower("Hertz exponent, off 1.5 by", hertz["exponent"], 0.002),
-        lower("Hertz peak pressure, a/dx ≥ 4", hertz["peak"], 0.01),
-        *(lower(f"pressure against {name}", error, 1e-3) for name, error in oracles.items()),
-    )
-
-
-def _verdict(rows: Mapping[str, Mapping[str, Any]], hertz: Mapping[str, float]) -> tuple[str, ...]:
-    main, base, cheap = rows[MAIN], rows[BASELINE], rows["Winkler"]
+def _verdict(
+    main: Mapping[str, float], base: Mapping[str, float], springs: Mapping[str, float], hertz: Mapping[str, float]
+) -> tuple[str, ...]:
     return (
         f"{MAIN} takes {main['time']:.2f} ms per frame with {main['convolutions']:.1f} convolutions, "
         f"{main[f'against {BASELINE}']:.2f} of the plain solver's time ({base['time']:.2f} ms, "
         f"{base['convolutions']:.1f} convolutions); its median error is {main['u median']:.1e} in displacement and "
         f"{main['slope median']:.1e} in slope.",
-        f"Springs alone take {cheap['time']:.2f} ms and err by {cheap['u median']:.0%} in displacement and "
-        f"{cheap['slope median']:.0%} in slope: no cheap method is accurate enough, so accuracy is traded for time by "
-        "grid and tolerance.",
+        f"Springs alone take {springs['time']:.2f} ms and err by {springs['u median']:.0%} in displacement and "
+        f"{springs['slope median']:.0%} in slope: no cheap method is accurate enough, so accuracy is traded for time "
+        "by grid and tolerance.",
         f"Compared with Hertz, the exponent of force over depth deviates from 1.5 by {hertz['exponent']:.4f} and the "
         f"peak pressure by {hertz['peak']:.2%}, from four pixels per contact radius on.",
     )
 
 
-def _method_table(rows: Mapping[str, Mapping[str, Any]], config: ParetoContactConfig) -> Table:
-    cells = [{"method": name} | {key: cell for key, cell in row.items() if key != "kind"} for name, row in rows.items()]
-    errors = dict.fromkeys(("u median", "u p95", "slope median", "slope p95"), ".1e")
+def _method_table(rows: Rows, config: ParetoContactConfig) -> Table:
+    ratio, errors = f"against {BASELINE}", ("u median", "u p95", "slope median", "slope p95")
     return named_table(
         f"Tiers at {config.grid}², {config.scenes} random scenes",
-        cells,
-        formats={"time": ".2f", f"against {BASELINE}": ".2f", "convolutions": ".1f", **errors},
+        [{"method": name, **row} for name, row in rows.items()],
+        formats={"time": ".2f", ratio: ".2f", "convolutions": ".1f", **dict.fromkeys(errors, ".1e")},
         units={"time": "ms"},
         meanings={
-            f"against {BASELINE}": "median over rounds of the ratio within a round",
+            ratio: "median over rounds of the ratio within a round",
             "convolutions": "padded, on this grid, mean over scenes",
         },
         note="Errors are relative L₂, compared with the float64 solution on the same grid.",
@@ -211,11 +194,11 @@ def _grid_table(ladder: Mapping[int, Mapping[str, float]]) -> Table:
     )
 
 
-def _method_picture(rows: Mapping[str, Mapping[str, Any]]) -> Picture:
+def _method_picture(rows: Rows) -> Picture:
     groups: dict[str, list[Point]] = {}
     for name, row in rows.items():
         label = name.removeprefix("nested ").removeprefix("plain ")
-        groups.setdefault(row["kind"], []).append((label, row["time"], row["slope median"], row["slope p95"]))
+        groups.setdefault(METHODS[name].kind, []).append((label, row["time"], row["slope median"], row["slope p95"]))
     return Picture(
         name="pareto_contact",
         title="Speed against error",

@@ -1,19 +1,24 @@
-"""Checks of friction: closed forms, promised errors on held-out contacts, load–unload loops of real presses."""
+"""Checks of friction: closed forms, promised errors, the effect of coupling, load–unload loops of real presses."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.errors import require
 from experiments.core.results import Cell, Table, named_table
+from experiments.core.timing import median_ms
+from experiments.mechanics import tangential_scenes as scenes
+from experiments.mechanics.tangential_methods import dragged
 from sensors_io.scenes import history, partial_slip, tangential
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.sensors import BODY, SensorModel
-from sensors_io.scenes.traction import Compliance, rigid_field
+from sensors_io.scenes.traction import Compliance, make_coupling, rigid_field
 
 SIDE_MM, TIGHT = 16.0, 1e-4
 SHEAR_MODULUS_MPA, FRICTION = 0.15, 0.5
@@ -24,13 +29,6 @@ PULL_SHARES = (0.3, 0.6, 0.9)
 STICK_RATIOS = (0.8, 0.5, 0.2)
 ACCEPTED_AT = (0.02, 0.05, 0.1, 0.2)
 """Tolerances at which the superposition is accepted where it promises them."""
-
-RECORDING = "example_1_AD2-0065L.npz"
-"""The vendor's longer recording, 20 × 20 markers, frames 32.7 ms apart."""
-
-LAGS_S = (0.0, 0.03, 0.06, 0.09)
-TOUCHES_N = 0.05
-"""Force above which the sensor is touched."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,6 +44,12 @@ class PromiseCheck:
     def kept(self) -> bool:
         """True if the promise holds."""
         return self.error <= self.promised
+
+
+def closed_forms(grid: int, context: Context) -> dict[str, float]:
+    """Relative deviation from every closed form, by form and quantity."""
+    mindlin = {f"Cattaneo–Mindlin: {name}": value for name, value in cattaneo_mindlin(grid, context).items()}
+    return mindlin | {"Lubkin: torque": lubkin(grid, context)}
 
 
 def cattaneo_mindlin(grid: int, context: Context) -> dict[str, float]:
@@ -100,12 +104,9 @@ def promise(sensor: SensorModel, kind: str, error: float, modulus_mpa: float, ra
 def promise_table(promises: Sequence[PromiseCheck]) -> Table:
     """Errors and promises by kind of body, by sensor, and of all."""
     groups: dict[str, list[PromiseCheck]] = {}
-    for name, p in [
-        *((p.kind, p) for p in promises),
-        *((p.sensor, p) for p in promises),
-        *(("all", p) for p in promises),
-    ]:
-        groups.setdefault(name, []).append(p)
+    for group_of in (lambda p: p.kind, lambda p: p.sensor, lambda p: "all"):
+        for p in promises:
+            groups.setdefault(group_of(p), []).append(p)
     rows: list[dict[str, Cell]] = []
     for name, group in groups.items():
         errors = 100 * np.array([p.error for p in group])
@@ -120,7 +121,7 @@ def promise_table(promises: Sequence[PromiseCheck]) -> Table:
             }
         )
     return named_table(
-        "What the superposition promises, on contacts that its constants were not fitted to",
+        "Promised errors of the superposition, on contacts to which its constants were not fitted",
         rows,
         formats={"count": "d", "error": ".1f", "error, 95th": ".1f", "promised": ".1f", "kept": ".0f"},
         units=dict.fromkeys(("error", "error, 95th", "promised", "kept"), "%"),
@@ -148,7 +149,7 @@ def decision_table(promises: Sequence[PromiseCheck]) -> Table:
         )
     figures = ("taken", "of these within", "in hindsight")
     return named_table(
-        "The cheap tier, where its promise lets it in",
+        "The superposition, where it promises the tolerance",
         rows,
         formats=dict.fromkeys(figures, ".0f"),
         units=dict.fromkeys(figures, "%"),
@@ -159,9 +160,8 @@ def decision_table(promises: Sequence[PromiseCheck]) -> Table:
     )
 
 
-def closed_form_table(mindlin: Mapping[str, float], torque: float, grid: int) -> Table:
+def closed_form_table(errors: Mapping[str, float], grid: int) -> Table:
     """Deviations from all closed forms."""
-    errors = {f"Cattaneo–Mindlin: {name}": value for name, value in mindlin.items()} | {"Lubkin: torque": torque}
     return named_table(
         f"Closed forms at {grid}², {SPHERE.contact_radius_mm / SIDE_MM * grid:.1f} pixels a contact radius",
         [{"figure": name, "worst error": 100 * value} for name, value in errors.items()],
@@ -169,6 +169,130 @@ def closed_form_table(mindlin: Mapping[str, float], torque: float, grid: int) ->
         units={"worst error": "%"},
         note="The traction's error is that of the edge of the contact, which cuts through pixels.",
     )
+
+
+def _sphere(grid: int) -> tuple[np.ndarray, float, jnp.ndarray, Compliance]:
+    """Pixel centres, pixel size, μp of the sphere, which carries its force exactly, and the half-space."""
+    spacing = SIDE_MM / grid
+    x = (np.arange(grid) + 0.5) * spacing - SIDE_MM / 2
+    p = SPHERE.pressure_mpa(np.hypot(x[None], x[:, None]))
+    limit = FRICTION * p * SPHERE.force_n / (p.sum() * spacing**2)
+    half = half_space_spectrum(grid, spacing, 2 * SHEAR_MODULUS_MPA)
+    mirrored = np.roll(half[::-1], 1, 0)[:, grid - 1 : 0 : -1]
+    even = jnp.asarray(np.concatenate([half, mirrored], 1), jnp.float32)
+    return x, spacing, jnp.asarray(limit, jnp.float32), Compliance(even=even, odd=jnp.zeros_like(even, jnp.complex64))
+
+
+def _lubkin(stick_ratio: float) -> tuple[float, float]:
+    """Twist and torque of the sphere when it sticks within `stick_ratio` of its contact radius."""
+    a, angle = SPHERE.contact_radius_mm, np.linspace(0, np.pi / 2, 4001)
+    ratio = np.linspace(stick_ratio, 1, 400)
+    root = np.sqrt(1 - (1 - ratio[:, None] ** 2) * np.sin(angle) ** 2)
+    scale = 3 * FRICTION * SPHERE.force_n / (4 * np.pi * SHEAR_MODULUS_MPA * a**2)
+    twist = scale * np.trapezoid(1 / root - root, angle, axis=1)
+    return float(twist[0]), float(np.trapezoid(16 / 3 * SHEAR_MODULUS_MPA * (ratio * a) ** 3, -twist))
+
+
+# Coupling ------------------------------------------------------------------------------------------------------------
+
+MOTIONS = ("hold", "slide_x", "twist")
+"""A press that is held and released, which has no friction at all without coupling, and two that have."""
+
+_ROUNDS = 3  # of timing; the ratio is reported to a tenth
+_MICROMETRES = 1e3
+
+
+def coupling_rows(sensor: SensorModel, grid: int, frames: int, bodies: int, seed: int) -> list[dict[str, Any]]:
+    """Effect of every motion on the gel of one sensor, over `bodies` objects of every kind in turn.
+
+    Pressure alone moves the surface of the gel sideways, and that of the object by another amount.  Where both stick,
+    friction takes up the difference; the generator leaves that out unless its scenes are `coupled`.
+    """
+    kernels = scenes.friction_kernels(sensor, grid)
+    size, spacing = kernels.normal_gel.shape[0], sensor.window_mm / grid
+    gel, body = (make_coupling(layer, size, spacing) for layer in (sensor.gel, BODY))
+    rng = np.random.default_rng([seed, 2])
+    drawn = [scenes.draw(rng, scenes.KINDS[i % len(scenes.KINDS)]) for i in range(bodies)]
+    rows = []
+    for name in MOTIONS:
+        motions = [scenes.make_motion(kernels, each, name, frames) for each in drawn]
+        couplings = {"without": [None] * bodies, "with": [gel - body / m.modulus_mpa for m in motions]}
+        calls = {
+            key: lambda couplings=couplings[key], motions=motions: [
+                _frames(motion, kernels, each) for motion, each in zip(motions, couplings, strict=True)
+            ]
+            for key in couplings
+        }
+        without, coupled = (jax.device_get(call()) for call in calls.values())
+        ms = {key: time / (bodies * frames) for key, time in median_ms(calls, range(_ROUNDS)).items()}
+        before, after = (np.stack([f.displacement_mm[:, :2] for f in found]) for found in (without, coupled))
+        forces = []
+        for still, moved, motion in zip(without, coupled, motions, strict=True):
+            off = np.linalg.norm(moved.force_n[:, :2] - still.force_n[:, :2], axis=1)
+            forces.append(float(off.max() / (float(motion.friction) * np.abs(still.force_n[:, 2]).max())))
+        rows.append(
+            {
+                "motion, sensor": f"{name}, {sensor.name}",
+                "markers": 100 * float(np.linalg.norm(after - before) / np.linalg.norm(before)),
+                "by": _MICROMETRES * float(np.sqrt(np.mean(np.sum((after - before) ** 2, 2)))),
+                "noise": _MICROMETRES * sensor.lateral_noise_mm,
+                "force": 100 * max(forces),
+                "time without": None if name == "hold" else ms["without"],
+                "time with": ms["with"],
+                "not converged": 100 * float(np.mean([~f.converged for f in coupled])),
+            }
+        )
+    return rows
+
+
+_frames = jax.jit(lambda motion, kernels, coupling: dragged(motion, kernels, lambda frame: frame, coupling))
+
+
+def coupling_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Effect and cost of coupling for all motions on all gels."""
+    percent, times = ("markers", "by", "force", "not converged"), ("time without", "time with")
+    return named_table(
+        "Effect and cost of coupling",
+        rows,
+        formats={**dict.fromkeys(percent, ".1f"), "noise": ".0f", **dict.fromkeys(times, ".2f")},
+        units={
+            **{"markers": "%", "by": "µm", "noise": "µm", "force": "% of μF", "not converged": "%"},
+            **dict.fromkeys(times, "ms"),
+        },
+        meanings={
+            "markers": "change of their sideways displacement, relative",
+            "by": "the same, rms over pixels and frames",
+            "noise": "of one node of the sensor's field",
+            "force": "greatest change of the tangential force",
+            "time without": "friction, a frame; a press has none",
+            "time with": "friction, a frame",
+            "not converged": "frames, with coupling",
+        },
+        note="Of sensors with markers, means over bodies of every kind.  Coupled presses pay for friction in full.",
+    )
+
+
+def coupling_verdict(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Effect and cost of coupling in a sentence."""
+    press, moved = ([row for row in rows if (row["time without"] is None) is still] for still in (True, False))
+    mean = lambda rows: float(np.mean([row["markers"] / 100 for row in rows]))
+    return (
+        f"Coupling changes the markers' sideways displacement by {mean(press):.0%} in a press and {mean(moved):.0%} "
+        f"in a motion, at most {max(row['by'] / row['noise'] for row in rows):.1f} of a node's noise; it adds "
+        f"{float(np.mean([row['time with'] for row in press])):.1f} ms per frame to a press, which needs no friction "
+        "without it, and makes the friction of a motion cost "
+        f"{float(np.mean([row['time with'] / row['time without'] for row in moved])):.1f} times as much."
+    )
+
+
+# Loops of real presses -----------------------------------------------------------------------------------------------
+
+RECORDING = "example_1_AD2-0065L.npz"
+"""The vendor's longer recording, 20 × 20 markers, frames 32.7 ms apart."""
+
+LAGS_S = (0.0, 0.03, 0.06, 0.09)
+TOUCHES_N = 0.05
+"""Force above which the sensor is touched."""
 
 
 def loop_table(data_dir: Path) -> Table:
@@ -209,25 +333,3 @@ def _presses(force_n: np.ndarray) -> list[slice]:
     edges = np.diff((force_n > TOUCHES_N).astype(int))
     begins, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     return [slice(int(b), int(ends[ends > b][0]) + 2) for b in begins if np.any(ends > b)]
-
-
-def _sphere(grid: int) -> tuple[np.ndarray, float, jnp.ndarray, Compliance]:
-    """Pixel centres, pixel size, μp of the sphere, which carries its force exactly, and the half-space."""
-    spacing = SIDE_MM / grid
-    x = (np.arange(grid) + 0.5) * spacing - SIDE_MM / 2
-    p = SPHERE.pressure_mpa(np.hypot(x[None], x[:, None]))
-    limit = FRICTION * p * SPHERE.force_n / (p.sum() * spacing**2)
-    half = half_space_spectrum(grid, spacing, 2 * SHEAR_MODULUS_MPA)
-    mirrored = np.roll(half[::-1], 1, 0)[:, grid - 1 : 0 : -1]
-    even = jnp.asarray(np.concatenate([half, mirrored], 1), jnp.float32)
-    return x, spacing, jnp.asarray(limit, jnp.float32), Compliance(even=even, odd=jnp.zeros_like(even, jnp.complex64))
-
-
-def _lubkin(stick_ratio: float) -> tuple[float, float]:
-    """Twist and torque of the sphere when it sticks within `stick_ratio` of its contact radius."""
-    a, angle = SPHERE.contact_radius_mm, np.linspace(0, np.pi / 2, 4001)
-    ratio = np.linspace(stick_ratio, 1, 400)
-    root = np.sqrt(1 - (1 - ratio[:, None] ** 2) * np.sin(angle) ** 2)
-    scale = 3 * FRICTION * SPHERE.force_n / (4 * np.pi * SHEAR_MODULUS_MPA * a**2)
-    twist = scale * np.trapezoid(1 / root - root, angle, axis=1)
-    return float(twist[0]), float(np.trapezoid(16 / 3 * SHEAR_MODULUS_MPA * (ratio * a) ** 3, -twist))

@@ -4,10 +4,9 @@ A solver maps one contact, the spectra of its gel and a number (tolerance or ite
 x + iy; one of sequences maps a motion likewise to tractions [F, N, N] and to the displacement that the markers show.
 """
 
-import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +17,19 @@ from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKer
 from sensors_io.scenes import contact, drag, partial_slip, tangential
 from sensors_io.scenes.traction import Compliance, displacement, in_series, rigid_field, shear_displacement
 
-Solver = Callable[[FrictionContact, FrictionKernels, Array], Any]
+Solver = Callable[[FrictionContact, FrictionKernels, Array], Array]
 SequenceSolver = Callable[[FrictionSequence, FrictionKernels, Array], tuple[Array, Any]]
 FrameSolver = Callable[[Array, Array, Compliance, Array], tuple[Array, Any]]
 """μp, target, compliance and the previous traction → the traction, and anything else to return."""
+
+Kept = TypeVar("Kept")
+
+SOLVER, PLAIN, SUPERPOSED = "SPG to tolerance", "plain SPG", "superposition"
+"""Kinds of methods."""
+
+FROM_PRESS = f"{SUPERPOSED} from the press"
+MAIN = f"{SOLVER} {tangential.TOLERANCE:g}"
+SEQUENCE = "sequence"
 
 MOST_ITERATIONS = 400
 EXACT_TOLERANCE, EXACT_ITERATIONS = 1e-8, 4000
@@ -29,25 +37,25 @@ _TINY = 1e-30
 _SHORTEST = 1e-12  # MPa; below it a traction has no direction
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FrictionMethod:
+class FrictionMethod(NamedTuple):
     """A solver at one setting; `kind` groups the chart, `label` is its mark there."""
 
     kind: str
-    label: str = ""
     solve: Callable[[Any, FrictionKernels, Array], Any]
     setting: float | int = 0.0
-
-    @property
-    def name(self) -> str:
-        """Name in the tables."""
-        return f"{self.kind} {self.label}".strip()
+    label: str = ""
 
 
 @functools.partial(jax.jit, static_argnames="solve")
-def every(solve: Solver, cases: FrictionContact, kernels: FrictionKernels, setting: Array) -> Any:
+def every(
+    solve: Callable[[FrictionContact, FrictionKernels, Array], Kept],
+    cases: FrictionContact,
+    kernels: FrictionKernels,
+    setting: Array,
+) -> Kept:
     """Solutions of S contacts, one after the other, so that each stops on its own."""
-    return jax.lax.map(lambda case: solve(case, kernels, setting), cases)
+    found: Kept = jax.lax.map(lambda case: solve(case, kernels, setting), cases)
+    return found
 
 
 @functools.partial(jax.jit, static_argnames="solve")
@@ -59,7 +67,7 @@ def sequence(
 
 
 def exact(task: str, cases: FrictionContact, kernels: FrictionKernels) -> np.ndarray:
-    """Tractions [S, N, N] of a task of `TASKS` in float64, which a duality gap below 1e-8 proves.
+    """Tractions [S, N, N] of a task in float64, which a duality gap below 1e-8 proves.
 
     Raises:
       RuntimeError: a gap that stays wider.
@@ -72,7 +80,7 @@ def exact(task: str, cases: FrictionContact, kernels: FrictionKernels) -> np.nda
 def exact_sequence(motion: FrictionSequence, kernels: FrictionKernels) -> np.ndarray:
     """The same of all frames of a sequence."""
     with jax.enable_x64(True):
-        found, (_, gap) = sequence(_tight_frames, _double(motion), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
+        found, (_, gap) = sequence(_exact_frames, _double(motion), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
         return _proven(found, gap)
 
 
@@ -82,19 +90,33 @@ def marker_motion(tractions: Array, kernels: FrictionKernels) -> Array:
     return jax.lax.map(lambda each: shear_displacement(each, kernels.markers.shear), tractions)
 
 
-def spg_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
-    """A prescribed force by the package's solver."""
-    return _solved_pull(case, kernels, tolerance).traction_mpa
+# One contact ---------------------------------------------------------------------------------------------------------
 
 
-def spg_slide(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
-    """A prescribed slide by the package's solver."""
-    return _solved_slide(case, kernels, tolerance).traction_mpa
+def solve_task(task: str, case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
+    """A prescribed force, slide or twist by the package's solver."""
+    cap = jnp.where(tolerance <= EXACT_TOLERANCE, EXACT_ITERATIONS, MOST_ITERATIONS)
+    compliance = _series(case, kernels)
+    if task == "force":
+        pull = case.pull_share * case.direction * jnp.sum(case.limit_mpa) * kernels.spacing_mm**2
+        force, still = jnp.stack([pull.real, pull.imag]), jnp.zeros_like(case.limit_mpa * case.direction)
+        return tangential.solve_force(case.limit_mpa, force, still, compliance, kernels.spacing_mm, tolerance, cap)
+    return tangential.solve(case.limit_mpa, _target(task, case, kernels), compliance, None, tolerance, cap)
 
 
-def spg_twist(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
-    """A prescribed twist by the package's solver."""
-    return _solved_twist(case, kernels, tolerance).traction_mpa
+_SOLVED = {task: functools.partial(solve_task, task) for task in ("force", "slide", "twist")}
+
+
+def spg(task: str) -> Solver:
+    """The package's solver."""
+    return lambda case, kernels, tolerance: solve_task(task, case, kernels, tolerance).traction_mpa
+
+
+def plain(task: str) -> Solver:
+    """The plain solver of a slide or a twist."""
+    return lambda case, kernels, iterations: plain_spg(
+        case.limit_mpa, _target(task, case, kernels), _series(case, kernels), iterations
+    )
 
 
 def superposed_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> Array:
@@ -131,18 +153,8 @@ def full_slip(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Arra
 
 def full_twist(case: FrictionContact, kernels: FrictionKernels, _: Array) -> Array:
     """A twist that slips everywhere."""
-    target = _twist(case, kernels)
+    target = _target("twist", case, kernels)
     return case.limit_mpa * target / jnp.maximum(jnp.abs(target), _TINY)
-
-
-def plain_slide(case: FrictionContact, kernels: FrictionKernels, iterations: Array) -> Array:
-    """A prescribed slide by the plain solver."""
-    return plain_spg(case.limit_mpa, _slide(case, kernels), _series(case, kernels), iterations)
-
-
-def plain_twist(case: FrictionContact, kernels: FrictionKernels, iterations: Array) -> Array:
-    """A prescribed twist by the plain solver."""
-    return plain_spg(case.limit_mpa, _twist(case, kernels), _series(case, kernels), iterations)
 
 
 def plain_spg(limit: Array, target: Array, compliance: Compliance, iterations: Array) -> Array:
@@ -176,20 +188,36 @@ def plain_spg(limit: Array, target: Array, compliance: Compliance, iterations: A
     return jax.lax.complex(x, y)
 
 
-def spg_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
-    """A sequence as the generator makes it."""
-    bodies = drag.Bodies(compliance=_series(motion, kernels), coupling=None, response=kernels.markers)
+# Sequences -----------------------------------------------------------------------------------------------------------
 
-    def go_on(history: drag.History, frame: tuple[Array, drag.RigidMotion]) -> tuple[drag.History, tuple[Array, Array]]:
+
+def dragged(
+    motion: FrictionSequence,
+    kernels: FrictionKernels,
+    keep: Callable[[drag.Frame], Kept],
+    coupling: Array | None = None,
+    tolerance: Array | float = tangential.TOLERANCE,
+    max_iterations: int = tangential.MAX_ITERATIONS,
+) -> Kept:
+    """A sequence as the generator makes it, coupled or not; `keep` picks what is kept of every frame."""
+    bodies = drag.Bodies(compliance=_series(motion, kernels), coupling=coupling, response=kernels.markers)
+
+    def advance(history: drag.History, frame: tuple[Array, drag.RigidMotion]) -> tuple[drag.History, Kept]:
         pressure, step = frame
-        history, seen = drag.advance(
-            history, pressure, motion.friction, step, bodies, kernels.x_mm, tolerance, MOST_ITERATIONS
+        history, solved = drag.advance(
+            history, pressure, motion.friction, step, bodies, kernels.x_mm, tolerance, max_iterations
         )
-        return history, (seen.traction_mpa, seen.displacement_mm)
+        return history, keep(solved)
 
     start = drag.at_rest(kernels.x_mm.shape[0])
-    found: tuple[Array, Array] = jax.lax.scan(go_on, start, (motion.pressure_mpa, motion.step))[1]
+    found: Kept = jax.lax.scan(advance, start, (motion.pressure_mpa, motion.step))[1]
     return found
+
+
+def spg_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
+    """A sequence by the package's solver."""
+    keep = lambda frame: (frame.traction_mpa, frame.displacement_mm)
+    return dragged(motion, kernels, keep, None, tolerance, MOST_ITERATIONS)
 
 
 def plain_frames(motion: FrictionSequence, kernels: FrictionKernels, iterations: Array) -> tuple[Array, Any]:
@@ -210,7 +238,7 @@ def full_slip_frames(motion: FrictionSequence, kernels: FrictionKernels, _: Arra
     return tractions
 
 
-def _tight_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
+def _exact_frames(motion: FrictionSequence, kernels: FrictionKernels, tolerance: Array) -> tuple[Array, Any]:
     def solve(limit: Array, target: Array, compliance: Compliance, before: Array) -> tuple[Array, Array]:
         solved = tangential.solve(limit, target, compliance, before, tolerance, EXACT_ITERATIONS)
         return solved.traction_mpa, solved.residual
@@ -222,7 +250,7 @@ def _frames(motion: FrictionSequence, kernels: FrictionKernels, solve: FrameSolv
     """Regions that stick keep their displacement: the target of a frame is that of the last frame plus the motion."""
     compliance = _series(motion, kernels)
 
-    def go_on(state: tuple[Array, Array], frame: tuple[Array, drag.RigidMotion]) -> tuple[tuple[Array, Array], Any]:
+    def advance(state: tuple[Array, Array], frame: tuple[Array, drag.RigidMotion]) -> tuple[tuple[Array, Array], Any]:
         (before, carried), (pressure, step) = state, frame
         target = carried + rigid_field(kernels.x_mm, step.slide_mm, step.twist_rad, step.centre_mm)
         found, more = solve(motion.friction * pressure, target, compliance, before)
@@ -230,41 +258,54 @@ def _frames(motion: FrictionSequence, kernels: FrictionKernels, solve: FrameSolv
         return (found, shear_displacement(found, compliance)), (found, (seen, more))
 
     rest = jax.lax.complex(*[jnp.zeros_like(motion.pressure_mpa[0])] * 2)
-    found: tuple[Array, Any] = jax.lax.scan(go_on, (rest, rest), (motion.pressure_mpa, motion.step))[1]
+    found: tuple[Array, Any] = jax.lax.scan(advance, (rest, rest), (motion.pressure_mpa, motion.step))[1]
     return found
 
 
-def _solved_pull(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
-    pull = case.pull_share * case.direction * jnp.sum(case.limit_mpa) * kernels.spacing_mm**2
-    force, still = jnp.stack([pull.real, pull.imag]), jnp.zeros_like(case.limit_mpa * case.direction)
-    compliance, cap = _series(case, kernels), _cap(tolerance)
-    return tangential.solve_force(case.limit_mpa, force, still, compliance, kernels.spacing_mm, tolerance, cap)
+def _to_tolerance(solve: Callable[..., Any]) -> list[FrictionMethod]:
+    tolerances = (2e-2, 5e-3, tangential.TOLERANCE, 1e-3, 3e-4)
+    return [FrictionMethod(SOLVER, solve, t, f"{t:g}") for t in tolerances]
 
 
-def _solved_slide(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
-    target, compliance = _slide(case, kernels), _series(case, kernels)
-    return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
+def _with_iterations(solve: Callable[..., Any]) -> list[FrictionMethod]:
+    return [FrictionMethod(PLAIN, solve, count, f"{count}") for count in (5, 10, 20, 40, 80)]
 
 
-def _solved_twist(case: FrictionContact, kernels: FrictionKernels, tolerance: Array) -> tangential.Traction:
-    target, compliance = _twist(case, kernels), _series(case, kernels)
-    return tangential.solve(case.limit_mpa, target, compliance, None, tolerance, _cap(tolerance))
+def _named(*methods: FrictionMethod) -> dict[str, FrictionMethod]:
+    return {f"{method.kind} {method.label}".strip(): method for method in methods}
 
 
-def _cap(tolerance: Array) -> Array:
-    """More iterations for the tolerance of the reference."""
-    return jnp.where(tolerance <= EXACT_TOLERANCE, EXACT_ITERATIONS, MOST_ITERATIONS)
+METHODS: Mapping[str, Mapping[str, FrictionMethod]] = {
+    "force": _named(
+        FrictionMethod("scaled pressure", scaled_pull),
+        FrictionMethod(FROM_PRESS, ramp_pull),
+        FrictionMethod(SUPERPOSED, superposed_pull, 1e-3),  # the generator's tolerance
+        *_to_tolerance(spg("force")),
+    ),
+    "slide": _named(
+        FrictionMethod("full slip", full_slip),
+        FrictionMethod(FROM_PRESS, ramp_slide),
+        *_to_tolerance(spg("slide")),
+        *_with_iterations(plain("slide")),
+    ),
+    "twist": _named(
+        FrictionMethod("full slip", full_twist), *_to_tolerance(spg("twist")), *_with_iterations(plain("twist"))
+    ),
+    SEQUENCE: _named(
+        FrictionMethod("full slip", full_slip_frames), *_to_tolerance(spg_frames), *_with_iterations(plain_frames)
+    ),
+}
+"""Task → name → method, cheapest first within each kind."""
 
 
 def _series(of: FrictionContact | FrictionSequence, kernels: FrictionKernels) -> Compliance:
     return in_series(kernels.gel, kernels.body, 1.0, of.modulus_mpa)
 
 
-def _slide(case: FrictionContact, kernels: FrictionKernels) -> Array:
-    return jnp.broadcast_to(case.slide_mm * case.direction, case.gap_mm.shape)
-
-
-def _twist(case: FrictionContact, kernels: FrictionKernels) -> Array:
+def _target(task: str, case: FrictionContact, kernels: FrictionKernels) -> Array:
+    """Prescribed displacement of the object's surface by a slide or a twist, [N, N] mm."""
+    if task == "slide":
+        return jnp.broadcast_to(case.slide_mm * case.direction, case.gap_mm.shape)
     still = jnp.zeros_like(kernels.x_mm, shape=(2,))
     return rigid_field(kernels.x_mm, still, case.twist_rad, still)
 
@@ -290,8 +331,3 @@ def _proven(tractions: Array, gap: Array) -> np.ndarray:
             "raise EXACT_ITERATIONS"
         )
     return np.asarray(tractions)
-
-
-_SOLVED = {"force": _solved_pull, "slide": _solved_slide, "twist": _solved_twist}
-TASKS = tuple(_SOLVED)
-"""Quantities that a task prescribes."""

@@ -1,6 +1,6 @@
 """Contacts with friction: three kinds of bodies on the gels of the sensors, pushed, slid and twisted.
 
-None of them is among the contacts that `partial_slip.promised_error` was fitted to: other gels, other shapes.
+`partial_slip.promised_error` was fitted to other gels and shapes.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Complex, Float
 
-from sensors_io import layer
+from experiments.mechanics.contact_scenes import SHORTEST_WAVE_MM, normal_compliances
 from sensors_io.scenes import contact, drag, motions, objects, partial_slip, press, schedule, surface
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
 from sensors_io.scenes.traction import Compliance, Response, in_series, make_compliance, make_response
@@ -21,7 +21,7 @@ KINDS = ("sphere", "rough", "patterned")
 
 FORCES_N = (1.0, 8.0)
 PULL_SHARES = (0.3, 0.9)
-"""Of the friction limit: the range that `partial_slip.promised_error` speaks of."""
+"""Of the friction limit: the range for which `partial_slip.promised_error` holds."""
 
 SLIDE_SHARES = (0.2, 0.9)
 """Of the slide at which a round contact has slipped everywhere."""
@@ -30,7 +30,6 @@ SEQUENCE_FORCE_N = 5.0
 _RAMP = 16  # frames of the press that went before
 _RISE = 1.5  # force over time in a press, see `motions`
 _ROUGHNESS_MM, _RELIEF_MM = (0.01, 0.06), (0.05, 0.4)
-_SHORTEST_MM = 0.8
 _PRESSURE_TOLERANCE, _PRESSURE_ITERATIONS = 1e-4, 400
 
 
@@ -112,11 +111,11 @@ def friction_kernels(sensor: SensorModel, grid: int) -> FrictionKernels:
     """A gel's spectra, on the padding that the widest-reaching gel needs, so that one program serves all."""
     spacing = sensor.window_mm / grid
     size = max(press.padded_size(grid, m.window_mm, m.gel.thickness_mm) for m in MODELS)
-    q = np.hypot(*layer.wave_numbers(size, spacing))
+    normal_gel, normal_body = normal_compliances(sensor, size, spacing)
     return FrictionKernels(
         x_mm=jnp.asarray((np.arange(grid) + 0.5) * spacing - sensor.window_mm / 2, jnp.float32),
-        normal_gel=jnp.asarray(layer.normal_compliance(q, sensor.gel), jnp.float32),
-        normal_body=jnp.asarray(layer.normal_compliance(q, BODY), jnp.float32),
+        normal_gel=jnp.asarray(normal_gel, jnp.float32),
+        normal_body=jnp.asarray(normal_body, jnp.float32),
         gel=make_compliance(sensor.gel, size, spacing),
         body=make_compliance(BODY, size, spacing),
         markers=make_response(sensor.gel, size, spacing, sensor.marker_depth_mm or 0.0),
@@ -125,7 +124,7 @@ def friction_kernels(sensor: SensorModel, grid: int) -> FrictionKernels:
 
 def draw(rng: np.random.Generator, kind: str) -> FrictionBody:
     """An object of a kind of `KINDS`, with a modulus and a friction of any material."""
-    solid = objects.sample(rng, 0.0, _SHORTEST_MM)
+    solid = objects.sample(rng, 0.0, SHORTEST_WAVE_MM)
     radius = solid.radius_1_mm if kind == "sphere" else solid.radius_2_mm
     rms = rng.uniform(*_ROUGHNESS_MM) if kind == "rough" else 0.0
     amplitudes = solid.wave_amplitudes_mm * (rms / solid.rms_mm)
@@ -138,13 +137,7 @@ def draw(rng: np.random.Generator, kind: str) -> FrictionBody:
 
 
 def sample(kernels: FrictionKernels, count: int, seed: int, order: int) -> tuple[FrictionContact, tuple[str, ...]]:
-    """`count` contacts of every kind on one gel, stacked, and the kind of each.
-
-    Args:
-      kernels: of the gel.
-      count: contacts of a kind.
-      seed, order: of the draws; `order` is the number of the gel.
-    """
+    """`count` contacts of every kind on gel number `order`, stacked, and the kind of each."""
     kinds = tuple(kind for kind in KINDS for _ in range(count))
     rng = np.random.default_rng([seed, order])
     cases = [_case(kernels, draw(rng, kind), rng) for kind in kinds]
@@ -156,14 +149,10 @@ def make_motion(kernels: FrictionKernels, body: FrictionBody, name: str, frames:
     hand = motions.plan(name, SEQUENCE_FORCE_N, schedule.pace(frames))
     slide, twist = (jnp.asarray(a, jnp.float32) for a in (hand.slide_mm, hand.twist_rad))
     force, modulus = jnp.asarray(hand.force_n, jnp.float32), jnp.float32(body.modulus_mpa)
-    still = jnp.zeros(2)
-
-    def since(path: Array) -> Array:
-        return jnp.diff(path, axis=0, prepend=jnp.zeros_like(path[:1]))
-
+    since = lambda path: jnp.diff(path, axis=0, prepend=jnp.zeros_like(path[:1]))
     return FrictionSequence(
         pressure_mpa=_pressures(kernels, body.skin, modulus, force, slide, twist),
-        step=drag.RigidMotion(slide_mm=since(slide), twist_rad=since(twist), centre_mm=still + slide),
+        step=drag.RigidMotion(slide_mm=since(slide), twist_rad=since(twist), centre_mm=jnp.zeros(2) + slide),
         modulus_mpa=modulus,
         friction=jnp.float32(body.friction),
     )

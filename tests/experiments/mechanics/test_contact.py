@@ -9,14 +9,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.mechanics import contact_oracles, contact_scenes, pareto_contact, stability_contact
-from experiments.mechanics.contact_methods import (
-    blur,
-    contact_methods,
-    polonsky_keer,
-    spg_plain,
-    winkler_and_response,
-    winkler_only,
-)
+from experiments.mechanics.contact_methods import METHODS, polonsky_keer, spg_plain
 from experiments.mechanics.contact_scenes import displacement_error, exact, failure_suite, slope_error
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 from tests.experiments.shrunk import run_shrunk
@@ -27,29 +20,18 @@ PARETO = pareto_contact.ParetoContactConfig(
 STABILITY = dataclasses.replace(stability_contact.SMOKE, scenes=12, forces_n=(0.01, 1.0), roughness=(2.0,))
 
 
-@pytest.fixture(scope="module")
-def pareto(tmp_path_factory):
-    home = tmp_path_factory.mktemp("runs")
-    return read_json(run_shrunk(pareto_contact, PARETO, home) / "results.json")
-
-
-def test_every_method_has_a_finite_row(pareto):
-    rows = pareto["tables"][0]["rows"]
-    assert [row[0] for row in rows] == [m.name for m in contact_methods()]
-    assert all(np.isfinite(cell) for row in rows for cell in row[1:])
-
-
-def test_accuracy_is_kept(pareto):
-    met = {r["name"]: r["met"] for r in pareto["requirements"] if "time" not in r["name"]}
+def test_pareto_contact(tmp_path):
+    results = read_json(run_shrunk(pareto_contact, PARETO, tmp_path) / "results.json")
+    rows = {row[0]: row[1:] for row in results["tables"][0]["rows"]}
+    assert list(rows) == list(METHODS)
+    assert all(np.isfinite(cell) for row in rows.values() for cell in row)
+    convolutions = {name: row[2] for name, row in rows.items()}
+    assert convolutions["Winkler"] == 0
+    assert convolutions["PK-25"] == 51
+    assert convolutions["nested 1e-3"] < convolutions["plain 1e-3"]
+    met = {r["name"]: r["met"] for r in results["requirements"] if "time" not in r["name"]}
     assert met
     assert all(met.values()), met
-
-
-def test_convolutions_are_counted(pareto):
-    rows = {row[0]: row[3] for row in pareto["tables"][0]["rows"]}
-    assert rows["Winkler"] == 0
-    assert rows["PK-25"] == 51
-    assert rows["nested 1e-3"] < rows["plain 1e-3"]
 
 
 def test_same_seed_same_scene_on_every_grid():
@@ -64,16 +46,12 @@ def test_same_seed_same_scene_on_every_grid():
     [
         pytest.param(spg_plain(1e-5, False), 0, 1e-4, id="plain SPG"),
         pytest.param(polonsky_keer(40), 0, 1e-4, id="Polonsky–Keer"),
-        pytest.param(winkler_only, 0.01, 1, id="Winkler"),
-        pytest.param(winkler_and_response, 0.01, 1, id="Winkler + response"),
-        pytest.param(blur, 0.01, 1, id="blur"),
+        *(pytest.param(METHODS[name].solve, 0.01, 1, id=name) for name in ("Winkler", "Winkler + response", "blur")),
     ],
 )
 def test_error_of_each_method(solve, least, most):
-    scenes, kernels = (
-        contact_scenes.sample_scenes(GELSIGHT_MINI, 1, 32, 1),
-        contact_scenes.gel_kernels(GELSIGHT_MINI, 32),
-    )
+    scenes = contact_scenes.sample_scenes(GELSIGHT_MINI, 1, 32, 1)
+    kernels = contact_scenes.gel_kernels(GELSIGHT_MINI, 32)
     gel = jnp.asarray(kernels.gel, jnp.float32)
     total = gel + jnp.asarray(kernels.body, jnp.float32) / scenes.modulus_mpa[0]
     found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, kernels.spacing_mm)
@@ -95,25 +73,17 @@ def test_oracles_agree_where_they_are_installed(context):
     assert max(errors.values()) < 1e-3
 
 
-@pytest.fixture(scope="module")
-def stability(tmp_path_factory):
-    return run_shrunk(stability_contact, STABILITY, tmp_path_factory.mktemp("runs"))
-
-
 @pytest.mark.slow
-def test_no_failure_goes_unflagged(stability):
-    results = read_json(stability / "results.json")
+def test_stability_contact(tmp_path):
+    directory = run_shrunk(stability_contact, STABILITY, tmp_path)
+    results = read_json(directory / "results.json")
     assert {r["name"]: r["measured"] for r in results["requirements"] if not r["met"]} == {}
     assert results["data"]["good scenes"] >= 10
-    assert [row[0] for row in results["tables"][0]["rows"]] == [case.name for case in failure_suite(STABILITY.grid)]
-    assert {p.name for p in (stability / "plots").iterdir()} == {"stability_roughness.svg", "stability_thickness.svg"}
-
-
-@pytest.mark.slow
-def test_adhesion_is_flagged_where_it_matters(stability):
-    (table,) = (t for t in read_json(stability / "results.json")["tables"] if t["title"].startswith("Adhesion"))
-    assert len(table["rows"]) == 12
-    for _, flagged, matters, ratio in table["rows"]:
+    suite, adhesive = (table["rows"] for table in results["tables"])
+    assert [row[0] for row in suite] == [case.name for case in failure_suite(STABILITY.grid)]
+    assert {p.name for p in (directory / "plots").iterdir()} == {"stability_roughness.svg", "stability_thickness.svg"}
+    assert len(adhesive) == 12
+    for _, flagged, matters, ratio in adhesive:
         assert 0.7 * flagged < matters <= flagged  # a bonded gel sticks less than a half-space
         assert ratio == pytest.approx(matters / flagged)
 

@@ -8,10 +8,11 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.core.errors import ResultsError
-from experiments.mechanics import pareto_tangential, tangential_checks, tangential_report, tangential_scenes
+from experiments.mechanics import pareto_tangential, tangential_checks, tangential_scenes
 from experiments.mechanics import tangential_methods as methods
+from experiments.mechanics.pareto_tangential import MethodErrors, at_equal_error, time_at
 from experiments.mechanics.tangential_checks import PromiseCheck
-from experiments.mechanics.tangential_report import MAIN, PLAIN, SOLVER, MethodErrors
+from experiments.mechanics.tangential_methods import MAIN, METHODS, PLAIN, SOLVER
 from sensors_io.scenes.sensors import XENSE
 from tests.experiments.shrunk import run_shrunk
 
@@ -21,47 +22,42 @@ TINY = dataclasses.replace(
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory):
-    home = tmp_path_factory.mktemp("runs")
-    return run_shrunk(pareto_tangential, TINY, home)
-
-
-@pytest.fixture(scope="module")
 def contacts():
     kernels = tangential_scenes.friction_kernels(XENSE, 24)
     return kernels, *tangential_scenes.sample(kernels, 1, 0, 0)
 
 
 @pytest.mark.slow
-def test_every_method_has_a_row(directory):
-    tables = read_json(directory / "results.json")["tables"]
-    for table, compared in zip(tables, pareto_tangential.methods().values(), strict=False):
-        assert [row[0] for row in table["rows"]] == [m.name for m in compared]
-        assert np.all(np.isfinite([row[1:] for row in table["rows"]]))
+def test_a_shrunken_run(tmp_path):
+    directory = run_shrunk(pareto_tangential, TINY, tmp_path)
+    results = read_json(directory / "results.json")
     assert {p.name for p in (directory / "plots").iterdir()} == {"pareto_tangential.svg", "promise.svg"}
-
-
-@pytest.mark.slow
-def test_a_tighter_setting_errs_less(directory):
-    tables = read_json(directory / "results.json")["tables"]
-    for table in tables[:4]:
-        worst = {row[0]: row[4] for row in table["rows"]}
+    assert {"Cattaneo–Mindlin, slide off by", "Lubkin, torque off by"} <= {r["name"] for r in results["requirements"]}
+    by_task = [{row[0]: row[1:] for row in table["rows"]} for table in results["tables"][: len(METHODS)]]
+    for rows, compared in zip(by_task, METHODS.values(), strict=True):
+        assert list(rows) == list(compared)
+        assert np.all(np.isfinite(list(rows.values())))
+        worst = {name: row[3] for name, row in rows.items()}
         assert worst[f"{SOLVER} 0.0003"] < worst[f"{SOLVER} 0.02"]
         assert worst[MAIN] < 15  # per cent, on 24²
-    for table in tables[1:4]:
-        median = {row[0]: row[2] for row in table["rows"]}
+    for rows in by_task[1:]:
+        median = {name: row[1] for name, row in rows.items()}
         assert median[f"{PLAIN} 80"] < median[f"{PLAIN} 5"] < median["full slip"]
+    hold, slide, twist = results["tables"][7]["rows"]  # coupling
+    assert [row[0] for row in (hold, slide, twist)] == [f"{m}, xense" for m in tangential_checks.MOTIONS]
+    assert hold[5] is None
+    assert slide[5] > 0
+    assert 0 < hold[1] < 100
+    assert hold[4] < slide[4] + 20
 
 
 @pytest.mark.slow
-def test_closed_forms_are_kept(directory, context):
-    names = {r["name"] for r in read_json(directory / "results.json")["requirements"]}
-    assert {"Cattaneo–Mindlin, slide off by", "Lubkin, torque off by"} <= names
-    assert tangential_checks.lubkin(48, context) < 0.02
-    off = tangential_checks.cattaneo_mindlin(48, context)
-    assert off["slide"] < 0.01
-    assert off["force"] < 0.01
-    assert off["traction"] < 0.08
+def test_closed_forms_are_kept(context):
+    off = tangential_checks.closed_forms(48, context)
+    assert off["Lubkin: torque"] < 0.02
+    assert off["Cattaneo–Mindlin: slide"] < 0.01
+    assert off["Cattaneo–Mindlin: force"] < 0.01
+    assert off["Cattaneo–Mindlin: traction"] < 0.08
 
 
 @pytest.mark.parametrize("task", ["slide", "twist"])
@@ -69,11 +65,7 @@ def test_two_solvers_meet_at_the_exact_traction(contacts, task):
     kernels, cases, _ = contacts
     true = methods.exact(task, cases, kernels)
     assert true.dtype == np.complex128
-    tight, plain = {
-        "slide": (methods.spg_slide, methods.plain_slide),
-        "twist": (methods.spg_twist, methods.plain_twist),
-    }[task]
-    for solve, setting in ((tight, 1e-5), (plain, 300)):
+    for solve, setting in ((methods.spg(task), 1e-5), (methods.plain(task), 300)):
         found = methods.every(solve, cases, kernels, jnp.asarray(setting))
         off = np.linalg.norm(found - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
         assert off.max() < 0.02
@@ -83,7 +75,7 @@ def test_a_force_is_carried_by_every_method(contacts):
     kernels, cases, _ = contacts
     most = np.asarray(cases.friction * cases.ramp_mpa[:, -1].sum((1, 2))) * float(kernels.spacing_mm) ** 2
     pull = most * np.asarray(cases.pull_share * cases.direction)
-    for solve in (methods.scaled_pull, methods.ramp_pull, methods.superposed_pull, methods.spg_pull):
+    for solve in (methods.scaled_pull, methods.ramp_pull, methods.superposed_pull, methods.spg("force")):
         found = np.asarray(methods.every(solve, cases, kernels, jnp.asarray(1e-3)))
         np.testing.assert_allclose(found.sum((1, 2)) * float(kernels.spacing_mm) ** 2, pull, rtol=0.03)
         assert np.all(np.abs(found) <= np.asarray(cases.limit_mpa) * (1 + 1e-4) + 1e-9)
@@ -117,16 +109,14 @@ def _rows(**ladders):
 def test_times_at_equal_error_by_hand():
     ours = [(MAIN, 2.0, 0.01), ("tight", 4.0, 0.001)]
     rows = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.1), ("", 16.0, 0.001)]})
-    assert tangential_report.time_at(rows, PLAIN, 0.01) == pytest.approx(8.0)
-    assert tangential_report.time_at(rows, PLAIN, 0.2) is None
-    assert tangential_report.time_at(rows, SOLVER, 0.0001) is None
-    assert tangential_report.at_equal_error(rows) == (pytest.approx(0.25), "")
+    assert time_at(rows, PLAIN, 0.01) == pytest.approx(8.0)
+    assert time_at(rows, PLAIN, 0.2) is None
+    assert time_at(rows, SOLVER, 0.0001) is None
+    assert at_equal_error(rows) == (pytest.approx(0.25), "")
     worse = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.1), ("", 16.0, 0.02)]})
-    ratio, reservation = tangential_report.at_equal_error(worse)
-    assert (ratio, reservation[:7]) == (pytest.approx(2 / 16), "at most")
+    assert at_equal_error(worse)[0] == pytest.approx(2 / 16)
     better = _rows(**{SOLVER: ours, PLAIN: [("", 4.0, 0.005), ("", 16.0, 0.001)]})
-    ratio, reservation = tangential_report.at_equal_error(better)
-    assert (ratio, reservation[:8]) == (pytest.approx(2 / 4), "at least")
+    assert at_equal_error(better)[0] == pytest.approx(2 / 4)
 
 
 def test_promises_are_counted():
@@ -161,16 +151,3 @@ def test_a_lag_of_the_force_makes_a_negative_loop_and_a_loss_a_positive_one(tmp_
     assert by_lag[0.06] == pytest.approx(0, abs=0.5)
     with pytest.raises(ResultsError, match="must hold example_1"):
         tangential_checks.loop_table(tmp_path / "nowhere")
-
-
-@pytest.mark.slow
-def test_coupling_is_measured_on_gels_with_markers(directory):
-    results = read_json(directory / "results.json")
-    (table,) = (t for t in results["tables"] if t["title"].startswith("What coupling changes"))
-    assert [row[0] for row in table["rows"]] == [f"{m}, xense" for m in ("hold", "slide_x", "twist")]
-    hold, slide, _ = table["rows"]
-    assert hold[5] is None
-    assert slide[5] > 0
-    assert 0 < hold[1] < 100
-    assert hold[4] < slide[4] + 20
-    assert "Coupling changes" in results["verdict"][-1]
