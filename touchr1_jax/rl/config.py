@@ -31,6 +31,9 @@ class Average(enum.Enum):
 
     ROLLOUT = "rollout"
     TOKEN = "token"
+    """Over the tokens of each prompt's group, then over prompts."""
+    BATCH = "batch"
+    """Over the tokens of the whole batch."""
     LENGTH = "length"
 
 

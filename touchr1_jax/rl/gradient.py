@@ -28,8 +28,7 @@ from touchr1_jax.types import Params, Rollout
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
-    `old` are the log-probabilities that ratios are taken to: the sampler's, or, under an importance cap and after the
-    first of several updates, the learner's before it.
+    `old` are the log-probabilities that ratios are taken to after the first of several updates: the learner's before it.
     """
 
     batch: GRPOBatch
@@ -57,22 +56,21 @@ def grpo_gradient(
       params: the learner.
       reference: the policy that the KL is taken to.
       experience: rollouts with their advantages.
-      first: true before the first update from this experience; read under an importance cap only, where the learner's
-        own log-probabilities are then the old ones.
+      first: true before the first update from this experience: the learner's own log-probabilities are then the old
+        ones, so that every ratio is 1 whatever precision the sampler computed in.
 
     Returns:
       The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest); and the
       log-probabilities that the ratios were taken to.
     """
     algorithm = config.algorithm
+    batch_length = jnp.mean(masked.count(experience.old, experience.rollout.mask, -1))
 
     def loss(params: Params, micro: Experience) -> tuple[Array, tuple[dict[str, Array], Array]]:
         terms = experience_terms(fns, config, params, reference, micro)
-        old = micro.old
-        if algorithm.importance_cap is not None:
-            old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
-        rollout = micro.rollout
-        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, micro.advantage, micro.weight, config)
+        old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), micro.old)
+        rollout, a, w = micro.rollout, micro.advantage, micro.weight
+        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, batch_length)
         return value, (parts | {"loss": value}, old)
 
     def add_micro_batch(grads: Params, micro: Experience) -> tuple[Params, tuple[dict[str, Array], Array]]:

@@ -11,7 +11,7 @@ the device between the first line and the metrics.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,11 @@ from touchr1_jax.rl.advantages import (
 )
 from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.gradient import Experience, grpo_gradient
+from touchr1_jax.rl.gradient import Experience
 from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metrics, touch_metrics
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import ScoreFn
-from touchr1_jax.rl.trust_region import within_trust
+from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout
 
@@ -155,7 +155,9 @@ class _Engine:
             group = jax.tree.map(lambda x: x[rows], group)
         learn = self.experience(group, frozen.noise, mask_key)
         reference = frozen.reference if state.reference is None else state.reference
-        params, opt_state, parts = self.update(state, reference, learn)
+        params, opt_state, parts = update_policy(
+            self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
+        )
         metrics = parts | control_metrics | self.metrics(group, learn)
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
         return self.refreshed(after), metrics
@@ -220,52 +222,6 @@ class _Engine:
             advantage=advantage,
             weight=prompt_weights(~no_signal) if algorithm.drop_degenerate else even,
         )
-
-    def update(
-        self, state: GRPOState, reference: Params, learn: Experience
-    ) -> tuple[Params, optax.OptState, dict[str, Array]]:
-        """μ gradient steps on the same rollouts; the parts are those of the first, `clip_share` that of the last."""
-
-        def once(carry: tuple[Params, optax.OptState, Array], first: Any):
-            params, opt_state, old = carry
-            grads, parts, old = self.gradient(params, reference, learn._replace(old=old), first)
-            updates, opt_state = self.optimizer.update(grads, opt_state, params)
-            parts = parts | {"grad_norm": optax.tree.norm(grads)}
-            moved = optax.apply_updates(params, updates)
-            if (trust := self.config.algorithm.trust_nat) is not None:
-                moved, size = within_trust(self.fns, self.config, params, moved, learn, trust)
-                parts |= size
-            return (moved, opt_state, old), parts
-
-        start, count = (state.params, state.opt_state, learn.old), self.config.algorithm.updates
-        if count == 1:
-            (params, opt_state, _), parts = once(start, True)
-            return params, opt_state, parts
-        (params, opt_state, _), all_parts = jax.lax.scan(once, start, jnp.arange(count) == 0)
-        parts = jax.tree.map(lambda x: x[0], all_parts)
-        return params, opt_state, parts | {"clip_share": all_parts["clip_share"][-1]}
-
-    def gradient(
-        self, params: Params, reference: Params, learn: Experience, first: bool | Bool[Array, ""] = True
-    ) -> tuple[Params, dict[str, Array], Float[Array, "P G T"]]:
-        """`grpo_gradient` over as many tokens as the shortest sufficient bucket has."""
-        lengths = (*self.config.buckets, self.config.length)
-
-        def over(length: int) -> Callable[[Params], tuple[Params, dict[str, Array], Array]]:
-            cut = lambda x: x[..., :length]
-            short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
-
-            def of(params: Params) -> tuple[Params, dict[str, Array], Array]:
-                grads, parts, old = grpo_gradient(self.fns, self.config, params, reference, short, first=first)
-                return grads, parts, jnp.pad(old, [(0, 0), (0, 0), (0, self.config.length - length)])
-
-            return of
-
-        if len(lengths) == 1:
-            return over(self.config.length)(params)
-        longest = jnp.max(jnp.sum(learn.rollout.mask, -1))
-        bucket = jnp.sum(jnp.asarray(lengths) < longest)
-        return jax.lax.switch(bucket, [over(length) for length in lengths], params)
 
     def refreshed(self, state: GRPOState) -> GRPOState:
         """The state with the policy as its own reference where the algorithm's period is over."""

@@ -38,6 +38,7 @@ def grpo_loss(
     advantage: Float[Array, "P G"],
     weight: Float[Array, "P"],
     config: GRPOConfig,
+    batch_length: Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
     """Loss −J of a micro-batch of groups; the losses of all micro-batches of a step add up to that of the step.
 
@@ -56,23 +57,30 @@ def grpo_loss(
       advantage: A of each rollout.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
+      batch_length: mean number of tokens of the step's rollouts, which a mean over the tokens of the batch divides by.
 
     Returns:
-      The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, and the share
-      of clipped tokens.
+      The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
+      clipped tokens, and the mean and the largest |log π(o_t) − log π_sampler(o_t)|.
     """
     algorithm = config.algorithm
+    longest: float | Array = config.length
+    if algorithm.average is Average.BATCH:
+        if batch_length is None:
+            raise ValueError("batch_length is None: a mean over the tokens of the batch needs it; pass it")
+        longest = batch_length
     objective, clipped = surrogate(algorithm, terms.log_prob, old, mask, advantage)
     if algorithm.importance_cap is not None:
         objective *= jnp.minimum(_ratio(old - sampler), algorithm.importance_cap)
-    policy, kl = (group_mean(algorithm.average, x, mask, config.length) for x in (objective, terms.reference_kl))
-    per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, config.length)
+    policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
+    per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
 
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     gain = jnp.sum(weight * policy) + jnp.sum(grounded - algorithm.beta * kl + explored) / config.prompts
 
+    gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, {
         "surrogate": policy,
@@ -82,6 +90,8 @@ def grpo_loss(
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
         "clip_share": per_rollout(clipped.astype(jnp.float32)),
+        "sampler_gap": per_rollout(gap),
+        "sampler_gap_peak": peak(gap),
     }
 
 
@@ -119,24 +129,27 @@ def surrogate(
     return jnp.minimum(free, bound), free > bound
 
 
-def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: int) -> Array:
+def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: float | Array) -> Array:
     """Mean over the tokens of each group, [*p].
 
-    ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO), so that long rollouts weigh more.
-    LENGTH: mean_i 1/N Σ_t x with the longest length N that is allowed (Dr. GRPO), so that no length is favoured.
+    ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long
+    rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest length N that is allowed (Dr. GRPO), so that no
+    length is favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over the
+    prompts is Σ x over all tokens of the batch by their number, as DAPO's code and TRL compute TOKEN: prompts with long
+    answers weigh more too.
 
     Args:
       kind: which of them.
       x: value of each token.
       mask: which tokens exist.
-      longest: N, which may exceed the T at hand.
+      longest: N, which may differ from the T at hand.
     """
     match kind:
         case Average.ROLLOUT:
             return jnp.mean(masked.mean(x, mask, -1), -1)
         case Average.TOKEN:
             return masked.mean(x, mask, (-2, -1))
-        case Average.LENGTH:
+        case Average.LENGTH | Average.BATCH:
             return jnp.mean(masked.total(x, mask, -1), -1) / longest
         case _:
             assert_never(kind)

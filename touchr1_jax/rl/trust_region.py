@@ -28,16 +28,16 @@ def within_trust(
     θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
     is quadratic in a small step, so that one shortening is enough for a step that is slightly too long, but not for a
     much longer one, where KL grows more slowly.  An update that is short enough is measured once.  The KL is the k3
-    estimate on the rollouts, which π₀ sampled.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix
+    estimate on the rollouts, with `learn.old` as the log-probabilities under π₀.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix
     C), here of any optimizer's, with this fixed point for its line search.
 
     Args:
       fns, config: as in `make_grpo_step`.
-      before: parameters θ₀ that the rollouts were sampled with.
+      before: parameters θ₀.
       after: parameters θ₁ that the optimizer proposes.
-      learn: the rollouts.
+      learn: the rollouts, and the log-probabilities `old` that the KL is taken to.
       delta: δ; with several updates from the same rollouts it bounds all of them together, since the KL is that to the
-        policy that sampled.
+        policy before the first.
 
     Returns:
       The parameters θ, and `update_kl`, the KL that was proposed, and `update_scale`, s.
@@ -46,7 +46,7 @@ def within_trust(
 
     def moved_by(scale: Float[Array, ""]) -> Float[Array, ""]:
         moved = log_probs(fns, config, between(scale), learn)
-        return jnp.mean(masked.mean(estimated_kl(learn.rollout.log_prob, moved, "k3"), learn.rollout.mask, axis=-1))
+        return jnp.mean(masked.mean(estimated_kl(learn.old, moved, "k3"), learn.rollout.mask, axis=-1))
 
     def too_long(carry: tuple[Array, Array, Array]) -> Array:
         _, kl, measured = carry

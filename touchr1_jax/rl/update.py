@@ -1,0 +1,104 @@
+"""The update of a step: one or several optimizer steps from the same rollouts."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float
+
+from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.gradient import Experience, grpo_gradient
+from touchr1_jax.rl.trust_region import within_trust
+from touchr1_jax.skipping import Skipping
+from touchr1_jax.types import Params
+
+Gradient = tuple[Params, dict[str, Array], Float[Array, "P G T"]]
+"""Gradient, parts and old log-probabilities, as `grpo_gradient` returns them."""
+
+
+def update_policy(
+    fns: PolicyFns,
+    optimizer: optax.GradientTransformation,
+    config: GRPOConfig,
+    params: Params,
+    opt_state: optax.OptState,
+    reference: Params,
+    learn: Experience,
+) -> tuple[Params, optax.OptState, dict[str, Array]]:
+    """μ optimizer steps on the same rollouts.
+
+    Returns:
+      Parameters, state of the optimizer, and parts of the first gradient, but `clip_share` of the last one.
+    """
+
+    def once(carry: tuple[Params, optax.OptState, Array], first: Any):
+        params, opt_state, old = carry
+        grads, parts, old = bucketed_gradient(fns, config, params, reference, learn._replace(old=old), first)
+        norm = optax.tree.norm(grads)
+        moved, opt_state = finite_update(optimizer, grads, norm, opt_state, params)
+        parts = parts | {"grad_norm": norm}
+        if (trust := config.algorithm.trust_nat) is not None:
+            moved, size = within_trust(fns, config, params, moved, learn._replace(old=old), trust)
+            parts |= size
+        return (moved, opt_state, old), parts
+
+    start, count = (params, opt_state, learn.old), config.algorithm.updates
+    if count == 1:
+        (params, opt_state, _), parts = once(start, True)
+        return params, opt_state, parts
+    (params, opt_state, _), all_parts = jax.lax.scan(once, start, jnp.arange(count) == 0)
+    parts = jax.tree.map(lambda x: x[0], all_parts)
+    return params, opt_state, parts | {"clip_share": all_parts["clip_share"][-1]}
+
+
+def finite_update(
+    optimizer: optax.GradientTransformation,
+    grads: Params,
+    norm: Float[Array, ""],
+    opt_state: optax.OptState,
+    params: Params,
+) -> tuple[Params, optax.OptState]:
+    """Parameters and optimizer state after a gradient; as before where its norm is NaN or infinite.
+
+    An optimizer of `skipping.skip_nonfinite` sees to that itself and counts; any other receives zeros instead of such a
+    gradient, and what it answers is discarded.
+    """
+    if isinstance(opt_state, Skipping):
+        updates, opt_state = optimizer.update(grads, opt_state, params)
+        return optax.apply_updates(params, updates), opt_state
+    finite = jnp.isfinite(norm)
+    pick = lambda new, old: jnp.where(finite, new, old)
+    updates, after = optimizer.update(jax.tree.map(lambda g: pick(g, jnp.zeros_like(g)), grads), opt_state, params)
+    return jax.tree.map(pick, (optax.apply_updates(params, updates), after), (params, opt_state))
+
+
+def bucketed_gradient(
+    fns: PolicyFns,
+    config: GRPOConfig,
+    params: Params,
+    reference: Params,
+    learn: Experience,
+    first: bool | Bool[Array, ""] = True,
+) -> Gradient:
+    """`grpo_gradient` over as many tokens as the shortest sufficient bucket has."""
+    lengths = (*config.buckets, config.length)
+
+    def over(length: int) -> Callable[[Params], Gradient]:
+        cut = lambda x: x[..., :length]
+        short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
+
+        def of(params: Params) -> Gradient:
+            grads, parts, old = grpo_gradient(fns, config, params, reference, short, first=first)
+            return grads, parts, jnp.pad(old, [(0, 0), (0, 0), (0, config.length - length)])
+
+        return of
+
+    if len(lengths) == 1:
+        return over(config.length)(params)
+    longest = jnp.max(jnp.sum(learn.rollout.mask, -1))
+    bucket = jnp.sum(jnp.asarray(lengths) < longest)
+    return jax.lax.switch(bucket, [over(length) for length in lengths], params)
