@@ -22,6 +22,7 @@ LAYERS = {
         "types",
         "validation",
         "masked",
+        "skipping",
         "text",
         "models",
         "rewards",

@@ -1,6 +1,5 @@
 """The update of a step: one or several optimizer steps from the same rollouts."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 

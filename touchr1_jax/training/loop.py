@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import numpy as np
 
+from touchr1_jax.skipping import count_skipped
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import return_memory
-from touchr1_jax.training.optimizer import count_skipped
 
 Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
 """(state, batch, *constants) → (state, metrics), jitted; it may donate its state."""
@@ -45,7 +45,7 @@ class NonFiniteGradientError(RuntimeError):
 class LoopConfig:
     """Number of steps, every how many a checkpoint is saved, and how many updates in a row may be left out.
 
-    An update is left out where its gradient is not finite (see `optimizer.skip_nonfinite`).
+    An update is left out where its gradient is not finite (see `skipping.skip_nonfinite`).
     """
 
     steps: int

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 
 from touchr1_jax.rl.grpo import GRPOState
-from touchr1_jax.training.optimizer import skip_nonfinite
+from touchr1_jax.skipping import skip_nonfinite
 
 OPTIMIZER = optax.adam(0.1)
 GUARDED = skip_nonfinite(OPTIMIZER)

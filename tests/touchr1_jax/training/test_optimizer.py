@@ -6,12 +6,11 @@ import numpy as np
 import optax
 import pytest
 
+from touchr1_jax.skipping import count_skipped, skip_nonfinite
 from touchr1_jax.training.optimizer import (
     OptimizerConfig,
-    count_skipped,
     falling_adamw,
     make_optimizer,
-    skip_nonfinite,
 )
 
 CONFIG = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, warmup_steps=4, max_grad_norm=1e9)
