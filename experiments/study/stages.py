@@ -25,7 +25,7 @@ from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.scoring import ScoreFn, make_score
+from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score
 from touchr1_jax.training import encoding
 from touchr1_jax.training.feeds import AnswerFeed, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
@@ -275,19 +275,27 @@ ALARM = "alarm_"
 def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[str, float]], None]:
     """A function that logs the metrics of each step and the alarms they raise, `alarm_F7` with the number that fired.
 
-    Each alarm of a stage is also printed once.  A stage that resumes at step `start` first looks at the steps that it
-    logged before, so that its lines are those of an uninterrupted run.
+    Each alarm of a stage is also printed once, and so is each reward that is not finite and the first update that is
+    left out.  A stage that resumes at step `start` first looks at the steps that it logged before, so that its lines
+    are those of an uninterrupted run.
     """
     monitor, printed = AlarmMonitor(), set[str]()
 
     def alarms_of(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
-        if SKIPPED in metrics:  # its update was left out, and the numbers that are not finite are missing
-            return {}
-        alarms = monitor.update(metrics)
-        for alarm in alarms:
-            if aloud and alarm.code not in printed:
-                context.print(f"{stage}, step {t}: {alarm}")
-            printed.add(alarm.code)
+        left_out = SKIPPED in metrics  # then the numbers that are not finite are missing
+        alarms = monitor.update({} if left_out else metrics, left_out=left_out)
+        notes = {f"{alarm.code} {alarm.meaning}": str(alarm) for alarm in alarms}
+        if left_out:
+            notes[SKIPPED] = "the update is left out, for its gradient is not finite; the report counts all of them"
+        for name, share in metrics.items():
+            if name.startswith(NONFINITE_IN) and share > 0:
+                reward = name.removeprefix(NONFINITE_IN)
+                what = f"reward {reward!r} is not finite in {share:.0%} of the groups, which are left out"
+                notes[name] = f"{what}; the report counts all of them"
+        for name, note in notes.items():
+            if aloud and name not in printed:
+                context.print(f"{stage}, step {t}: {note}")
+            printed.add(name)
         return {f"{ALARM}{alarm.code}": alarm.value for alarm in alarms}
 
     for line in read_metrics(context.directory):

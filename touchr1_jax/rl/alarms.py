@@ -2,7 +2,8 @@
 
 A function gets the mean metrics of the last `WINDOW` steps and of the first `START`, those of the policy that training
 starts from, and returns the number that is compared with a bound, or `None`.
-The codes F1 … F13 number the failures; F11, the collapse of latent prediction, belongs to another stage.
+The codes F1 … F15 number the failures; F11, the collapse of latent prediction, and F14, the prior of the labels, belong
+to other stages.
 """
 
 import collections
@@ -25,6 +26,9 @@ WORSE = 0.1
 NO_LEAD = 0.04
 """Leads of touch below this are chance: two standard errors of the difference of two means in a window, from 1,280
 answers and from 640 under a control."""
+
+LEFT_OUT = "left_out_share"
+"""Share of the last `WINDOW` updates that were left out, for their gradient was not finite."""
 
 Metrics = Mapping[str, float]
 
@@ -53,6 +57,8 @@ class AlarmRule:
     check: Callable[[Metrics, Metrics], float | None]
     below: bool = False
     """Fire below the bound instead of above."""
+    at_once: bool = False
+    """Judge every step alone, from the first one on, instead of windows."""
 
     def alarm(self, now: Metrics, start: Metrics) -> Alarm | None:
         """The alarm, if it fires; metrics that a run does not log raise none."""
@@ -118,12 +124,14 @@ def _controls(now: Metrics) -> dict[str, float]:
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
     """F7: share of groups of equal rewards among those that are not all right, while answers get no better.
 
-    A group that is all right has nothing to learn.
+    A group that is all right has nothing to learn.  Under dynamic sampling these are shares of all candidates, which
+    the log names `drawn_…`: the selected groups hide what was passed over.
     """
-    if now["accuracy"] > start["accuracy"]:
+    drawn = lambda metrics, name: metrics.get(f"drawn_{name}", metrics[name])
+    if drawn(now, "accuracy") > drawn(start, "accuracy"):
         return None
-    unsolved = 1 - now["all_right_share"]
-    return (now["degenerate_share"] - now["all_right_share"]) / unsolved if unsolved > 0 else 0.0
+    solved = drawn(now, "all_right_share")
+    return (drawn(now, "degenerate_share") - solved) / (1 - solved) if solved < 1 else 0.0
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
@@ -147,6 +155,24 @@ def forgotten_stream(now: Metrics, start: Metrics) -> float | None:
     del start
     streams = [n.removeprefix("perturbed_stream_") for n in now if n.startswith("perturbed_stream_") and now[n] > 0]
     return min((now[f"grounding_stream_{s}"] for s in streams), default=None)
+
+
+def touched_share(now: Metrics, start: Metrics) -> float | None:
+    """F10: share of the prompts that have any touch."""
+    del start
+    return now.get("touch_share")
+
+
+def left_out_groups(now: Metrics, start: Metrics) -> float | None:
+    """F15: share of the groups that are left out, for a reward is not finite."""
+    del start
+    return now.get("drawn_nonfinite_share", now.get("nonfinite_share"))
+
+
+def left_out_updates(now: Metrics, start: Metrics) -> float | None:
+    """F15: share of the last `WINDOW` updates that were left out, for a gradient was not finite."""
+    del start
+    return now[LEFT_OUT]
 
 
 def frozen_time(now: Metrics, start: Metrics) -> float | None:
@@ -242,6 +268,15 @@ RULES: tuple[AlarmRule, ...] = (
         below=True,
     ),
     AlarmRule(
+        code="F10",
+        meaning="no prompt of a batch has any touch",
+        bound=1e-7,
+        reason="without touch there is nothing to ground and nothing to reason from",
+        check=touched_share,
+        below=True,
+        at_once=True,
+    ),
+    AlarmRule(
         code="F12",
         meaning="time ids stand still, so that a shuffle tests nothing",
         bound=0.01,
@@ -255,6 +290,21 @@ RULES: tuple[AlarmRule, ...] = (
         reason="a supervised policy writes one such answer in twenty; four times as many are a strategy",
         check=gamed_answers,
     ),
+    AlarmRule(
+        code="F15",
+        meaning="groups are left out, for a reward is not finite",
+        bound=RARE,
+        reason="more than three groups in a window of 160 are no accident of one batch",
+        check=left_out_groups,
+    ),
+    AlarmRule(
+        code="F15",
+        meaning="updates are left out, for their gradient is not finite",
+        bound=0.1,
+        reason="one update in ten is lost; a single one may be a rare overflow",
+        check=left_out_updates,
+        at_once=True,
+    ),
 )
 
 
@@ -264,16 +314,26 @@ class AlarmMonitor:
     def __init__(self) -> None:
         self._first: list[Metrics] = []
         self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
+        self._left_out: collections.deque[bool] = collections.deque(maxlen=WINDOW)
 
-    def update(self, metrics: Metrics) -> list[Alarm]:
-        """The alarms after one more step; none before the first window is full."""
-        self._last.append(metrics)
-        if len(self._first) < START:
-            self._first.append(metrics)
-        if len(self._last) < WINDOW:
-            return []
-        now, start = _mean(self._last), _mean(self._first)
-        return [alarm for rule in RULES if (alarm := rule.alarm(now, start)) is not None]
+    def update(self, metrics: Metrics, *, left_out: bool = False) -> list[Alarm]:
+        """The alarms after one more step; before the first window is full those that one step raises.
+
+        Args:
+          metrics: of the step; empty where the update was `left_out`, whose metrics may not be finite.
+          left_out: the update was left out, for its gradient was not finite.
+        """
+        self._left_out.append(left_out)
+        at_once = {**metrics, LEFT_OUT: sum(self._left_out) / WINDOW}
+        found = [rule.alarm(at_once, at_once) for rule in RULES if rule.at_once]
+        if not left_out:
+            self._last.append(metrics)
+            if len(self._first) < START:
+                self._first.append(metrics)
+            if len(self._last) == WINDOW:
+                now, start = _mean(self._last), _mean(self._first)
+                found += [rule.alarm(now, start) for rule in RULES if not rule.at_once]
+        return [alarm for alarm in found if alarm is not None]
 
 
 def _mean(steps: Collection[Metrics]) -> Metrics:

@@ -28,7 +28,7 @@ from touchr1_jax.types import Params, Rollout
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
-    `old` are the log-probabilities that ratios are taken to after the first of several updates: the learner's before it.
+    `old` are the log-probabilities that ratios are taken to after the first of several updates: the learner's before.
     """
 
     batch: GRPOBatch

@@ -34,9 +34,9 @@ from touchr1_jax.rl.advantages import (
 from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.gradient import Experience
-from touchr1_jax.rl.metrics import answer_metrics, group_metrics, rollout_metrics, touch_metrics
+from touchr1_jax.rl.metrics import advantage_metrics, answer_metrics, reward_metrics, rollout_metrics, touch_metrics
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.rl.scoring import ScoreFn, left_out_groups
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout
@@ -74,13 +74,17 @@ class FrozenInputs(NamedTuple):
 
 
 class Group(NamedTuple):
-    """The rollouts of D prompts with their rewards; every field has a leading D."""
+    """The rollouts of D prompts with their rewards; every field has a leading D.
+
+    `finite` is false where a reward was NaN or infinite: the group has no part in the policy gradient.
+    """
 
     batch: GRPOBatch
     rollout: Rollout
     parsed: Parsed
     reward: Float[Array, "D G"]
     terms: dict[str, Float[Array, "D G"]]
+    finite: Bool[Array, "D"]
     bonus: Float[Array, "D G"]
 
 
@@ -149,8 +153,9 @@ class _Engine:
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
         control_key = jax.random.fold_in(key, 2)
-        group, control_metrics = self.rollouts(state.params, batch, frozen.noise, sample_key, control_key)
+        group, metrics = self.rollouts(state.params, batch, frozen.noise, sample_key, control_key)
         if self.config.algorithm.candidates > 1:
+            metrics |= {f"drawn_{name}": value for name, value in self.group_metrics(group).items()}
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         learn = self.experience(group, frozen.noise, mask_key)
@@ -158,7 +163,7 @@ class _Engine:
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
-        metrics = parts | control_metrics | self.metrics(group, learn)
+        metrics |= parts | self.group_metrics(group) | self.metrics(group, learn)
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
         return self.refreshed(after), metrics
 
@@ -172,6 +177,7 @@ class _Engine:
         rollout = sample_prompts(fns, params, prompts, key, self.draw(self.config.group))
         score = jax.vmap(jax.vmap(self.score, in_axes=(0, None), axis_name=GROUP))
         reward, terms, parsed = score(rollout.tokens, batch.target)
+        reward, terms, finite, left_out = left_out_groups(reward, terms)
 
         def answer(features: Features, key: Array) -> Parsed:
             changed = dataclasses.replace(batch, features=features)
@@ -185,7 +191,7 @@ class _Engine:
         if algorithm.tactile_use is TactileUse.LITERAL:
             terms = {**terms, tactile_use.TERM: algorithm.tactile_weight * bonus}
             reward = reward + terms[tactile_use.TERM]
-        return Group(batch, rollout, parsed, reward, terms, bonus), metrics
+        return Group(batch, rollout, parsed, reward, terms, finite, bonus), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:
         """Settings of the sampler for so many completions of a prompt."""
@@ -201,8 +207,9 @@ class _Engine:
     def no_signal(self, group: Group) -> Bool[Array, "D"]:
         """Groups without a gradient: the reward is constant, and the bonus where it is added to the advantage."""
         equal = no_signal(self.config.algorithm, group.reward, group.terms)
-        counts = self.config.algorithm.tactile_use is TactileUse.RECOMMENDED
-        return equal & zero_variance(group.bonus) if counts else equal
+        if self.config.algorithm.tactile_use is TactileUse.RECOMMENDED:
+            equal &= zero_variance(group.bonus)
+        return equal | ~group.finite
 
     def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
@@ -210,6 +217,7 @@ class _Engine:
         advantage = advantages(algorithm, group.reward, group.terms)
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             advantage += added_after(group.bonus, algorithm.tactile_weight)
+        advantage = jnp.where(group.finite[:, None], advantage, 0.0)
         no_signal = self.no_signal(group)
         even = jnp.full(no_signal.shape, 1 / self.config.prompts)
         masked_touch, stream = mask_one_stream(batch.features, noise, key)
@@ -233,15 +241,21 @@ class _Engine:
         pick = lambda new, old: jnp.where(state.step % every == 0, new, old)
         return dataclasses.replace(state, reference=jax.tree.map(pick, state.params, state.reference))
 
-    def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
-        """Everything that is logged of a step but the parts of the loss."""
+    def group_metrics(self, group: Group) -> dict[str, Array]:
+        """Metrics of rollouts and rewards: of dynamic sampling those of all candidates and of the selected ones."""
         target = group.batch.target
         right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
-        metrics = {f"reward_{name}": jnp.mean(value) for name, value in group.terms.items()}
-        metrics |= rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.parsed, target)
-        metrics |= answer_metrics(group.parsed, target)
-        metrics |= group_metrics(group.reward, learn.advantage, right)
-        metrics |= tactile_use.bonus_metrics(
-            self.config.algorithm, group.reward, group.terms, group.bonus, learn.advantage
-        )
-        return metrics | touch_metrics(group.batch.features)
+        return {
+            **reward_metrics(group.terms, right, group.finite),
+            **rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.parsed, target),
+        }
+
+    def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
+        """Metrics of the selected groups alone: their answers, advantages, bonuses and touch."""
+        algorithm, reward = self.config.algorithm, group.reward
+        return {
+            **answer_metrics(group.parsed, group.batch.target),
+            **advantage_metrics(reward, learn.advantage),
+            **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage),
+            **touch_metrics(group.batch.features),
+        }

@@ -1,5 +1,7 @@
 """Metrics of every step: reward and its spread, accuracy, parse rate, agreement, lengths, touch."""
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -58,22 +60,36 @@ def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
     }
 
 
-def group_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"], right: Bool[Array, "P G"]):
-    """Size of the advantages, and shares of groups whose answers are all right or all wrong."""
-    informative = ~zero_variance(reward)
+def reward_metrics(
+    terms: Mapping[str, Float[Array, "P G"]], right: Bool[Array, "P G"], finite: Bool[Array, "P"]
+) -> dict[str, Array]:
+    """Mean of each term, shares of groups whose answers are all right or all wrong, and of groups left out."""
+    return {
+        **{f"reward_{name}": jnp.mean(value) for name, value in terms.items()},
+        "all_right_share": jnp.mean(jnp.all(right, -1)),
+        "none_right_share": jnp.mean(~jnp.any(right, -1)),
+        "nonfinite_share": jnp.mean(~finite),
+    }
+
+
+def advantage_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"]) -> dict[str, Array]:
+    """Size of the advantages, and number of groups whose rewards differ."""
     return {
         "advantage_abs": jnp.mean(jnp.abs(advantage)),
         "advantage_peak": jnp.max(jnp.abs(advantage)),
-        "all_right_share": jnp.mean(jnp.all(right, -1)),
-        "none_right_share": jnp.mean(~jnp.any(right, -1)),
-        "lively_groups": jnp.sum(informative).astype(jnp.float32),
+        "lively_groups": jnp.sum(~zero_variance(reward)).astype(jnp.float32),
     }
 
 
 def touch_metrics(features: Features) -> dict[str, Array]:
-    """`static_time_share`: share of streams with several steps whose time ids are all equal."""
+    """`static_time_share`: share of streams with several steps whose time ids are all equal; `touch_share`: share of
+    prompts with any touch.
+    """
     time, there = features.touch_time, features.touch_time >= 0
     several = features.stream_mask & (jnp.sum(there, -1) > 1)
     low = masked.minimum(time, there, -1, empty=0.0)
     high = masked.maximum(time, there, -1, empty=0.0)
-    return {"static_time_share": masked.mean(low == high, several)}
+    return {
+        "static_time_share": masked.mean(low == high, several),
+        "touch_share": jnp.mean(jnp.any(features.stream_mask, -1)),
+    }

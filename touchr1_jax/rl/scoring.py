@@ -3,12 +3,14 @@
 Both are a `ScoreFn`, so that the step needs no distinction.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax import masked
 from touchr1_jax.rewards.base import AnyReward, Decode, on_host, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.types import Parsed, Target
@@ -46,6 +48,25 @@ def make_score(
         return reward, terms, parsed
 
     return score
+
+
+def left_out_groups(
+    reward: Float[Array, "D G"], terms: Mapping[str, Float[Array, "D G"]]
+) -> tuple[Float[Array, "D G"], dict[str, Float[Array, "D G"]], Bool[Array, "D"], dict[str, Float[Array, ""]]]:
+    """Take groups with a NaN or infinite reward out: theirs becomes the mean of all others, which teaches nothing.
+
+    Returns:
+      Reward and terms without such numbers, true for each group that is left, and `nonfinite_TERM`, the share of groups
+      in which a term was not finite (`nonfinite_total` where every term was, but not their sum).
+    """
+    is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)
+    by_term = {name: is_finite(term) for name, term in terms.items()}
+    all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))
+    finite = all_terms & is_finite(reward)
+    neutral = lambda x: jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
+    shares = {f"nonfinite_{name}": jnp.mean(~each) for name, each in by_term.items()}
+    shares["nonfinite_total"] = jnp.mean(all_terms & ~finite)
+    return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares
 
 
 def make_host_score(parser: Callable[[Int[Array, "T"]], Parsed], reward: HostReward, terms: tuple[str, ...]) -> ScoreFn:

@@ -55,11 +55,16 @@ def stream_influence(
 
 
 def check_streams(influence: Float[np.ndarray, "S"], present: Bool[np.ndarray, "S"]) -> None:
-    """Check that every present stream has an influence.
+    """Check that every present stream has an influence, and that there is any.
 
     Raises:
-      ValueError: noise in a stream changes the answers by no more than the rounding of float32.
+      ValueError: no prompt has touch; noise in a stream changes the answers by no more than the rounding of float32.
     """
+    if not np.any(present):
+        raise ValueError(
+            "stream_mask is false for every prompt and stream: no prompt of the first batch has touch, so that rewards "
+            "for touch and G_tg mean nothing; look at the masks of the records and of the encoder"
+        )
     for s, (size, there) in enumerate(zip(influence, present, strict=True)):
         if there and not size > ROUNDING_NAT:
             raise ValueError(

@@ -28,8 +28,8 @@ def within_trust(
     θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
     is quadratic in a small step, so that one shortening is enough for a step that is slightly too long, but not for a
     much longer one, where KL grows more slowly.  An update that is short enough is measured once.  The KL is the k3
-    estimate on the rollouts, with `learn.old` as the log-probabilities under π₀.  The scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix
-    C), here of any optimizer's, with this fixed point for its line search.
+    estimate on the rollouts, with `learn.old` as log π₀.  The scaling of the trust-region step (TRPO, arXiv 1502.05477,
+    appendix C), here of any optimizer's, with this fixed point for its line search.
 
     Args:
       fns, config: as in `make_grpo_step`.

@@ -59,13 +59,12 @@ def train_grpo(
       seed: of rollouts and fresh adapters.
 
     Raises:
-      ValueError: a stream whose touch does not reach the policy.
+      ValueError: a first batch without touch, a stream whose touch does not reach the policy.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
     optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, lora, hooks.devices.gather_params)
     decoder = {"decoder": params["decoder"]}
-    influence = influence_program(policy.fns, config.length)
-    check_streams(*jax.device_get(influence(decoder, _peek(batches), noise, jax.random.key(seed))))
+    check_whole_batch(policy.fns, decoder, batches, config, hooks, noise, seed)
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
     state = start_state(trained, optimizer, jax.random.key(seed), config)
     constants = (FrozenInputs(reference=trained, noise=noise), *(() if lora is None else (decoder,)))
@@ -129,10 +128,30 @@ def grpo_program(
     return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
+def check_whole_batch(
+    fns: PolicyFns,
+    decoder: Params,
+    batches: Batches,
+    config: GRPOConfig,
+    hooks: Hooks,
+    noise: Float[Array, "K S N D"],
+    seed: int,
+) -> None:
+    """`check_streams` of the first batch, of all rows that all processes read, so that all of them decide alike.
+
+    Raises:
+      ValueError: as `check_streams`.
+    """
+    program, key = influence_program(fns, config.length), jax.random.key(seed)
+    frozen = FrozenInputs(reference=(), noise=noise)
+    check, placed, rows = hooks.devices.shard(program, decoder, batches, config.drawn, frozen, key)
+    check_streams(*jax.device_get(check(placed, _peek(rows))[1]))
+
+
 @functools.cache
 def influence_program(fns: PolicyFns, length: int) -> Any:
-    """Compiled `stream_influence`, made once for all rewards and seeds."""
-    return jax.jit(lambda p, batch, noise, key: stream_influence(fns, p, batch, noise, key, length))
+    """Compiled `stream_influence`, made once for all rewards and seeds; its parameters come back as they are."""
+    return jax.jit(lambda p, batch, frozen, key: (p, stream_influence(fns, p, batch, frozen.noise, key, length)))
 
 
 def _peek(batches: Batches) -> Any:
