@@ -1,12 +1,14 @@
 """Training stages of a run: checkpoints, log, progress bar, wall time, a stop when a signal asks for it."""
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from experiments.core.context import Context
+from experiments.core.results import Table, named_table
+from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import Batches, Hooks, Log, LoopConfig, LoopTime, Step, fit
+from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, LoopTime, Step, fit
 
 STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
@@ -37,7 +39,7 @@ def stage_hooks(
       make_log: by default the metrics are logged unchanged.
       scored: keep the checkpoint of the highest held-out score too.
     """
-    times, logs = LoopTime(), list[Log]()
+    times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)
     with (
         Checkpoints(folder, better="higher" if scored else None, say=context.print) as checkpoints,
@@ -55,6 +57,7 @@ def stage_hooks(
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps)))
 
             def log(t: int, metrics: dict[str, float]) -> None:
+                left_out.append(metrics.get(SKIPPED, 0.0))
                 write(t, metrics)
                 advance()
 
@@ -70,11 +73,34 @@ def stage_hooks(
             devices=context.devices,
         )
         bar.close()
+        if max(left_out):
+            context.print(f"{stage}: {max(left_out):.0f} updates were left out, for their gradient was not finite")
         if times.steps:
             context.add_time(f"{STEPPING}/{stage}", times.total_s)
             context.add_time(f"{WAITING}/{stage}", times.input_s)
             ms = 1e3 * times.total_s / times.steps
             context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
+
+
+def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
+    """A table of the updates and groups that training left out because a number was not finite, if there were any.
+
+    Args:
+      lines: those of `metrics.jsonl`.
+    """
+    stages: dict[str, list[Mapping[str, Any]]] = {}
+    for line in lines:
+        stages.setdefault(line["stage"], []).append(line)
+    rows = []
+    for stage, of_stage in stages.items():
+        terms = sorted({name for line in of_stage for name in line if name.startswith(NONFINITE_IN)})
+        share = {name: sum(line.get(name, 0.0) for line in of_stage) / len(of_stage) for name in terms}
+        updates = max(line.get(SKIPPED, 0.0) for line in of_stage)
+        if updates or any(share.values()):
+            named = ", ".join(f"{name.removeprefix(NONFINITE_IN)} {x:.1%}" for name, x in share.items() if x)
+            rows.append({"stage": stage, "steps": len(of_stage), "updates left out": updates, "groups left out": named})
+    note = "A gradient, or a reward in the named share of the groups, was NaN or infinite."
+    return (named_table("Left out of training", rows, note=note),) if rows else ()
 
 
 def run_loop(

@@ -24,7 +24,8 @@ from rich.console import Console
 from experiments.core import runs, watchers
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_json
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
-from experiments.core.context import Context
+from experiments.core.context import Context, read_metrics
+from experiments.core.loops import left_out_tables
 from experiments.core.machine import (
     Accelerators,
     Launch,
@@ -262,7 +263,8 @@ def _compute(
         context = make_context(Console(), [page, *events])
         with contextlib.closing(context), context.timed("total"):
             results = experiment.run(command.config, context)
-        results = dataclasses.replace(results, timing={**context.timing(), **results.timing})
+        tables = (*results.tables, *left_out_tables(read_metrics(directory)))
+        results = dataclasses.replace(results, timing={**context.timing(), **results.timing}, tables=tables)
         report = write_report(directory, results, about=about, description=description)
         write_json(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
     except BaseException as error:

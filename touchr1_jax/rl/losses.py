@@ -64,7 +64,7 @@ def grpo_loss(
       clipped tokens, and the mean and the largest |log π(o_t) − log π_sampler(o_t)|.
     """
     algorithm = config.algorithm
-    longest: float | Array = config.length
+    longest: int | Array = config.length
     if algorithm.average is Average.BATCH:
         if batch_length is None:
             raise ValueError("batch_length is None: a mean over the tokens of the batch needs it; pass it")
@@ -129,7 +129,7 @@ def surrogate(
     return jnp.minimum(free, bound), free > bound
 
 
-def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: float | Array) -> Array:
+def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: int | Array) -> Array:
     """Mean over the tokens of each group, [*p].
 
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long

@@ -22,6 +22,10 @@ HostReward = Callable[[np.ndarray, Parsed, Target], Mapping[str, float]]
 """(tokens, parsed completion, target) of one rollout, all NumPy → its named terms; the reward is their sum."""
 
 
+NONFINITE_IN = "nonfinite_in_"
+"""Prefix of the metrics that name a reward: the share of groups in which it was NaN or infinite."""
+
+
 def make_score(
     parser: Callable[[Int[Array, "T"]], Parsed],
     rewards: Mapping[str, AnyReward],
@@ -56,16 +60,16 @@ def left_out_groups(
     """Take groups with a NaN or infinite reward out: theirs becomes the mean of all others, which teaches nothing.
 
     Returns:
-      Reward and terms without such numbers, true for each group that is left, and `nonfinite_TERM`, the share of groups
-      in which a term was not finite (`nonfinite_total` where every term was, but not their sum).
+      Reward and terms without such numbers, true for each group that stays, and by `nonfinite_in_TERM` the share of
+      groups in which a term was not finite (`nonfinite_in_total` where every term was, but not their sum).
     """
     is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)
     by_term = {name: is_finite(term) for name, term in terms.items()}
     all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))
     finite = all_terms & is_finite(reward)
     neutral = lambda x: jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
-    shares = {f"nonfinite_{name}": jnp.mean(~each) for name, each in by_term.items()}
-    shares["nonfinite_total"] = jnp.mean(all_terms & ~finite)
+    shares = {f"{NONFINITE_IN}{name}": jnp.mean(~each) for name, each in by_term.items()}
+    shares[f"{NONFINITE_IN}total"] = jnp.mean(all_terms & ~finite)
     return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares
 
 

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.loops import run_loop
+from experiments.core.loops import left_out_tables, run_loop
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import run_counting, run_directory
 from experiments.faults.trainings import counting
+from touchr1_jax.rl.scoring import NONFINITE_IN
 
 
 def run(folder, *options: str) -> int:
@@ -73,10 +74,26 @@ def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_pat
 
 def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_path, capsys):
     assert run(tmp_path, "--poison-from", "3", "--poison-to", "5") == 0
-    assert "of it waiting for data" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "of it waiting for data" in printed
+    assert "count/0: 2 updates were left out" in printed
+    (table,) = read_json(run_directory(tmp_path) / "results.json")["tables"]
+    assert table["rows"] == [["count/0", 12, 2, ""]]
+    assert table["title"] in (run_directory(tmp_path) / "report.html").read_text()
     logged = lines(tmp_path)
     assert [line.get("skipped") for line in logged] == [None] * 3 + [1, 2] + [None] * 7
     assert "loss" not in logged[3]
+
+
+def test_groups_that_a_reward_left_out_are_counted_for_each_stage():
+    lines = [
+        {"stage": "grpo/a/0", "step": 0, f"{NONFINITE_IN}spread": 0.5, f"{NONFINITE_IN}format": 0.0},
+        {"stage": "grpo/a/0", "step": 1, f"{NONFINITE_IN}spread": 0.0, f"{NONFINITE_IN}format": 0.0},
+        {"stage": "grpo/b/0", "step": 0, f"{NONFINITE_IN}spread": 0.0},
+    ]
+    (table,) = left_out_tables(lines)
+    assert table.rows == (("grpo/a/0", 2, 0.0, "spread 25.0%"),)
+    assert left_out_tables(lines[1:]) == ()
 
 
 def test_the_best_checkpoint_is_kept_beside_the_newest(context):

@@ -34,6 +34,11 @@ HEALTHY = {
     "grounding_stream_1": 0.05,
     "static_time_share": 0.0,
     "gamed_share": 0.05,
+    "touch_share": 1.0,
+    "nonfinite_share": 0.0,
+    "drawn_degenerate_share": 0.6,
+    "drawn_all_right_share": 0.5,
+    "drawn_accuracy": 0.7,
 }
 FAILURES = [
     ("F1", {"middle_rate": 0.9}, 0.9 - 1 / 3),
@@ -43,13 +48,15 @@ FAILURES = [
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
     ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
-    ("F7", {"degenerate_share": 0.9, "accuracy": 0.65}, 0.8),
     ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5, "echo_share": 0.5}, 3.0),
     ("F9", {"entropy": 0.01}, 0.02),
     ("F9", {"entropy": 2.5}, 2.0),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
     ("F12", {"static_time_share": 1.0}, 1.0),
+    ("F7", {"drawn_degenerate_share": 0.9, "drawn_all_right_share": 0.5, "drawn_accuracy": 0.65}, 0.8),
+    ("F10", {"touch_share": 0.0}, 0.0),
     ("F13", {"gamed_share": 0.5}, 0.5),
+    ("F15", {"nonfinite_share": 0.1}, 0.1),
 ]
 
 
@@ -69,17 +76,43 @@ def test_each_failure_fires_its_alarm_alone(code, change, value):
 
 
 def test_all_codes_are_covered():
-    codes = {f"F{k}" for k in (*range(1, 11), 12, 13)}
+    codes = {f"F{k}" for k in (*range(1, 11), 12, 13, 15)}
     assert {rule.code for rule in RULES} == codes == {code for code, _, _ in FAILURES}
 
 
 def test_groups_that_are_all_right_are_no_waste():
-    assert fired({"degenerate_share": 0.95, "all_right_share": 0.95}) == {}
-    assert fired({"degenerate_share": 1.0, "all_right_share": 1.0}) == {}
+    assert fired({"drawn_degenerate_share": 0.95, "drawn_all_right_share": 0.95}) == {}
+    assert fired({"drawn_degenerate_share": 1.0, "drawn_all_right_share": 1.0}) == {}
 
 
 def test_constant_groups_are_no_failure_while_answers_get_better():
-    assert fired({"degenerate_share": 0.9, "accuracy": 0.75}) == {}
+    assert fired({"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.75}) == {}
+
+
+def test_without_dynamic_sampling_the_groups_are_those_that_are_learned_from():
+    monitor = AlarmMonitor()
+    plain = {name: value for name, value in HEALTHY.items() if not name.startswith("drawn")}
+    for _ in range(WINDOW):
+        assert monitor.update(plain) == []
+    for _ in range(WINDOW):
+        alarms = monitor.update(plain | {"degenerate_share": 0.9, "accuracy": 0.65})
+    assert [(a.code, round(a.value, 6)) for a in alarms] == [("F7", 0.8)]
+
+
+def test_a_single_batch_without_touch_is_reported_at_once():
+    monitor = AlarmMonitor()
+    assert monitor.update(HEALTHY) == []
+    assert [a.code for a in monitor.update(HEALTHY | {"touch_share": 0.0})] == ["F10"]
+    assert monitor.update(HEALTHY) == []
+
+
+def test_updates_that_are_left_out_are_counted_over_a_window():
+    """Their metrics are not judged, and one in twenty is no alarm."""
+    monitor = AlarmMonitor()
+    assert monitor.update({}, left_out=True) == monitor.update({}, left_out=True) == []
+    (alarm,) = monitor.update({}, left_out=True)
+    assert (alarm.code, alarm.value) == ("F15", 3 / WINDOW)
+    assert [a.code for _ in range(WINDOW) for a in monitor.update(HEALTHY)] == ["F15"] * (WINDOW - 3)
 
 
 def test_honest_slots_never_agree_oftener_than_they_are_right():
@@ -130,5 +163,6 @@ def test_a_bonus_that_hardly_any_group_earns_is_not_judged():
 
 
 def test_an_alarm_says_what_fired():
-    (alarm,) = (a for a in [RULES[6].alarm(HEALTHY | {"degenerate_share": 0.9, "accuracy": 0.65}, HEALTHY)] if a)
+    failing = HEALTHY | {"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.65}
+    (alarm,) = (a for a in [RULES[6].alarm(failing, HEALTHY)] if a)
     assert str(alarm) == "alarm F7: most groups teach nothing (0.8, bound 0.5)"

@@ -9,7 +9,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl import reference
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import GRPOConfig, Paper, Surrogate
 from touchr1_jax.rl.gradient import Experience, grpo_gradient, prompt_terms
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Rollout
@@ -46,8 +46,8 @@ def experience() -> Experience:
 
 
 def gradient(config: GRPOConfig):
-    """The jitted (experience, parameters) → gradient, parts and old log-probabilities."""
-    return jax.jit(lambda e, params=PARAMS: grpo_gradient(FNS, config, params, REFERENCE, e))
+    """The jitted (experience, parameters) → gradient, parts and old log-probabilities of a later update."""
+    return jax.jit(lambda e, params=PARAMS: grpo_gradient(FNS, config, params, REFERENCE, e, first=False))
 
 
 compute = gradient(CONFIG)
@@ -139,23 +139,33 @@ def test_blocks_of_tokens_give_the_gradient_of_all_of_them(one_stream):
         np.testing.assert_allclose(parts[name], value, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_under_a_cap_the_learner_before_the_update_is_old(experience):
-    """At the first update its ratio is 1 whatever the sampler said, and the sampler counts in the weight alone."""
+@pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
+@pytest.mark.parametrize("kind", Surrogate)
+def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(experience, kind, bfloat16):
+    """The sampler's log-probabilities are off by up to ±.6, and the clip range is a millionth."""
+    algorithm = Paper(surrogate=kind, clip_low=1e-6, clip_high=1e-6, beta=0.0, gamma=0.0)
+    config = dataclasses.replace(CONFIG, algorithm=algorithm, bfloat16=bfloat16)
+    both = jax.jit(lambda e, first: grpo_gradient(FNS, config, PARAMS, REFERENCE, e, first=first))
+    _, parts, old = both(experience, True)
+    assert parts["clip_share"] == 0
+    gap = np.abs(old - experience.rollout.log_prob)[np.asarray(experience.rollout.mask)]
+    assert parts["sampler_gap_peak"] == pytest.approx(gap.max(), abs=1e-6)
+    _, later, kept = both(experience, False)
+    np.testing.assert_array_equal(kept, experience.old)
+    assert later["clip_share"] > 0
+
+
+def test_under_a_cap_the_sampler_counts_in_the_weight_alone(experience):
     cap = 1.2
     config = dataclasses.replace(ALONE, algorithm=dataclasses.replace(ALONE.algorithm, importance_cap=cap))
-    capped = jax.jit(lambda e, f: grpo_gradient(FNS, config, PARAMS, REFERENCE, e, first=f))
     b, r = experience.batch, experience.rollout
     log_p = jax.nn.log_softmax(group_logits(PARAMS, b.features, b.ids, b.mask, r.tokens))
     learner = token_log_probs(log_p, r.tokens)
-    _, parts, old = capped(experience, True)
+    _, parts, old = jax.jit(lambda e: grpo_gradient(FNS, config, PARAMS, REFERENCE, e))(experience)
     np.testing.assert_allclose(old, learner, rtol=1e-5, atol=1e-5)
-    assert parts["clip_share"] == 0
     weight = np.minimum(np.exp(learner - r.log_prob), cap)
     gain = np.where(r.mask, weight * experience.advantage[..., None], 0).sum(-1) / r.mask.sum(-1)
     np.testing.assert_allclose(parts["surrogate"], gain.mean(), rtol=1e-4)
-    _, later, old = capped(experience, False)  # a later update: the ratio is to what the first one returned as old
-    np.testing.assert_array_equal(old, experience.old)
-    assert later["clip_share"] > 0
 
 
 @pytest.mark.parametrize("change", [{"remat": True}, {"bfloat16": True}])

@@ -50,6 +50,12 @@ def test_a_stream_that_is_hidden_from_attention_is_refused_and_one_that_is_absen
         check_streams(size, np.array([True, True]))
 
 
+def test_a_batch_without_any_touch_is_refused():
+    """No stream is present, so that none can be found silent."""
+    with pytest.raises(ValueError, match="no prompt of the first batch has touch"):
+        check_streams(np.zeros(2), np.zeros(2, bool))
+
+
 def test_a_divergence_that_is_no_number_is_refused():
     with pytest.raises(ValueError, match="stream 0"):
         check_streams(np.array([np.nan]), np.array([True]))

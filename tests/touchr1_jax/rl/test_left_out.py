@@ -1,0 +1,102 @@
+"""Numbers that are not finite: a reward's group is left out and named, an optimizer never receives them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.scoring import left_out_groups
+from touchr1_jax.rl.update import finite_update
+from touchr1_jax.skipping import count_skipped, skip_nonfinite
+
+CONFIG = GRPOConfig(prompts=P, group=3, length=4, micro_prompts=2, algorithm=Paper(gamma=0.0))
+OPTIMIZER = optax.adam(0.05)
+
+
+def step_with(value: float):
+    """State and metrics after a step in which every answer to the first prompt's question earns this."""
+
+    def worth(tokens, target):
+        reward, terms, parsed = score(tokens, target)
+        spread = jnp.where(target.asked[0], value, 0.0)
+        return jnp.where(target.asked[0], value, reward), {**terms, "spread": spread}, parsed
+
+    step = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG)
+    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), CONFIG)
+    return jax.device_get(step(state, tiny.question_batch(1, P), FROZEN))
+
+
+def test_a_reward_that_is_nan_costs_its_group_and_nothing_else():
+    """The step is that of a group whose rewards are all equal, which teaches nothing either."""
+    (broken, metrics), (equal, _) = step_with(np.nan), step_with(0.4)
+    jax.tree.map(np.testing.assert_array_equal, broken.params, equal.params)
+    assert all(np.isfinite(value) for value in metrics.values())
+    assert metrics["nonfinite_share"] == metrics["nonfinite_in_spread"] == 1 / P
+    assert metrics["nonfinite_in_right"] == 0
+
+
+REWARD = jnp.array([[0.2, 0.4], [0.1, jnp.inf], [1.0, 0.0]])
+A, B = jnp.array([[0.1, 0.3], [0.1, 0.5], [1.0, 0.0]]), jnp.array([[0.1, 0.1], [0.0, jnp.inf], [0.0, 0.0]])
+
+
+def test_a_group_that_is_left_out_has_the_mean_of_the_others():
+    reward, terms, finite, shares = left_out_groups(REWARD, {"a": A, "b": B})
+    np.testing.assert_array_equal(finite, [True, False, True])
+    np.testing.assert_allclose(reward, [[0.2, 0.4], [0.4, 0.4], [1.0, 0.0]], rtol=1e-6)
+    np.testing.assert_allclose(terms["b"], [[0.1, 0.1], [0.05, 0.05], [0.0, 0.0]], rtol=1e-6)
+    expected = {"nonfinite_in_a": 0, "nonfinite_in_b": 1 / 3, "nonfinite_in_total": 0}
+    assert {name: pytest.approx(float(share)) for name, share in shares.items()} == expected
+
+
+def test_a_sum_that_overflows_is_named_too():
+    big = jnp.full((2, 2), 3e38)
+    _, _, finite, shares = left_out_groups(big + big, {"a": big, "b": big})
+    assert not finite.any()
+    assert (shares["nonfinite_in_a"], shares["nonfinite_in_total"]) == (0, 1)
+
+
+PARAMS = {"w": jnp.arange(3.0)}
+
+
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf])
+def test_an_optimizer_of_a_callers_own_never_receives_what_is_not_finite(bad):
+    grads = {"w": jnp.array([1.0, bad, 1.0])}
+    before = OPTIMIZER.init(PARAMS)
+    same = finite_update(OPTIMIZER, grads, optax.tree.norm(grads), before, PARAMS)
+    jax.tree.map(np.testing.assert_array_equal, same, (PARAMS, before))
+    guarded = skip_nonfinite(OPTIMIZER)
+    params, state = finite_update(guarded, grads, optax.tree.norm(grads), guarded.init(PARAMS), PARAMS)
+    jax.tree.map(np.testing.assert_array_equal, params, PARAMS)
+    assert count_skipped(state).tolist() == [1, 1]
+
+
+def test_finite_gradients_reach_it_as_they_are():
+    grads = {"w": jnp.array([1.0, -2.0, 0.5])}
+    state = OPTIMIZER.init(PARAMS)
+    updates, after = OPTIMIZER.update(grads, state, PARAMS)
+    found = finite_update(OPTIMIZER, grads, optax.tree.norm(grads), state, PARAMS)
+    jax.tree.map(np.testing.assert_array_equal, found, (optax.apply_updates(PARAMS, updates), after))
+
+
+def test_dynamic_sampling_logs_what_it_passed_over():
+    """Its candidates' metrics are those of a step that learns from all; the selected ones hide constant groups."""
+
+    def metrics_of(**change) -> dict[str, np.ndarray]:
+        algorithm = Paper(beta=0.0, gamma=0.0, candidates=P // change["prompts"])
+        config = dataclasses.replace(CONFIG, group=6, algorithm=algorithm, **change)
+        step = make_grpo_step(FNS, score, OPTIMIZER, config)
+        state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config)
+        return jax.device_get(step(state, tiny.question_batch(1, P), FROZEN))[1]
+
+    chosen, whole = metrics_of(prompts=2), metrics_of(prompts=P)
+    for name in ("reward", "accuracy", "degenerate_share", "all_right_share", "nonfinite_share"):
+        np.testing.assert_allclose(chosen[f"drawn_{name}"], whole[name], rtol=1e-6)
+    assert chosen["degenerate_share"] < chosen["drawn_degenerate_share"]
+    assert chosen["reward"] != chosen["drawn_reward"]
