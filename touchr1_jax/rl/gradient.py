@@ -20,7 +20,7 @@ from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out
-from touchr1_jax.rl.losses import TokenTerms, grpo_loss, token_terms
+from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_terms
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.types import Params, Rollout
 
@@ -64,13 +64,13 @@ def grpo_gradient(
       log-probabilities that the ratios were taken to.
     """
     algorithm = config.algorithm
-    batch_length = jnp.mean(masked.count(experience.old, experience.rollout.mask, -1))
+    longest = divisor(config, experience.rollout.mask)
 
     def loss(params: Params, micro: Experience) -> tuple[Array, tuple[dict[str, Array], Array]]:
         terms = experience_terms(fns, config, params, reference, micro)
         old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), micro.old)
         rollout, a, w = micro.rollout, micro.advantage, micro.weight
-        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, batch_length)
+        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest)
         return value, (parts | {"loss": value}, old)
 
     def add_micro_batch(grads: Params, micro: Experience) -> tuple[Params, tuple[dict[str, Array], Array]]:

@@ -38,7 +38,7 @@ def grpo_loss(
     advantage: Float[Array, "P G"],
     weight: Float[Array, "P"],
     config: GRPOConfig,
-    batch_length: Float[Array, ""] | None = None,
+    longest: int | Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
     """Loss −J of a micro-batch of groups; the losses of all micro-batches of a step add up to that of the step.
 
@@ -57,18 +57,14 @@ def grpo_loss(
       advantage: A of each rollout.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
-      batch_length: mean number of tokens of the step's rollouts, which a mean over the tokens of the batch divides by.
+      longest: `divisor` of the whole batch; by default that of these rollouts.
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
       clipped tokens, and the mean and the largest |log π(o_t) − log π_sampler(o_t)|.
     """
     algorithm = config.algorithm
-    longest: int | Array = config.length
-    if algorithm.average is Average.BATCH:
-        if batch_length is None:
-            raise ValueError("batch_length is None: a mean over the tokens of the batch needs it; pass it")
-        longest = batch_length
+    longest = divisor(config, mask) if longest is None else longest
     objective, clipped = surrogate(algorithm, terms.log_prob, old, mask, advantage)
     if algorithm.importance_cap is not None:
         objective *= jnp.minimum(_ratio(old - sampler), algorithm.importance_cap)
@@ -127,6 +123,11 @@ def surrogate(
         return weight * a * log_prob, weight != ratio
     free, bound = ratio * a, jnp.clip(ratio, 1.0 - low, 1.0 + high) * a
     return jnp.minimum(free, bound), free > bound
+
+
+def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:
+    """N of `group_mean`: the mean length of the rollouts where tokens are averaged over the batch, otherwise T."""
+    return jnp.mean(jnp.sum(mask, -1)) if config.algorithm.average is Average.BATCH else config.length
 
 
 def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: int | Array) -> Array:
