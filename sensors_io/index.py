@@ -8,6 +8,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import zlib
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -21,6 +22,7 @@ READABLE = (1, 2)
 """Versions whose records this code reads; 1 stored camera frames as they are, 2 stores differences."""
 
 INDEX = "index.json"
+_CHECKSUM = "crc32"  # of the text before it
 
 
 class MissingIndexError(RecordsError):
@@ -78,15 +80,19 @@ class Index:
                 f"{root} has no {INDEX}: give the directory of a data set, or write one there first"
             )
         try:
-            tree = json.loads(path.read_text())
+            text = path.read_text()
+            tree = json.loads(text)
             found = (tree["format"], tree["version"])
             if found in [(FORMAT, version) for version in READABLE]:
+                stated = tree.get(_CHECKSUM)  # an index of an earlier version of this code has none
+                if stated is not None and stated != zlib.crc32(text.rpartition(f',"{_CHECKSUM}"')[0].encode()):
+                    raise ValueError("its checksum does not hold")
                 return cls._from_tree(tree)
         except OSError as error:
             raise RecordsError(
                 f"{path} cannot be read ({error}); make it readable, or copy it again from its source"
             ) from error
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise CorruptRecordsError(f"{path} is damaged ({error!r}); delete {root} and write it again") from error
         raise RecordsVersionError(
             f"{path} is {found[0]!r} version {found[1]!r}, this code reads {FORMAT!r} versions {READABLE}; "
@@ -123,8 +129,9 @@ class Index:
             "frames": self.frames,
         }
         temporary = root / f".{INDEX}.tmp"
+        body = json.dumps(tree, separators=(",", ":"), allow_nan=False).removesuffix("}")
         with temporary.open("w") as file:
-            json.dump(tree, file, separators=(",", ":"), allow_nan=False)
+            file.write(f'{body},"{_CHECKSUM}":{zlib.crc32(body.encode())}}}')
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(root / INDEX)

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import pathlib
+import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -13,7 +14,7 @@ import rich.progress_bar
 import rich.table
 
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
-from sensors_io.commands.console import OUT, live_display
+from sensors_io.commands.console import ERR, OUT, live_display
 from sensors_io.commands.extraction import Extraction
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.devices.reader import Reader
@@ -98,6 +99,7 @@ class Record(Bench):
         parts = self.parts()
         parts.require_tactile()
         config = self.session()
+        _warn_of_little_disk(self.out)
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(stop_on_interrupt())
             tactile = stack.enter_context(readers(parts.tactile))
@@ -158,6 +160,22 @@ class Record(Bench):
             OUT.print(f"live view at {live.address}", highlight=False)
             with Presenter(channels, force[0] if force else None, live, board.words).beside():
                 yield
+
+
+_LITTLE_BYTES = 5e9
+_BYTES_PER_S = 320 * 240 * 3 * 25  # of one camera, uncompressed as in the journal
+
+
+def _warn_of_little_disk(out: pathlib.Path) -> None:
+    """Say before anything is recorded that the disk will not carry much."""
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    free = shutil.disk_usage(there).free
+    if free < _LITTLE_BYTES:
+        ERR.print(
+            f"only {free / 1e9:.1f} GB are free at {there}: about {free / _BYTES_PER_S / 60:.0f} minutes of one camera "
+            "of 320 × 240 at 25 Hz; free some, or record elsewhere",
+            markup=False,
+        )
 
 
 _MINI_MM_PER_PX = 0.0634  # of a GelSight Mini at 320 × 240, where no device tells its pitch

@@ -23,7 +23,7 @@ class View(Bench):
     port: int = 8765
     """Of the page."""
     host: str = "127.0.0.1"
-    """0.0.0.0 shows it to the whole network, without any password."""
+    """0.0.0.0 shows it to the whole network, to those who know the token in the printed address."""
     background: pathlib.Path | None = None
     """Picture of the gel at rest: fields are then extracted from the first camera's frames."""
     calibration: pathlib.Path | None = None

@@ -107,12 +107,18 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     fields = {name: a.astype(np.float32) for name, a in rest.items()}
     for name, resultant in resultants.items():
         six = resultant.astype(np.float32).ravel()
+        if six.size not in (3, 6):
+            raise DeviceDataError(f"bridge resultant {name} has {six.size} numbers: must have 3 or 6")
         fields["force_n"] = six[:3]
         if six.size >= 6:
             fields["moment_nmm"] = six[3:6] * np.float32(_MOMENT_UNIT_NMM[name])
     if picture is None:
         return None, fields
-    picture = np.asarray(picture, np.uint8)
+    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[2:] not in ((), (1,), (3,)):
+        raise DeviceDataError(
+            f"bridge picture is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W] or [H, W, 3]"
+        )
+    picture = picture.reshape(picture.shape[:2]) if picture.shape[2:] == (1,) else picture
     code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(picture, code), fields
 

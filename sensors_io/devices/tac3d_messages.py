@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError
 
 GRID = 20
@@ -253,15 +254,18 @@ def load_recording(path: pathlib.Path) -> Tac3dArrays:
 
     Raises:
       DeviceNotFoundError: it is neither.
-      DeviceDataError: it lacks counter or time stamps, or its arrays differ in length.
+      DeviceDataError: it is damaged, lacks counter or time stamps, or its arrays differ in length.
     """
     if path.is_dir():
-        arrays = {p.stem: np.load(p) for p in sorted(path.glob("*.npy"))}
+        files = sorted(path.glob("*.npy"))
     elif path.suffix == ".npz" and path.is_file():
-        with np.load(path) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        files = [path]
     else:
         raise DeviceNotFoundError(f"{path} is neither a folder of .npy files nor an .npz; give a Tac3D recording")
+    try:
+        arrays = {name: array for file in files for name, array in load_arrays(file).items()}
+    except ArraysError as error:
+        raise DeviceDataError(str(error)) from error
     if not {"index", "sendTimestamp"} <= arrays.keys():
         raise DeviceDataError(f"{path} holds {sorted(arrays)}: index and sendTimestamp must be among them")
     index, times = arrays["index"].ravel(), arrays["sendTimestamp"].ravel().astype(np.float64)

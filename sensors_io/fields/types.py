@@ -10,12 +10,12 @@ import json
 import os
 import pathlib
 import tempfile
-import zipfile
 from collections.abc import Mapping
 from typing import Any, Self
 
 import numpy as np
 
+from sensors_io.arrays import load_arrays
 from sensors_io.errors import UserError
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.schema import SchemaError, Spec, check_arrays
@@ -127,12 +127,12 @@ class Calibration:
           CalibrationError: no such file, no calibration, or one whose hash does not hold.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                weights, background, plain = file["weights"], file["background"], json.loads(str(file["plain"]))
+            file = load_arrays(path)
+            weights, background, plain = file["weights"], file["background"], json.loads(str(file["plain"]))
             degrees = {name: plain.pop(name) for name in ("degree", "position_degree")}
             stated = plain.pop("hash")
             found = cls(background=background, colours=ColourMap(weights=weights, **degrees), **plain)
-        except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise CalibrationError(
                 f"{path} is no calibration ({error}); make one with `python -m sensors_io calibrate`"
             ) from error

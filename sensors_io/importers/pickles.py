@@ -12,6 +12,7 @@ import pathlib
 import pickle
 import pickletools
 import re
+import tokenize
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -119,7 +120,7 @@ _ALLOWED: Mapping[tuple[str, str], Callable[..., Any]] = {
 
 _BROKEN = (
     pickle.UnpicklingError, EOFError, ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError,
-    RecursionError, MemoryError,
+    RecursionError, MemoryError, SyntaxError, tokenize.TokenError,
 )  # fmt: skip
 """Errors that truncated or foreign bytes raise during unpickling."""
 

@@ -16,10 +16,10 @@ the client's receive time where it was stored, the sensor's send time elsewhere.
 
 import functools
 import pathlib
-import zipfile
 
 import numpy as np
 
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import Shares, Skip, UnreadableError
 from sensors_io.importers.pictures import film
@@ -102,10 +102,10 @@ def _read(path: pathlib.Path, key: ContactKey) -> Taken:
 def _load(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Arrays of one recording, their shapes and the order of the grid checked."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:  # np.load leaves a bad one open
-            arrays = {name: data[name] for name in (*_SHAPES, "recvTimestamp") if name in data}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        data = load_arrays(path)
+    except ArraysError as error:
         raise RecordingError(f"is damaged ({error})") from error
+    arrays = {name: data[name] for name in (*_SHAPES, "recvTimestamp") if name in data}
     missing = [name for name in _SHAPES if name not in arrays]
     if missing:
         raise RecordingError(f"lacks {', '.join(missing)}")

@@ -20,6 +20,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sensors_io.arrays import load_arrays
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip, UnreadableError
@@ -166,8 +167,8 @@ def _times(folder: pathlib.Path, numbers: np.ndarray) -> tuple[np.ndarray, str]:
     if not path.is_file():
         return nominal_ns(numbers, RATE_HZ), f"frame number at a nominal {RATE_HZ:g} Hz"
     try:
-        seconds = np.load(path, allow_pickle=False).astype(np.float64).ravel()
-    except (ValueError, EOFError) as error:
+        seconds = load_arrays(path)[path.stem].astype(np.float64).ravel()
+    except ValueError as error:
         raise UnreadableError(f"time2.npy is damaged ({error})") from error
     if numbers[-1] >= len(seconds):
         raise UnreadableError(f"time2.npy has {len(seconds)} times and frame {numbers[-1]} is listed")

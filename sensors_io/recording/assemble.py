@@ -14,6 +14,7 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.codec import FIELDS, WIDEST
+from sensors_io.errors import UserError
 from sensors_io.force import ForceError, at_frames
 from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
@@ -54,6 +55,18 @@ def assemble(path: pathlib.Path) -> Assembled | None:
     start = entries[0].plain
     if "streams" not in start:
         raise JournalError(f"{path} was written by an earlier version: bring it in with that one, or move it away")
+    try:
+        return _assembled(start, entries, torn)
+    except UserError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+        raise JournalError(
+            f"{path} holds entries of another layout ({error!r}): move it away, or bring it in with the version that "
+            "wrote it"
+        ) from error
+
+
+def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) -> Assembled | None:
     ends = [e for e in entries if e.kind == "end"]
     end = ends[0].plain if ends else None
     frames = [

@@ -91,6 +91,13 @@ class Book:
 
     def store(self, path: pathlib.Path) -> bool | None:
         """Write a journal's contact; whether it was complete, `None` if there was nothing in it."""
+        try:
+            return self._store(path)
+        except SchemaError as error:  # set aside, or it would stop every later session
+            kept = path.rename(path.with_suffix(".refused"))
+            raise SchemaError(f"{error}; nothing is lost: the contact's journal is kept as {kept}") from error
+
+    def _store(self, path: pathlib.Path) -> bool | None:
         found = assemble(path)
         if found is None:
             path.unlink()
@@ -100,11 +107,7 @@ class Book:
             self.add_object(key.object_id)
             for sensor, picture in found.backgrounds.items():
                 _write_picture(self._journals.parent / background_name(key, sensor), picture)
-            try:
-                self._writer.write_contact(found.sequences)
-            except SchemaError as error:  # set aside, or it would stop every later session
-                kept = path.rename(path.with_suffix(".refused"))
-                raise SchemaError(f"{error}; nothing is lost: the contact's journal is kept as {kept}") from error
+            self._writer.write_contact(found.sequences)
             self._report.contacts += 1
             if not found.complete:
                 self._report.incomplete += 1

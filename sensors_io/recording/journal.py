@@ -116,7 +116,14 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
             raise JournalError(f"{path} is damaged at byte {start}: move it away, its contact has to be recorded again")
         if end > len(data):
             return
-        yield _decode(body), end
+        try:
+            entry = _decode(body)
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError, MemoryError, struct.error) as error:
+            raise JournalError(
+                f"{path} holds an entry of another layout at byte {start} ({error!r}): move it away, or bring it in "
+                "with the version that wrote it"
+            ) from error
+        yield entry, end
         start = end
 
 

@@ -7,8 +7,12 @@ connections that browsers open to one server.
 """
 
 import dataclasses
+import http.cookies
 import http.server
+import ipaddress
 import json
+import math
+import secrets
 import threading
 import urllib.parse
 from collections.abc import Mapping
@@ -22,6 +26,9 @@ from sensors_io.viewer.page import PAGE
 from sensors_io.viewer.panels import Panel
 
 _QUALITY = 85  # of the pictures' JPEG; recordings are lossless, a view need not be
+_CONNECTIONS = 64
+"""Open at once: ten browsers with their six, and what is half open; more are closed at once."""
+_SILENT_S = 10.0  # a connection that sends or takes nothing for so long is closed
 _WAIT_S = 1.0  # how long a stream that has nothing new waits before it looks whether the view has ended
 
 
@@ -61,7 +68,7 @@ class PublishedState:
     def event(self) -> bytes:
         """The numbers as a server-sent event."""
         tree = dataclasses.asdict(self._numbers) | {"panels": list(self._panels), "version": self.version}
-        return f"data: {json.dumps(tree)}\n\n".encode()
+        return f"data: {json.dumps(_finite(tree), allow_nan=False)}\n\n".encode()
 
     def picture(self, name: str) -> bytes:
         """A panel as JPEG.
@@ -80,7 +87,8 @@ class LiveView:
 
     Args:
       port: of the server; 0 takes a free one, see `address`.
-      host: 127.0.0.1 keeps the view on this machine; 0.0.0.0 shows it to the network, without any password.
+      host: 127.0.0.1 keeps the view on this machine; any other shows it to the network, to those who know the token in
+        `address`.
 
     Raises:
       OSError: on entering, if the port is taken.
@@ -88,6 +96,7 @@ class LiveView:
 
     def __init__(self, *, port: int = 8765, host: str = "127.0.0.1"):
         self._wanted = (host, port)
+        self._token = "" if _loopback(host) else secrets.token_urlsafe(16)
         self._changed = threading.Condition()
         self._shown = PublishedState(0, {}, Numbers(title="touch", time_s=0.0, force_n=None, tables={}))
         self._version = 0
@@ -97,9 +106,15 @@ class LiveView:
 
     @property
     def address(self) -> str:
-        """Address for browsers."""
-        host, port = self._wanted if self._server is None else self._server.server_address[:2]
-        return f"http://{host if isinstance(host, str) else host.decode()}:{port}/"
+        """Address for browsers, with the token if one is needed."""
+        host, port = self._wanted[0], (self._wanted if self._server is None else self._server.server_address)[1]
+        return f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else "")
+
+    def admits(self, host: str, token: str) -> bool:
+        """True if a request may be answered: it names this machine, so that no other page can ask, or has the token."""
+        if self._token:
+            return secrets.compare_digest(token.encode(), self._token.encode())
+        return _loopback(urllib.parse.urlsplit(f"//{host}").hostname or "")
 
     def publish(self, panels: Mapping[str, Panel], numbers: Numbers) -> None:
         """Show these panels and numbers from now on; returns at once, and nothing is drawn that nobody watches."""
@@ -123,7 +138,7 @@ class LiveView:
 
     def __enter__(self) -> Self:
         handler = type("Handler", (_Handler,), {"live": self})
-        self._server = http.server.ThreadingHTTPServer(self._wanted, handler)
+        self._server = _Server(self._wanted, handler)
         self._server.daemon_threads = True  # a watcher may be asleep on a dead connection
         self._thread = threading.Thread(target=self._server.serve_forever, name="live-view", daemon=True)
         self._thread.start()
@@ -142,34 +157,73 @@ class LiveView:
         self._server.server_close()
 
 
+class _Server(http.server.ThreadingHTTPServer):
+    """A thread for each connection, of which there are so many at most."""
+
+    request_queue_size = _CONNECTIONS
+
+    def __init__(self, *args: Any):
+        super().__init__(*args)
+        self._free = threading.Semaphore(_CONNECTIONS)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Close a connection too many instead of giving it a thread."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve one connection to its end."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+
 class _Handler(http.server.BaseHTTPRequestHandler):
     live: ClassVar[LiveView]
+    timeout = _SILENT_S
     protocol_version = "HTTP/1.1"  # keeps connections open: a browser asks for hundreds of pictures a second
     disable_nagle_algorithm = True  # a picture would wait 40 ms for the acknowledgement of its own header
 
     def do_GET(self) -> None:
         """Answer one request; the stream of numbers lasts until the browser or the view goes away."""
-        path = urllib.parse.unquote(urllib.parse.urlsplit(self.path).path)
+        split = urllib.parse.urlsplit(self.path)
+        path = urllib.parse.unquote(split.path)
+        token = urllib.parse.parse_qs(split.query).get("token", [self._cookie()])[0]
         try:
-            if path == "/":
-                self._whole("text/html; charset=utf-8", PAGE.encode())
+            if not self.live.admits(self.headers.get("Host", ""), token):
+                self.send_error(403, "open the address that the program printed")
+            elif path == "/":
+                self._whole("text/html; charset=utf-8", PAGE.encode(), f"token={token}; HttpOnly; SameSite=Strict")
             elif path == "/numbers":
                 self._numbers()
             elif path.startswith("/panel/"):
                 self._panel(path.removeprefix("/panel/"))
             else:
                 self.send_error(404)
-        except (BrokenPipeError, ConnectionResetError):
+        except (BrokenPipeError, ConnectionResetError, TimeoutError):
             self.close_connection = True  # the browser was closed
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing: the terminal belongs to the session."""
 
-    def _whole(self, kind: str, data: bytes) -> None:
+    def _cookie(self) -> str:
+        """The token that the page was opened with."""
+        try:
+            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get("token")
+        except http.cookies.CookieError:
+            return ""
+        return "" if found is None else found.value
+
+    def _whole(self, kind: str, data: bytes, cookie: str = "") -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))
         self.send_header("Cache-Control", "no-store")
+        if cookie:
+            self.send_header("Set-Cookie", cookie)
         self.end_headers()
         self.wfile.write(data)
 
@@ -192,6 +246,23 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             version = shown.version
             self.wfile.write(shown.event())
             self.wfile.flush()
+
+
+def _loopback(host: str) -> bool:
+    """True of the names and addresses by which a machine reaches itself alone."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _finite(tree: Any) -> Any:
+    """The tree with `None` for numbers that JSON does not know."""
+    if isinstance(tree, float):
+        return tree if math.isfinite(tree) else None
+    if isinstance(tree, dict):
+        return {name: _finite(value) for name, value in tree.items()}
+    return [_finite(value) for value in tree] if isinstance(tree, list | tuple) else tree
 
 
 def _jpeg(name: str, picture: np.ndarray) -> bytes:

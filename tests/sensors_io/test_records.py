@@ -33,6 +33,7 @@ def rewrite(shard, change):
         writer.write(entry)
     writer.close()
     index = json.loads((shard.parent / "index.json").read_text())
+    del index["crc32"]
     text = json.dumps(index).replace(f'"bytes": {size}', f'"bytes": {shard.stat().st_size}')
     (shard.parent / "index.json").write_text(text)
 
@@ -264,3 +265,15 @@ class TestDamage:
         rewrite(shards(path)[0], lambda entries: entries[::-1])
         with pytest.raises(records.CorruptRecordsError, match=r"entry 0 is object_0/0/press/1/dmtac_x, the index says"):
             RecordStore(path).contact(0)
+
+
+def test_every_flipped_bit_of_the_index_is_found(tmp_path):
+    fakes.write(tmp_path, 1)
+    path = tmp_path / "index.json"
+    whole = path.read_bytes()
+    end = whole.index(b',"crc32"')
+    for i in range(end):
+        for bit in (0, 4, 7):
+            path.write_bytes(whole[:i] + bytes([whole[i] ^ (1 << bit)]) + whole[i + 1 :])
+            with pytest.raises(records.RecordsError):
+                records.RecordStore(tmp_path)

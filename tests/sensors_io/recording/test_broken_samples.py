@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.base import Sample
+from sensors_io.recording.assemble import assemble
+from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
@@ -108,3 +110,13 @@ def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch
     with pytest.raises(CorruptRecordsError):
         record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
     assert len(list(pathlib.Path(tmp_path / ".journals").glob("*.journal"))) == 2
+
+
+def test_a_journal_of_another_layout_is_named(tmp_path):
+    """Its checksums hold, for another version wrote it."""
+    for k, plain in enumerate(({"streams": [{}]}, {"streams": [{"identity": {}}], "key": {}})):
+        with JournalWriter(tmp_path / f"{k}.journal") as journal:
+            journal.append("start", plain)
+            journal.append("frame", {"stream": 0, "time_ns": 1, "index": 0})
+        with pytest.raises(JournalError, match="entries of another layout"):
+            assemble(tmp_path / f"{k}.journal")

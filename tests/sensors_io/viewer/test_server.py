@@ -3,6 +3,7 @@
 import dataclasses
 import http.client
 import json
+import socket
 import threading
 import urllib.error
 import urllib.parse
@@ -122,3 +123,51 @@ def test_fields_are_coloured_and_holes_are_black():
     assert still.shape[:2] == (320, 240)
     assert np.ptp(still.reshape(-1, 3), axis=0).max() == 0  # no arrow where nothing moves
     assert (arrows(np.full((40, 30, 2), 0.2)) == 255).all(-1).any()
+
+
+def requested(view, path="/", **headers):
+    """Status and cookie of a plain request with headers of its own."""
+    port = int(urllib.parse.urlsplit(view.address).port)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    connection.close()
+    return answer.status, answer.headers.get("Set-Cookie", "")
+
+
+@pytest.mark.parametrize(
+    ("host", "status"), [("127.0.0.1:80", 200), ("localhost", 200), ("[::1]:9", 200), ("evil.example", 403), ("", 403)]
+)
+def test_another_sites_name_is_refused(host, status):
+    with LiveView(port=0) as view:
+        assert requested(view, Host=host)[0] == status
+
+
+def test_a_view_for_the_network_wants_its_token():
+    with LiveView(port=0, host="0.0.0.0") as view:
+        token = view.address.partition("?token=")[2]
+        assert len(token) >= 16
+        assert [requested(view, path)[0] for path in ("/", "/numbers", "/panel/a", "/?token=wrong")] == [403] * 4
+        status, cookie = requested(view, f"/?token={token}")
+        assert (status, cookie.partition(";")[0]) == (200, f"token={token}")
+        view.publish({"a": plain(1, 2, 3)}, NUMBERS)
+        assert requested(view, "/panel/a", Cookie=f"token={token}")[0] == 200
+
+
+def test_connections_too_many_are_closed():
+    with LiveView(port=0) as view:
+        port = int(urllib.parse.urlsplit(view.address).port)
+        before = threading.active_count()
+        silent = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(100)]
+        for connection in silent[64:]:
+            assert connection.recv(1) == b""
+        assert threading.active_count() - before <= 64
+        for connection in silent:
+            connection.close()
+
+
+def test_numbers_that_json_does_not_know_are_null():
+    with LiveView(port=0) as view:
+        view.publish({}, dataclasses.replace(NUMBERS, force_n=(0.0, float("nan"), float("inf"))))
+        with ask(view, "numbers") as events:
+            assert json.loads(events.readline().removeprefix(b"data: "))["force_n"] == [0.0, None, None]

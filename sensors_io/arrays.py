@@ -1,0 +1,63 @@
+"""Arrays of .npy and .npz files that come from outside: read whole, or refused with the reason."""
+
+import lzma
+import math
+import os
+import pathlib
+import struct
+import tokenize
+import zipfile
+import zlib
+from typing import IO
+
+import numpy as np
+
+from sensors_io.errors import UserError
+
+_BROKEN = (
+    OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError,
+)  # fmt: skip
+"""Errors that damaged bytes raise in NumPy and zipfile."""
+
+
+class ArraysError(UserError, ValueError):
+    """A file that holds no readable arrays."""
+
+
+def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
+    """Arrays of an .npz by name; of an .npy its one array, by the file's stem.
+
+    No memory is reserved before an array's stated size was seen to be that of its bytes, and nothing is unpickled.
+
+    Raises:
+      ArraysError: the file is absent, damaged, or holds objects.
+    """
+    path = pathlib.Path(path)
+    try:
+        if path.suffix == ".npy":
+            with path.open("rb") as file:
+                return {path.stem: _array(file, path.stat().st_size)}
+        with zipfile.ZipFile(path) as archive:
+            found = {}
+            for member in archive.infolist():
+                with archive.open(member) as file:
+                    found[member.filename.removesuffix(".npy")] = _array(file, member.file_size)
+            return found
+    except _BROKEN as error:
+        raise ArraysError(f"{path} cannot be read as arrays ({error}); copy it again from its source") from error
+
+
+def _array(file: IO[bytes], size: int) -> np.ndarray:
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"its format is {version}: must be (1, 0) or (2, 0)")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    wanted = file.tell() + math.prod(shape) * dtype.itemsize
+    if wanted != size:
+        raise ValueError(f"its header states {wanted} bytes of {size}")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

@@ -1,0 +1,49 @@
+"""Arrays of files from outside: equal to NumPy's, or refused."""
+
+import io
+
+import numpy as np
+import pytest
+
+from sensors_io.arrays import ArraysError, load_arrays
+
+
+def test_arrays_come_back_from_both_formats(tmp_path):
+    arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.asfortranarray(np.ones((2, 2), ">i4"))}
+    np.savez_compressed(tmp_path / "x.npz", **arrays)
+    np.testing.assert_equal(load_arrays(tmp_path / "x.npz"), arrays)
+    np.save(tmp_path / "a.npy", arrays["a"])
+    np.testing.assert_equal(load_arrays(tmp_path / "a.npy"), {"a": arrays["a"]})
+
+
+def npy(header):
+    text = header.encode()
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "cannot be read"),
+        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"), "its header states"),
+        (npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,), }") + b"\0" * 8, "Python objects"),
+        (npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }"), "cannot be read"),
+        (npy("{'descr': 'nonsense'"), "cannot be read"),
+    ],
+)
+def test_what_is_no_array_is_refused(tmp_path, data, message):
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(ArraysError, match=message):
+        load_arrays(tmp_path / "a.npy")
+
+
+def test_no_flip_of_a_byte_raises_anything_else(tmp_path):
+    stream = io.BytesIO()
+    np.savez_compressed(stream, a=np.arange(9.0))
+    whole = stream.getvalue()
+    for i in range(len(whole)):
+        (tmp_path / "a.npz").write_bytes(whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :])
+        try:
+            load_arrays(tmp_path / "a.npz")
+        except ArraysError:
+            continue
