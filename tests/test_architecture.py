@@ -34,7 +34,7 @@ LAYERS = {
     "sensors_io": (
         "errors",
         "schema",
-        "clock json_files",
+        "arrays clock json_files",
         "sync taps force offsets",
         "poses",
         "deltas",
