@@ -80,10 +80,6 @@ def questions(policy: TouchPolicy, touch: TouchBatch, data: Dataset, scale: Feed
 def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
     """Floating-point operations of the products and convolutions of a call, a loop's as often as it turns.
 
-    Args:
-      function: what is traced, not run.
-      arguments: arrays, or their shapes and dtypes.
-
     Raises:
       ValueError: a product within a loop of unknown length.
     """
@@ -94,12 +90,6 @@ def sft_seconds(policy: TouchPolicy, config: StudySFT, batch: SFTBatch, devices:
     """Least seconds of a step of SFT, W / (devices · peak · share), where W are the step's operations.
 
     Exchange between devices is not counted: it could only make the step longer, and so easier to feed.
-
-    Args:
-      policy, config: as in `run_sft`.
-      batch: one whole batch, or its shapes and dtypes.
-      devices: that share it.
-      machine: what each can do.
     """
     optimizer, step = sft_program(policy.fns, config, False)
 
@@ -112,13 +102,7 @@ def sft_seconds(policy: TouchPolicy, config: StudySFT, batch: SFTBatch, devices:
 
 
 def grpo_seconds(policy: TouchPolicy, config: GRPOConfig, devices: int, machine: Machine) -> float:
-    """Seconds of a step of GRPO as `touchr1_jax.distributed.work` predicts them, weights split over all devices.
-
-    Args:
-      policy, config: as in `run_grpo`.
-      devices: that share a batch.
-      machine: what each can do.
-    """
+    """Seconds of a step of GRPO as `touchr1_jax.distributed.work` predicts them, weights split over all devices."""
     shape = GRPOShape(
         decoder=policy.fns.module.config.decoder,
         grpo=config,
@@ -162,9 +146,6 @@ class SimulatedDevice:
     """A device that computes nothing for as long as a step would take, and knows how long it had nothing to do.
 
     Like a real one it takes the next step while it is at one, and whoever reads a step's metrics waits for its end.
-
-    Args:
-      step_s: seconds of a step.
     """
 
     def __init__(self, step_s: float) -> None:
@@ -220,15 +201,7 @@ def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterab
 
 
 def idle_share(batches: Batches, step_s: float, steps: int, context: Context, stage: str) -> float:
-    """Share of the time that a device stands still in the loop that trains, fed by these batches.
-
-    Args:
-      batches: of the stage.
-      step_s: that a step lasts.
-      steps: of them.
-      context: the run.
-      stage: its name.
-    """
+    """Share of the time that a device stands still in the loop that trains, fed by these batches."""
     device = SimulatedDevice(step_s)
     run_loop(
         device.step, {"nothing": jnp.zeros(())}, batches, LoopConfig(steps=steps, save_every=steps), context, stage

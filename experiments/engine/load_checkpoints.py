@@ -93,14 +93,7 @@ SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
 
 
 def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, tell: ProgressCallback) -> int:
-    """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes.
-
-    Args:
-      directory: filled with shards and the index.
-      config: shape.
-      shard_bytes: a shard is closed before it would exceed this, unless a single tensor does.
-      tell: progress callback; drawing and writing a tensor count half of its bytes each.
-    """
+    """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes."""
     rng = np.random.default_rng(0)
     place: dict[str, str] = {}
     cut = list(shards(config, shard_bytes))
@@ -140,12 +133,6 @@ def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int
 
 def measure(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressCallback) -> LoadMeasurement:
     """Read once in a fresh process, whose largest size is then that of the reading.
-
-    Args:
-      reader: a function of a module.
-      directory: of the checkpoint.
-      config: its shape.
-      tell: progress callback of the bytes read.
 
     Raises:
       RuntimeError: the process ended without an answer, as one that the system stops for its memory does.

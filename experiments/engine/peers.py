@@ -142,12 +142,7 @@ class PeerTimes(EngineTimes):
 
 
 def format_answer(job: PeerJob, starts: Sequence[float], versions: Mapping[str, str]) -> str:
-    """The line that a harness prints.
-
-    Args:
-      job: the measurement.
-      starts: clock at the start of every iteration, s.
-      versions: package → version.
+    """The line that a harness prints; `starts` are clock times (s) at the start of every iteration.
 
     Raises:
       ValueError: fewer or more iterations than the job has.

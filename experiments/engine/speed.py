@@ -128,15 +128,7 @@ class ProcessTiming(EngineTimes):
 
 
 def time_alone(size: JobSize, prefix: int, config: GRPOConfig, rounds: int, cache: Path) -> ProcessTiming:
-    """Time the first iteration and those after the second, this process's peak memory, and matrix products.
-
-    Args:
-      size: of the job.
-      prefix: prompt tokens.
-      config: the step.
-      rounds: iterations to time.
-      cache: folder of compiled programs.
-    """
+    """Time the first iteration and those after the second, this process's peak memory, and matrix products."""
     began = time.perf_counter()
     with compilations_kept(cache):
         job = Job(size, prefix, config)
@@ -191,14 +183,7 @@ def repeated(size: JobSize, prefix: int) -> dict[str, Callable[[], Job]]:
 
 
 def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, context: Context) -> dict[str, float]:
-    """Median over rounds of each job's time over that of `this` in the same round.
-
-    Args:
-      makers: how to make each job.
-      rounds: of timing.
-      what: title of the progress.
-      context: shows progress.
-    """
+    """Median over rounds of each job's time over that of `this` in the same round."""
     calls = {}
     for name, make in context.each(f"compiling {what}", makers.items()):
         calls[name] = make().step
@@ -237,15 +222,7 @@ class LongRun:
 
 
 def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: ProgressCallback) -> LongRun:
-    """Steps whose answers end early and late, so that every bucket is used; the policy stays as it is.
-
-    Args:
-      size: of the job.
-      prefix: prompt tokens.
-      buckets: lengths that an update may pay for.
-      steps: how many.
-      tell: progress callback, called whenever the memory is looked at.
-    """
+    """Steps whose answers end early and late, so that every bucket is used; the policy stays as it is."""
     job = Job(size, prefix, dataclasses.replace(config_of(size), buckets=buckets), end_share=SHORT, learning_rate=0.0)
     for _ in range(3):
         jax.block_until_ready(job.step())

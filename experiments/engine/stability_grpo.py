@@ -175,12 +175,7 @@ def _noticed(outcomes: Sequence[ScenarioOutcome], *, failed: bool) -> np.ndarray
 
 
 def verdict(outcomes: Sequence[ScenarioOutcome], undriven: Mapping[str, Sequence[Alarms]]) -> tuple[str, ...]:
-    """Count the failures provoked, those where `stable` failed too, and the alarms.
-
-    Args:
-      outcomes: of the driven scenarios.
-      undriven: preset → alarms of each seed where no knob is driven.
-    """
+    """Count the failures provoked, those where `stable` failed too, and the alarms; `undriven` as `undriven_alarms`."""
     provoked = [o for o in outcomes if len(o.compared)]
     harmed = [f"{o.name} ({o.compared.sum()} of {len(o.compared)} runs)" for o in provoked if o.compared.any()]
     failed, others = (_noticed(outcomes, failed=f) for f in (True, False))

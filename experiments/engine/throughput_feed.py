@@ -159,16 +159,9 @@ def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Contex
 def watch(
     config: FeedingConfig, stage: str, feed: Feed, step_s: float, context: Context, *, configured: bool, warm: int = 1
 ) -> FeedMeasurement:
-    """Time some batches of a feed, then run it beside a stand-in.
+    """Time some batches of a feed, then run it beside a stand-in; `warm` batches are drawn first.
 
-    Args:
-      config: how many batches and steps.
-      stage: scale, stage and source, by slashes.
-      feed: of the stage.
-      step_s: that a step takes there.
-      context: the run.
-      configured: whether the scale's study would feed it so.
-      warm: batches that are drawn first.
+    `stage` is scale, stage and source, by slashes; `configured` tells if the scale's study would feed it so.
     """
     if not context.done(stage):
         ahead = context.each(f"{stage}, ahead", range(warm))

@@ -156,12 +156,7 @@ class FirstAlarm(NamedTuple):
 
 
 class VariantRuns:
-    """Train and evaluate variants, each in each setting once.
-
-    Args:
-      budget: of training and evaluation.
-      seeds: numbers of the seeds.
-    """
+    """Train and evaluate variants, each in each setting once."""
 
     def __init__(self, budget: TrainingBudget, seeds: Sequence[int]) -> None:
         self._budget = budget

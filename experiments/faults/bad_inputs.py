@@ -150,84 +150,71 @@ def _half_written(name: str) -> bool:
 
 
 def cases(unfinished: Path) -> tuple[BadInput, ...]:
-    """All cases.
-
-    Args:
-      unfinished: a folder that `fixtures.unfinished_run` filled.
-    """
-    return (*command_lines(), *configurations(), *records(), *recordings(), *answers(), *run_files(unfinished))
+    """All cases; `unfinished` is a folder that `fixtures.unfinished_run` filled."""
+    return (*typed(), *records(), *recordings(), *run_files(unfinished))
 
 
-def command_lines() -> tuple[BadInput, ...]:
-    """Typing mistakes."""
+def typed() -> tuple[BadInput, ...]:
+    """Typing mistakes, values that contradict each other or make no sense, and a line that is no JSON."""
+    line, values = (functools.partial(BadInput, kind) for kind in ("command line", "configuration"))
     study = "experiments ablation_ordinal"
-    typed = functools.partial(BadInput, "command line")
     return (
-        typed("an experiment that there is not", "experiments ablation_ordinl", "There is no experiment",
-              "'ablation_ordinl'", "Did you mean ablation_ordinal"),
-        typed("an option that there is not", f"{study} --grpo-stepz 3", "Unrecognized", "--grpo-stepz", "--grpo-steps"),
-        typed("a number that is none", f"{study} --seeds many", "Error parsing", "--seeds", "INT"),
-        typed("a scale that there is not", f"{study} --scale huge", "invalid choice", "'huge'", "smoke"),
-        typed("a run that there is not", "experiments compare nothing nowhere --runs-dir {folder}", "FileNotFoundError",
-              "'nothing'", "must be a directory with config.json"),
-        typed("a label that no object has", "rewards explain --text soft --label hardness pink", "ExplainError",
-              "'pink'", "correct the word"),
-    )  # fmt: skip
-
-
-def configurations() -> tuple[BadInput, ...]:
-    """Values that contradict each other or make no sense."""
-    study = "experiments ablation_ordinal"
-    configured = functools.partial(BadInput, "configuration")
-    return (
-        configured("micro-batches that do not divide the batch", f"{study} --sft.micro-contacts 5", "Value error",
-                   "micro_contacts is 5", "must divide batch_size"),
-        configured("answers of two lengths", f"{study} --grpo.length 9", "ValueError", "grpo.length is 9", "set both"),
-        configured("a negative weight", f"{study} grpo.algorithm:paper --grpo.algorithm.beta -1", "Value error",
-                   "beta is -1.0", "must be ≥ 0"),
-        configured("a checkpoint every zero steps", f"{COUNTING} --save-every 0", "ValueError", "save_every is 0",
-                   "must be at least 1"),
-        configured("recordings without a folder",
-                   f"{study} --data records --runs-dir {{folder}}/runs --cache-dir {{folder}}/cache", "ValueError",
-                   "data_dir is None", "needs data_dir"),
-        configured("scenes without an object", "sensors_io generate --out {folder}/new --objects 0", "Value error",
-                   "objects", "must be"),
+        line("an experiment that there is not", "experiments ablation_ordinl", "There is no experiment",
+             "'ablation_ordinl'", "Did you mean ablation_ordinal"),
+        line("an option that there is not", f"{study} --grpo-stepz 3", "Unrecognized", "--grpo-stepz", "--grpo-steps"),
+        line("a number that is none", f"{study} --seeds many", "Error parsing", "--seeds", "INT"),
+        line("a scale that there is not", f"{study} --scale huge", "invalid choice", "'huge'", "smoke"),
+        line("a run that there is not", "experiments compare nothing nowhere --runs-dir {folder}", "FileNotFoundError",
+             "'nothing'", "must be a directory with config.json"),
+        line("a label that no object has", "rewards explain --text soft --label hardness pink", "ExplainError",
+             "'pink'", "correct the word"),
+        values("micro-batches that do not divide the batch", f"{study} --sft.micro-contacts 5", "Value error",
+               "micro_contacts is 5", "must divide batch_size"),
+        values("answers of two lengths", f"{study} --grpo.length 9", "ValueError", "grpo.length is 9", "set both"),
+        values("a negative weight", f"{study} grpo.algorithm:paper --grpo.algorithm.beta -1", "Value error",
+               "beta is -1.0", "must be ≥ 0"),
+        values("a checkpoint every zero steps", f"{COUNTING} --save-every 0", "ValueError", "save_every is 0",
+               "must be at least 1"),
+        values("recordings without a folder",
+               f"{study} --data records --runs-dir {{folder}}/runs --cache-dir {{folder}}/cache", "ValueError",
+               "data_dir is None", "needs data_dir"),
+        values("scenes without an object", "sensors_io generate --out {folder}/new --objects 0", "Value error",
+               "objects", "must be"),
+        BadInput("answers", "a line that is no JSON", "bench score {folder}/questions.jsonl {folder}/answers.jsonl",
+                 "LinesError", "line 1", "must be one JSON object", _text("questions.jsonl", '{"id": 1\n')),
     )  # fmt: skip
 
 
 def records() -> tuple[BadInput, ...]:
     """Damaged records that `check` reads, and paths at which no records can be written."""
-    corrupt, again = "CorruptRecordsError", "copy it again"
     index, shard, objects = "index.json", "contacts-00000.arrayrecord", "objects-00000.arrayrecord"
+    corrupt, again, rewrite = "CorruptRecordsError", "copy it again", "write it again"
     other_version = functools.partial(replaced, old='"version":2', new='"version":9')
     damaged: tuple[tuple[str, str, Prepare, str, str, str], ...] = (
         ("no index", index, Path.unlink, "MissingIndexError", "records", "give the directory"),
-        ("an index cut in half", index, cut, corrupt, "records", "write it again"),
-        ("an empty index", index, emptied, corrupt, "records", "write it again"),
+        ("an index cut in half", index, cut, corrupt, "records", rewrite),
+        ("an empty index", index, emptied, corrupt, "records", rewrite),
         ("an index that cannot be read", index, _unreadable, "RecordsError", "records", again),
-        ("an index of another version", index, other_version, "RecordsVersionError", "records",
-         "write the records again"),
+        ("an index of another version", index, other_version, "RecordsVersionError", "records", "write the records"),
         ("a missing shard", shard, Path.unlink, corrupt, "is missing", again),
         ("a shard cut in half", shard, cut, corrupt, "bytes where", again),
         ("an empty shard", shard, emptied, corrupt, "has 0 bytes", again),
         ("a flipped byte in a shard", shard, flipped, corrupt, "records", "copy the file again"),
         ("a flipped byte in the objects", objects, flipped, corrupt, "records", "copy"),
-    )  # fmt: skip
+    )
 
     def prepared(file: str, damage: Prepare, folder: Path) -> None:
         write_records(folder)
         damage(folder / "records" / file)
 
-    check = functools.partial(BadInput, "records")
-    unended = functools.partial(write_records, complete=False)
+    check, command = functools.partial(BadInput, "records"), "sensors_io check {folder}/records"
     return (
         *(
-            check(name, "sensors_io check {folder}/records", error, where, way_out,
-                  functools.partial(prepared, file, damage))
-            for name, file, damage, error, where, way_out in damaged
+            check(name, command, error, where, fix, functools.partial(prepared, file, damage))
+            for name, file, damage, error, where, fix in damaged
         ),
-        check("records whose writing has not ended", "sensors_io check {folder}/records", "IncompleteRecordsError",
-              "records", "run its command again", unended),
+        check("records whose writing has not ended", command, "IncompleteRecordsError", "records",
+              "run its command again", functools.partial(write_records, complete=False)),
         check("records of another making in the way", "sensors_io generate --out {folder}/records", "RecordsExistError",
               "made by config 'made up'", "choose another directory", write_records),
         check("a file where records should go", "sensors_io generate --out {folder}/taken", "RecordsExistError",
@@ -237,33 +224,17 @@ def records() -> tuple[BadInput, ...]:
 
 def recordings() -> tuple[BadInput, ...]:
     """Pictures and folders that a command cannot use."""
-    recorded = functools.partial(BadInput, "recordings")
-    rest = "--background {folder}/rest.png --out {folder}/out.npz --mm-per-px 0.06"
-    tac3d = "sensors_io import tac3d {folder}"
+    recorded, source = functools.partial(BadInput, "recordings"), "ImportSourceError"
+    extract = "sensors_io extract {folder}/%s --background {folder}/rest.png --out {folder}/out.npz --mm-per-px 0.06"
+    tac3d = "sensors_io import tac3d {folder}/%s --out {folder}/new"
     return (
-        *(
-            recorded(name, f"sensors_io extract {{folder}}/{picture} {rest}", "Error", where, way_out, write_pictures)
-            for name, picture, where, way_out in (
-                ("a picture that there is not", "no.png", "no.png", "replace it"),
-                ("a picture that is none", "none.png", "none.png", "picture"),
-                ("sizes that differ", "press.png", "(120, 160)", "crop them"),
-            )
-        ),
-        recorded("a folder to import that there is not", f"{tac3d}/nowhere --out {{folder}}/new", "ImportSourceError",
-                 "nowhere", "give"),
-        recorded("a folder to import that holds nothing", f"{tac3d}/empty --out {{folder}}/new", "ImportSourceError",
-                 "empty", "give", lambda folder: (folder / "empty").mkdir()),
+        recorded("a picture that there is not", extract % "no.png", "Error", "no.png", "replace it", write_pictures),
+        recorded("a picture that is none", extract % "none.png", "Error", "none.png", "picture", write_pictures),
+        recorded("sizes that differ", extract % "press.png", "Error", "(120, 160)", "crop them", write_pictures),
+        recorded("a folder to import that there is not", tac3d % "nowhere", source, "nowhere", "give"),
+        recorded("a folder to import that holds nothing", tac3d % "empty", source, "empty", "give",
+                 lambda folder: (folder / "empty").mkdir()),
     )  # fmt: skip
-
-
-def answers() -> tuple[BadInput, ...]:
-    """Files of questions and answers."""
-    command = "bench score {folder}/questions.jsonl {folder}/answers.jsonl"
-    broken = _text("questions.jsonl", '{"id": 1\n')
-    one = BadInput(
-        "answers", "a line that is no JSON", command, "LinesError", "line 1", "must be one JSON object", broken
-    )
-    return (one,)
 
 
 def run_files(unfinished: Path) -> tuple[BadInput, ...]:
@@ -291,10 +262,8 @@ def run_files(unfinished: Path) -> tuple[BadInput, ...]:
         case("checkpoint", "a changed iterator", none_left, "its data does not hold", "copies", _changed_iterator),
         case("checkpoint", "other shapes", "CheckpointError", "holds another state", "go back to", _other_shapes),
         case("checkpoint", "a file in their place", unwritten, "count/0", "move away", _file_for_folder),
-        BadInput(
-            "run", "targets that are NaN from step 5 on", f"{COUNTING} --poison-from 5", "NonFiniteGradientError",
-            "step 8", "lower the learning rate",
-        ),
+        BadInput("run", "targets that are NaN from step 5 on", f"{COUNTING} --poison-from 5", "NonFiniteGradientError",
+                 "step 8", "lower the learning rate"),
         dataclasses.replace(full, around=full_disk(FULL_BYTES)),
     )  # fmt: skip
 

@@ -36,14 +36,7 @@ class Damage:
 
 
 def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
-    """Damage one file of a copy of the run, continue it, and compare its end with that of an undamaged copy.
-
-    Args:
-      unfinished: a folder that `fixtures.unfinished_run` filled.
-      scratch: an empty folder.
-      context: shows progress.
-      most: files to damage at most; `None` takes all.
-    """
+    """Damage each file in a copy of an unfinished run, continue it, and compare its end with an undamaged copy's."""
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
     _continued(whole)

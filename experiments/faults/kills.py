@@ -119,13 +119,7 @@ class RunSize(NamedTuple):
 
 
 class Session:
-    """One session of a training, from its start.
-
-    Args:
-      training: to run or continue.
-      home: folder of its run.
-      programs: folder of compiled programs.
-    """
+    """One session of a training, from its start."""
 
     def __init__(self, training: KillableTraining, home: Path, programs: Path) -> None:
         self._runs, self._steps, self._printed = home / training.name, training.steps, home / "printed.txt"
@@ -169,11 +163,7 @@ class Session:
         return self._process.is_alive()
 
     def kill(self, lines: int) -> Kill | None:
-        """End it by SIGKILL; `None` if it ended just before.
-
-        Args:
-          lines: of the log of a whole run.
-        """
+        """End it by SIGKILL; `None` if it ended just before."""
         age_s = self.age_s
         self._process.kill()
         self._process.join()
@@ -285,12 +275,6 @@ class Campaign:
     """Runs of one training, which share compiled programs and the records that the first one made.
 
     Everything else in a run's cache, such as trained policies, is its own and must be made again.
-
-    Args:
-      home: folder of the runs.
-      programs: folder of compiled programs.
-      training: to run.
-      config: moments of the kills.
     """
 
     def __init__(self, home: Path, programs: Path, training: KillableTraining, config: KillConfig) -> None:
@@ -318,12 +302,7 @@ class Campaign:
     ) -> tuple[Kill, ...]:
         """Start or continue a run and kill it until it ends, which it may after all kills have struck.
 
-        Args:
-          number: of the run.
-          kills: that shall strike it.
-          undisturbed: gives pace and length of a run.
-          before: kills that struck it in an earlier session of the caller.
-          keep: called after each kill with all that have struck.
+        `before` are the kills of an earlier session; `keep` is called after each kill with all that have struck.
         """
         struck, schedule = tuple(before), KillSchedule(undisturbed.work_s)
         home = self._home / str(number) / self._training.name

@@ -22,12 +22,7 @@ _PICTURES = 100_000
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NoiseCamera:
-    """A source of pictures of noise, no two of 100,000 alike: each begins elsewhere in one long noise.
-
-    Args:
-      rate_hz: of the pictures.
-      size_px: rows and columns.
-    """
+    """A source of pictures of noise, no two of 100,000 alike: each begins elsewhere in one long noise."""
 
     rate_hz: float
     size_px: tuple[int, int]
