@@ -47,9 +47,6 @@ REWRITTEN = frozenset({"metrics.jsonl", "timing.json", "report.html"})
 LOCKS = frozenset({".lock", ".lockfile"})
 """Empty files that only serve as locks."""
 
-FULL_BYTES = 6_000
-"""Largest file on a full disk: the counting run's small files fit, its report, which grows with its log, does not."""
-
 Kind = Literal["command line", "configuration", "records", "recordings", "run", "checkpoint", "answers", "disk"]
 
 Prepare = Callable[[Path], None]
@@ -264,7 +261,7 @@ def run_files(unfinished: Path) -> tuple[BadInput, ...]:
         case("checkpoint", "a file in their place", unwritten, "count/0", "move away", _file_for_folder),
         BadInput("run", "targets that are NaN from step 5 on", f"{COUNTING} --poison-from 5", "NonFiniteGradientError",
                  "step 8", "lower the learning rate"),
-        dataclasses.replace(full, around=full_disk(FULL_BYTES)),
+        dataclasses.replace(full, around=full_disk),
     )  # fmt: skip
 
 

@@ -19,12 +19,10 @@ import numpy as np
 from experiments.core.results import Requirement, Table, at_least, at_most, named_table
 from experiments.faults.replayed_camera import NoiseCamera
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.base import Identity
 from sensors_io.devices.bridge import BridgeConfig
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.replay import Replay
-from sensors_io.devices.sources import Recorded
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.viewer.presenter import Channel, Presenter
 from sensors_io.viewer.server import LiveView
@@ -36,7 +34,6 @@ FASTEST_HZ = 120.0
 """Rate of the vendors' fastest camera, a DM-Tac."""
 
 _IDLE_S = 0.002  # between looks of a session at its devices
-_FIELD = (18, 24)  # rows and columns of the fields that are shown
 
 BROWSER = """
 import http.client, json, sys, threading, time, urllib.parse
@@ -67,22 +64,10 @@ print(json.dumps({"ages_s": ages}))
 The age of what it shows is the time from the sample's stamp until the last panel is there."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class NoiseFieldCamera:
-    """A noise camera that also gives fields to show."""
-
-    camera: NoiseCamera
-
-    @property
-    def identity(self) -> Identity:
-        return self.camera.identity
-
-    def samples(self) -> Iterator[Recorded]:
-        depth = np.linspace(0, 1, _FIELD[0] * _FIELD[1], dtype=np.float32).reshape(_FIELD)
-        shift = np.stack([depth, depth[::-1]], -1) * np.float32(0.3)
-        arrays = {"depth_mm": depth, "deformation_mm": shift, "shear_mm": shift}
-        for recorded in self.camera.samples():
-            yield dataclasses.replace(recorded, arrays=arrays)
+_DEPTH = np.linspace(0, 1, 18 * 24, dtype=np.float32).reshape(18, 24)
+_SHIFT = np.stack([_DEPTH, _DEPTH[::-1]], -1) * np.float32(0.3)
+FIELDS = {"depth_mm": _DEPTH, "deformation_mm": _SHIFT, "shear_mm": _SHIFT}
+"""Fields to show with every picture."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +94,7 @@ def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedR
     """Record a camera for some seconds, watched by so many browsers; `None` records without a page."""
     with contextlib.ExitStack() as stack:
         home = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        reader = stack.enter_context(Reader(Replay(NoiseFieldCamera(camera=camera))))
+        reader = stack.enter_context(Reader(Replay(dataclasses.replace(camera, arrays=FIELDS))))
         journal = stack.enter_context(JournalWriter(home / "journal"))
         watching = []
         if browsers is not None:

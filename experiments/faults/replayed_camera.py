@@ -3,7 +3,7 @@
 import dataclasses
 import threading
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ class NoiseCamera:
 
     rate_hz: float
     size_px: tuple[int, int]
+    arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Given with every picture."""
 
     @property
     def identity(self) -> Identity:
@@ -37,7 +39,7 @@ class NoiseCamera:
         noise = np.random.default_rng(0).integers(0, 256, size + _PICTURES, dtype=np.uint8)
         for i in range(_PICTURES):
             frame = noise[i : i + size].reshape(shape)
-            yield Recorded(time_ns=round(i * NS_PER_S / self.rate_hz), index=i, frame=frame, arrays={})
+            yield Recorded(time_ns=round(i * NS_PER_S / self.rate_hz), index=i, frame=frame, arrays=self.arrays)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

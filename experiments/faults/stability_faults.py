@@ -86,14 +86,7 @@ class WaitingConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FaultsConfig:
-    """Sizes of the four parts.
-
-    Args:
-      grpo, study: kills of the two trainings.
-      grpo_steps, study_scale: size of the two trainings.
-      damaged_files, bad_inputs: files and inputs to try at most; `None` tries all.
-      waiting: stages to time.
-    """
+    """Kills of the two trainings and their sizes, files and inputs to try at most (`None`: all), stages to time."""
 
     grpo: KillConfig = KillConfig(kills=KILLS)
     grpo_steps: int = 2000
@@ -248,20 +241,15 @@ def requirements(
 def verdict(
     killed: Mapping[str, KilledRuns], damage: Sequence[Damage], inputs: Sequence[InputRow], waited: Waits
 ) -> tuple[str, ...]:
-    """The answer in sentences."""
-    ends = [
-        f"the {name} was killed {len(k.kills)} times in {k.runs} run{'s' if k.runs > 1 else ''} and "
-        + ("ended in the same bits" if not k.differs else f"differs in {', '.join(k.differs)}")
-        for name, k in killed.items()
-    ]
-    counts = ", ".join(f"{sum(one.outcome == outcome for one in damage)} {outcome}" for outcome in OUTCOMES)
-    answered = sum(not row["faults"] for row in inputs)
+    """Kills and differences of each training, ends with damaged files, answered inputs, the longest wait."""
+    kills = "; ".join(f"the {name}, {len(k.kills)} times, {len(k.differs)} differences" for name, k in killed.items())
+    ends = ", ".join(f"{sum(one.outcome == outcome for one in damage)} {outcome}" for outcome in OUTCOMES)
     worst = max(wait_s / steps_s for steps_s, wait_s in waited.values())
     return (
-        f"By kill -9 {'; '.join(ends)}.",
-        f"Of {len(damage)} damaged files: {counts}.",
-        f"Of {len(inputs)} kinds of bad input {answered} are answered with error, place and way out; nothing is lost.",
-        f"At most {worst:.2%} of a training step waits for data.",
+        f"Killed by kill -9: {kills}.",
+        f"Of {len(damage)} damaged files: {ends}.",
+        f"Of {len(inputs)} kinds of bad input {sum(not row['faults'] for row in inputs)} are answered with error, "
+        f"place and way out.  At most {worst:.2%} of a training step waits for data.",
     )
 
 
@@ -275,11 +263,7 @@ def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
             | {"torn lines": sum(k.torn for k in each.kills), "differences": len(each.differs)}
             for name, each in killed.items()
         ],
-        meanings={
-            "runs": "that they were spread over; each ended by itself after its last kill",
-            "torn lines": "kills that left half a line in the log",
-            "differences": "from the undisturbed run, in any bit",
-        },
+        meanings={"torn lines": "kills that left half a line in the log", "differences": "from the undisturbed run"},
         note="Compared are metrics.jsonl, all answers, results, and step, iterator and every array of every stage.",
     )
 
@@ -289,14 +273,10 @@ def damage_table(damage: Sequence[Damage]) -> Table:
     by_kind: dict[str, list[Damage]] = {}
     for one in damage:
         by_kind.setdefault(f"{one.file}, {one.damage}", []).append(one)
+    count = lambda same: {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
     return named_table(
         "Damaged files of a run that goes on",
-        [
-            {"damage": kind}
-            | {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
-            | {"said": same[0].message[:CELL]}
-            for kind, same in by_kind.items()
-        ],
+        [{"damage": kind, **count(same), "said": same[0].message[:CELL]} for kind, same in by_kind.items()],
         note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
     )
 
@@ -312,17 +292,15 @@ def input_table(inputs: Sequence[InputRow]) -> Table:
 
 def waiting_table(waited: Waits) -> Table:
     """Waits of every stage."""
-    rows = [
-        {"stage": stage, "in steps": steps_s, "waiting": wait_s, "share": 100 * wait_s / steps_s}
-        for stage, (steps_s, wait_s) in waited.items()
-    ]
     return named_table(
         "Waiting for data, on a CPU",
-        rows,
+        [
+            {"stage": stage, "in steps": steps_s, "waiting": wait_s, "share": 100 * wait_s / steps_s}
+            for stage, (steps_s, wait_s) in waited.items()
+        ],
         formats={"in steps": ".2f", "waiting": ".4f", "share": ".3f"},
         units={"in steps": "s", "waiting": "s", "share": "%"},
         meanings={"in steps": "after the first, which compiles", "waiting": "device idle, the next batch not ready"},
-        note="Every run writes the same times to timing.json and prints them at the end of each stage.",
     )
 
 
@@ -351,13 +329,8 @@ def kill_picture(kills: Mapping[str, Sequence[Kill]]) -> Picture:
 
 DEFAULT = FaultsConfig()
 SMOKE = FaultsConfig(
-    grpo=KillConfig(kills=3),
-    grpo_steps=20,
-    study=KillConfig(kills=1),
-    study_scale="short",
-    damaged_files=2,
-    bad_inputs=30,
-    waiting=WaitingConfig(steps=3),
-)
+    grpo=KillConfig(kills=3), grpo_steps=20, study=KillConfig(kills=1), study_scale="short", damaged_files=2,
+    bad_inputs=30, waiting=WaitingConfig(steps=3),
+)  # fmt: skip
 
 EXPERIMENT = Experiment(name="stability_faults", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

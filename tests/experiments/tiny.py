@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
+from experiments.faults.trainings.small_grpo import drawn_features
 from experiments.faults.trainings.small_study import MODEL, SCENES
 from experiments.study.dataset import Dataset
 from experiments.study.stages import StudySFT
@@ -44,13 +45,4 @@ def params(policy: TouchPolicy, data: Dataset, *, loud: float = 0.4, seed: int =
 
 def features(n: int, seed: int = 0) -> Features:
     """N encoded contacts made up without an encoder, everything present; on the host, as the stages keep them."""
-    rng = np.random.default_rng(seed)
-    width, steps = MODEL.decoder.hidden_size, MODEL.frames // MODEL.tactile.frames_per_step
-    time = np.repeat(np.arange(steps), MODEL.tactile.tokens_per_step)
-    return Features(
-        touch=rng.normal(0, 1, (n, 4, len(time), width)).astype(np.float32),
-        touch_time=np.tile(time.astype(np.int32), (n, 4, 1)),
-        stream_mask=np.ones((n, 4), bool),
-        view=rng.normal(0, 1, (n, MODEL.vision.grid**2, width)).astype(np.float32),
-        view_mask=np.ones(n, bool),
-    )
+    return drawn_features(np.random.default_rng(seed), n)

@@ -70,15 +70,15 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     prior = uniform_prior(list(policy.levels))
     score, fns = make_score(policy.parser, make_rewards(prior), PUBLISHED), policy.fns
     optimizer, step = grpo_program(fns, score, config.grpo, config.steps, None)
-    decoder = {"decoder": _decoder(policy, context.directory / "start.npz")}
+    decoder = {"decoder": fresh_decoder(policy, context.directory / "start.npz")}
     rng = np.random.default_rng(1)
-    noise = _features(rng, NOISE).touch
+    noise = drawn_features(rng, NOISE).touch
     frozen = FrozenInputs(reference=decoder, noise=jnp.asarray(noise))
-    feed = _questions(policy, rng, CONTACTS, config.grpo.drawn)
-    held = next(_questions(policy, rng, HELD_OUT, HELD_OUT))
+    feed = drawn_questions(policy, rng, CONTACTS, config.grpo.drawn)
+    held = next(drawn_questions(policy, rng, HELD_OUT, HELD_OUT))
     begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
     state = begin(decoder, jax.random.key(0))
-    judge = jax.jit(lambda params: _certainty(policy, params, held))
+    judge = jax.jit(lambda params: certainty(policy, params, held))
     run_loop(
         lambda s, batch: step(s, batch, frozen),
         state,
@@ -92,19 +92,19 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     return Results(verdict=("It came to its end.",))
 
 
-def _certainty(policy: TouchPolicy, params: Params, held: GRPOBatch) -> jax.Array:
+def certainty(policy: TouchPolicy, params: Params, held: GRPOBatch) -> jax.Array:
     """Mean largest log-probability of the first word about held-out contacts: cheap, and any score will do."""
     first = jax.vmap(lambda f, i, m: policy.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
     return jnp.mean(jnp.max(jax.nn.log_softmax(first), -1))
 
 
-def _questions(policy: TouchPolicy, rng: np.random.Generator, contacts: int, batch_size: int) -> QuestionFeed:
+def drawn_questions(policy: TouchPolicy, rng: np.random.Generator, contacts: int, batch_size: int) -> QuestionFeed:
     """Questions about contacts whose features and labels are drawn."""
     label = np.stack([rng.integers(0, levels, contacts) for levels in policy.levels], 1).astype(np.int32)
-    return QuestionFeed(policy, _features(rng, contacts), label, batch_size=batch_size, seed=0)
+    return QuestionFeed(policy, drawn_features(rng, contacts), label, batch_size=batch_size, seed=0)
 
 
-def _features(rng: np.random.Generator, contacts: int) -> Features:
+def drawn_features(rng: np.random.Generator, contacts: int) -> Features:
     """Encoded contacts, all there, drawn from N(0, 1); on the host, as stages keep them."""
     width, times = MODEL.decoder.hidden_size, MODEL.frames // MODEL.tactile.frames_per_step
     time = np.repeat(np.arange(times, dtype=np.int32), MODEL.tactile.tokens_per_step)
@@ -119,21 +119,16 @@ def _features(rng: np.random.Generator, contacts: int) -> Features:
     return Features(**on_host)
 
 
-def _decoder(policy: TouchPolicy, path: Path) -> Params:
+def fresh_decoder(policy: TouchPolicy, path: Path) -> Params:
     """A fresh policy's, drawn by the first session and found by the others, as GRPO finds what SFT left."""
     if not path.exists():
-        arrays: dict[str, Any] = traverse_util.flatten_dict(_drawn(policy)["decoder"], sep="/")
-        buffer = io.BytesIO()
+        shapes = touch_shapes(MODEL, MODEL.vision.image_px, SENSORS)
+        params = policy.init(0, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
+        buffer, arrays = io.BytesIO(), dict[str, Any](traverse_util.flatten_dict(params["decoder"], sep="/"))
         np.savez(buffer, **arrays)
         write_bytes(path, buffer.getvalue())
     with np.load(path) as file:
         return jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(dict(file), sep="/"))
-
-
-def _drawn(policy: TouchPolicy) -> Params:
-    """Parameters of a fresh policy."""
-    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), touch_shapes(MODEL, MODEL.vision.image_px, SENSORS))
-    return policy.init(0, nothing)
 
 
 EXPERIMENT = Experiment(name="small_grpo", config=ReinforcingConfig(), run=run)

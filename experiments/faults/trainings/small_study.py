@@ -29,32 +29,17 @@ MODEL = ModelConfig(
     tactile=TactileViTConfig(sensors=0, width=16, num_layers=0, num_heads=2, stem_width=4),
     vision=VisionConfig(image_px=16, patch_px=8, width=8, num_layers=0),
     decoder=DecoderConfig(
-        vocab_size=0,
-        hidden_size=24,
-        num_layers=1,
-        num_heads=2,
-        num_kv_heads=1,
-        head_dim=8,
-        intermediate_size=32,
+        vocab_size=0, hidden_size=24, num_layers=1, num_heads=2, num_kv_heads=1, head_dim=8, intermediate_size=32,
         mrope_section=(1, 1, 2),
     ),
-    frames=4,
-    image_px=28,
-    completion_tokens=20,
-)
+    frames=4, image_px=28, completion_tokens=20,
+)  # fmt: skip
 """So small that a step takes as long as the loop around it."""
 
 SCENES = SceneConfig(
-    objects=16,
-    sites=1,
-    frames=4,
-    image_px=28,
-    contact_grid=24,
-    view_px=16,
-    split_shares=(0.6, 0.1, 0.3),
-    solver_tolerance=1e-2,
-    solver_max_iterations=20,
-)
+    objects=16, sites=1, frames=4, image_px=28, contact_grid=24, view_px=16, split_shares=(0.6, 0.1, 0.3),
+    solver_tolerance=1e-2, solver_max_iterations=20,
+)  # fmt: skip
 
 STUDY = StudyConfig(
     seeds=1,
