@@ -28,6 +28,7 @@ from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
 from touchr1_jax.rl.config import Paper
 from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
+from touchr1_jax.validation import at_least
 
 BACKWARD = 2
 """Operations of a backward pass over those of its forward pass."""
@@ -87,8 +88,7 @@ class GpuConfig:
             raise ValueError(
                 f"frames is {self.frames}: must be a multiple of {self.vision.patch_frames}, the frames of a patch"
             )
-        if self.rounds < 1:
-            raise ValueError(f"rounds is {self.rounds}: must be at least 1; raise it")
+        at_least(self, 1, "rounds")
 
 
 class AttentionInputs(NamedTuple):

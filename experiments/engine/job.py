@@ -22,7 +22,7 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import Advantage, AnyAlgorithm, GRPOConfig, Paper
-from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
+from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
@@ -43,8 +43,7 @@ class Job:
       config: the step.
       repeated: encode the prefix for every rollout, as if each were a prompt of its own.
       host: compute the reward in Python.
-      end_share: share of the vocabulary that ends a completion, so that an untrained policy's completions have 1/share
-        tokens on average; at 0 none ends early.
+      end_share: share of the vocabulary that ends a completion, whose mean length is then 1/share; at 0 none does.
       learning_rate: AdamW's; 0 keeps the policy as it is.
       seed: of the prompts and of the sampling.
     """
@@ -73,17 +72,12 @@ class Job:
         self.batch = make_batch(size, prefix, config.drawn, seed)
         params = init_decoder(self.fns, self.batch)
         self.frozen = FrozenInputs(reference=params, noise=jnp.zeros((1, 1, TOUCH, size.hidden_size)))
-        self._state = start_state(params, optimizer, jax.random.key(seed), config)
+        self.state = start_state(params, optimizer, jax.random.key(seed), config)
 
     def step(self) -> dict[str, jax.Array]:
         """Run one iteration, which replaces the state."""
-        self._state, metrics = self._step(self._state, self.batch, self.frozen)
+        self.state, metrics = self._step(self.state, self.batch, self.frozen)
         return metrics
-
-    @property
-    def state(self) -> GRPOState:
-        """The state after the last iteration."""
-        return self._state
 
     @property
     def compilations(self) -> int:
@@ -92,7 +86,7 @@ class Job:
 
     def lowered(self) -> jax.stages.Lowered:
         """The step before compilation."""
-        return self._step.lower(self._state, self.batch, self.frozen)
+        return self._step.lower(self.state, self.batch, self.frozen)
 
 
 @functools.cache
@@ -100,23 +94,14 @@ def engine(
     size: JobSize, prefix: int, config: GRPOConfig, host: bool, end_share: float, learning_rate: float
 ) -> tuple[PolicyFns, optax.GradientTransformation, Any]:
     """Policy, optimizer and jitted step, made once for all seeds."""
-    fns = make_fns(size, prefix, end_share)
-    score = low_ids_on_host(size.vocab_size) if host else low_ids(size.vocab_size)
-    optimizer = optax.adamw(learning_rate)
-    return fns, optimizer, make_grpo_step(fns, score, optimizer, config)
+    fns, optimizer = make_fns(size, prefix, end_share), optax.adamw(learning_rate)
+    return fns, optimizer, make_grpo_step(fns, low_ids(size.vocab_size, host=host), optimizer, config)
 
 
 def config_of(size: JobSize, algorithm: AnyAlgorithm = PLAIN, **options: Any) -> GRPOConfig:
     """A step of the job's size, plain GRPO with a reference policy by default; `options` are fields of `GRPOConfig`."""
-    return GRPOConfig(
-        prompts=size.prompts,
-        group=size.group,
-        length=size.length,
-        micro_prompts=1,
-        algorithm=algorithm,
-        inverse_draws=True,
-        **options,
-    )
+    sizes: dict[str, Any] = {"prompts": size.prompts, "group": size.group, "length": size.length, "micro_prompts": 1}
+    return GRPOConfig(**sizes, algorithm=algorithm, inverse_draws=True, **options)
 
 
 def decoder_config(size: JobSize) -> DecoderConfig:
@@ -130,18 +115,12 @@ def decoder_config(size: JobSize) -> DecoderConfig:
 
 def make_fns(size: JobSize, prefix: int, end_share: float = 0.0) -> PolicyFns:
     """A policy whose prompts have `prefix` tokens and whose highest token ids end a completion."""
-    policy = Policy(
-        PolicyConfig(
-            tactile=TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1),
-            vision=VisionConfig(),
-            decoder=decoder_config(size),
-        )
-    )
+    tactile = TactileViTConfig(sensors=1, width=8, num_layers=0, num_heads=1)
+    policy = Policy(PolicyConfig(tactile=tactile, vision=VisionConfig(), decoder=decoder_config(size)))
     slots = Slots(touch=np.arange(VIEW, VIEW + TOUCH)[None], view=np.arange(VIEW), stream_text=np.full(prefix, -1))
-    banned = np.zeros(size.vocab_size, bool)
-    out_of_reach = (size.vocab_size,)
-    ends = tuple(range(size.vocab_size - round(end_share * size.vocab_size), size.vocab_size)) or out_of_reach
-    return PolicyFns(module=policy, slots=slots, banned=banned, end_ids=ends, pad_id=0)
+    first_end = size.vocab_size - round(end_share * size.vocab_size)
+    ends = tuple(range(first_end, size.vocab_size)) or (size.vocab_size,)  # out of reach
+    return PolicyFns(module=policy, slots=slots, banned=np.zeros(size.vocab_size, bool), end_ids=ends, pad_id=0)
 
 
 def make_batch(size: JobSize, prefix: int, prompts: int, seed: int = 0) -> GRPOBatch:
@@ -185,24 +164,18 @@ def init_decoder(fns: PolicyFns, batch: GRPOBatch) -> Params:
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
-def low_ids(vocab_size: int) -> ScoreFn:
-    """Share of token ids in the lower half of the vocabulary."""
+def low_ids(vocab_size: int, *, host: bool) -> ScoreFn:
+    """Share of token ids in the lower half of the vocabulary; on the host to measure the cost of leaving the device."""
 
     def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
         del target
         return jnp.mean(tokens < vocab_size // 2), {}, parsed_without_tags(tokens)
 
-    return score
-
-
-def low_ids_on_host(vocab_size: int) -> ScoreFn:
-    """The same reward computed in Python, to measure the cost of leaving the device."""
-
     def reward(tokens: np.ndarray, parsed: Parsed, target: Target) -> dict[str, float]:
         del parsed, target
         return {"low": float(np.mean(tokens < vocab_size // 2))}
 
-    return make_host_score(parsed_without_tags, reward, ("low",))
+    return make_host_score(parsed_without_tags, reward, ("low",)) if host else score
 
 
 def parsed_without_tags(tokens: jax.Array) -> Parsed:

@@ -171,10 +171,7 @@ def table(readings: Measured) -> Table:
         ],
         formats={"weights": ".2f", "peak": ".2f", "peak over weights": ".3f", "process before": ".2f", "time": ".1f"},
         units={"weights": "GB", "peak": "GB", "process before": "GB", "time": "s"},
-        meanings={
-            "peak": "largest resident size of the process",
-            "process before": "with the runtime, without weights",
-        },
+        meanings={"process before": "with the runtime, without weights"},
         note="The files were just written: they may come from the page cache, which the peak does not count.",
     )
 

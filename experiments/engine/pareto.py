@@ -31,14 +31,9 @@ Axes = Mapping[str, Literal["lower", "higher"]]
 
 
 class JudgedDefault(NamedTuple):
-    """A default and the table that measures it.
+    """The default of `what` and the tables of an experiment, by the beginning of their titles, that measure it.
 
-    Attributes:
-      what: component that has the default.
-      experiment: name of the experiment with the table.
-      table: beginning of the table's title; every table whose title begins so is judged.
-      default: beginning of the default's row.
-      axes: figures that are compared.
+    `default` begins its row; `axes` are the figures that are compared.
     """
 
     what: str
@@ -70,10 +65,9 @@ CHARTS_ONLY = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GatherConfig:
-    """Location of the other experiments' runs."""
+    """Folder of the other experiments' runs; by default the one that holds this run."""
 
     others: Path | None = None
-    """Folder of the runs; by default the one that holds this run."""
 
 
 class ParetoPoint(NamedTuple):
@@ -135,11 +129,7 @@ def judge(judged: JudgedDefault, past: PastRun) -> list[DefaultJudgement]:
 
 
 def points_of(table: Mapping[str, Any], axes: Axes) -> tuple[ParetoPoint, ...]:
-    """The rows of a table of `results.json` that have a number on every axis.
-
-    Args:
-      table: `columns` and `rows`; the first column names the row.
-      axes: of several columns whose names begin as given, the first is taken.
+    """The rows of a table of `results.json` that have a number on every axis, the first column that begins as given.
 
     Raises:
       ResultsError: the table has no column for an axis.
@@ -203,10 +193,7 @@ def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
             }
             for j in judgements
         ],
-        meanings={
-            "measured": "rows that have a number on every axis",
-            "on the front": "rows that no other row dominates",
-        },
+        meanings={"measured": "rows that have a number on every axis"},
     )
 
 

@@ -94,10 +94,8 @@ class PeerJob:
     def prompts(self) -> list[list[list[int]]]:
         """Random token ids, [iteration, prompt, prefix], without padding."""
         draw = random.Random(0)
-        token = lambda: draw.randrange(PAD_ID + 1, self.size.vocab_size)
-        return [
-            [[token() for _ in range(self.prefix)] for _ in range(self.size.prompts)] for _ in range(self.iterations)
-        ]
+        prompt = lambda: [draw.randrange(PAD_ID + 1, self.size.vocab_size) for _ in range(self.prefix)]
+        return [[prompt() for _ in range(self.size.prompts)] for _ in range(self.iterations)]
 
     def reward(self, completion: Sequence[int]) -> float:
         """Share of ids in the lower half of the vocabulary.

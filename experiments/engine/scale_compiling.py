@@ -14,7 +14,7 @@ import dataclasses
 import importlib.util
 import os
 from collections.abc import Iterator, Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -65,15 +65,9 @@ class Training:
 
     def shape(self, setup: Setup) -> GRPOShape:
         """The sizes that the memory of a step depends on."""
-        grpo = GRPOConfig(
-            prompts=self.prompts,
-            micro_prompts=min(self.prompts, setup.mesh.data * setup.mesh.fsdp),  # one prompt a device
-            group=self.group,
-            length=self.length,
-            remat=True,
-            bfloat16=True,
-            algorithm=Paper(),
-        )
+        micro_prompts = min(self.prompts, setup.mesh.data * setup.mesh.fsdp)  # one prompt a device
+        sizes: dict[str, Any] = {"prompts": self.prompts, "group": self.group, "length": self.length}
+        grpo = GRPOConfig(**sizes, micro_prompts=micro_prompts, remat=True, bfloat16=True, algorithm=Paper())
         return GRPOShape(decoder=self.model.decoder, grpo=grpo, mesh=setup.mesh, prompt_tokens=self.prompt.tokens)
 
     def step(self, setup: Setup) -> AbstractStep:

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 
 from experiments.core.charts import bars
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
+from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.engine.gpu_workloads import (
     AttentionInputs,
@@ -148,14 +148,12 @@ def verdict(
     engine, flash = (t for name, t in timed.items() if name.startswith("attention") and name.endswith("gradient"))
     read = memory_share(decoding, sheet)
     memory = "" if read is None else f", {read:.1%} of what the memory can deliver"
-    sentences = (
+    return (
+        *(() if device.platform == "gpu" else ("This device is no GPU: no figure here holds for one.",)),
         f"On {device.device_kind} a GRPO step takes {step.median_s:.3g} s, {step.flops / peak:.1%} of the peak; "
         f"decoding makes {decoding.made}{memory}.",
         f"Flash attention with its gradient takes {flash.median_s / engine.median_s:.2f} of the time of the engine's.",
     )
-    if device.platform != "gpu":
-        return "This device is no GPU: the code was tried, and no figure here holds for one.", *sentences
-    return sentences
 
 
 def memory_share(timed: TimedWorkload, sheet: DataSheet | None) -> float | None:
@@ -165,20 +163,18 @@ def memory_share(timed: TimedWorkload, sheet: DataSheet | None) -> float | None:
 
 def time_table(timed: Mapping[str, TimedWorkload], sheet: DataSheet | None, peak_flops: float) -> Table:
     """Every workload against the peak."""
-    rows: list[dict[str, Cell]] = []
-    for name, t in timed.items():
-        read = memory_share(t, sheet)
-        rows.append(
-            {
-                "piece": name,
-                "median": 1e3 * t.median_s,
-                "spread": 1e3 * (max(t.seconds) - min(t.seconds)),
-                "makes": t.made,
-                "work": t.flops / 1e12,
-                "of peak": 100 * t.flops / peak_flops,
-                "of memory": None if read is None else 100 * read,
-            }
-        )
+    rows = [
+        {
+            "piece": name,
+            "median": 1e3 * t.median_s,
+            "spread": 1e3 * (max(t.seconds) - min(t.seconds)),
+            "makes": t.made,
+            "work": t.flops / 1e12,
+            "of peak": 100 * t.flops / peak_flops,
+            "of memory": None if (read := memory_share(t, sheet)) is None else 100 * read,
+        }
+        for name, t in timed.items()
+    ]
     peak = "the data sheet" if sheet is not None else "the plain product, for the device's data sheet is not known here"
     return named_table(
         "Time and share of the peak",
@@ -210,29 +206,17 @@ def memory_table(reserved: int, counted: int, device: jax.Device) -> Table:
 
 DEFAULT = GpuConfig()
 SMOKE = GpuConfig(
-    anywhere=True,
-    rounds=2,
-    side=64,
-    prompts=1,
-    tokens=24,
-    heads=4,
-    kv_heads=2,
-    head_dim=8,
-    flash="xla",
-    streams=2,
-    frames=4,
-    contacts=1,
-    tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
+    anywhere=True, rounds=2, side=64, prompts=1, tokens=24, heads=4, kv_heads=2, head_dim=8, flash="xla", streams=2,
+    frames=4, contacts=1, tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
     tactile_px=28,
     vision=QwenVisionConfig(
         out_size=16, depth=1, hidden_size=16, num_heads=2, intermediate_size=32, patch_px=2, window_px=8,
         full_layers=(0,),
     ),
-    vision_px=16,
+    vision_px=16, prefix=16,
     size=JobSize(
         prompts=2, group=2, length=6, vocab_size=64, hidden_size=32, num_layers=1, head_dim=8, intermediate_size=64
     ),
-    prefix=16,
 )  # fmt: skip
 
 EXPERIMENT = Experiment(name="speed_gpu", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

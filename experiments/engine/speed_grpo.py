@@ -182,17 +182,11 @@ def measure_peers(config: SpeedConfig, peers: Sequence[Peer], context: Context) 
 
 DEFAULT = SpeedConfig()
 SMOKE = SpeedConfig(
-    prefixes=(16,),
-    rounds=2,
-    options=("importance weights", "short answers, buckets"),
-    options_at=16,
-    repeated_at=(16,),
-    buckets=(4,),
-    words=0,
-    steps=300,
+    prefixes=(16,), rounds=2, options=("importance weights", "short answers, buckets"), options_at=16,
+    repeated_at=(16,), buckets=(4,), words=0, steps=300,
     size=JobSize(
         prompts=2, group=2, length=8, vocab_size=64, hidden_size=32, num_layers=1, head_dim=8, intermediate_size=64
     ),
-)
+)  # fmt: skip
 
 EXPERIMENT = Experiment(name="speed_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -45,13 +45,7 @@ def requirements(
 ) -> tuple[Requirement, ...]:
     """The bounds on time, memory, compilations and drift.
 
-    Args:
-      alone: in processes that read their programs from the cache.
-      first: in processes that compile them.
-      lean: in processes that compile them leanly.
-      peers: the other engines.
-      long: many steps.
-      parser_s: seconds that the parser takes.
+    `alone` read their programs from the cache, `first` compile them, `lean` compile them leanly.
     """
     ratios = [
         at_least(
@@ -134,7 +128,6 @@ def alone_table(size: JobSize, alone: Timings, first: Timings) -> Table:
         formats={"share of peak": ".2f"},
         units={"prefix": "tokens", **dict.fromkeys(seconds, "s"), **dict.fromkeys(memory, "GB"), "work": "GFLOP"},
         meanings={
-            "first iteration": "programs read from the cache",
             "peak memory": "of the process, interpreter included",
             "work": "matrix products, the prefix once a prompt and pass",
             "share of peak": "of the speed of large matrix products in the same process",
@@ -164,12 +157,7 @@ def peer_table(size: JobSize, alone: Timings, first: Timings, peers: Peers) -> T
         rows,
         formats={"over this": ".1f", "over this one's": ".1f", "share of peak": ".2f"},
         units={"prefix": "tokens", "an iteration": "s", "peak memory": "GB", "first iteration": "s"},
-        meanings={
-            "an iteration": "median of the timed ones",
-            "over this": "its time over that of this engine",
-            "over this one's": "that of this engine's process, which compiles too",
-            "share of peak": "the work that this engine needs, over its time",
-        },
+        meanings={"over this": "its time over that of this engine", "share of peak": "by the work of this engine"},
         note="; ".join(f"{name}: {text}" for name, text in versions.items()),
     )
 

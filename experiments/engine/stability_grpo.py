@@ -248,9 +248,7 @@ def summary_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
             "knob": "in brackets the variant that is compared with the stable preset",
             "breaks": "first value at which any seed of that variant fails",
             "half": "first value at which more than half of them do",
-            "stable": "first value at which any seed of the stable preset fails",
             "failed": "runs of the stable preset that fail at values where the variant does",
-            "of": "number of runs of the stable preset at these values",
             "alarm": "share of failed runs of both variants whose alarm fired",
             "false": "share of runs that did not fail whose alarm fired",
         },
@@ -295,12 +293,9 @@ def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
         formats={"number": ".2g", "step": ".0f"},
         meanings={
             "alarm": "codes of which any counts, with the bounds of their rules",
-            "failed": "runs of both variants that failed",
-            "noticed": "those whose alarm fired",
-            "number": "that fired first, median over these runs",
-            "step": "at which it fired first, median over these runs",
-            "others": "runs of both variants that did not fail",
-            "struck": "those whose alarm fired all the same",
+            "number": "that fired first, median over failed runs",
+            "step": "at which it fired first, median over failed runs",
+            "struck": "runs that did not fail, whose alarm fired all the same",
         },
     )
 

@@ -48,6 +48,7 @@ from sensors_io.pipeline import ClipMemory
 from touchr1_jax.distributed.work import Machine
 from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.feeds import Feed
+from touchr1_jax.validation import at_least
 
 MOST_S = 60.0
 """Seconds after which the loop ends, but for two steps."""
@@ -75,11 +76,8 @@ class FeedingConfig:
     """Of the loop, at most."""
 
     def __post_init__(self) -> None:
-        for name in ("cores", "batches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: must be at least 1; raise it")
-        if self.steps < 2:
-            raise ValueError(f"steps is {self.steps}: must be at least 2, the first is not watched; raise it")
+        at_least(self, 1, "cores", "batches")
+        at_least(self, 2, "steps")  # the first is not watched
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,11 +201,9 @@ def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
         units={"batch": "MB", "made in": "core s", "step": "s", "device stands still": "%"},
         meanings={
             "feed": "scale, stage, where clips or features lie",
-            "batch": "bytes for one device",
             "made in": "processor time, all threads",
             "step": "predicted",
             "cores needed": f"of {config.cores} beside a device",
-            "device stands still": "a stand-in, in the loop that trains",
         },
         note=f"Steps are as short as {config.machine.flops_share:.0%} of {config.machine.flops / 1e12:.0f} TFLOP/s "
         "make them.",
@@ -222,11 +218,6 @@ def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str,
         "No accelerator was at work: what its steps take is predicted, and a stand-in waited for the batches.",
         f"It stands still for at most {worst.idle:.2%} of the time ({worst.name}); the hardest to feed asks for "
         f"{hardest.cores:.2g} of {config.cores} cores ({hardest.name}).",
-        *(
-            f"Without the memory {one.name} would ask for {one.cores:.2g}, and stand still for {one.idle:.1%}."
-            for one in fed
-            if not one.configured
-        ),
     )
 
 

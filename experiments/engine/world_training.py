@@ -131,10 +131,9 @@ class VariantRun:
 
     def streams_pass(self) -> bool:
         """True if every seed passes the stream check that each study makes before it trains."""
-        influence = np.stack([self.before[f"grounding_{s}"] for s in range(S)], 1)
         try:
-            for row in influence:
-                check_streams(row, np.ones(S, bool))
+            for influence in np.stack([self.before[f"grounding_{s}"] for s in range(S)], 1):
+                check_streams(influence, np.ones(S, bool))
         except ValueError:
             return False
         return True
@@ -225,14 +224,8 @@ def reinforce(
     algorithm = dataclasses.replace(
         variant.algorithm, beta=values.beta, gamma=values.gamma, entropy_weight=values.entropy_weight
     )
-    config = GRPOConfig(
-        prompts=budget.prompts,
-        group=budget.group,
-        length=LENGTH,
-        micro_prompts=budget.prompts,
-        algorithm=algorithm,
-        inverse_draws=True,
-    )
+    sizes: dict[str, Any] = {"prompts": budget.prompts, "group": budget.group, "micro_prompts": budget.prompts}
+    config = GRPOConfig(**sizes, length=LENGTH, algorithm=algorithm, inverse_draws=True)
     optimizer = falling_adamw(values.learning_rate, budget.final_share, budget.steps, config.max_grad_norm)
     step = make_grpo_step(FNS, make_world_score(variant, values), optimizer, config)
     noise_key, run_key, scene_key = jax.random.split(key, 3)
