@@ -4,7 +4,6 @@ import json
 import os
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -27,42 +26,38 @@ def test_experiment_runs_shrunken(tmp_path):
     assert not list(tmp_path.glob("weights-*"))  # the checkpoint is gone
 
 
-def test_readers_read_the_same(tmp_path):
-    told: list[tuple[int, int]] = []
-    size = random_checkpoint(tmp_path, TINY, 50_000, tell=lambda *word: told.append(word))
-    assert told == sorted(told)
-    assert told[-1] == (size, size)
-    assert len(list(tmp_path.glob("*.safetensors"))) > 3
-    ours, theirs = (sorted(map(digest, read(tmp_path, TINY, silent))) for read in READERS.values())
-    assert ours == theirs
-    assert json.loads((tmp_path / "model.safetensors.index.json").read_text())["metadata"]["total_size"] == size
-    assert (
-        size == sum(x.nbytes for x in READERS["streamed"](tmp_path, TINY, silent)) == load_weights.weight_bytes("tiny")
-    )
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    """Folder of a random checkpoint in several shards, its size, and the progress of writing it."""
+    folder, progress = tmp_path_factory.mktemp("checkpoint"), []
+    size = random_checkpoint(folder, TINY, 50_000, lambda *word: progress.append(word))
+    return folder, size, progress
 
 
 def silent(done: int, total: int) -> None:
     del done, total
 
 
-def digest(x: jax.Array) -> tuple[tuple[int, ...], bytes]:
-    return x.shape, np.asarray(x).tobytes()
+def test_readers_read_the_same_small_numbers(checkpoint):
+    folder, size, progress = checkpoint
+    assert progress == sorted(progress)
+    assert progress[-1] == (size, size)
+    assert len(list(folder.glob("*.safetensors"))) > 3
+    assert json.loads((folder / "model.safetensors.index.json").read_text())["metadata"]["total_size"] == size
+    ours, theirs = ([np.asarray(x) for x in read(folder, TINY, silent)] for read in READERS.values())
+    by_content = lambda arrays: sorted((x.shape, x.tobytes()) for x in arrays)
+    assert by_content(ours) == by_content(theirs)
+    assert size == sum(x.nbytes for x in ours) == load_weights.weight_bytes("tiny")
+    sizes = np.abs(np.concatenate([x.ravel() for x in ours]).astype(np.float32))
+    assert 2**-7 <= sizes.min() <= sizes.max() < 2**-6
 
 
-def test_contents_are_small_numbers(tmp_path):
-    random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
-    for x in READERS["streamed"](tmp_path, TINY, silent):
-        size = jnp.abs(x.astype(jnp.float32))
-        assert float(size.min()) >= 2**-7
-        assert float(size.max()) < 2**-6
-
-
-def test_no_shard_is_larger_than_said_but_for_single_tensors():
+def test_only_single_tensors_exceed_a_shard():
     for shard in shards(TINY, 20_000):
         assert len(shard) == 1 or 2 * sum(int(np.prod(s)) for s in shard.values()) <= 20_000
 
 
-def test_a_reader_that_fails_says_why(tmp_path):
+def test_a_reader_that_fails_names_the_fix(tmp_path):
     with pytest.raises(FileNotFoundError, match="no weights; correct the directory"):
         measure(READERS["streamed"], tmp_path, TINY, silent)
 
@@ -77,13 +72,16 @@ def test_a_reader_that_is_stopped_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_bytes_are_told_from_the_process_that_reads(tmp_path, reader):
-    size = random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
-    told: list[tuple[int, int]] = []
-    measure(READERS[reader], tmp_path, TINY, lambda *word: told.append(word))
-    assert told == sorted(told)
-    assert told[-1] == (size, size)
-    assert len(told) > 3
+def test_the_process_that_reads_reports_its_progress_and_its_own_memory(checkpoint, reader):
+    """This process has imported more than the reader will, and has held what its child has not."""
+    folder, size, _ = checkpoint
+    held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
+    progress: list[tuple[int, int]] = []
+    assert measure(READERS[reader], folder, TINY, lambda *word: progress.append(word)).before < peak_memory()
+    assert progress == sorted(progress)
+    assert progress[-1] == (size, size)
+    assert len(progress) > 3
+    assert peak_memory() >= held.nbytes
 
 
 def test_sizes_must_have_shapes_and_room(tmp_path):
@@ -93,11 +91,3 @@ def test_sizes_must_have_shapes_and_room(tmp_path):
         load_weights.LoadWeightsConfig(sizes=("3B",), compare=("7B",))
     with pytest.raises(ValueError, match=r"size 7B takes 16.6 GB of disk and .* of memory"):
         load_weights.check_room("7B", tmp_path, copies=10**6)
-
-
-def test_peak_memory_is_that_of_the_program_and_not_of_its_parent(tmp_path):
-    """This process has imported more than the reader will, and has held what its child has not."""
-    held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
-    random_checkpoint(tmp_path, TINY, 10**9, tell=silent)
-    assert measure(READERS["streamed"], tmp_path, TINY, silent).before < peak_memory()
-    assert peak_memory() >= held.nbytes

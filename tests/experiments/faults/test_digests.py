@@ -38,8 +38,3 @@ def test_the_file_that_names_the_devices_does_not_count(run):
     sharding = damaged / "checkpoints" / "sft" / "0" / "12" / "state" / "_sharding"
     sharding.write_bytes(b"\x80" + sharding.read_bytes()[1:])
     assert digests(whole) == digests(damaged)
-
-
-def test_differences_are_named():
-    assert differences({"a": "1", "b": "2"}, {"a": "1", "b": "3", "c": "4"}) == ("b", "c")
-    assert differences({"a": "1"}, {"a": "1"}) == ()
