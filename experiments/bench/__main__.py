@@ -3,9 +3,9 @@
 import contextlib
 import dataclasses
 import itertools
-import pathlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -27,6 +27,7 @@ from experiments.bench.generate import (
 from experiments.bench.rules import FilteredItems, apply_rules
 from experiments.bench.sheets import SheetError
 from experiments.core.artifacts import write_json
+from experiments.core.text import number
 from sensors_io.commands.console import complain, progress_bar
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
@@ -38,7 +39,7 @@ OUT = Console(highlight=False)
 KNOWN_ERRORS = (card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, UserError, OSError)
 """Errors whose message tells a user all that is needed."""
 
-Records = tyro.conf.Positional[pathlib.Path]
+Records = tyro.conf.Positional[Path]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,7 +48,9 @@ class FromRecords:
 
     records: Records
     """Directory of the records; the questions are about objects of their test split."""
-    quota: Quota = dataclasses.field(default_factory=Quota)
+    out: Path
+    """File to write, JSON Lines."""
+    quota: Quota = Quota()
     seed: int = 0
 
     def source(self) -> BenchSource:
@@ -61,9 +64,6 @@ class FromRecords:
 class GenerateItems(FromRecords):
     """Make a bench of questions worded by rule; it is written only if every check of the data card passes."""
 
-    out: pathlib.Path
-    """File for the items, JSON Lines."""
-
     def run(self) -> int:
         source = self.source()
         return _publish(self.out, generate(source, self.quota, self.seed), source)
@@ -72,9 +72,6 @@ class GenerateItems(FromRecords):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Propose(FromRecords):
     """Write requests from which another author, such as a language model, can word the same questions."""
-
-    out: pathlib.Path
-    """File for the requests, JSON Lines."""
 
     def run(self) -> int:
         source = self.source()
@@ -86,12 +83,13 @@ class Propose(FromRecords):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Accept(FromRecords):
-    """Make a bench of another author's candidates that pass the rules and the data card."""
+    """Make a bench of another author's candidates that pass the rules and the data card.
 
-    candidates: tyro.conf.Positional[pathlib.Path]
+    Removed candidates are written next to it, to a file that ends in .rejected.jsonl.
+    """
+
+    candidates: tyro.conf.Positional[Path]
     """File of the candidates, JSON Lines."""
-    out: pathlib.Path
-    """File for the items; removed candidates are written next to it, to a file that ends in .rejected.jsonl."""
 
     def run(self) -> int:
         source = self.source()
@@ -108,10 +106,10 @@ class Score:
     An answer is {"id", "text"}, the text in the three segments; a question without an answer counts as unparsable.
     """
 
-    items: tyro.conf.Positional[pathlib.Path]
-    answers: tyro.conf.Positional[pathlib.Path]
+    items: tyro.conf.Positional[Path]
+    answers: tyro.conf.Positional[Path]
     """File of the answers, JSON Lines."""
-    by_sight: pathlib.Path | None = None
+    by_sight: Path | None = None
     """File of the answers given the picture alone, which define which questions are a conflict."""
 
     def run(self) -> int:
@@ -120,9 +118,9 @@ class Score:
         answers = read(self.answers)
         table = Table("metric", "", "95 %, over objects", "values", "meaning")
         for row in scoring.metric_rows(items, answers, None if self.by_sight is None else read(self.by_sight)):
-            spec, span = row.metric.format, row.interval
-            interval = f"{span.low:{spec}} – {span.high:{spec}}"
-            table.add_row(row.metric.title, format(span.mean, spec), interval, str(row.values), row.metric.meaning)
+            found, metric = row.interval, row.metric
+            mean, low, high = (format(x, metric.format) for x in (found.mean, found.low, found.high))
+            table.add_row(metric.title, mean, f"{low} – {high}", str(row.values), metric.meaning)
         OUT.print(table)
         OUT.print(f"parsed {100 * scoring.parsed_share(answers):.1f} %; {scoring.average_line(items, answers)}")
         return 0
@@ -133,13 +131,13 @@ class AnnotateSheets:
     """Write a blank sheet for each of two annotators, the objects in an order of its own."""
 
     records: Records
-    out: pathlib.Path
+    out: Path
     """Folder for the sheets, a.csv and b.csv."""
     seed: int = 0
 
     def run(self) -> int:
         objects = sorted(RecordStore(self.records).objects)
-        annotate.write_blank([str(self.out / name) for name in ("a.csv", "b.csv")], objects, self.seed)
+        annotate.write_blank([self.out / name for name in ("a.csv", "b.csv")], objects, self.seed)
         OUT.print(f"{len(objects)} objects in {self.out / 'a.csv'} and b.csv; fill them in independently")
         return 0
 
@@ -152,29 +150,29 @@ class Annotate:
     """
 
     records: Records
-    folder: tyro.conf.Positional[pathlib.Path]
+    folder: tyro.conf.Positional[Path]
     """Folder of the sheets; the labels are written to labels.json in it."""
 
     def run(self) -> int:
         store = RecordStore(self.records)
-        a, b = (annotate.read_labels(str(self.folder / name), sorted(store.objects)) for name in ("a.csv", "b.csv"))
+        a, b = (annotate.read_labels(self.folder / name, sorted(store.objects)) for name in ("a.csv", "b.csv"))
         table = Table("attribute", "objects", "κ", "κ, quadratic", "equal")
         for row in annotate.agreement(a, b):
-            kappas = ["–" if k is None else f"{k:.2f}" for k in (row.kappa, row.weighted)]
+            kappas = [number(k, ".2f") for k in (row.kappa, row.weighted)]
             table.add_row(row.attribute, str(row.objects), *kappas, f"{100 * row.exact:.1f} %")
         OUT.print(table)
         sheet, cases = self.folder / "open.csv", annotate.open_cases(a, b)
         if cases and not sheet.exists():
-            annotate.write_open(str(sheet), a, b)
+            annotate.write_open(sheet, a, b)
             OUT.print(f"{len(cases)} labels differ: decide them in {sheet}")
             return 1
-        labels = annotate.adjudicate(a, b, annotate.read_decisions(str(sheet), a, b) if cases else {})
+        labels = annotate.adjudicate(a, b, annotate.read_decisions(sheet, a, b) if cases else {})
         splits = ("train", "val", "test", "unlabelled")
         with _contact_bar(store, *splits) as advance:
             contacts = [c for split in splits for c in measure_split(store, split, advance).contacts]
         for doubt in annotate.doubtful_labels(labels, contacts):
-            against = ", ".join(doubt.sensors)
-            OUT.print(f"check again: {doubt.object}, {doubt.attribute} {doubt.label}, contradicted by {against}")
+            label, against = f"{doubt.object}, {doubt.attribute} {doubt.label}", ", ".join(doubt.sensors)
+            OUT.print(f"check again: {label}, contradicted by {against}")
         for (name, sensor), rho in annotate.rank_correlations(labels, contacts).items():
             OUT.print(f"{name} and {annotate.PHYSICAL[name]} by {sensor}: ρ = {rho:.2f}")
         write_json(self.folder / "labels.json", labels)
@@ -185,9 +183,9 @@ class Annotate:
 class AuditSheet:
     """Draw a sample of items for a blind audit: a sheet to fill in, and a key that the judge does not see."""
 
-    items: tyro.conf.Positional[pathlib.Path]
+    items: tyro.conf.Positional[Path]
     records: Records
-    out: pathlib.Path
+    out: Path
     """File for the sheet; its key is written next to it, to a file that ends in .key.json."""
     count: int = 2000
     seed: int = 0
@@ -197,7 +195,7 @@ class AuditSheet:
         key = audit.sample(items, min(self.count, len(items)), self.seed)
         with _contact_bar(store, "test") as advance:
             contacts = measure_split(store, "test", advance).by_touch()
-        audit.write_blank(str(self.out), items, key, contacts)
+        audit.write_blank(self.out, items, key, contacts)
         write_json(self.out.with_suffix(".key.json"), key)
         OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
         return 0
@@ -207,10 +205,10 @@ class AuditSheet:
 class Audit:
     """Score filled-in sheets: the pass rates with intervals, and κ if two judges filled in the same sample."""
 
-    items: tyro.conf.Positional[pathlib.Path]
-    key: tyro.conf.Positional[pathlib.Path]
+    items: tyro.conf.Positional[Path]
+    key: tyro.conf.Positional[Path]
     """The key of the sample."""
-    sheets: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    sheets: tyro.conf.Positional[tuple[Path, ...]]
     """One or two filled-in sheets."""
 
     def run(self) -> int:
@@ -218,7 +216,7 @@ class Audit:
             raise SheetError(f"sheets holds {len(self.sheets)}: must be one or two; score judges in pairs")
         items = read_items(self.items)
         key = audit.read_key(self.key, items)
-        judged = [audit.read_judgement(str(sheet), key) for sheet in self.sheets]
+        judged = [audit.read_judgement(sheet, key) for sheet in self.sheets]
         for sheet, judgement in zip(self.sheets, judged, strict=True):
             table = Table("axis", "items", "passed", "95 %", "95 %, by object", title=sheet.name)
             for row in audit.pass_rates(judgement, key, items):
@@ -239,7 +237,7 @@ def _contact_bar(store: RecordStore, *splits: str) -> Iterator[Callable[[], None
         yield lambda: show(next(done), total)
 
 
-def _publish(path: pathlib.Path, found: FilteredItems, source: BenchSource) -> int:
+def _publish(path: Path, found: FilteredItems, source: BenchSource) -> int:
     """Print the removed candidates and the data card, and write the items if all checks pass."""
     OUT.print("removed: " + ", ".join(f"{rule} {count}" for rule, count in found.counts.items()))
     if not found.kept:
@@ -247,7 +245,7 @@ def _publish(path: pathlib.Path, found: FilteredItems, source: BenchSource) -> i
     checks = card.checks(found.kept, source.bench, source.train)
     table = Table("check", "measured", "bound", "")
     for c in checks:
-        table.add_row(c.name, f"{c.measured:.3g} {c.unit}", f"{c.bound:g}", "ok" if c.passed else "FAILED")
+        table.add_row(c.name, f"{c.measured:.3g} {c.unit}", f"{c.bound:g}", "ok" if c.met else "FAILED")
     OUT.print(table)
     card.require(checks)
     write_items(path, found.kept)

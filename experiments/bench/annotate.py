@@ -7,16 +7,16 @@ opposite level than to that of its own.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from scipy import stats
 
 from experiments.bench.contacts import MeasuredContact
-from experiments.bench.sheets import SheetError, read_sheet, write_sheet
+from experiments.bench.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
 from experiments.bench.wording import level_words
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.bench.statistics import cohens_kappa
 
 KEY, CASE, DECISION = "object", "case", "decision"
 
@@ -57,7 +57,7 @@ class DoubtfulLabel:
     sensors: tuple[str, ...]
 
 
-def write_blank(paths: Sequence[str], objects: Sequence[str], seed: int) -> None:
+def write_blank(paths: Sequence[Path], objects: Sequence[str], seed: int) -> None:
     """Write one blank sheet for each annotator, the objects in an order of its own.
 
     Raises:
@@ -68,7 +68,7 @@ def write_blank(paths: Sequence[str], objects: Sequence[str], seed: int) -> None
         write_sheet(path, (KEY, *ATTRIBUTES), ({KEY: objects[i]} for i in order))
 
 
-def read_labels(path: str, objects: Sequence[str]) -> dict[str, dict[str, int]]:
+def read_labels(path: Path, objects: Sequence[str]) -> dict[str, dict[str, int]]:
     """A filled-in sheet as levels.
 
     Raises:
@@ -83,16 +83,10 @@ def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
     found = []
     for name in ATTRIBUTES:
         x, y = (np.array([labels[o][name] for o in sorted(a)]) for labels in (a, b))
-        varied = len({*x.tolist(), *y.tolist()}) > 1
-        found.append(
-            AnnotatorAgreement(
-                attribute=name,
-                objects=len(x),
-                kappa=cohens_kappa(x, y, LEVELS[name]) if varied else None,
-                weighted=cohens_kappa(x, y, LEVELS[name], weights="quadratic") if varied and name in ORDINAL else None,
-                exact=float(np.mean(x == y)),
-            )
-        )
+        kappa = kappa_unless_constant(x, y, LEVELS[name])
+        weighted = kappa_unless_constant(x, y, LEVELS[name], "quadratic") if name in ORDINAL else None
+        exact = float(np.mean(x == y))
+        found.append(AnnotatorAgreement(attribute=name, objects=len(x), kappa=kappa, weighted=weighted, exact=exact))
     return tuple(found)
 
 
@@ -101,20 +95,18 @@ def open_cases(a: Labels, b: Labels) -> dict[str, tuple[str, str]]:
     return {f"{o}: {name}": (o, name) for o in sorted(a) for name in ATTRIBUTES if a[o][name] != b[o][name]}
 
 
-def write_open(path: str, a: Labels, b: Labels) -> None:
+def write_open(path: Path, a: Labels, b: Labels) -> None:
     """Write the sheet of the adjudicator: one row for each disagreement, both labels, the decision blank.
 
     Raises:
       SheetError: the sheet exists.
     """
-    rows = []
-    for case, (o, name) in open_cases(a, b).items():
-        both = sorted(WORDS[name][labels[o][name]] for labels in (a, b))  # sorted: the order does not reveal the author
-        rows.append({CASE: case, "labels": " or ".join(both)})
+    both = lambda o, name: sorted(WORDS[name][labels[o][name]] for labels in (a, b))  # does not reveal the author
+    rows = ({CASE: case, "labels": " or ".join(both(*where))} for case, where in open_cases(a, b).items())
     write_sheet(path, (CASE, "labels", DECISION), rows)
 
 
-def read_decisions(path: str, a: Labels, b: Labels) -> dict[tuple[str, str], int]:
+def read_decisions(path: Path, a: Labels, b: Labels) -> dict[tuple[str, str], int]:
     """The adjudicator's sheet: (object, attribute) → level.
 
     Raises:
@@ -125,12 +117,11 @@ def read_decisions(path: str, a: Labels, b: Labels) -> dict[tuple[str, str], int
     decided = {}
     for case, row in read_sheet(path, CASE, {DECISION: words}, cases).items():
         o, name = cases[case]
-        if row[DECISION] not in WORDS[name]:
-            raise SheetError(
-                f"{path}: {DECISION} for {case!r} is {row[DECISION]!r}: must be one of {', '.join(WORDS[name])}; "
-                "correct it"
-            )
-        decided[o, name] = WORDS[name].index(row[DECISION])
+        word, choices = row[DECISION], WORDS[name]
+        if word not in choices:
+            must = f"must be one of {', '.join(choices)}; correct it"
+            raise SheetError(f"{path}: {DECISION} for {case!r} is {word!r}: {must}")
+        decided[o, name] = choices.index(word)
     return decided
 
 
@@ -140,10 +131,8 @@ def adjudicate(a: Labels, b: Labels, decided: Mapping[tuple[str, str], int]) -> 
     Raises:
       KeyError: a disagreement without a decision.
     """
-    return {
-        o: {name: a[o][name] if a[o][name] == b[o][name] else decided[o, name] for name in ATTRIBUTES}
-        for o in sorted(a)
-    }
+    final = lambda o, name: a[o][name] if a[o][name] == b[o][name] else decided[o, name]
+    return {o: {name: final(o, name) for name in ATTRIBUTES} for o in sorted(a)}
 
 
 def rank_correlations(labels: Labels, contacts: Sequence[MeasuredContact]) -> dict[tuple[str, str], float]:

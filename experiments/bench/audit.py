@@ -6,17 +6,16 @@ nothing of an item's kind, author or place in the file; the key that does is a f
 
 import dataclasses
 import json
-import os
-import pathlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from experiments.bench.contacts import MeasuredContact
-from experiments.bench.sheets import SheetError, read_sheet, write_sheet
+from experiments.bench.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
 from experiments.bench.wording import answer_words, level_words
 from touchr1_jax.bench.items import Item, Touch
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, cohens_kappa, wilson_interval
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, wilson_interval
 
 AXES = ("grounded", "fits the labels", "self-consistent")
 """Is the rationale grounded in tactile evidence, does it fit the human labels, is its reasoning consistent?"""
@@ -52,7 +51,7 @@ def sample(items: Sequence[Item], count: int, seed: int) -> dict[str, str]:
     return {f"{number:0{width}d}": items[i].ask.id for number, i in enumerate(chosen, 1)}
 
 
-def read_key(path: str | os.PathLike[str], items: Sequence[Item]) -> dict[str, str]:
+def read_key(path: Path, items: Sequence[Item]) -> dict[str, str]:
     """A key that `sample` drew from these items.
 
     Raises:
@@ -60,9 +59,7 @@ def read_key(path: str | os.PathLike[str], items: Sequence[Item]) -> dict[str, s
     """
     must = "must be the .key.json next to the sheet; correct the path"
     try:
-        key = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise SheetError(f"{path} is missing: {must}") from None
+        key = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise SheetError(f"{path} cannot be read ({error}): {must}") from error
     if not isinstance(key, dict) or not all(isinstance(name, str) for name in key.values()):
@@ -74,7 +71,7 @@ def read_key(path: str | os.PathLike[str], items: Sequence[Item]) -> dict[str, s
 
 
 def write_blank(
-    path: str, items: Sequence[Item], key: Mapping[str, str], contacts: Mapping[Touch, MeasuredContact]
+    path: Path, items: Sequence[Item], key: Mapping[str, str], contacts: Mapping[Touch, MeasuredContact]
 ) -> None:
     """Write the sheet of a judge, the three axes blank.
 
@@ -82,21 +79,21 @@ def write_blank(
       SheetError: the sheet exists.
     """
     by_id = {item.ask.id: item for item in items}
-    rows = ({NUMBER: number} | _row(by_id[name], contacts) for number, name in key.items())
+
+    def shown(item: Item) -> dict[str, str]:
+        cited = (f"touch {c.touch + 1} {c.sensor}: {c.quantity} {c.value:g} {c.unit}" for c in item.evidence)
+        labels = (
+            ", ".join(level_words(name)[contacts[touch].labels[name]] for name in item.ask.attributes)
+            for touch in item.ask.touches
+        )
+        cells = (item.question, " | ".join(labels), "; ".join(cited), item.rationale, answer_words(item.ask))
+        return dict(zip(SHOWN, cells, strict=True))
+
+    rows = ({NUMBER: number} | shown(by_id[name]) for number, name in key.items())
     write_sheet(path, (NUMBER, *SHOWN, *AXES), rows)
 
 
-def _row(item: Item, contacts: Mapping[Touch, MeasuredContact]) -> dict[str, str]:
-    cited = (f"touch {c.touch + 1} {c.sensor}: {c.quantity} {c.value:g} {c.unit}" for c in item.evidence)
-    labels = (
-        ", ".join(level_words(name)[contacts[touch].labels[name]] for name in item.ask.attributes)
-        for touch in item.ask.touches
-    )
-    cells = (item.question, " | ".join(labels), "; ".join(cited), item.rationale, answer_words(item.ask))
-    return dict(zip(SHOWN, cells, strict=True))
-
-
-def read_judgement(path: str, key: Mapping[str, str]) -> dict[str, dict[str, bool]]:
+def read_judgement(path: Path, key: Mapping[str, str]) -> dict[str, dict[str, bool]]:
     """A filled-in sheet.
 
     Raises:
@@ -129,8 +126,5 @@ def pass_rates(judged: Judgement, key: Mapping[str, str], items: Sequence[Item])
 
 def judge_agreement(a: Judgement, b: Judgement) -> dict[str, float | None]:
     """Cohen's κ of two judges of one sample, by axis; `None` where both gave one and the same answer throughout."""
-    found: dict[str, float | None] = {}
-    for axis in AXES:
-        x, y = (np.array([int(judged[number][axis]) for number in sorted(a)]) for judged in (a, b))
-        found[axis] = cohens_kappa(x, y, 2) if len({*x.tolist(), *y.tolist()}) > 1 else None
-    return found
+    answers = lambda judged, axis: np.array([int(judged[number][axis]) for number in sorted(a)])
+    return {axis: kappa_unless_constant(answers(a, axis), answers(b, axis), 2) for axis in AXES}

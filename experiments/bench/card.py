@@ -6,11 +6,11 @@ A shortcut that needs no touch would let a constant or a look-up table beat chan
 import collections
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from experiments.bench.contacts import MeasuredContact, SplitContacts
 from experiments.bench.wording import answer_choices, read_answer
-from sensors_io.schema import ATTRIBUTES
+from experiments.core.results import Requirement, at_most
 from touchr1_jax.bench.items import Ask, Item
 
 BALANCE, CONSTANT, WORDING = 3.0, 3.0, 6.0
@@ -24,29 +24,19 @@ FEWEST = 30
 LEAST_OBJECTS = 0.95
 """Share of the split's objects that some question must show."""
 
+AnswerCell = tuple[str, str]
+"""Kind and attribute; each part of a composed answer is a cell of its own."""
+
+Asked = Sequence[tuple[Ask, int]]
+"""Questions of a cell and their answers."""
+
 
 class CardError(ValueError):
     """Items that do not pass the card; the message names every check that failed."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CardCheck:
-    """A number that must not exceed a bound, and what it means."""
-
-    name: str
-    measured: float
-    bound: float
-    unit: str
-    meaning: str
-
-    @property
-    def passed(self) -> bool:
-        """True if the bound is kept."""
-        return self.measured <= self.bound
-
-
-def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[CardCheck, ...]:
-    """Every check of the card.
+def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[Requirement, ...]:
+    """Every check of the card: figures that must not exceed their bounds.
 
     Args:
       items: the bench.
@@ -65,31 +55,25 @@ def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) ->
         ("pairs not in both orders", _lone_pairs(items), "each once, with opposite answers"),
         ("rationales against the answer", wrong, "or not in the three segments"),
     )
-    cells = _cells(items)
+    unseen, cells = len(bench.objects() - objects) / len(bench.objects()), answer_cells(items)
     return (
-        *(CardCheck(name=n, measured=float(count), bound=0.0, unit="", meaning=m) for n, count, m in counts),
-        CardCheck(
-            name="objects never shown",
-            measured=100.0 * len(bench.objects() - objects) / len(bench.objects()),
-            bound=100.0 * (1 - LEAST_OBJECTS),
-            unit="%",
-            meaning="of the split",
-        ),
+        *(at_most(name, count, 0.0, note=meaning) for name, count, meaning in counts),
+        at_most("objects never shown", 100.0 * unseen, 100.0 * (1 - LEAST_OBJECTS), "%", "of the split"),
         _worst("commonest answer over equal shares", cells, _commonest, BALANCE),
         _worst("training mode over chance", cells, lambda c, s: _mode(c, s, train.contacts), CONSTANT),
         _worst("best answer to each wording over chance", cells, _by_wording, WORDING),
     )
 
 
-def require(results: Sequence[CardCheck]) -> None:
+def require(results: Sequence[Requirement]) -> None:
     """Raise unless all checks passed.
 
     Raises:
       CardError: naming every check that did not pass.
     """
-    failed = [c for c in results if not c.passed]
+    failed = [c for c in results if not c.met]
     if failed:
-        each = (f"{c.name} is {c.measured:.4g} {c.unit}, must be ≤ {c.bound:g} ({c.meaning})" for c in failed)
+        each = (f"{c.name} is {c.measured:.4g} {c.unit}, must be ≤ {c.bound:g} ({c.note})" for c in failed)
         raise CardError(f"{'; '.join(each)}; nothing is written until the records or the quota are corrected")
 
 
@@ -99,37 +83,23 @@ class AnswerShare:
 
     kind: str
     attribute: str
-    questions: int
     counts: tuple[int, ...]
 
 
 def shares(items: Sequence[Item]) -> list[AnswerShare]:
     """The answers to the questions of every kind and attribute."""
     found = []
-    for (kind, attribute), rows in _cells(items).items():
+    for (kind, attribute), rows in answer_cells(items).items():
         ask = rows[0][0]
-        levels = len(answer_choices(ask)[ask.attributes.index(attribute)])
-        counts = tuple(sum(level == k for _, level in rows) for k in range(levels))
-        found.append(AnswerShare(kind=kind, attribute=attribute, questions=len(rows), counts=counts))
+        levels = range(len(answer_choices(ask)[ask.attributes.index(attribute)]))
+        counts = tuple(sum(level == k for _, level in rows) for k in levels)
+        found.append(AnswerShare(kind=kind, attribute=attribute, counts=counts))
     return found
 
 
-def coverage(bench: SplitContacts) -> Iterator[tuple[str, dict[int, int]]]:
-    """Number of objects of the split that have each level, by attribute."""
-    labels = {contact.touch.object: contact.labels for contact in bench.contacts}
-    for name in ATTRIBUTES:
-        yield name, dict(sorted(collections.Counter(of[name] for of in labels.values() if name in of).items()))
-
-
-Cell = tuple[str, str]
-"""Kind and attribute; each part of a composed answer is a cell of its own."""
-
-CellRows = list[tuple[Ask, int]]
-"""Questions of a cell and their answers."""
-
-
-def _cells(items: Sequence[Item]) -> dict[Cell, CellRows]:
-    cells: dict[Cell, CellRows] = {}
+def answer_cells(items: Sequence[Item]) -> Mapping[AnswerCell, Asked]:
+    """Questions and their answers by kind and attribute."""
+    cells: dict[AnswerCell, list[tuple[Ask, int]]] = {}
     for ask in (item.ask for item in items):
         names = ask.attributes if len(ask.answer) == len(ask.attributes) else ask.attributes[:1]
         for name, level in zip(names, ask.answer, strict=True):
@@ -138,31 +108,27 @@ def _cells(items: Sequence[Item]) -> dict[Cell, CellRows]:
 
 
 def _worst(
-    name: str, cells: Mapping[Cell, CellRows], right: Callable[[Cell, CellRows], int | None], bound: float
-) -> CardCheck:
+    name: str, cells: Mapping[AnswerCell, Asked], right: Callable[[AnswerCell, Asked], int | None], bound: float
+) -> Requirement:
     """The cell whose shortcut is furthest above equal shares of the levels that occur, in points."""
     judged = {}
     for cell, rows in cells.items():
         if len(rows) >= FEWEST:
             count, occurring = right(cell, rows), len({level for _, level in rows})
             judged[cell] = 0.0 if count is None else 100.0 * (count / len(rows) - 1 / occurring)
-    worst = max(judged, key=lambda cell: judged[cell], default=None)
-    return CardCheck(
-        name=name,
-        measured=0.0 if worst is None else judged[worst],
-        bound=bound,
-        unit="points",
-        meaning="nothing to judge" if worst is None else f"the worst is {worst[0]} {worst[1]}",
-    )
+    if not judged:
+        return at_most(name, 0.0, bound, "points", "nothing to judge")
+    worst = max(judged, key=lambda cell: judged[cell])
+    return at_most(name, judged[worst], bound, "points", f"the worst is {' '.join(worst)}")
 
 
-def _commonest(cell: Cell, rows: CellRows) -> int:
+def _commonest(cell: AnswerCell, rows: Asked) -> int:
     """Right answers of the commonest level of the cell."""
     del cell
     return max(collections.Counter(level for _, level in rows).values())
 
 
-def _mode(cell: Cell, rows: CellRows, train: Sequence[MeasuredContact]) -> int | None:
+def _mode(cell: AnswerCell, rows: Asked, train: Sequence[MeasuredContact]) -> int | None:
     """Right answers of the commonest level of the training contacts; comparisons have no such level."""
     kind, attribute = cell
     counts = collections.Counter(c.labels[attribute] for c in train if attribute in c.labels)
@@ -172,13 +138,10 @@ def _mode(cell: Cell, rows: CellRows, train: Sequence[MeasuredContact]) -> int |
     return sum(level == mode for _, level in rows)
 
 
-def _by_wording(cell: Cell, rows: CellRows) -> int:
+def _by_wording(cell: AnswerCell, rows: Asked) -> int:
     """Right answers of the commonest level of each wording, on the very same questions."""
-    del cell
-    by_wording: dict[int, collections.Counter[int]] = {}
-    for ask, level in rows:
-        by_wording.setdefault(ask.phrasing, collections.Counter())[level] += 1
-    return sum(max(counts.values()) for counts in by_wording.values())
+    wordings = {ask.phrasing for ask, _ in rows}
+    return sum(_commonest(cell, [row for row in rows if row[0].phrasing == wording]) for wording in wordings)
 
 
 def _lone_pairs(items: Sequence[Item]) -> int:

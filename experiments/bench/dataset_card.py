@@ -14,7 +14,9 @@ Expected: all checks pass; no constant beats chance by three points.  The sensor
 give the right answer to about half of the questions, material least.
 """
 
+import collections
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 from experiments.bench import card
@@ -24,11 +26,12 @@ from experiments.bench.rules import FilteredItems, count_found_errors
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import KINDS, Item, write_items
 
 
@@ -52,14 +55,14 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
         found, again = (
             generate(source, config.quota, config.seed) for _ in context.each("making the bench twice", range(2))
         )
-    checks = card.checks(found.kept, source.bench, source.train)
+    items, checks = found.kept, card.checks(found.kept, source.bench, source.train)
     card.require(checks)
-    write_items(context.directory / "items.jsonl", found.kept)
+    write_items(context.directory / "items.jsonl", items)
     with context.timed("faults"):
-        sound = found.kept[:: max(1, len(found.kept) // config.faulty)]
+        sound = items[:: max(1, len(items) // config.faulty)]
         counts = count_found_errors(context.each("planted errors", sound), source.bench.by_touch())
-        caught = {rule: n / len(sound) for rule, n in counts.items()}
-    items, least = found.kept, 100 * min(caught.values())
+    caught = {rule: 100 * (n / len(sound)) for rule, n in counts.items()}
+    least = min(caught.values())
     shown = {touch.object for item in items for touch in item.ask.touches}
     return Results(
         verdict=(
@@ -70,10 +73,15 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             "thresholds, do not give the answer: these questions stay, or the bench would hold only what a threshold "
             "can answer.",
         ),
-        requirements=_requirements(config, len(items), again == found, least, checks),
+        requirements=(
+            at_least("questions", len(items), config.quota.total, note="of the quota"),
+            at_least("made twice, the same bytes", again == found, 1),
+            at_least("planted faults caught, the worst rule", least, 100, "%"),
+            *checks,
+        ),
         tables=(
             _question_table(items),
-            _answer_table(items),
+            _answer_table(card.shares(items)),
             _rule_table(found, caught),
             _threshold_table(source),
             _object_table(source),
@@ -84,7 +92,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
                 name="answers",
                 title="Answers",
                 caption="Each bar is a kind and an attribute; colours are levels in their order, from the left.",
-                content=answer_chart(card.shares(items)),
+                content=_answer_chart(card.shares(items)),
             ),
         ),
         data={
@@ -97,60 +105,46 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
     )
 
 
-def _requirements(
-    config: DatasetCardConfig, questions: int, same: bool, least: float, checks: Sequence[card.CardCheck]
-) -> tuple[Requirement, ...]:
-    return (
-        Requirement(
-            name="questions", measured=questions, bound=config.quota.total, better="higher", note="of the quota"
-        ),
-        Requirement(name="made twice, the same bytes", measured=float(same), bound=1, better="higher"),
-        Requirement(name="planted faults caught, the worst rule", measured=least, bound=100, better="higher", unit="%"),
-        *(
-            Requirement(name=c.name, measured=c.measured, bound=c.bound, better="lower", unit=c.unit, note=c.meaning)
-            for c in checks
-        ),
-    )
-
-
 def _object_table(source: BenchSource) -> Table:
-    rows = [
-        {"attribute": name, "objects by level": ", ".join(f"{level}: {n}" for level, n in counts.items())}
-        for name, counts in card.coverage(source.bench)
-    ]
+    labels = {contact.touch.object: contact.labels for contact in source.bench.contacts}.values()
+    rows = []
+    for name in ATTRIBUTES:
+        counts = collections.Counter(of[name] for of in labels if name in of)
+        levels = ", ".join(f"{level}: {n}" for level, n in sorted(counts.items()))
+        rows.append({"attribute": name, "objects by level": levels})
     return named_table("Objects of the bench", rows)
 
 
 def _question_table(items: Sequence[Item]) -> Table:
-    rows = []
-    for kind, about in KINDS.items():
-        if of := [item for item in items if item.ask.kind == kind]:
-            row: dict[str, Cell] = {
-                "kind": kind,
-                "tier": about.tier,
-                "questions": len(of),
-                "objects": len({touch.object for item in of for touch in item.ask.touches}),
-                "picture shown": about.view,
-                "at odds": 100 * share_at_odds(of),
-                "asks for": about.meaning,
-            }
-            rows.append(row)
+    rows: list[dict[str, Cell]] = [
+        {
+            "kind": kind,
+            "tier": about.tier,
+            "questions": len(of),
+            "objects": len({touch.object for item in of for touch in item.ask.touches}),
+            "picture shown": about.view,
+            "at odds": 100 * share_at_odds(of),
+            "asks for": about.meaning,
+        }
+        for kind, about in KINDS.items()
+        if (of := [item for item in items if item.ask.kind == kind])
+    ]
     meaning = "questions whose answer the sensors' numbers, each read by its thresholds, do not give together"
     return named_table(
         "Questions", rows, formats={"at odds": ".0f"}, units={"at odds": "%"}, meanings={"at odds": meaning}
     )
 
 
-def _answer_table(items: Sequence[Item]) -> Table:
+def _answer_table(shares: Sequence[card.AnswerShare]) -> Table:
     rows: list[dict[str, Cell]] = [
         {
             "kind": share.kind,
             "attribute": share.attribute,
-            "questions": share.questions,
+            "questions": sum(share.counts),
             "answers": " ".join(map(str, share.counts)),
-            "commonest": 100 * max(share.counts) / share.questions,
+            "commonest": 100 * max(share.counts) / sum(share.counts),
         }
-        for share in card.shares(items)
+        for share in shares
     ]
     meanings = {"answers": "how often each level is right, in the order of the levels"}
     return named_table("Answers", rows, formats={"commonest": ".1f"}, units={"commonest": "%"}, meanings=meanings)
@@ -158,13 +152,9 @@ def _answer_table(items: Sequence[Item]) -> Table:
 
 def _rule_table(found: FilteredItems, caught: Mapping[str, float]) -> Table:
     share = "planted faults caught"
-    return named_table(
-        "Rules",
-        [{"rule": rule, "removed": n, share: 100 * caught[rule]} for rule, n in found.counts.items()],
-        formats={share: ".1f"},
-        units={share: "%"},
-        meanings={"removed": "of the questions worded by rule"},
-    )
+    rows = [{"rule": rule, "removed": n, share: caught[rule]} for rule, n in found.counts.items()]
+    meanings = {"removed": "of the questions worded by rule"}
+    return named_table("Rules", rows, formats={share: ".1f"}, units={share: "%"}, meanings=meanings)
 
 
 def _threshold_table(source: BenchSource) -> Table:
@@ -176,12 +166,12 @@ def _threshold_table(source: BenchSource) -> Table:
                 label = contact.labels[attribute]
                 right.setdefault(label, []).append(source.reader.level(contact, sensor, attribute) == label)
         unseen = sum(sum(hits) / len(hits) for hits in right.values()) / len(right) if right else None
+        cuts = " and ".join(f"{cut:.3g}" for cut in thresholds.cuts)
         rows.append(
             {
                 "attribute and sensor": f"{attribute}, {sensor}",
                 "quantity": thresholds.quantity,
-                "cuts": f"{'rises' if thresholds.rising else 'falls'}, "
-                + " and ".join(f"{cut:.3g}" for cut in thresholds.cuts),
+                "cuts": f"{'rises' if thresholds.rising else 'falls'}, {cuts}",
                 "training": 100 * thresholds.accuracy,
                 "bench": None if unseen is None else 100 * unseen,
             }
@@ -203,28 +193,20 @@ def _threshold_table(source: BenchSource) -> Table:
 
 def _sample_table(items: Sequence[Item]) -> Table:
     first = {item.ask.kind: item for item in reversed(items)}
-    return named_table(
-        "One of each",
-        [
-            {"kind": kind, "question": first[kind].question, "rationale": first[kind].rationale}
-            for kind in KINDS
-            if kind in first
-        ],
-    )
+    samples = ((kind, first[kind]) for kind in KINDS if kind in first)
+    rows = [{"kind": kind, "question": item.question, "rationale": item.rationale} for kind, item in samples]
+    return named_table("One of each", rows)
 
 
-def answer_chart(shares: Sequence[card.AnswerShare]) -> bytes:
+def _answer_chart(shares: Sequence[card.AnswerShare]) -> bytes:
     """Share of every answer of every kind and attribute as stacked bars, with marks where equal shares would end."""
-    levels = max(len(share.counts) for share in shares)
-    part = lambda share, k: 100 * share.counts[k] / share.questions if k < len(share.counts) else 0.0
-    answers = [
-        Series(x=[part(share, k) for share in shares], bar=True, alpha=0.75, colour=PALETTE[k % len(PALETTE)])
-        for k in range(levels)
-    ]
+    parts = [[100 * count / sum(share.counts) for count in share.counts] for share in shares]
+    levels = list(itertools.zip_longest(*parts, fillvalue=0.0))
+    bars = [Series(x=x, bar=True, alpha=0.75, colour=PALETTE[k % len(PALETTE)]) for k, x in enumerate(levels)]
     ends = [(100 * k / len(s.counts), row) for row, s in enumerate(shares) for k in range(1, len(s.counts))]
     x, y = zip(*ends, strict=True)
     panel = Panel(
-        [*answers, Series(x=x, y=y, marker="$|$", size=90.0, colour=SHARED)],
+        [*bars, Series(x=x, y=y, marker="$|$", size=90.0, colour=SHARED)],
         rows=[f"{share.kind}, {share.attribute}" for share in shares],
         x_label="share of the answers, %; marks: equal shares",
         x_limits=(0, 100),

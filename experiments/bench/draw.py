@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import functools
 import itertools
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 
@@ -72,19 +73,19 @@ def draw(contacts: Sequence[MeasuredContact], sensors: Sequence[str], quota: Quo
       QuotaError: too few contacts for a quota.
     """
     dealer = _Dealer(contacts, np.random.default_rng(seed))
-    kinds: Mapping[str, Callable[[], Iterator[Ask]]] = {
-        "identify": lambda: _singles(dealer, sensors, "identify", ATTRIBUTES, quota.identify),
-        "scale": lambda: _singles(dealer, sensors, "scale", ORDINAL, quota.scale),
-        "compose": lambda: _composed(dealer, sensors, quota.compose),
-        "compare": lambda: _pairs(dealer, sensors, quota.compare),
-        "order": lambda: _orders(dealer, sensors, quota.order),
-        "one_sensor": lambda: _by_one_sensor(dealer, sensors, quota.one_sensor),
-        "conflict": lambda: _singles(dealer, sensors, "conflict", ATTRIBUTES, quota.conflict),
+    draw_kind: Mapping[str, Callable[[_Dealer, Sequence[str], int], Iterator[Ask]]] = {
+        "identify": functools.partial(_singles, "identify", ATTRIBUTES),
+        "scale": functools.partial(_singles, "scale", ORDINAL),
+        "compose": _composed,
+        "compare": _pairs,
+        "order": _orders,
+        "one_sensor": _by_one_sensor,
+        "conflict": functools.partial(_singles, "conflict", ATTRIBUTES),
     }
     return tuple(
         dataclasses.replace(ask, id=f"{kind}-{number:04d}")
         for kind in KINDS
-        for number, ask in enumerate(kinds[kind]())
+        for number, ask in enumerate(draw_kind[kind](dealer, sensors, getattr(quota, kind)))
     )
 
 
@@ -115,16 +116,8 @@ class _Dealer:
     ) -> tuple[list[MeasuredContact], int]:
         """The first candidates that were not used with every wording yet, and their wording.
 
-        The wording is the one used least for this answer; ties are broken by a random order that is the same for all
-        answers, so that the questions by which a quota exceeds a multiple fall to the same wordings.
-
-        Args:
-          topic: kind and attributes.
-          answer: the right one, part by part.
-          candidates: contacts to show, the best first.
-
-        Raises:
-          QuotaError: every candidate was used with every wording.
+        The wording is the one used least for this answer, part by part; ties are broken by a random order that is the
+        same for all answers, so that the questions by which a quota exceeds a multiple fall to the same wordings.
         """
         order = self._orders.setdefault(topic, self.rng.permutation(WORDINGS).tolist())
         keys = lambda wording: [(topic, part, level, wording) for part, level in enumerate(answer)]
@@ -172,7 +165,7 @@ class _Dealer:
 
 
 def _singles(
-    dealer: _Dealer, sensors: Sequence[str], kind: str, attributes: Sequence[str], quota: int
+    kind: str, attributes: Sequence[str], dealer: _Dealer, sensors: Sequence[str], quota: int
 ) -> Iterator[Ask]:
     for attribute, count in zip(attributes, _split(quota, len(attributes)), strict=True):
         for level in dealer.levels(kind, attribute, count):
@@ -185,20 +178,13 @@ def _composed(dealer: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[A
     for attributes, count in zip(COMPOSED, _split(quota, len(COMPOSED)), strict=True):
         seen: collections.Counter[tuple[str, int]] = collections.Counter()
         for _ in range(count):
-            ranked = _least_asked(dealer, attributes, seen)
+            ranked = dealer.ranked(lambda contact: set(attributes) <= set(contact.labels))  # noqa: B023
+            ranked.sort(key=lambda contact: sum(seen[a, contact.labels[a]] for a in attributes))  # least asked first
             levels = tuple(ranked[0].labels[a] for a in attributes) if ranked else ()
             (contact,), wording = dealer.take(("compose", *attributes), levels, zip(ranked))
             levels = tuple(contact.labels[a] for a in attributes)
             seen.update(zip(attributes, levels, strict=True))
             yield _ask("compose", attributes, [contact], sensors, levels, wording)
-
-
-def _least_asked(
-    dealer: _Dealer, attributes: Sequence[str], seen: Mapping[tuple[str, int], int]
-) -> list[MeasuredContact]:
-    """Contacts whose levels were asked for least; ties show those of the least used objects first."""
-    ranked = dealer.ranked(lambda contact: set(attributes) <= set(contact.labels))
-    return sorted(ranked, key=lambda contact: sum(seen[a, contact.labels[a]] for a in attributes))
 
 
 def _pairs(dealer: _Dealer, sensors: Sequence[str], quota: int) -> Iterator[Ask]:
@@ -249,13 +235,12 @@ def _ask(
     answer: tuple[int, ...],
     wording: int,
 ) -> Ask:
-    shown = tuple(s for s in sensors if all(s in contact.measured for contact in contacts))
     return Ask(
         id=kind,  # numbered when all are drawn
         kind=kind,
         attributes=attributes,
         touches=tuple(contact.touch for contact in contacts),
-        sensors=shown,
+        sensors=tuple(s for s in sensors if all(s in contact.measured for contact in contacts)),
         answer=answer,
         phrasing=wording,
         deceptive=contacts[0].deceptive if len(contacts) == 1 else None,

@@ -20,7 +20,7 @@ from experiments.bench.rationales import compose_item
 from experiments.bench.rules import CandidateItem, FilteredItems, apply_rules
 from experiments.bench.thresholds import ThresholdReader, fit_thresholds
 from experiments.bench.wording import answer_choices, answer_words, read_answer, slots_of
-from sensors_io.measures import UNITS, Measured
+from sensors_io.measures import UNITS
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import KINDS, Ask, Item, Touch, citation_of
 from touchr1_jax.bench.json_lines import LinesError
@@ -76,20 +76,23 @@ def share_at_odds(items: Sequence[Item]) -> float:
 
     They stay in the bench: without them it would hold only what a threshold on one number can answer.
     """
-    odd = 0
-    for item in items:
-        reading, _ = read_answer(item.ask, item.rationale)
-        odd += tuple(reading.compare[slot] for slot in slots_of(item.ask)) != item.ask.answer
+    compared = lambda item: read_answer(item.ask, item.rationale)[0].compare
+    odd = sum(tuple(compared(item)[slot] for slot in slots_of(item.ask)) != item.ask.answer for item in items)
     return odd / len(items)
 
 
 def author_requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContact]) -> Iterator[dict[str, Any]]:
     """One request for each question."""
+    value = lambda name, number: {"value": float(f"{number:.4g}"), "unit": UNITS[name]}
     for ask in asks:
-        touches = [
-            dataclasses.asdict(touch) | {"measured": {s: _measured(contacts[touch].measured[s]) for s in ask.sensors}}
-            for touch in ask.touches
-        ]
+        touches = []
+        for touch in ask.touches:
+            measured = {}
+            for sensor in ask.sensors:
+                m = contacts[touch].measured[sensor]
+                quantities = {name: value(name, x) for name, x in m.quantities.items()}
+                measured[sensor] = {"quantities": quantities, "at": list(m.at), "box": list(m.box)}
+            touches.append(dataclasses.asdict(touch) | {"measured": measured})
         yield {
             "id": ask.id,
             "kind": ask.kind,
@@ -101,13 +104,6 @@ def author_requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContac
             "choices": answer_choices(ask),
             "touches": touches,
         }
-
-
-def _measured(measured: Measured) -> dict[str, Any]:
-    quantities = {
-        name: {"value": float(f"{value:.4g}"), "unit": UNITS[name]} for name, value in measured.quantities.items()
-    }
-    return {"quantities": quantities, "at": list(measured.at), "box": list(measured.box)}
 
 
 def read_candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask]) -> Iterator[CandidateItem]:
@@ -123,9 +119,8 @@ def read_candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequenc
     known, seen = {ask.id: ask for ask in asks}, set[str]()
     for number, row in rows:
         if set(row) != set(CANDIDATE_FIELDS):
-            raise LinesError(
-                f"line {number} has fields {sorted(row)}: must be {', '.join(CANDIDATE_FIELDS)}; correct it"
-            )
+            fields = ", ".join(CANDIDATE_FIELDS)
+            raise LinesError(f"line {number} has fields {sorted(row)}: must be {fields}; correct it")
         if row["id"] not in known or row["id"] in seen:
             fix = "answer each request once" if row["id"] in seen else "use the records, quota and seed of the requests"
             raise LinesError(f"line {number}: id is {row['id']!r}: must be that of an open request; {fix}")

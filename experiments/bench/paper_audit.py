@@ -29,7 +29,7 @@ from experiments.bench.paper_checks import (
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.study import paper_numbers as paper
 
@@ -60,22 +60,14 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
             "of the data set.",
         ),
         requirements=(
-            Requirement(name="known inconsistencies that do not show", measured=unseen, bound=0, better="lower"),
-            Requirement(name="statements taken to hold that fail", measured=failed, bound=0, better="lower"),
+            at_most("known inconsistencies that do not show", unseen, 0),
+            at_most("statements taken to hold that fail", failed, 0),
         ),
         tables=(
             _statement_table("What does not stand", wrong),
             _statement_table("What holds", right),
             _average_table(),
-            named_table(
-                "OMAE and its bound",
-                [
-                    {"row": name, "1 − Acc": error, "OMAE": omae, "possible": name not in impossible_distances()}
-                    for name, (error, omae) in error_and_distance().items()
-                ],
-                formats={"1 − Acc": ".3f", "OMAE": ".2f"},
-                meanings={"1 − Acc": "of the mean of H-, R- and P-Acc: least possible OMAE"},
-            ),
+            _distance_table(),
             _vtv_table(config),
         ),
         pictures=(
@@ -97,16 +89,8 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
 
 
 def _statement_table(title: str, checks: tuple[StatementCheck, ...]) -> Table:
-    rows: list[dict[str, Cell]] = [
-        {
-            "statement, and where": f"{c.title} ({c.where})",
-            "verdict": c.verdict,
-            "published": c.published,
-            "recomputed": c.recomputed,
-        }
-        for c in checks
-    ]
-    return named_table(title, rows)
+    statement = lambda c: {"statement, and where": f"{c.title} ({c.where})", "verdict": c.verdict}
+    return named_table(title, [statement(c) | {"published": c.published, "recomputed": c.recomputed} for c in checks])
 
 
 def _average_table() -> Table:
@@ -126,9 +110,20 @@ def _average_table() -> Table:
     )
 
 
+def _distance_table() -> Table:
+    impossible = impossible_distances()
+    rows: list[dict[str, Cell]] = [
+        {"row": name, "1 − Acc": error, "OMAE": omae, "possible": name not in impossible}
+        for name, (error, omae) in error_and_distance().items()
+    ]
+    meanings = {"1 − Acc": "of the mean of H-, R- and P-Acc: least possible OMAE"}
+    return named_table("OMAE and its bound", rows, formats={"1 − Acc": ".3f", "OMAE": ".2f"}, meanings=meanings)
+
+
 def _vtv_table(config: PaperAuditConfig) -> Table:
     rows: list[dict[str, Cell]] = []
-    for column, a, b in list(zip(paper.VTV_COLUMNS, paper.VTV["Ours"][0], paper.VTV["VTV-LLM-7B"][0], strict=True))[:5]:
+    ours, theirs = paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5]
+    for column, a, b in zip(paper.VTV_COLUMNS[:5], ours, theirs, strict=True):
         gain, half, p = gain_interval(a, b, config.vtv_items)
         span = f"[{gain - half:.1f}, {gain + half:.1f}]"
         rows.append({"property": column, "Touch-R1": a, "VTV-LLM": b, "gain": gain, "95 %": span, "p": p})
@@ -147,22 +142,15 @@ def distance_chart() -> bytes:
     diagonal = Series("OMAE = 1 − Acc; below it is impossible", x=ends, y=ends, marker="", line=":", colour=SHARED)
     shaded = Series(x=ends, y=ends, low=[0, 0], band=True, marker="", line="", colour=PALETTE[1], alpha=0.4)
     series = [shaded, diagonal]
+    every = error_and_distance()
     for table, marker in (("main table", "o"), ("ablation", "D")):
-        rows = {
-            name: row for name, row in error_and_distance().items() if name.endswith("(ablation)") == (marker == "D")
-        }
+        rows = {name: row for name, row in every.items() if name.endswith("(ablation)") == (table == "ablation")}
         x, y = zip(*rows.values(), strict=True)
         labels = [name if name in impossible and not name.startswith("+") else "" for name in rows]
         colour = [PALETTE[1] if name in impossible else PALETTE[0] for name in rows]
         series.append(Series(table, x=x, y=y, marker=marker, line="", colour=colour, labels=labels))
-    panel = Panel(
-        series,
-        x_label="1 − mean of H-, R-, P-Acc",
-        y_label="OMAE, levels",
-        x_limits=(0.25, 0.75),
-        y_limits=(0.15, 0.95),
-    )
-    return draw([panel])
+    x_label, y_label = "1 − mean of H-, R-, P-Acc", "OMAE, levels"
+    return draw([Panel(series, x_label=x_label, y_label=y_label, x_limits=(0.25, 0.75), y_limits=(0.15, 0.95))])
 
 
 def average_chart() -> bytes:

@@ -5,7 +5,7 @@ A printed number stands for every number that rounds to it.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import numpy as np
@@ -51,14 +51,10 @@ def best_weighting(main: MainTable = paper.MAIN) -> tuple[np.ndarray, float]:
     A miss of 0 means that some weighted mean of the unrounded columns gives every Avg.
     """
     low, high, average = columns_as_scores(main)
-    slack = -np.ones((len(average), 1))
-    found = optimize.linprog(
-        np.eye(low.shape[1] + 1)[-1],
-        A_ub=np.block([[low, slack], [-high, slack]]),
-        b_ub=np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average]),
-        A_eq=np.append(np.ones(low.shape[1]), 0)[None],
-        b_eq=np.ones(1),
-    )
+    slack, n = -np.ones((len(average), 1)), low.shape[1]
+    limits = np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average])
+    bounded, sums = np.block([[low, slack], [-high, slack]]), np.append(np.ones(n), 0)[None]
+    found = optimize.linprog(np.eye(n + 1)[-1], A_ub=bounded, b_ub=limits, A_eq=sums, b_eq=np.ones(1))
     return found.x[:-1], float(found.x[-1])
 
 
@@ -69,11 +65,8 @@ def perfect_average(main: MainTable = paper.MAIN) -> float:
       ValueError: no weights give every Avg.
     """
     low, high, average = columns_as_scores(main)
-    found = optimize.linprog(
-        -np.ones(low.shape[1]),
-        A_ub=np.concatenate([low, -high]),
-        b_ub=np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average]),
-    )
+    limits = np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average])
+    found = optimize.linprog(-np.ones(low.shape[1]), A_ub=np.concatenate([low, -high]), b_ub=limits)
     if found.status != 0:
         raise ValueError(f"main allows no weights: {found.message}; ask for `best_weighting` instead")
     return -100.0 * float(found.fun)
@@ -89,11 +82,8 @@ def error_and_distance() -> dict[str, tuple[float, float]]:
 
 def impossible_distances() -> list[str]:
     """Rows whose OMAE, rounding granted, is below the share of wrong answers."""
-    return [
-        name
-        for name, (error, omae) in error_and_distance().items()
-        if omae + LEVEL_ROUNDING < error - SHARE_ROUNDING / 100
-    ]
+    too_small = lambda error, omae: omae + LEVEL_ROUNDING < error - SHARE_ROUNDING / 100
+    return [name for name, row in error_and_distance().items() if too_small(*row)]
 
 
 def gain_interval(ours: float, theirs: float, items: int) -> tuple[float, float, float]:
@@ -113,11 +103,8 @@ def attainable(share: float, items: int) -> bool:
 
     Source: Brown and Heathers, The GRIM test, Soc. Psychol. Personal. Sci. 8 (2017).
     """
-    near = round(share * items / 100)
-    return any(
-        share - SHARE_ROUNDING - 1e-9 <= 100 * k / items < share + 2 * SHARE_ROUNDING - 1e-9
-        for k in (near - 1, near, near + 1)
-    )
+    near, low, high = round(share * items / 100), share - SHARE_ROUNDING - 1e-9, share + 2 * SHARE_ROUNDING - 1e-9
+    return any(low <= 100 * k / items < high for k in (near - 1, near, near + 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,26 +126,7 @@ def _check(
 
 def inconsistencies() -> tuple[StatementCheck, ...]:
     """Every known inconsistency, in the order of the report."""
-    return (
-        average_check(paper.MAIN),
-        *_averages(),
-        _distance(),
-        *_method(),
-        _subsets(),
-        _backbones(),
-        _noise(),
-        _check(
-            "No seeds, no intervals",
-            "all tables",
-            "single numbers",
-            f"seeds {paper.SEEDS or 'not given'}, intervals or tests {paper.INTERVALS}",
-            paper.SEEDS is None and paper.INTERVALS == 0,
-            "not given",
-        ),
-        _sequences(),
-        _counts(),
-        _pictures(),
-    )
+    return (average_check(paper.MAIN), *_accuracies(), *_method(), *_claims(), *_data_and_units())
 
 
 def average_check(main: MainTable) -> StatementCheck:
@@ -177,36 +145,36 @@ def average_check(main: MainTable) -> StatementCheck:
     )
 
 
-def _averages() -> tuple[StatementCheck, ...]:
-    worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.PER_ATTRIBUTE.values())
+def _worst_average(rows: Mapping[str, tuple[paper.Row, float]]) -> float:
+    return max(abs(math.fsum(row) / len(row) - average) for row, average in rows.values())
+
+
+def _accuracies() -> Iterator[StatementCheck]:
+    """Averages and accuracies that differ between tables, and an OMAE below its bound."""
+    worst = _worst_average(paper.PER_ATTRIBUTE)
     ladder = all(paper.LADDER[name][2] == avg for name, (_, avg) in paper.PER_ATTRIBUTE.items())
+    yield _check(
+        "Avg is the mean of four accuracies",
+        "ablation tables (a) and (b)",
+        "one Avg for main table and ablation",
+        f"the mean of the four columns of (b) gives the Avg of (a) and (b) within {worst:.3f} in every row",
+        ladder and worst <= 2 * SHARE_ROUNDING,
+    )
     gaps = [
         abs(a - b)
         for main, ablation in SAME_MODELS.items()
         for a, b in zip(paper.MAIN[main][0][:4], paper.PER_ATTRIBUTE[ablation][0], strict=True)
     ]
-    return (
-        _check(
-            "Avg is the mean of four accuracies",
-            "ablation tables (a) and (b)",
-            "one Avg for main table and ablation",
-            f"the mean of the four columns of (b) gives the Avg of (a) and (b) within {worst:.3f} in every row",
-            ladder and worst <= 2 * SHARE_ROUNDING,
-        ),
-        _check(
-            "The same models have two sets of accuracies",
-            "main table against ablation table (b)",
-            f"{OURS} hardness {paper.MAIN[OURS][0][0]} and {paper.PER_ATTRIBUTE['Touch-R1'][0][0]}",
-            f"all {len(gaps)} pairs differ, by {min(gaps):.1f} to {max(gaps):.1f} points",
-            min(gaps) > 2 * SHARE_ROUNDING,
-        ),
+    yield _check(
+        "The same models have two sets of accuracies",
+        "main table against ablation table (b)",
+        f"{OURS} hardness {paper.MAIN[OURS][0][0]} and {paper.PER_ATTRIBUTE['Touch-R1'][0][0]}",
+        f"all {len(gaps)} pairs differ, by {min(gaps):.1f} to {max(gaps):.1f} points",
+        min(gaps) > 2 * SHARE_ROUNDING,
     )
-
-
-def _distance() -> StatementCheck:
     rows, impossible = error_and_distance(), impossible_distances()
     error, omae = rows[OURS]
-    return _check(
+    yield _check(
         "OMAE lies below the error rate",
         "main table and ablation",
         f"{OURS}: OMAE {omae}",
@@ -216,44 +184,42 @@ def _distance() -> StatementCheck:
     )
 
 
-def _method() -> tuple[StatementCheck, ...]:
+def _method() -> Iterator[StatementCheck]:
     """Terms, hyperparameters and measures that are announced and not given."""
     terms = {*paper.REWARD_WEIGHTS, *paper.ABLATED_TERMS}
     no_term = [term for term in paper.ADVERTISED_TERMS if term not in terms]
+    yield _check(
+        "The tactile-use reward is in no equation",
+        "abstract, introduction; reward equations, ablation",
+        f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
+        f"weights {sum(paper.REWARD_WEIGHTS.values()):g} in all, none for {', '.join(no_term)}; no row of its own",
+        bool(no_term),
+    )
     no_value = [name for name in paper.OBJECTIVE_NEEDS if name not in paper.HYPERPARAMETERS]
+    yield _check(
+        "The objective cannot be computed from what is given",
+        "overall objective; implementation details",
+        ", ".join(f"{name} {value:g}" for name, value in list(paper.HYPERPARAMETERS.items())[:2]),
+        f"missing: {', '.join(no_value)}",
+        bool(no_value),
+        "not given",
+    )
     no_metric = [name for name in paper.ADVERTISED_MEASURES if name not in paper.MEASURED]
-    return (
-        _check(
-            "The tactile-use reward is in no equation",
-            "abstract, introduction; reward equations, ablation",
-            f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
-            f"weights {sum(paper.REWARD_WEIGHTS.values()):g} in all, none for {', '.join(no_term)}; no row of its own",
-            bool(no_term),
-        ),
-        _check(
-            "The objective cannot be computed from what is given",
-            "overall objective; implementation details",
-            ", ".join(f"{name} {value:g}" for name, value in list(paper.HYPERPARAMETERS.items())[:2]),
-            f"missing: {', '.join(no_value)}",
-            bool(no_value),
-            "not given",
-        ),
-        _check(
-            "Visual–tactile conflict is never measured",
-            "abstract and introduction; metrics",
-            f"evaluates {', '.join(paper.ADVERTISED_MEASURES)}",
-            f"no metric and no column for {', '.join(no_metric)}",
-            bool(no_metric),
-            "not given",
-        ),
+    yield _check(
+        "Visual–tactile conflict is never measured",
+        "abstract and introduction; metrics",
+        f"evaluates {', '.join(paper.ADVERTISED_MEASURES)}",
+        f"no metric and no column for {', '.join(no_metric)}",
+        bool(no_metric),
+        "not given",
     )
 
 
-def _subsets() -> StatementCheck:
-    questions = paper.SFT_QA + paper.RL_QA
-    left = paper.RECORDS - paper.PRETRAIN_FRAMES
+def _claims() -> Iterator[StatementCheck]:
+    """Subsets, models and gains that other numbers contradict or do not support."""
+    questions, left = paper.SFT_QA + paper.RL_QA, paper.RECORDS - paper.PRETRAIN_FRAMES
     training = round(paper.RECORDS * (1 - paper.HELD_OUT_OBJECTS / paper.OBJECTS)) - paper.PRETRAIN_FRAMES
-    return _check(
+    yield _check(
         "Disjoint subsets do not fit",
         "training data and protocol",
         f"{paper.PRETRAIN_FRAMES:,} frames, then {questions:,} questions on other data",
@@ -261,24 +227,18 @@ def _subsets() -> StatementCheck:
         "about each",
         questions > left,
     )
-
-
-def _backbones() -> StatementCheck:
     sizes = lambda billions: ", ".join(f"{size}B" for size in billions)
     unknown = [size for size in paper.BACKBONES if size not in paper.RELEASED_BACKBONES]
-    return _check(
+    yield _check(
         "A backbone that does not exist",
         "scaling figure",
         sizes(paper.BACKBONES),
         f"Qwen2.5-VL was released with {sizes(paper.RELEASED_BACKBONES)}; no {sizes(unknown)}",
         bool(unknown),
     )
-
-
-def _noise() -> StatementCheck:
     pairs = zip(paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5], strict=True)
     gains, halves, p = zip(*(gain_interval(a, b, paper.VTV_ITEMS) for a, b in pairs), strict=True)
-    return _check(
+    yield _check(
         "Gains on VTV150K are within one run's noise",
         f"VTV150K table, {paper.VTV_ITEMS} questions a property",
         f"{min(gains):+.1f} to {max(gains):+.1f} points",
@@ -286,11 +246,20 @@ def _noise() -> StatementCheck:
         all(half > gain for gain, half in zip(gains, halves, strict=True)),
         "unsupported",
     )
+    yield _check(
+        "No seeds, no intervals",
+        "all tables",
+        "single numbers",
+        f"seeds {paper.SEEDS or 'not given'}, intervals or tests {paper.INTERVALS}",
+        paper.SEEDS is None and paper.INTERVALS == 0,
+        "not given",
+    )
 
 
-def _sequences() -> StatementCheck:
+def _data_and_units() -> Iterator[StatementCheck]:
+    """Counts that the protocol does not give, and an error without its unit."""
     each = paper.SENSORS * paper.MOTIONS
-    return _check(
+    yield _check(
         "Sequences do not fit the protocol",
         "overview and acquisition",
         f"{paper.SEQUENCES:,} sequences of {paper.OBJECTS:,}+ objects, {paper.SENSORS} sensors, a press and six "
@@ -298,13 +267,10 @@ def _sequences() -> StatementCheck:
         f"that makes {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} are {paper.SEQUENCES / each:.0f} objects",
         paper.OBJECTS * each > paper.SEQUENCES,
     )
-
-
-def _counts() -> StatementCheck:
     shares = {name: row[:4] for name, (row, _) in paper.VTV.items()}
     fit = {name: sum(attainable(share, paper.VTV_ITEMS) for share in row) for name, row in shares.items()}
     others = sum(fit.values()) - fit["Ours"]
-    return _check(
+    yield _check(
         "Shares that no count gives",
         f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
         f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
@@ -312,11 +278,8 @@ def _counts() -> StatementCheck:
         fit["Ours"] < 4,
         "unsupported",
     )
-
-
-def _pictures() -> StatementCheck:
     errors = [e for row in paper.VIDEO_L1.values() for e in row]
-    return _check(
+    yield _check(
         "L1 worse than a grey picture's",
         "video prediction table",
         f"L1 {min(errors)} to {max(errors)}",
@@ -339,10 +302,9 @@ def confirmed() -> tuple[StatementCheck, ...]:
         gain = cell(OURS, column) - cell(model, column)
         wrong = not abs(gain - claimed) < SHARE_ROUNDING
         gains.append(_check(f"{column} over {model}", where, f"{claimed:+.1f}", f"{gain:+.1f} points", wrong))
-    worst = max(abs(math.fsum(row) / len(row) - avg) for row, avg in paper.VTV.values())
+    worst, ends = _worst_average(paper.VTV), ("OMAE", "CSC", "Avg")
     differ = any(
-        tuple(cell(main, column) for column in ("OMAE", "CSC", "Avg")) != paper.LADDER[name]
-        for main, name in SAME_MODELS.items()
+        tuple(cell(main, column) for column in ends) != paper.LADDER[name] for main, name in SAME_MODELS.items()
     )
     passed = round(paper.AUDITED * paper.AUDIT_PASSED / 100)
     interval = wilson_interval(passed, paper.AUDITED)

@@ -40,17 +40,11 @@ class CandidateItem:
     @classmethod
     def of(cls, item: Item) -> "CandidateItem":
         """The candidate whose answer is the right one."""
-        return cls(
-            ask=item.ask,
-            question=item.question,
-            answer=answer_words(item.ask),
-            rationale=item.rationale,
-            evidence=item.evidence,
-        )
+        return cls(**vars(item), answer=answer_words(item.ask))
 
     def item(self) -> Item:
         """The item without the author's answer."""
-        return Item(ask=self.ask, question=self.question, rationale=self.rationale, evidence=self.evidence)
+        return Item(**{name: value for name, value in vars(self).items() if name != "answer"})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -79,9 +73,8 @@ def apply_rules(candidates: Iterable[CandidateItem], contacts: Mapping[Touch, Me
 def broken_rule(candidate: CandidateItem, contacts: Mapping[Touch, MeasuredContact]) -> str | None:
     """The first rule that a candidate breaks; `None` if it passes."""
     ask = candidate.ask
-    _, answered = read_answer(
-        ask, f"<perceive> . </perceive> <compare> . </compare> <conclude> {candidate.answer} </conclude>"
-    )
+    alone = f"<perceive> . </perceive> <compare> . </compare> <conclude> {candidate.answer} </conclude>"
+    _, answered = read_answer(ask, alone)
     reading, concluded = read_answer(ask, candidate.rationale)
     if not candidate.question.strip() or not reading.formatted or -1 in answered or -1 in concluded:
         return "missing answer"

@@ -30,12 +30,7 @@ class MetricRow:
 
 
 def ask_all(items: Iterable[Item], answer: Callable[[Item], str]) -> dict[str, tuple[int, ...]]:
-    """The levels that a model answers to every question.
-
-    Args:
-      items: the bench.
-      answer: gives the model's text; it may read the question, touches and sensors of the item, and nothing else.
-    """
+    """The levels that a model answers to every question; it may read an item's question, touches and sensors alone."""
     return {item.ask.id: read_answer(item.ask, answer(item))[1] for item in items}
 
 
@@ -66,10 +61,7 @@ def read_answers(
 def metric_rows(items: Sequence[Item], answers: AnswerLevels, by_sight: AnswerLevels | None = None) -> list[MetricRow]:
     """Every metric that the items define, but for those about a single object, which have no interval.
 
-    Args:
-      items: the bench.
-      answers: to all of them.
-      by_sight: the answers given the picture alone, where known: they define which questions are a conflict.
+    Answers given the picture alone, `by_sight`, define which questions are a conflict.
     """
     rows, asks = [], [item.ask for item in items]
     for name, scores in score(asks, answers, by_sight).items():

@@ -1,37 +1,38 @@
-"""Tables that people fill in, as CSV files: written blank, read back with every cell checked."""
+"""Tables that people fill in, as CSV files, written blank and read back with every cell checked; their agreement."""
 
 import csv
 import io
-import os
-import pathlib
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from experiments.core import artifacts
+from touchr1_jax.bench.statistics import cohens_kappa
 
 
 class SheetError(ValueError):
     """A sheet that cannot be used; the message names the file, the line, the value, the constraint and the fix."""
 
 
-def write_sheet(path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
+def write_sheet(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, str]]) -> None:
     """Write a sheet in one step; columns that a row lacks stay blank.
 
     Raises:
       SheetError: the file exists, and may be filled in.
     """
-    path = pathlib.Path(path)
     if path.exists():
         raise SheetError(f"{path} exists and may be filled in; move it away, or choose another place")
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text.getvalue(), encoding="utf-8")
-    temporary.replace(path)
+    artifacts.write_text(path, text.getvalue())
 
 
 def read_sheet(
-    path: str | os.PathLike[str], key: str, cells: Mapping[str, Sequence[str]], wanted: Iterable[str]
+    path: Path, key: str, cells: Mapping[str, Sequence[str]], wanted: Iterable[str]
 ) -> dict[str, dict[str, str]]:
     """A filled-in sheet: key → column → word.
 
@@ -45,9 +46,15 @@ def read_sheet(
       SheetError: a file that is missing or not text, a key that is unknown, missing or there twice, a missing column,
         or a word that is not allowed.
     """
-    path, names = pathlib.Path(path), set(wanted)
+    names = set(wanted)
     rows: dict[str, dict[str, str]] = {}
-    reader = csv.DictReader(io.StringIO(_text(path), newline=""))
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise SheetError(f"{path} is missing: must be a filled-in sheet; correct the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SheetError(f"{path} cannot be read ({error}): must be CSV in UTF-8; save it so") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""))
     missing = [column for column in (key, *cells) if column not in (reader.fieldnames or ())]
     if missing:
         raise SheetError(f"{path} lacks the columns {missing}: must have {key}, {', '.join(cells)}; add them")
@@ -56,24 +63,19 @@ def read_sheet(
         if name not in names or name in rows:
             why = "occurs twice" if name in rows else "is not asked for"
             raise SheetError(f"{where}: {key} {name!r} {why}; each row of the blank sheet belongs there once")
-        rows[name] = {column: _word(where, column, row[column], words) for column, words in cells.items()}
+        rows[name] = {column: (row[column] or "").strip().lower() for column in cells}
+        for column, words in cells.items():
+            if rows[name][column] not in words:
+                choices = ", ".join(words)
+                raise SheetError(f"{where}: {column} is {row[column]!r}: must be one of {choices}; fill it in")
     absent = sorted(names - set(rows))
     if absent:
         raise SheetError(f"{path} lacks {len(absent)} rows, the first {absent[0]!r}; fill in all of the blank sheet")
     return rows
 
 
-def _text(path: pathlib.Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise SheetError(f"{path} is missing: must be a filled-in sheet; correct the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SheetError(f"{path} cannot be read ({error}): must be CSV in UTF-8; save it so") from error
-
-
-def _word(where: str, column: str, cell: str | None, words: Sequence[str]) -> str:
-    word = (cell or "").strip().lower()
-    if word not in words:
-        raise SheetError(f"{where}: {column} is {cell!r}: must be one of {', '.join(words)}; fill it in")
-    return word
+def kappa_unless_constant(
+    a: np.ndarray, b: np.ndarray, categories: int, weights: Literal["none", "quadratic"] = "none"
+) -> float | None:
+    """Cohen's κ of two columns of categories; `None` where all entries are equal, for which κ is undefined."""
+    return cohens_kappa(a, b, categories, weights=weights) if len({*a.tolist(), *b.tolist()}) > 1 else None

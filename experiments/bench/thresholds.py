@@ -87,15 +87,12 @@ def fit_thresholds(contacts: Sequence[MeasuredContact]) -> ThresholdReader:
             f"contacts holds {len(contacts)}: rationales need {LEAST_CONTACTS} training contacts with all three levels "
             "of an attribute; use more training objects"
         )
-    count = LEVELS["material"]
-    odds = {name: np.ones((count, LEVELS[name])) for name in ORDINAL}
-    prior = np.ones(count)
-    for contact in contacts:
-        if "material" in contact.labels:
-            prior[contact.labels["material"]] += 1
-            for name in ORDINAL:
-                if name in contact.labels:
-                    odds[name][contact.labels["material"], contact.labels[name]] += 1
+    odds = {name: np.ones((LEVELS["material"], LEVELS[name])) for name in ORDINAL}
+    prior = np.ones(LEVELS["material"])
+    for labels in (contact.labels for contact in contacts if "material" in contact.labels):
+        prior[labels["material"]] += 1
+        for name in labels.keys() & odds.keys():
+            odds[name][labels["material"], labels[name]] += 1
     log_odds = {name: np.log(table / table.sum(1, keepdims=True)) for name, table in odds.items()}
     return ThresholdReader(thresholds=thresholds, log_odds=log_odds, log_prior=np.log(prior / prior.sum()))
 
@@ -111,11 +108,9 @@ def _best(contacts: Sequence[MeasuredContact], sensor: str, attribute: str) -> L
             and sensor in contact.measured
             and quantity in contact.measured[sensor].quantities
         ]
-        if len(rows) < LEAST_CONTACTS or len({level for _, level in rows}) < LEVELS[attribute]:
-            continue
-        found = _cut(quantity, np.array([v for v, _ in rows]), np.array([level for _, level in rows]))
-        if best is None or found.accuracy > best.accuracy:
-            best = found
+        if len(rows) >= LEAST_CONTACTS and len({level for _, level in rows}) == LEVELS[attribute]:
+            found = _cut(quantity, *map(np.array, zip(*rows, strict=True)))
+            best = found if best is None or found.accuracy > best.accuracy else best
     return best
 
 
@@ -131,12 +126,8 @@ def _cut(quantity: str, value: np.ndarray, level: np.ndarray) -> LevelThresholds
     middle = below[1, high] - below[1, low]
     rising = (below[0, low] + middle + 1 - below[2, high]) / 3
     falling = (below[2, low] + middle + 1 - below[0, high]) / 3
-    up = float(rising.max()) >= float(falling.max())
+    up = bool(rising.max() >= falling.max())
     accuracy = rising if up else falling
     at = int(np.argmax(accuracy))
-    return LevelThresholds(
-        quantity=quantity,
-        cuts=(float(cuts[low[at]]), float(cuts[high[at]])),
-        rising=up,
-        accuracy=float(accuracy[at]),
-    )
+    chosen = (float(cuts[low[at]]), float(cuts[high[at]]))
+    return LevelThresholds(quantity=quantity, cuts=chosen, rising=up, accuracy=float(accuracy[at]))

@@ -42,28 +42,15 @@ RESAMPLES = 2_000
 """Resamples of each interval: the error of its ends is about a tenth of its width."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class UseScenario:
-    """A use of an object: attribute → +1 if it needs more of it, −1 if less."""
-
-    text: str
-    wants: Mapping[str, int]
-
-    @property
-    def weights(self) -> Float[np.ndarray, "A"]:
-        """`wants` in the order of `ATTRIBUTES`."""
-        return np.array([self.wants.get(name, 0) for name in ATTRIBUTES], float)
-
-
-SCENARIOS: tuple[UseScenario, ...] = (
-    UseScenario(text="to be held with wet hands", wants={"friction": 1}),
-    UseScenario(text="to slide under a cupboard", wants={"friction": -1, "protrusion": -1}),
-    UseScenario(text="to drive a tent peg into the ground", wants={"hardness": 1, "friction": 1}),
-    UseScenario(text="to sit on for an hour", wants={"hardness": -1, "elasticity": 1}),
-    UseScenario(text="to give back the push of a spring", wants={"elasticity": 1}),
-    UseScenario(text="to be found by its relief in the dark", wants={"protrusion": 1}),
-)
-"""Scenarios of this project: those of the benchmark are not published."""
+SCENARIOS: Mapping[str, Mapping[str, int]] = {
+    "to be held with wet hands": {"friction": 1},
+    "to slide under a cupboard": {"friction": -1, "protrusion": -1},
+    "to drive a tent peg into the ground": {"hardness": 1, "friction": 1},
+    "to sit on for an hour": {"hardness": -1, "elasticity": 1},
+    "to give back the push of a spring": {"elasticity": 1},
+    "to be found by its relief in the dark": {"protrusion": 1},
+}
+"""Use of an object → attribute → +1 if it needs more of it, −1 if less; those of the benchmark are not published."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -152,7 +139,7 @@ def _unequal(label: np.ndarray, scenario: int, rng: np.random.Generator) -> Int[
     one = int(rng.integers(len(label)))
     others = np.flatnonzero(worth != worth[one])
     if not len(others):
-        raise ValueError(f"label suits {SCENARIOS[scenario].text!r} alike throughout: it must not; use more objects")
+        raise ValueError(f"label suits {list(SCENARIOS)[scenario]!r} alike throughout: it must not; use more objects")
     return np.array([one, rng.choice(others)])
 
 
@@ -173,30 +160,21 @@ def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, S
     sign = np.where(tasks.most, 1, -1)
     found = {name: (right[:, a], own) for a, name in enumerate(ATTRIBUTES)}
     found["combined"] = right.all(1), own
-    same_more = lambda predicted, true, rows, column: _second(predicted, rows, column) == _second(true, rows, column)
+    second = lambda value, rows, column: value[rows[:, 1], column] >= value[rows[:, 0], column]
+    same_more = lambda predicted, true, rows, column: second(predicted, rows, column) == second(true, rows, column)
     found["sfd"] = same_more(expected, label, tasks.pairs, tasks.pair_of), tasks.pairs.min(1)
-    found["soi"] = _extreme(expected, tasks, sign) == _extreme(label, tasks, sign), tasks.threes.min(1)
+    extreme = lambda value: (sign[:, None] * value[tasks.threes, tasks.three_of[:, None]]).argmax(1)
+    found["soi"] = extreme(expected) == extreme(label), tasks.threes.min(1)
     found["osc"] = _matched(log_probs, tasks) == tasks.shown, tasks.names.min(1)
     found["tsa"] = same_more(_worth(expected), _worth(label), tasks.fits, tasks.scenario), tasks.fits.min(1)
-    return {
-        name: Scores(values=100.0 * values, items=items, strata=np.zeros(len(values), int))
-        for name, (values, items) in ((name, found[name]) for name in VTV)
-    }
+    scores = lambda values, items: Scores(values=100.0 * values, items=items, strata=np.zeros(len(values), int))
+    return {name: scores(*found[name]) for name in VTV}
 
 
 def _worth(levels: np.ndarray) -> Float[np.ndarray, "n scenario"]:
     """Suitability of recordings for each scenario; a matrix product would not give equal numbers for equal rows."""
-    return np.stack([(levels * s.weights).sum(-1) for s in SCENARIOS], 1)
-
-
-def _second(value: np.ndarray, pairs: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """True where the second of a pair has more, bool [P]; of equal ones the first is taken to have less."""
-    return value[pairs[:, 1], column] >= value[pairs[:, 0], column]
-
-
-def _extreme(value: np.ndarray, tasks: VTVTasks, sign: np.ndarray) -> np.ndarray:
-    """Place of the most or the least of three."""
-    return (sign[:, None] * value[tasks.threes, tasks.three_of[:, None]]).argmax(1)
+    weights = np.array([[wants.get(name, 0) for name in ATTRIBUTES] for wants in SCENARIOS.values()], float)
+    return np.stack([(levels * w).sum(-1) for w in weights], 1)
 
 
 def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:

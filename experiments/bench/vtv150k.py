@@ -23,6 +23,7 @@ touch even reaches guessing.
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -50,13 +51,8 @@ from touchr1_jax.training.linear_probe import ProbeConfig
 MOTIONS = ("slide_x", "hold")
 """One that reveals friction, one that reveals the returned energy; both reveal the other attributes."""
 
-FUSED, WITH_FORCE, FORCE, SHAPE, PRIOR = (
-    "all sensors",
-    "all sensors and force",
-    "force alone",
-    "true shape",
-    "commonest",
-)
+FUSED, WITH_FORCE = "all sensors", "all sensors and force"
+FORCE, SHAPE, PRIOR = "force alone", "true shape", "commonest"
 
 Scored = Mapping[str, Mapping[str, Interval]]
 """Predictor → task, and "average"."""
@@ -75,8 +71,7 @@ class VTVProtocolConfig:
     """Questions of each task that compares recordings."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordingFeatures:
+class RecordingFeatures(NamedTuple):
     """n objects: features by source, [n, D], true levels [n, A], names [n]."""
 
     features: Mapping[str, Float[np.ndarray, "n D"]]
@@ -129,9 +124,8 @@ def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
     Raises:
       DataError: no object has one of each.
     """
-    first: dict[str, dict[str, int]] = {
-        name: {scenes.contacts[row].object_id: row for row in reversed(contacts_of(scenes, name))} for name in MOTIONS
-    }
+    by_object = lambda rows: {scenes.contacts[row].object_id: row for row in reversed(rows)}
+    first: dict[str, dict[str, int]] = {name: by_object(contacts_of(scenes, name)) for name in MOTIONS}
     shared = sorted(set.intersection(*(set(rows) for rows in first.values())))
     if not shared:
         raise DataError(f"no object has a contact of each of {', '.join(MOTIONS)}: raise scenes.sequences")
@@ -180,8 +174,7 @@ def half_width(share: float, questions: int) -> float:
 
 def verdict(scored: Scored) -> tuple[str, ...]:
     """Touch against force, shape and guessing; and the paper's rows against guessing."""
-    average = {name: row["average"] for name, row in scored.items()}
-    guess = vtv_average(CHANCE)
+    average, guess = {name: row["average"] for name, row in scored.items()}, vtv_average(CHANCE)
     attributes = ", ".join(f"{name} {scored[FUSED][name].mean:.0f}" for name in ATTRIBUTES)
     below = [name for name, (_, value) in paper.VTV.items() if value < guess]
     return (
@@ -200,23 +193,19 @@ def verdict(scored: Scored) -> tuple[str, ...]:
 
 def score_table(scored: Scored) -> Table:
     """Every predictor, guessing, and every row of the paper."""
-    span = "95 %"
-    row = lambda name, values, average: {
-        "row": name,
-        **dict(zip(paper.VTV_COLUMNS, values, strict=True)),
-        "Average": average,
-    }
+    span, columns = "95 %", (*paper.VTV_COLUMNS, "Average")
+    row = lambda name, values: {"row": name, **dict(zip(columns, values, strict=True))}
     rows: list[dict[str, Cell]] = [
-        row(name, [of[task].mean for task in VTV], of["average"].mean)
+        row(name, [of[task].mean for task in (*VTV, "average")])
         | {span: bounds(of["average"].low, of["average"].high, ".1f")}
         for name, of in scored.items()
     ]
-    rows.append(row("guessing", [CHANCE[task] for task in VTV], vtv_average(CHANCE)))
-    rows += [row(_published(name), values, average) for name, (values, average) in paper.VTV.items()]
+    rows.append(row("guessing", [*(CHANCE[task] for task in VTV), vtv_average(CHANCE)]))
+    rows += [row(_published(name), (*values, average)) for name, (values, average) in paper.VTV.items()]
     return named_table(
         "The nine tasks, ours and the paper's",
         rows,
-        formats=dict.fromkeys((*paper.VTV_COLUMNS, "Average"), ".1f"),
+        formats=dict.fromkeys(columns, ".1f"),
         meanings={
             "Average": "plain mean of the nine",
             span: "of the average, whole objects resampled; the paper gives none",
@@ -231,10 +220,7 @@ def _published(name: str) -> str:
 
 
 MEANINGS: Mapping[str, str] = {
-    "hardness": "its level, of three",
-    "protrusion": "its level, of three",
-    "elasticity": "its level, of three",
-    "friction": "its level, of three",
+    **dict.fromkeys(ATTRIBUTES, "its level, of three"),
     "combined": "all four levels",
     "sfd": "which of two has more of an attribute",
     "soi": "which of three has the most, or the least",
@@ -244,12 +230,7 @@ MEANINGS: Mapping[str, str] = {
 
 
 def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Table:
-    """Meaning, number of questions and chance of each task, and the interval that the benchmark's size would give.
-
-    Args:
-      counts: task → questions.
-      scored: task → share of right answers.
-    """
+    """Meaning, questions and chance of each task, and the interval that the benchmark's size would give its share."""
     width = f"± of {paper.VTV_ITEMS}"
     rows: list[dict[str, Cell]] = [
         {

@@ -35,75 +35,59 @@ ADJECTIVE: Mapping[str, tuple[str, str]] = {
 }
 """Adjective of each ordinal attribute, and its comparative."""
 
-SINGLE: Mapping[str, tuple[str, ...]] = {
-    "hardness": (
-        "How hard is it?",
-        "Judge the hardness of this object by touch.",
-        "What does the contact tell about its hardness?",
-        "Name the hardness that the sensors feel.",
+SINGLE: Mapping[str, tuple[str, str]] = {
+    "hardness": ("How hard is it?", "Judge the hardness of this object by touch."),
+    "roughness": ("How rough is it?", "Judge the roughness of its surface by touch."),
+    "protrusion": ("How protruding is its relief?", "Judge by touch how far its surface features stand out."),
+    "material": ("Which material is it?", "Judge the material of this object by touch."),
+}
+"""The first two wordings of a question about one property of one touch."""
+
+TEMPLATES: Mapping[str, tuple[str, ...]] = {
+    "identify": (
+        "{first}",
+        "{second}",
+        "What does the contact tell about its {attribute}?",
+        "Name the {attribute} that the sensors feel.",
     ),
-    "roughness": (
-        "How rough is it?",
-        "Judge the roughness of its surface by touch.",
-        "What does the contact tell about its roughness?",
-        "Name the roughness that the sensors feel.",
+    "scale": (
+        "On the scale {scale}, where does its {attribute} lie?",
+        "Place its {attribute} on the scale {scale}.",
+        "Which step of {scale} fits its {attribute}?",
+        "Its {attribute} is one of {scale}, from the least to the most: which?",
     ),
-    "protrusion": (
-        "How protruding is its relief?",
-        "Judge by touch how far its surface features stand out.",
-        "What does the contact tell about its protrusion?",
-        "Name the protrusion that the sensors feel.",
+    "compose": (
+        "Describe its {attributes}.",
+        "Judge by touch its {attributes}.",
+        "What are its {attributes}? All of them count.",
+        "Name the levels of its {attributes}.",
     ),
-    "material": (
-        "Which material is it?",
-        "Judge the material of this object by touch.",
-        "What does the contact tell about its material?",
-        "Name the material that the sensors feel.",
+    "compare": (
+        "Two objects are touched one after the other. Which is {more}, the first or the second?",
+        "Which of the two touches feels {more}: first or second?",
+        "Decide by touch which object is {more}, the first or the second.",
+        "One of two objects is {more}. Is it the first or the second?",
+    ),
+    "order": (
+        "Three objects are touched. Order them from the least {adjective} to the most.",
+        "Which order of the three touches goes from the least to the most {adjective}?",
+        "Sort first, second and third by how {adjective} they feel, the least at the front.",
+        "Rank the three objects by touch, the least {adjective} at the front.",
+    ),
+    "one_sensor": (
+        "Only this sensor touched it. {single}",
+        "By this one sensor: {single}",
+        "With nothing but this sensor: {single}",
+        "This sensor is all there is. {single}",
+    ),
+    "conflict": (
+        "The picture may deceive. {single}",
+        "Trust touch where it differs from sight. {single}",
+        "Looks aside: {single}",
+        "Does touch bear out what it looks like? {single}",
     ),
 }
-"""Questions about one property of one touch."""
-
-SCALE = (
-    "On the scale {scale}, where does its {attribute} lie?",
-    "Place its {attribute} on the scale {scale}.",
-    "Which step of {scale} fits its {attribute}?",
-    "Its {attribute} is one of {scale}, from the least to the most: which?",
-)
-
-COMPOSE = (
-    "Describe its {attributes}.",
-    "Judge by touch its {attributes}.",
-    "What are its {attributes}? All of them count.",
-    "Name the levels of its {attributes}.",
-)
-
-COMPARE = (
-    "Two objects are touched one after the other. Which is {more}, the first or the second?",
-    "Which of the two touches feels {more}: first or second?",
-    "Decide by touch which object is {more}, the first or the second.",
-    "One of two objects is {more}. Is it the first or the second?",
-)
-
-ORDER = (
-    "Three objects are touched. Order them from the least {adjective} to the most.",
-    "Which order of the three touches goes from the least to the most {adjective}?",
-    "Sort first, second and third by how {adjective} they feel, the least at the front.",
-    "Rank the three objects by touch, the least {adjective} at the front.",
-)
-
-ALONE = (
-    "Only this sensor touched it. {question}",
-    "By this one sensor: {question}",
-    "With nothing but this sensor: {question}",
-    "This sensor is all there is. {question}",
-)
-
-CONFLICT = (
-    "The picture may deceive. {question}",
-    "Trust touch where it differs from sight. {question}",
-    "Looks aside: {question}",
-    "Does touch bear out what it looks like? {question}",
-)
+"""Wordings of each kind of question; `single` is that of `identify` of the same number."""
 
 
 def level_words(attribute: str) -> list[str]:
@@ -113,23 +97,19 @@ def level_words(attribute: str) -> list[str]:
 
 def question(ask: Ask) -> str:
     """The question in the wording that was drawn for it."""
-    wording, name = ask.phrasing % WORDINGS, ask.attributes[0]
-    match ask.kind:
-        case "identify":
-            return SINGLE[name][wording]
-        case "scale":
-            return SCALE[wording].format(scale=" – ".join(level_words(name)), attribute=name)
-        case "compose":
-            *others, last = ask.attributes
-            listed = f"{', '.join(others)} and {last}" if others else last
-            return COMPOSE[wording].format(attributes=listed)
-        case "compare":
-            return COMPARE[wording].format(more=ADJECTIVE[name][1])
-        case "order":
-            return ORDER[wording].format(adjective=ADJECTIVE[name][0])
-        case _:
-            templates = {"one_sensor": ALONE, "conflict": CONFLICT}[ask.kind]
-            return templates[wording].format(question=SINGLE[name][wording])
+    wording, name, (*others, last) = ask.phrasing % WORDINGS, ask.attributes[0], ask.attributes
+    adjective, more = ADJECTIVE.get(name, ("", ""))
+    first, second = SINGLE[name]
+    return TEMPLATES[ask.kind][wording].format(
+        attribute=name,
+        attributes=f"{', '.join(others)} and {last}" if others else last,
+        adjective=adjective,
+        more=more,
+        scale=" – ".join(level_words(name)),
+        first=first,
+        second=second,
+        single=TEMPLATES["identify"][wording].format(first=first, second=second, attribute=name),
+    )
 
 
 def language_of(kind: str) -> Language:

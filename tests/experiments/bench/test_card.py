@@ -10,7 +10,7 @@ from touchr1_jax.bench.items import Item
 
 def failing(items, source, **changes) -> list[str]:
     made = dataclasses.replace(source, **changes)
-    return [check.name for check in card.checks(items, made.bench, made.train) if not check.passed]
+    return [check.name for check in card.checks(items, made.bench, made.train) if not check.met]
 
 
 def change(item: Item, **fields) -> Item:

@@ -35,19 +35,19 @@ def in_words(given):
 
 def test_blank_sheets_hold_the_same_objects_in_other_orders(tmp_path):
     names = [f"o{n}" for n in range(30)]
-    annotate.write_blank([str(tmp_path / "a.csv"), str(tmp_path / "b.csv")], names, 0)
+    annotate.write_blank([tmp_path / "a.csv", tmp_path / "b.csv"], names, 0)
     a, b = ((tmp_path / f).read_text().splitlines()[1:] for f in ("a.csv", "b.csv"))
     assert sorted(a) == sorted(b)
     assert a != b
     assert a[0].endswith(",,,,")
     with pytest.raises(SheetError, match="may be filled in"):
-        annotate.write_blank([str(tmp_path / "a.csv")], names, 0)
+        annotate.write_blank([tmp_path / "a.csv"], names, 0)
 
 
 def test_a_filled_in_sheet_is_read_as_levels(tmp_path):
-    annotate.write_blank([str(tmp_path / "a.csv")], OBJECTS, 0)
+    annotate.write_blank([tmp_path / "a.csv"], OBJECTS, 0)
     fill(tmp_path / "a.csv", in_words(labels()))
-    assert annotate.read_labels(str(tmp_path / "a.csv"), OBJECTS) == labels()
+    assert annotate.read_labels(tmp_path / "a.csv", OBJECTS) == labels()
 
 
 @pytest.mark.parametrize(
@@ -83,15 +83,15 @@ def test_disagreements_are_decided_by_a_third(tmp_path):
     a, b = labels(), labels(cup=(1, 0, 2, 1))
     assert list(annotate.open_cases(a, b).values()) == [("cup", "hardness"), ("cup", "protrusion")]
     path = tmp_path / "open.csv"
-    annotate.write_open(str(path), a, b)
+    annotate.write_open(path, a, b)
     assert "firm or soft" in path.read_text()
     with pytest.raises(SheetError, match="decision is ''"):
-        annotate.read_decisions(str(path), a, b)
+        annotate.read_decisions(path, a, b)
     fill(path, lambda row: {"decision": "firm" if "hardness" in row["case"] else "rough"})
     with pytest.raises(SheetError, match="'rough': must be one of flat, bumpy, protruding"):
-        annotate.read_decisions(str(path), a, b)
+        annotate.read_decisions(path, a, b)
     fill(path, lambda row: {"decision": "firm" if "hardness" in row["case"] else "flat"})
-    final = annotate.adjudicate(a, b, annotate.read_decisions(str(path), a, b))
+    final = annotate.adjudicate(a, b, annotate.read_decisions(path, a, b))
     assert final == labels(cup=(1, 0, 0, 1))
 
 
@@ -113,7 +113,7 @@ def test_a_sample_hides_where_its_items_come_from(items, source, tmp_path):
     key = audit.sample(items, 40, 0)
     assert list(key)[:2] == ["01", "02"]
     assert len(set(key.values())) == 40
-    audit.write_blank(str(tmp_path / "s.csv"), items, key, source.bench.by_touch())
+    audit.write_blank(tmp_path / "s.csv", items, key, source.bench.by_touch())
     text = (tmp_path / "s.csv").read_text()
     assert not any(name in text for name in key.values())
     assert (
@@ -126,13 +126,13 @@ def test_a_sample_hides_where_its_items_come_from(items, source, tmp_path):
 
 def test_pass_rates_by_hand(items, source, tmp_path):
     key = audit.sample(items, 40, 0)
-    audit.write_blank(str(tmp_path / "s.csv"), items, key, source.bench.by_touch())
+    audit.write_blank(tmp_path / "s.csv", items, key, source.bench.by_touch())
     faulty = {"01": "grounded", "02": "self-consistent"}
     fill(
         tmp_path / "s.csv",
         lambda row: {axis: "no" if faulty.get(row["number"]) == axis else "Yes" for axis in audit.AXES},
     )
-    judged = audit.read_judgement(str(tmp_path / "s.csv"), key)
+    judged = audit.read_judgement(tmp_path / "s.csv", key)
     rows = {row.axis: row for row in audit.pass_rates(judged, key, items)}
     assert rows["grounded"].rate.mean == 39 / 40
     assert rows["fits the labels"].rate.mean == 1
@@ -147,7 +147,7 @@ def test_audits_by_command(items, source, tmp_path, capsys):
     path, sheet, key = tmp_path / "items.jsonl", tmp_path / "s.csv", tmp_path / "s.key.json"
     write_items(path, items)
     sample = audit.sample(items, 20, 1)
-    audit.write_blank(str(sheet), items, sample, source.bench.by_touch())
+    audit.write_blank(sheet, items, sample, source.bench.by_touch())
     fill(sheet, lambda row: dict.fromkeys(audit.AXES, "yes"))
     write_json(key, sample)
     assert main(["audit", str(path), str(key), str(sheet), str(sheet)]) == 0
