@@ -66,14 +66,14 @@ def compile_constraint(language: Language, tokenizer: Tokenizer) -> Constraint:
     place_after = _places_after(lexer.events)
     successor = _successors(lexer, place_after)
     may_end = (place_after[lexer.end_list] // 2 == _TAGS).reshape(-1)
-    writable = np.unique(lexer.token_class[~tokenizer.banned & ~is_end])
+    writable = np.unique(lexer.own_class[~tokenizer.banned & ~is_end])
     need = _fewest_tokens(successor[:, writable], may_end)
     if need[0] >= _NEVER:
         raise ValueError(
             f"tags {language.tags}: no sequence of tokens of this vocabulary is a formatted answer; "
             "add tokens that write the tags and some text"
         )
-    return Constraint(token_class=lexer.token_class, is_end=is_end, successor=successor, need=need, may_end=may_end)
+    return Constraint(token_class=lexer.own_class, is_end=is_end, successor=successor, need=need, may_end=may_end)
 
 
 def _places_after(events: np.ndarray) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""From token ids to events: an automaton over bytes, compiled on the host into tables over tokens.
+"""From token ids to events: an automaton over characters, compiled on the host into tables over tokens.
 
 Definitions, here and in the parser:
-  White space is ASCII white space.  Word characters are ASCII letters, digits, "_" and every byte ≥ 0x80, so that a
-  non-ASCII letter and the replacement character of broken UTF-8 behave alike in bytes and in text.
+  White space is ASCII white space.  Word characters are Unicode's letters, marks, numbers and connectors (see
+  `characters`); punctuation of any script, symbols and broken UTF-8 end a word as "." does.
   A tag is its literal lower-case bytes, `<perceive>`, wherever they stand, even inside a word; it breaks words.
   Phrases (level words, sensor names) match whole words outside tags, ASCII case-folded; a blank in a phrase matches one
   run of white space, a hyphen one hyphen.  Matching runs left to right over sensors and levels together; at each word
@@ -10,14 +10,17 @@ Definitions, here and in the parser:
 
 The events are: a tag, a phrase, and the first character after a tag (or the start) that is neither white nor part of a
 tag.  A token is a function from state to (state, events); tokens with equal functions share a class, so that the tables
-of a 150k vocabulary stay small.
+of a 150k vocabulary stay small.  A character that is cut between tokens counts at its last byte; its first emits that
+there is text.
 """
 
 import dataclasses
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
+from touchr1_jax.text.characters import A_BREAK, BEGUN, BOTH, NOTHING, WORD, Spelling
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.tokenizer import Tokenizer
 
@@ -30,6 +33,7 @@ EMPTY_CLASS = 0
 _WORD = re.compile(r"[a-z0-9_\x80]+")
 _FOREIGN = "\x80"  # stands for every word that begins no phrase
 _BREAK = "."  # stands for every character that is neither white, nor hyphen, nor of a word
+_BEGUN = "…"  # stands for the first bytes of a character that is not ASCII
 
 State = tuple[str, str, bool]  # beginning of a tag, beginning of a phrase, whether text was met since the last tag
 
@@ -38,16 +42,28 @@ State = tuple[str, str, bool]  # beginning of a tag, beginning of a phrase, whet
 class Lexer:
     """A language × tokenizer as tables: C token classes, Q states (0 starts), B lists of at most E events.
 
-    Token v in state q leads to state `next_state[token_class[v], q]` and emits the events of list
-    `event_list[token_class[v], q]`; the end of the text emits those of list `end_list[q]`.  `events[b]` is padded with
-    `NONE`; list 0 is empty; class 0 changes nothing.
+    Token v in state q leads to state `next_state[c, q]` and emits the events of list `event_list[c, q]`; the end of
+    the text emits those of list `end_list[q]`.  `events[b]` is padded with `NONE`; list 0 is empty; class 0 changes
+    nothing.
+    Its class c is `token_class[j, v]`, where j is what its first bytes complete of a character that is cut between
+    tokens: j = `completes[head[v], u]` for the open character u, after which `leaves[head[v], u]` is open, or `tail[v]`
+    where that is not −1.
     """
 
-    token_class: np.ndarray  # int32 [V]
+    token_class: np.ndarray  # int32 [4, V]
+    head: np.ndarray  # int32 [V]
+    tail: np.ndarray  # int32 [V]
+    completes: np.ndarray  # int32 [H, U]
+    leaves: np.ndarray  # int32 [H, U]
     next_state: np.ndarray  # int32 [C, Q]
     event_list: np.ndarray  # int32 [C, Q]
     end_list: np.ndarray  # int32 [Q]
     events: np.ndarray  # int32 [B, E]
+
+    @property
+    def own_class(self) -> np.ndarray:
+        """Class of each token as far as tags and text go, whatever is open before it, int32 [V]."""
+        return np.where(self.completes[self.head, 0] == NOTHING, self.token_class[NOTHING], self.token_class[A_BREAK])
 
 
 def phrases_of(language: Language) -> list[str]:
@@ -72,17 +88,23 @@ def tags_of(language: Language) -> list[str]:
 def compile_lexer(language: Language, tokenizer: Tokenizer) -> Lexer:
     """Build the tables of a language for a vocabulary; well under a second for 150k tokens.
 
-    The class of a token is found byte by byte: class(token + byte) = class(token) ∘ byte, each product computed once.
+    The class of a token is found unit by unit: class(token + unit) = class(token) ∘ unit, each product computed once.
     """
     lists = _EventLists()
     rules = _Rules(language)
-    states, byte_next, byte_list = _byte_tables(rules, lists)
-    classes = _Classes(len(states), byte_next, byte_list, lists)
-    token_class = np.array([classes.of(piece) for piece in tokenizer.pieces])
+    states, unit_next, unit_list = _unit_tables(rules, lists)
+    classes = _Classes(len(states), unit_next, unit_list, lists)
+    spelling = Spelling(tokenizer.pieces)
+    cases, tokens = range(NOTHING, BOTH + 1), range(len(tokenizer.pieces))
+    token_class = np.array([[classes.of(spelling.completed(v, case)) for v in tokens] for case in cases])
     used, token_class = np.unique(np.append(token_class, EMPTY_CLASS), return_inverse=True)
     end_list = [lists.index(rules.finish(state)) for state in states]
     return Lexer(
-        token_class=token_class[:-1].astype(np.int32),
+        token_class=token_class[:-1].reshape(len(cases), -1).astype(np.int32),
+        head=spelling.head,
+        tail=spelling.tail,
+        completes=spelling.completes,
+        leaves=spelling.leaves,
         next_state=np.stack([classes.rows[c][0] for c in used]).astype(np.int32),
         event_list=np.stack([classes.rows[c][1] for c in used]).astype(np.int32),
         end_list=np.array(end_list, np.int32),
@@ -91,7 +113,7 @@ def compile_lexer(language: Language, tokenizer: Tokenizer) -> Lexer:
 
 
 class _Rules:
-    """The byte automaton: one character leads from state to state and emits events."""
+    """The automaton: one character leads from state to state and emits events."""
 
     start: State = ("", "", False)
 
@@ -102,14 +124,16 @@ class _Rules:
         self.phrase_beginnings = {p[:n] for p in self.phrases for n in range(len(p) + 1)}
         self.letters = set("".join([*self.tags, *self.phrases]))
 
-    def symbol(self, byte: int) -> str:
-        """The character that stands for a byte; one for all bytes that no rule distinguishes."""
-        char = chr(byte)
+    def symbol(self, unit: int) -> str:
+        """The character that stands for a unit of `characters`; one for all units that no rule distinguishes."""
+        char = chr(unit)
         if char in " \t\n\r\v\f":
             return " "
-        if byte >= 0x80 or (_WORD.fullmatch(char.lower()) and char.lower() not in self.letters):
+        if unit == WORD or (unit < WORD and _WORD.fullmatch(char.lower()) and char.lower() not in self.letters):
             return _FOREIGN
-        return char if char.isalnum() or char in "_-</>" else _BREAK
+        if unit == BEGUN:
+            return _BEGUN
+        return char if unit < WORD and (char.isalnum() or char in "_-</>") else _BREAK
 
     def step(self, state: State, char: str) -> tuple[State, list[int]]:
         """Read one symbol."""
@@ -120,6 +144,8 @@ class _Rules:
         is_text = not grows and (tag != "" or char not in " <")
         events = [TEXT] if is_text and not met else []
         next_tag = tag + char if grows else "<" if char == "<" else ""
+        if char == _BEGUN:
+            return (next_tag, phrase, True), events
         found, phrase = self._settle(self._extend(phrase, char))
         return (next_tag, phrase, met or is_text), events + found
 
@@ -175,9 +201,9 @@ class _EventLists:
         return table
 
 
-def _byte_tables(rules: _Rules, lists: _EventLists) -> tuple[list[State], np.ndarray, np.ndarray]:
-    """Explore the byte automaton: its Q states, next state [256, Q] and event list [256, Q] of each byte."""
-    symbols = [rules.symbol(byte) for byte in range(256)]
+def _unit_tables(rules: _Rules, lists: _EventLists) -> tuple[list[State], np.ndarray, np.ndarray]:
+    """Explore the automaton: its Q states, next state [131, Q] and event list [131, Q] of each unit."""
+    symbols = [rules.symbol(unit) for unit in range(BEGUN + 1)]
     states: dict[State, int] = {rules.start: 0}
     columns: list[dict[str, tuple[int, int]]] = []
     queue = [rules.start]
@@ -195,29 +221,29 @@ def _byte_tables(rules: _Rules, lists: _EventLists) -> tuple[list[State], np.nda
 
 
 class _Classes:
-    """Distinct functions state → (state, events) and their products with single bytes."""
+    """Distinct functions state → (state, events) and their products with single units."""
 
-    def __init__(self, states: int, byte_next: np.ndarray, byte_list: np.ndarray, lists: _EventLists) -> None:
-        self._byte_next, self._byte_list, self._lists = byte_next, byte_list, lists
-        self._symbol = np.unique(np.concatenate([byte_next, byte_list], 1), axis=0, return_inverse=True)[1].tolist()
+    def __init__(self, states: int, unit_next: np.ndarray, unit_list: np.ndarray, lists: _EventLists) -> None:
+        self._unit_next, self._unit_list, self._lists = unit_next, unit_list, lists
+        self._symbol = np.unique(np.concatenate([unit_next, unit_list], 1), axis=0, return_inverse=True)[1].tolist()
         identity = (np.arange(states), np.zeros(states, np.int64))
         self.rows: list[tuple[np.ndarray, np.ndarray]] = [identity]
         self._index: dict[bytes, int] = {self._key(identity): EMPTY_CLASS}
         self._product: dict[tuple[int, int], int] = {}
 
-    def of(self, piece: bytes) -> int:
-        """Class of a token that adds these bytes."""
+    def of(self, piece: Sequence[int]) -> int:
+        """Class of a token that adds these units."""
         token_class = EMPTY_CLASS
-        for byte in piece:
-            key = (token_class, self._symbol[byte])
+        for unit in piece:
+            key = (token_class, self._symbol[unit])
             if key not in self._product:
-                self._product[key] = self._compose(token_class, byte)
+                self._product[key] = self._compose(token_class, unit)
             token_class = self._product[key]
         return token_class
 
-    def _compose(self, token_class: int, byte: int) -> int:
+    def _compose(self, token_class: int, unit: int) -> int:
         state, events = self.rows[token_class]
-        after, more = self._byte_next[byte][state], self._byte_list[byte][state]
+        after, more = self._unit_next[unit][state], self._unit_list[unit][state]
         joined = np.where(events == 0, more, events)
         for q in np.flatnonzero((events != 0) & (more != 0)):
             joined[q] = self._lists.joined(int(events[q]), int(more[q]))

@@ -5,10 +5,12 @@ It shares no code with `lexer` and `parser`, only the definitions in their docst
 
 import dataclasses
 import re
+import unicodedata
 
 from touchr1_jax.text.language import Language
 
-_WORD = r"[a-z0-9_\x80-\U0010FFFF]"
+_LETTER, _OTHER = "\x80", "\x81"  # stand for every character beyond ASCII that continues a word, and that ends one
+_WORD = rf"[a-z0-9_{_LETTER}]"
 _FOLD = {upper: upper + 32 for upper in range(ord("A"), ord("Z") + 1)}
 
 
@@ -52,7 +54,13 @@ def _phrases(language: Language, body: str) -> list[str]:
     by_length = sorted({*sensors, *levels}, key=len, reverse=True)
     choices = "|".join(re.escape(phrase).replace(r"\ ", r"[ \t\n\r\v\f]+") for phrase in by_length)
     pattern = f"(?<!{_WORD})(?:{choices})(?!{_WORD})"
-    return [re.sub(r"[ \t\n\r\v\f]+", " ", match) for match in re.findall(pattern, body.translate(_FOLD))]
+    plain = "".join(char if char.isascii() else _kind(char) for char in body).translate(_FOLD)
+    return [re.sub(r"[ \t\n\r\v\f]+", " ", match) for match in re.findall(pattern, plain)]
+
+
+def _kind(char: str) -> str:
+    kind = unicodedata.category(char)
+    return _LETTER if kind[0] in "LMN" or kind == "Pc" else _OTHER
 
 
 def _perceive(language: Language, body: str) -> list[list[int]]:

@@ -51,7 +51,7 @@ class Parser:
             raise ValueError(f"tokens have shape {tokens.shape}: must be one completion [T]; use jax.vmap(parser)")
         is_end = jnp.any(tokens[:, None] == jnp.array(self.end_ids), axis=-1)
         ended = jnp.cumsum(is_end) > 0
-        token_class = jnp.where(ended, EMPTY_CLASS, jnp.asarray(self.lexer.token_class)[tokens])
+        token_class = jnp.where(ended, EMPTY_CLASS, self._classes(tokens))
         perceive, compare, conclude, formatted = self._read(self._events(token_class))
         return Parsed(
             perceive=perceive,
@@ -61,6 +61,23 @@ class Parser:
             truncated=~jnp.any(is_end),
             length=jnp.sum(~ended, dtype=jnp.int32),
         )
+
+    def _classes(self, tokens: Int[Array, "T"]) -> Int[Array, "T"]:
+        """Class of each token after those before it, of which it may complete a character."""
+        lexer, whole = self.lexer, jnp.asarray(self.lexer.token_class)
+        if lexer.completes.shape[1] == 1:
+            return whole[0, tokens]  # no token holds a part of a character
+        completes, leaves = jnp.asarray(lexer.completes), jnp.asarray(lexer.leaves)
+
+        def step(
+            is_open: Int[Array, ""], token: tuple[Int[Array, ""], Int[Array, ""]]
+        ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+            head, tail = token
+            return jnp.where(tail < 0, leaves[head, is_open], tail), completes[head, is_open]
+
+        each = (jnp.asarray(lexer.head)[tokens], jnp.asarray(lexer.tail)[tokens])
+        _, completed = jax.lax.scan(step, jnp.int32(0), each, unroll=_UNROLL)
+        return whole[completed, tokens]
 
     def _events(self, token_class: Int[Array, "T"]) -> Int[Array, "N"]:
         """Events of a text in order, `NONE` in between."""
