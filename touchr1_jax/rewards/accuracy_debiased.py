@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.rewards.accuracy import credit
@@ -27,20 +27,12 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
     Raises:
       ValueError: a prior that is not [A, K], negative, or whose rows do not sum to 1.
     """
-    prior = np.asarray(prior, np.float32)
-    if prior.ndim != 2:
-        raise ValueError(f"prior has shape {prior.shape}: must be [A, K]; give one row per attribute")
-    for a, row in enumerate(prior):
-        if not (np.all(row >= 0) and abs(row.sum() - 1) <= PRIOR_TOLERANCE):
-            raise ValueError(
-                f"prior[{a}] is {row.tolist()}: must be ≥ 0 and sum to 1; count the training labels, "
-                "and give an attribute without labels a uniform row"
-            )
+    prior = checked_prior(prior)
 
     def value(parsed: Parsed, target: Target) -> Float[Array, ""]:
         answer = parsed.conclude
-        expected, exists = _constant_earnings(prior, target)
-        own = jnp.take_along_axis(expected, jnp.maximum(answer, 0)[:, None], axis=1, mode="clip")[:, 0]
+        expected, exists = constant_earnings(prior, target)
+        own = at_level(expected, answer)
         bias = jnp.where((answer < 0) | (target.label < 0), 0.0, own - masked.mean(expected, exists, axis=1))
         earned = credit(answer, target.label, target.levels, target.ordinal)
         return masked.mean(earned - bias, target.asked)
@@ -53,7 +45,30 @@ def uniform_prior(levels: Sequence[int]) -> np.ndarray:
     return np.array([[1 / k if level < k else 0.0 for level in range(max(levels))] for k in levels], np.float32)
 
 
-def _constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:
+def checked_prior(prior: np.ndarray) -> np.ndarray:
+    """The prior as float32.
+
+    Raises:
+      ValueError: a prior that is not [A, K], negative, or whose rows do not sum to 1.
+    """
+    prior = np.asarray(prior, np.float32)
+    if prior.ndim != 2:
+        raise ValueError(f"prior has shape {prior.shape}: must be [A, K]; give one row per attribute")
+    for a, row in enumerate(prior):
+        if not (np.all(row >= 0) and abs(row.sum() - 1) <= PRIOR_TOLERANCE):
+            raise ValueError(
+                f"prior[{a}] is {row.tolist()}: must be ≥ 0 and sum to 1; count the training labels, "
+                "and give an attribute without labels a uniform row"
+            )
+    return prior
+
+
+def at_level(table: Float[Array, "A K"], level: Int[Array, "A"]) -> Float[Array, "A"]:
+    """Of each attribute the entry at a level; that of level 0 where it is ⊥."""
+    return jnp.take_along_axis(table, jnp.maximum(level, 0)[:, None], axis=1, mode="clip")[:, 0]
+
+
+def constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:
     """Mean credit r̄(k) of the constant answer k, and the mask of levels that an attribute has, both [A, K]."""
     level = jnp.arange(prior.shape[1])
     levels, ordinal = target.levels[:, None, None], target.ordinal[:, None, None]
