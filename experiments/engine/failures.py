@@ -16,7 +16,7 @@ from touchr1_jax.rl.stream_check import ROUNDING_NAT
 
 WATCHING = Paper(tactile_use=TactileUse.RECOMMENDED, tactile_weight=0.0)
 PAPER = GrpoVariant(name="paper", algorithm=Paper())
-STABLE = GrpoVariant(name="stable", algorithm=Stable(), accuracy="accuracy_debiased", consistency="consistency_gated")
+STABLE = GrpoVariant(name="stable", algorithm=Stable())
 WATCHED = GrpoVariant(name="paper, controls watched", algorithm=WATCHING)
 LITERAL = GrpoVariant(name="paper, literal bonus", algorithm=Paper(tactile_use=TactileUse.LITERAL), accuracy="exact")
 SCORE_FUNCTION = GrpoVariant(name="paper, k1", algorithm=Paper(kl="k1"))

@@ -43,7 +43,7 @@ from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.losses import entropy, exact_kl, token_log_probs
 from touchr1_jax.rl.metrics import answer_metrics
 from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn
+from touchr1_jax.rl.scoring import ScoreFn, reward_weights
 from touchr1_jax.rl.stream_check import check_streams
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, Parsed, Rollout, Target
@@ -74,12 +74,11 @@ class TrainingBudget:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GrpoVariant:
-    """The static part of a program: the algorithm, and the rewards that stand for accuracy and consistency."""
+    """The static part of a program: the algorithm, and the reward that stands for accuracy."""
 
     name: str
     algorithm: AnyAlgorithm
     accuracy: str = "accuracy"
-    consistency: str = "consistency"
 
 
 class Hyperparameters(NamedTuple):
@@ -243,8 +242,8 @@ def reinforce(
 def make_world_score(variant: GrpoVariant, values: Hyperparameters) -> ScoreFn:
     """R = (.9 − w) accuracy + w consistency + .1 format, with the library's rewards and a traced w."""
     rewards = make_rewards(np.full((A, K), 1 / K, np.float32))
-    weights = {variant.accuracy: 1 - FORMAT - values.consistency, variant.consistency: values.consistency}
-    weights["format"] = FORMAT
+    shares = {variant.accuracy: 1 - FORMAT - values.consistency, "consistency": values.consistency, "format": FORMAT}
+    weights = reward_weights(variant.algorithm, shares)
 
     def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
         parsed = PARSER(tokens)

@@ -18,9 +18,9 @@ from experiments.core.loops import run_loop, stage_hooks
 from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS, DescriptionPolicy
 from touchr1_jax import masked
 from touchr1_jax.rewards import make_rewards
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.rollout import GRPOBatch
-from touchr1_jax.rl.scoring import ScoreFn, make_score
+from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.training.loop import Batches, LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.questions import ONE_AT_A_TIME
@@ -209,7 +209,7 @@ def reinforce(
             policy,
             params,
             iter(batches.to_iter_dataset(ONE_AT_A_TIME)),
-            _score(policy),
+            _score(policy, config.grpo.algorithm),
             config.grpo,
             LoopConfig(steps=config.steps),
             hooks,
@@ -219,9 +219,9 @@ def reinforce(
 
 
 @functools.cache
-def _score(policy: DescriptionPolicy) -> ScoreFn:
+def _score(policy: DescriptionPolicy, algorithm: AnyAlgorithm) -> ScoreFn:
     equal = np.full((len(LANGUAGE.attributes), LEVELS), 1 / LEVELS, np.float32)
-    return make_score(policy.parser, make_rewards(equal), REWARD)
+    return make_score(policy.parser, make_rewards(equal), reward_weights(algorithm, REWARD))
 
 
 def _questions(policy: DescriptionPolicy, params: Params, lesson: Lesson, rows: np.ndarray) -> GRPOBatch:

@@ -80,16 +80,21 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
         f"preset of {arm}": preset_name(dataclasses.replace(config.grpo, algorithm=algorithm))
         for arm, algorithm in ablation.algorithms.items()
     }
+    trained_on = {
+        f"rewards of {arm}": ", ".join(f"{name} {weight:g}" for name, weight in weights.items())
+        for arm, weights in study.arms.items()
+        if weights != ablation.arms[arm]
+    }
     results = study_results(
         study,
         scored,
-        settings={**study_settings(config), **presets},
+        settings={**study_settings(config), **presets, **trained_on},
         comparisons=comparisons,
         verdict=verdict(ablation, comparisons, scored.estimates),
         tables=tables,
         pictures=pictures,
         curves=ablation.drawn,
-        examples=rollout_examples(study, shown, ablation.arms[shown]),
+        examples=rollout_examples(study, shown, study.arms[shown]),
     )
     return study, scored, results
 
@@ -105,7 +110,7 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
         for metric in COMPARED
         if metric in rows[a]
     ]
-    for arm, weights in ablation.arms.items():
+    for arm, weights in study.arms.items():
         after, before = (own_reward(study, study.answers[name], weights) for name in (arm, SFT))
         found.append(compare_over_seeds(OWN_REWARD, arm, SFT, after, before))
     return found

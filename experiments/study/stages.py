@@ -25,7 +25,7 @@ from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score
+from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score, reward_weights
 from touchr1_jax.training import encoding
 from touchr1_jax.training.feeds import AnswerFeed, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
@@ -216,7 +216,8 @@ def make_arm(
     loop: LoopConfig,
     lora: LoraConfig | None = None,
 ) -> GRPOArm:
-    """An arm whose total reward is made of its weights and the prior."""
+    """An arm whose total reward is made of its weights, in the form that its algorithm asks for, and the prior."""
+    weights = reward_weights(config.algorithm, weights)
     score = make_score(policy.parser, make_rewards(prior), weights, policy.tokenizer.decode)
     return GRPOArm(weights=weights, prior=prior, score=score, config=config, loop=loop, lora=lora)
 

@@ -36,7 +36,7 @@ from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
-from touchr1_jax.rewards import Reward, RewardError, make_rewards, uniform_prior
+from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
@@ -141,7 +141,7 @@ def run_study(
       ValueError, RewardError, SizeError, EncoderError: as `check_variants`, `check_arms`, `check_model` and
         `load_encoder`.
     """
-    check_arms(arms)
+    check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()})
     check_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
@@ -152,7 +152,7 @@ def run_study(
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
-def check_arms(arms: Mapping[str, Weights], rewards: Mapping[str, Reward] | None = None) -> None:
+def check_arms(arms: Mapping[str, Weights], rewards: Mapping[str, AnyReward] | None = None) -> None:
     """Try every weighted reward of every arm, so that a misfit is reported before anything is made.
 
     Raises:
@@ -225,7 +225,7 @@ def train_study(
         policy=policy,
         probed=probed,
         prior=prior,
-        arms=arms,
+        arms={name: arm.weights for name, arm in made.items()},
         answers=answers,
         variants=further,
     )
@@ -234,7 +234,8 @@ def train_study(
 def make_study_arm(
     config: TrainingConfig, policy: TouchPolicy, weights: Weights, prior: np.ndarray, algorithm: AnyAlgorithm
 ) -> GRPOArm:
-    """An arm with a study's steps and adapters."""
+    """An arm with a study's steps, adapters and further rewards."""
+    weights = {**weights, **config.more_rewards}
     grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
     return make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
 

@@ -49,6 +49,8 @@ class TrainingConfig(SourceConfig):
     blind: StudySFT = StudySFT(micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
     grpo: GRPOConfig = GRPOConfig.paper()
+    more_rewards: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 900
     grpo_save_every: int = 200
     grpo_lora_rank: int = 0

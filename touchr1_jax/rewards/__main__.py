@@ -1,8 +1,9 @@
-"""`python -m touchr1_jax.rewards`: list the rewards, or explain the score of one answer.
+"""`python -m touchr1_jax.rewards`: list the rewards, explain the score of one answer, search for answers that cheat.
 
 python -m touchr1_jax.rewards list
 python -m touchr1_jax.rewards explain --text "<perceive> xense soft </perceive> <compare> soft </compare> …"
 python -m touchr1_jax.rewards explain --text "…" --label hardness firm --weights accuracy 0.6 format 0.1
+python -m touchr1_jax.rewards adversary --prior 0.5 0.3 0.2
 """
 
 import dataclasses
@@ -19,7 +20,15 @@ from jaxtyping import Array
 from rich.console import Console
 from rich.table import Table
 
-from touchr1_jax.rewards import AnyReward, check_weights, make_rewards, total_reward, uniform_prior
+from touchr1_jax.rewards import (
+    AnyReward,
+    check_weights,
+    make_rewards,
+    stable_weights,
+    total_reward,
+    uniform_prior,
+)
+from touchr1_jax.rewards.adversary import ACCURACY, AnswerProgram, earnings, programs, with_prior
 from touchr1_jax.rewards.base import GROUP, reward_value
 from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
@@ -262,8 +271,43 @@ def _console(stderr: bool = False) -> Console:
     return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=WIDTH)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SearchAnswers:
+    """Search all short answers for those that earn more without touch than an honest answer with touch."""
+
+    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+    """Weight of each reward; by default the published ones, and then the stable ones."""
+    prior: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3)
+    """Share of each level among the labels."""
+    accuracy: float = ACCURACY
+    """Share of right readings of touch."""
+    most: int = 8
+    """Answers of each table."""
+
+    def run(self) -> int:
+        """Print a table for each set of rewards and return the exit status: 0 if the last one has no such answer."""
+        sets = {"chosen": self.weights} if self.weights else {"paper": PUBLISHED, "stable": stable_weights(PUBLISHED)}
+        rewards = make_rewards(with_prior(self.prior))
+        better: list[tuple[AnswerProgram, float]] = []
+        for name, weights in sets.items():
+            try:
+                found = earnings(rewards, weights, self.prior)
+            except ValueError as error:
+                _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
+                return 1
+            better, honest = found.better(self.accuracy), found.expected(self.accuracy)[-1]
+            total = f"{len(better)} of {len(programs())} answers earn more than the honest one, {honest:.3f}"
+            table = Table("layout: perceive → compare → conclude", "earns", "more by", title=f"{name}: {total}")
+            for program, lead in better[: self.most]:
+                table.add_row(str(program), f"{honest + lead:.3f}", f"{lead:.3f}")
+            _console().print(table)
+        return int(bool(better))
+
+
 Command = (
-    Annotated[ListRewards, tyro.conf.subcommand("list")] | Annotated[ExplainAnswer, tyro.conf.subcommand("explain")]
+    Annotated[ListRewards, tyro.conf.subcommand("list")]
+    | Annotated[ExplainAnswer, tyro.conf.subcommand("explain")]
+    | Annotated[SearchAnswers, tyro.conf.subcommand("adversary")]
 )
 
 

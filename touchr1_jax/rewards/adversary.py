@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from touchr1_jax.rewards.base import Reward, total_reward
+from touchr1_jax.rewards.base import AnyReward, total_reward
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.oracle import read
 from touchr1_jax.types import Parsed, Target
@@ -96,7 +96,7 @@ class Earnings:
         return sorted((lead for lead in leads if lead[1] > slack), key=lambda lead: -lead[1])
 
 
-def earnings(rewards: Mapping[str, Reward], weights: Mapping[str, float], prior: Sequence[float]) -> Earnings:
+def earnings(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], prior: Sequence[float]) -> Earnings:
     """Reward of every program for every reading and label.
 
     Args:

@@ -74,6 +74,8 @@ class Algorithm:
     average: Average = Average.ROLLOUT
     advantage: Advantage = Advantage.GROUP
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
+    stable_rewards: bool = False
+    """Take each published reward in the form that no answer without touch outwits (`rewards.STABLE`)."""
     epsilon: float = 1e-4
     """Added to σ, in the units of the reward."""
     drop_degenerate: bool = False
@@ -138,7 +140,8 @@ class Paper(Algorithm):
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Stable(Algorithm):
     """Departures that keep the objective bounded: no gradient through the masked branch, G_tg capped at 1 nat a token,
-    exact KL, groups of equal rewards left out of the policy-gradient mean, R_tu added after normalisation.
+    exact KL, groups of equal rewards left out of the policy-gradient mean, R_tu added after normalisation, and strict
+    rewards in the place of the published ones (`stable_rewards`).
 
     Further departures: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most
     a twentieth of a standard deviation of the reward, so that at no γ it outweighs the answer; an entropy bonus up to
@@ -152,6 +155,7 @@ class Stable(Algorithm):
     """
 
     advantage: Advantage = Advantage.BATCH
+    stable_rewards: bool = True
     drop_degenerate: bool = True
     beta: float = 0.1
     kl: KLEstimator = "exact"

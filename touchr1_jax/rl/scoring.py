@@ -11,15 +11,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
+from touchr1_jax.rewards import stable_weights
 from touchr1_jax.rewards.base import AnyReward, Decode, on_host, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
+from touchr1_jax.rl.config import Algorithm
 from touchr1_jax.types import Parsed, Target
 
 ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, Array], Parsed]]
 """(tokens, target) → (total reward, its named terms, parsed completion), for one rollout."""
 
-HostReward = Callable[[np.ndarray, Parsed, Target], Mapping[str, float]]
+HostTerms = Callable[[np.ndarray, Parsed, Target], Mapping[str, float]]
 """(tokens, parsed completion, target) of one rollout, all NumPy → its named terms; the reward is their sum."""
+
+
+def reward_weights(algorithm: Algorithm, weights: Mapping[str, float]) -> dict[str, float]:
+    """Weights of the rewards that train by an algorithm: under `stable_rewards` those of their stable forms."""
+    return stable_weights(weights) if algorithm.stable_rewards else dict(weights)
 
 
 NONFINITE_IN = "nonfinite_in_"
@@ -73,7 +80,7 @@ def left_out_groups(
     return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares
 
 
-def make_host_score(parser: Callable[[Int[Array, "T"]], Parsed], reward: HostReward, terms: tuple[str, ...]) -> ScoreFn:
+def make_host_score(parser: Callable[[Int[Array, "T"]], Parsed], reward: HostTerms, terms: tuple[str, ...]) -> ScoreFn:
     """Score by a Python function on the host, for rewards that cannot be traced: slower, the same interface.
 
     The device waits while Python runs, once per step for all rollouts of the batch.

@@ -14,8 +14,7 @@ WORD, BREAK, BEGUN = 128, 129, 130
 """Units beside the ASCII characters: another word character, one that ends a word, the first bytes of either."""
 
 NOTHING, A_WORD, A_BREAK, BOTH = range(4)
-"""What the first bytes of a token complete: no character, a word character, one that ends a word, first one then the
-other."""
+"""Cases of the first bytes of a token: they complete no character, a word character, one that ends a word, or both."""
 
 _PREFIX = ((), (WORD,), (BREAK,), (WORD, BREAK))
 _ENDS_WORD, _IN_WORD = -2, -1  # leaves of the automaton; 0 is an invalid byte, others are nodes
@@ -71,7 +70,7 @@ def _cut(piece: bytes) -> tuple[bytes, tuple[int, ...], bytes]:
 
 
 def _feed(node: int, head: bytes, more: bool) -> tuple[int, int]:
-    """What a head completes from a node, and the node after it; `more` bytes break what stays open."""
+    """Case of a head from a node, and the node after it; `more` bytes break what stays open."""
     nodes, _ = _automaton()
     found: list[bool] = []
     for byte in head:

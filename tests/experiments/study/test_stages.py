@@ -8,10 +8,13 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
-from experiments.study.stages import ProbeFeatures, StudySFT, gather_evidence, run_sft
+from experiments.study.scores import PUBLISHED
+from experiments.study.stages import ProbeFeatures, StudySFT, gather_evidence, make_arm, run_sft
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
+from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.linear_probe import ProbeConfig
+from touchr1_jax.training.loop import LoopConfig
 
 PROBE = ProbeConfig(folds=2, iterations=4)
 CONFIG = StudySFT(steps=3, batch_size=4)
@@ -127,3 +130,12 @@ def test_devices_share_a_micro_batch():
     assert StudySFT().packing(3) is None
     with pytest.raises(ValueError, match="micro_contacts is 8: must be a multiple of the 3 devices"):
         config.packing(3)
+
+
+def test_one_word_chooses_the_stable_engine_and_the_stable_rewards(policy, data):
+    """`grpo.algorithm:stable` alone: rewards that touch must earn; `paper` keeps the weights that it is given."""
+    loop = LoopConfig(steps=1)
+    paper = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig.paper(), loop)
+    stable = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig.stable(), loop)
+    assert paper.weights == PUBLISHED
+    assert stable.weights == {"accuracy_strict": 0.6, "consistency_strict": 0.3, "format_strict": 0.1}

@@ -93,7 +93,7 @@ def test_every_reward_is_a_scalar(name):
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
-        ({"acuracy": 1.0}, r"no reward is called 'acuracy'; choose from accuracy, accuracy_debiased, consistency"),
+        ({"acuracy": 1.0}, r"no reward is called 'acuracy'; choose from accuracy, accuracy_debiased, accuracy_strict"),
         ({"accuracy": -1.0}, r"weights\[accuracy\] is -1\.0: must be finite and ≥ 0"),
         ({"accuracy": float("nan")}, r"weights\[accuracy\] is nan: must be finite"),
         ({"accuracy": 0.0}, r"at least one must be above 0"),
