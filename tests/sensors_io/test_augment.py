@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from sensors_io.augment import (
-    AugmentConfig,
-    Symmetry,
-    apply_symmetry,
-    draw_kept,
-    draw_symmetry,
-    jitter_exposure,
-)
+from sensors_io.augment import AugmentConfig, Symmetry, apply_symmetry, draw_kept, draw_symmetry, jitter_exposure
 from sensors_io.schema import SchemaError
+from tests.sensors_io.checks import refused
 from tests.sensors_io.fakes import sequence
 
 ELEMENTS = [Symmetry(mirrored=m, quarters=q) for m, q in itertools.product((False, True), range(4))]
@@ -172,8 +166,7 @@ class TestDropout:
     ],
 )
 def test_bad_options_are_named(bad, message):
-    with pytest.raises(SchemaError, match=message):
-        AugmentConfig(**bad)
+    refused(SchemaError, message, AugmentConfig, **bad)
 
 
 def test_off_by_default():

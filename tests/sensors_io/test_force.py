@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sensors_io.force import ForceError, Mount, at_frames, estimate_lag, fit_gravity, gravity_directions
+from tests.sensors_io.checks import refused
 
 MS = 1_000_000
 BIAS, BIAS_M = np.array([1.2, -0.4, 3.0]), np.array([20.0, -5.0, 8.0])
@@ -53,16 +54,13 @@ def test_directions_follow_from_the_readings_alone():
 @pytest.mark.parametrize("count", [2, 3])
 def test_too_few_poses_are_refused(count):
     down, force, moment = poses(count)
-    with pytest.raises(ForceError, match="turn the sensor in more directions"):
-        fit_gravity(down[:2], force[:2], moment[:2])
-    with pytest.raises(ForceError, match="span no sphere"):
-        gravity_directions(force)
+    refused(ForceError, "turn the sensor in more directions", fit_gravity, down[:2], force[:2], moment[:2])
+    refused(ForceError, "span no sphere", gravity_directions, force)
 
 
 def test_flat_and_unnormalised_directions_are_refused():
     down, force, moment = poses()
-    with pytest.raises(ForceError, match="length 1"):
-        fit_gravity(2 * down, force, moment)
+    refused(ForceError, "length 1", fit_gravity, 2 * down, force, moment)
     flat = down * [1, 1, 0]
     with pytest.raises(ForceError, match="span no sphere"):
         gravity_directions(BIAS + WEIGHT * flat / np.linalg.norm(flat, axis=-1, keepdims=True))
@@ -71,8 +69,7 @@ def test_flat_and_unnormalised_directions_are_refused():
 def test_a_weightless_mount_has_no_centre():
     down, _, _ = poses()
     zero = np.zeros_like(down)
-    with pytest.raises(ForceError, match=r"weight_n is 0\.0000"):
-        fit_gravity(down, zero, zero).centre_mm
+    refused(ForceError, r"weight_n is 0\.0000", lambda: fit_gravity(down, zero, zero).centre_mm)
 
 
 def test_a_press_on_a_sensor_mounted_upside_down():
@@ -87,10 +84,8 @@ def test_a_press_on_a_sensor_mounted_upside_down():
 
 
 def test_a_mirrored_mount_is_refused():
-    with pytest.raises(ForceError, match="must be a rotation"):
-        Mount(rotation=np.diag([1.0, 1.0, -1.0]))
-    with pytest.raises(ForceError, match="sign is 0"):
-        Mount(sign=0)
+    refused(ForceError, "must be a rotation", lambda: Mount(rotation=np.diag([1.0, 1.0, -1.0])))
+    refused(ForceError, "sign is 0", Mount, sign=0)
 
 
 def presses(lag_s, rate_hz=25.0, seed=0):
@@ -114,10 +109,8 @@ def test_the_lag_is_found_to_a_tenth_of_a_frame(lag):
 def test_unrelated_signals_have_no_lag():
     frame_time, signal, force_time, force = presses(0.0)
     noise = np.random.default_rng(1).standard_normal(len(signal))
-    with pytest.raises(ForceError, match="picture and force agree by"):
-        estimate_lag(frame_time, noise, force_time, force)
-    with pytest.raises(ForceError, match="overlaps by"):
-        estimate_lag(frame_time[:20], signal[:20], force_time, force)
+    refused(ForceError, "picture and force agree by", estimate_lag, frame_time, noise, force_time, force)
+    refused(ForceError, "overlaps by", estimate_lag, frame_time[:20], signal[:20], force_time, force)
 
 
 def test_readings_are_interpolated_and_gaps_are_not():

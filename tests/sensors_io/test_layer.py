@@ -6,15 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sensors_io.layer import Layer, depth_response, normal_compliance, shear_compliance, wave_numbers
+from tests.sensors_io.checks import refused
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 Q = np.geomspace(1e-3, 50, 60)
 
 layers = st.builds(
-    Layer,
-    modulus_mpa=st.floats(0.01, 10),
-    poisson=st.floats(0.0, 0.499),
-    thickness_mm=st.floats(0.3, 30),
+    Layer, modulus_mpa=st.floats(0.01, 10), poisson=st.floats(0.0, 0.499), thickness_mm=st.floats(0.3, 30)
 )
 
 
@@ -99,17 +97,11 @@ def test_wave_numbers_match_the_half_plane_of_rfft2() -> None:
 
 @pytest.mark.parametrize(
     ("field", "changes"),
-    [
-        ("modulus_mpa", {"modulus_mpa": 0.0}),
-        ("poisson", {"poisson": 0.51}),
-        ("thickness_mm", {"thickness_mm": -1.0}),
-    ],
+    [("modulus_mpa", {"modulus_mpa": 0.0}), ("poisson", {"poisson": 0.51}), ("thickness_mm", {"thickness_mm": -1.0})],
 )
 def test_impossible_layers_are_refused(field: str, changes: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match=field):
-        Layer(**{"modulus_mpa": 0.3, "poisson": 0.48, "thickness_mm": 4.0, **changes})
+    refused(ValueError, field, Layer, **{"modulus_mpa": 0.3, "poisson": 0.48, "thickness_mm": 4.0, **changes})
 
 
 def test_markers_outside_the_layer_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"depth_mm is 5\.0: must lie in"):
-        depth_response(Q, GEL, 5.0)
+    refused(ValueError, r"depth_mm is 5\.0: must lie in", depth_response, Q, GEL, 5.0)

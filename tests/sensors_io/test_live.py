@@ -12,6 +12,7 @@ from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import CLIP_ARRAYS, SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=6, sites=1)
 CLIP = ClipConfig(frames=3, image_px=8, view_px=8, sensors=("xense", "tac3d"))
@@ -68,8 +69,7 @@ def test_splits_are_those_of_the_cards(scenes):
     split = scenes.objects["object_0"].split
     rows = scenes.contacts_of_split(split)
     assert [scenes.objects[scenes.contacts[i].object_id].split for i in rows] == [split] * len(rows)
-    with pytest.raises(SchemaError, match="split is 'testing'"):
-        scenes.contacts_of_split("testing")
+    refused(SchemaError, "split is 'testing'", scenes.contacts_of_split, "testing")
 
 
 def test_an_endless_feed_of_single_clips_starts(scenes):

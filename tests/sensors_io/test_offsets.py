@@ -5,6 +5,7 @@ import json
 import pytest
 
 from sensors_io.offsets import Offset, Offsets, OffsetsError
+from tests.sensors_io.checks import refused
 
 FOUND = Offsets(
     reference="netft",
@@ -34,5 +35,4 @@ def test_offsets_come_back(tmp_path):
 )
 def test_anything_else_is_refused(tmp_path, text):
     (tmp_path / "s.json").write_text(text)
-    with pytest.raises(OffsetsError, match="make them with `sync`"):
-        Offsets.load(tmp_path / "s.json")
+    refused(OffsetsError, "make them with `sync`", Offsets.load, tmp_path / "s.json")

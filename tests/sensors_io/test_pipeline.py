@@ -11,6 +11,7 @@ from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches, make_clip
 from sensors_io.records import RecordStore
 from sensors_io.schema import CLIP_ARRAYS, SENSORS, UNKNOWN, Flag, SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 SMALL = ClipConfig(frames=4, image_px=8, view_px=6)
 LIVELY = AugmentConfig(mirror=0.5, turn=0.5, exposure_stops=0.5, white_balance_stops=0.2, frame_dropout=0.3)
@@ -78,10 +79,8 @@ class TestClipMemory:
 
     def test_it_belongs_to_its_clips_and_its_process(self, store):
         other = ClipMemory(ClipConfig(frames=2, image_px=8, view_px=6), 10**9)
-        with pytest.raises(SchemaError, match=r"memory keeps .*frames=2"):
-            self.feed(store, other)
-        with pytest.raises(SchemaError, match="1 worker processes"):
-            self.feed(store, ClipMemory(SMALL, 10**9), workers=1)
+        refused(SchemaError, r"memory keeps .*frames=2", self.feed, store, other)
+        refused(SchemaError, "1 worker processes", lambda: self.feed(store, ClipMemory(SMALL, 10**9), workers=1))
 
 
 class TestMakeClip:
@@ -149,14 +148,11 @@ class TestMakeClip:
         assert clip.label.tolist() == [2, UNKNOWN, UNKNOWN, UNKNOWN]
 
     def test_bad_input_is_named(self):
-        with pytest.raises(SchemaError, match=r"contact is \{\}"):
-            make_clip({}, fakes.card(0), SMALL)
+        refused(SchemaError, r"contact is \{\}", lambda: make_clip({}, fakes.card(0), SMALL))
         with pytest.raises(SchemaError, match="card is of object 'object_1': the contact is of 'object_0'"):
             make_clip(contact(0), fakes.card(1), SMALL)
-        with pytest.raises(SchemaError, match="frames is 0: must be ≥ 1"):
-            ClipConfig(frames=0)
-        with pytest.raises(SchemaError, match="each once"):
-            ClipConfig(sensors=("xense", "xense"))
+        refused(SchemaError, "frames is 0: must be ≥ 1", ClipConfig, frames=0)
+        refused(SchemaError, "each once", ClipConfig, sensors=("xense", "xense"))
 
 
 class TestAugmentedClip:
@@ -317,8 +313,7 @@ class TestClipBatches:
     def test_rows_that_a_batch_does_not_have_are_named(self, store, own):
         with pytest.raises(SchemaError, match=r"own is .* of batches of 3, all whole: must be ascending rows 0\.\.2"):
             self.batches(store, own=own)
-        with pytest.raises(SchemaError, match="the last perhaps smaller"):
-            self.batches(store, own=[0], repeat=False)
+        refused(SchemaError, "the last perhaps smaller", self.batches, store, own=[0], repeat=False)
 
     def test_bad_indices_are_named(self, store):
         with pytest.raises(SchemaError, match="indices is empty: a pipeline needs at least one contact"):

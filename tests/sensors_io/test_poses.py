@@ -8,6 +8,7 @@ import pytest
 
 from sensors_io.force import ForceError
 from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, fit_poses
+from tests.sensors_io.checks import refused
 
 BIAS, BIAS_M = np.array([1.2, -0.4, 3.0]), np.array([20.0, -5.0, 8.0])
 WEIGHT, CENTRE = 1.5, np.array([2.0, -1.0, 12.0])
@@ -60,8 +61,7 @@ def test_a_sensor_that_never_rests_has_no_pose():
 def test_the_same_pose_held_again_is_not_another():
     times, force, moment, _ = turned(count=1, hold_s=5)
     assert len(found_in(times, force, moment)) == 1
-    with pytest.raises(ForceError, match="span no sphere"):
-        fit_poses(found_in(times, force, moment))
+    refused(ForceError, "span no sphere", lambda: fit_poses(found_in(times, force, moment)))
 
 
 def test_a_zero_comes_back_from_its_file(tmp_path):
@@ -80,10 +80,8 @@ def test_a_file_without_a_zero_is_named(tmp_path, change):
     fit_poses(found_in(*turned()[:3])).save(path)
     tree = [] if change is None else json.loads(path.read_text()) | change
     path.write_text(json.dumps(tree))
-    with pytest.raises(ForceError, match="make one with `force-zero`"):
-        ForceZero.load(path)
+    refused(ForceError, "make one with `force-zero`", ForceZero.load, path)
 
 
 def test_configs_are_checked():
-    with pytest.raises(ValueError, match="still_n is 0"):
-        PoseConfig(still_n=0)
+    refused(ValueError, "still_n is 0", PoseConfig, still_n=0)

@@ -8,6 +8,7 @@ import pytest
 from sensors_io import quality
 from sensors_io.quality import QualityConfig
 from sensors_io.schema import ContactKey, Flag, Sequence
+from tests.sensors_io.checks import refused
 
 CONFIG = QualityConfig()
 
@@ -24,8 +25,7 @@ def test_rows_with_a_gap_in_any_column_are_incomplete() -> None:
     force = np.array([[0, 0, -1.0], [0, np.nan, -1], [0, 0, -1]])
     moment = np.array([[0, 0, 0.0], [0, 0, 0], [np.inf, 0, 0]])
     assert quality.incomplete(force, None, moment).tolist() == [False, True, True]
-    with pytest.raises(ValueError, match="all None"):
-        quality.incomplete(None)
+    refused(ValueError, "all None", quality.incomplete, None)
 
 
 def test_force_that_swings_in_a_hold_is_unstable_elsewhere_not() -> None:
@@ -81,5 +81,4 @@ def test_a_sequence_is_judged_by_what_it_holds() -> None:
 
 @pytest.mark.parametrize("wrong", [{"unstable_window": 1}, {"gap_periods": 1.0}, {"saturated_level": 0}])
 def test_limits_that_mean_nothing_are_refused(wrong: dict) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))} is"):
-        QualityConfig(**wrong)
+    refused(ValueError, f"{next(iter(wrong))} is", QualityConfig, **wrong)

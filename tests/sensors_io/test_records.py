@@ -16,6 +16,7 @@ from sensors_io import records
 from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.schema import SENSORS, SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 
 def shards(path):
@@ -64,8 +65,7 @@ def test_splits_are_by_object_and_cover_everything(tmp_path):
     np.testing.assert_array_equal(store.contacts_of_split("val"), [4, 5])
     np.testing.assert_array_equal(store.contacts_of_split("test"), [6, 7])
     assert store.contacts_of_split("unlabelled").shape == (0,)
-    with pytest.raises(SchemaError, match="split is 'dev': must be one of train, val, test, unlabelled"):
-        store.contacts_of_split("dev")
+    refused(SchemaError, "split is 'dev': must be one of train, val, test, unlabelled", store.contacts_of_split, "dev")
 
 
 def test_a_store_can_be_sent_to_a_worker(tmp_path):
@@ -110,13 +110,11 @@ class TestBadInput:
         ids=["empty", "keys", "twice", "stored", "card", "sensor", "length"],
     )
     def test_a_bad_contact_is_refused_before_anything_is_written(self, writer, sequences, message):
-        with pytest.raises(SchemaError, match=message):
-            writer.write_contact(sequences)
+        refused(SchemaError, message, writer.write_contact, sequences)
         assert writer.contacts_done == 1
 
     def test_an_object_is_stored_once(self, writer):
-        with pytest.raises(SchemaError, match="object_id is 'object_0'"):
-            writer.write_object(fakes.card(0))
+        refused(SchemaError, "object_id is 'object_0'", lambda: writer.write_object(fakes.card(0)))
         with pytest.raises(SchemaError, match="object_9: its settings cannot be stored as JSON"):
             writer.write_object(fakes.card(9, truth={"modulus_mpa": float("nan")}))
 
@@ -133,10 +131,8 @@ class TestInterrupted:
                     writer.write_contact(contact)
                 raise RuntimeError("stop")
 
-        with pytest.raises(RuntimeError, match="stop"):
-            stop_after_two()
-        with pytest.raises(records.IncompleteRecordsError, match="2 contacts and its writing has not ended"):
-            RecordStore(tmp_path)
+        refused(RuntimeError, "stop", stop_after_two)
+        refused(records.IncompleteRecordsError, "2 contacts and its writing has not ended", RecordStore, tmp_path)
         assert len(RecordStore(tmp_path, allow_incomplete=True)) == 2
 
     def test_resumed_equals_uninterrupted(self, tmp_path):
@@ -219,32 +215,27 @@ class TestDamage:
         return fakes.write(tmp_path / "r", 4, per_shard=2)
 
     def test_no_index(self, tmp_path):
-        with pytest.raises(records.MissingIndexError, match=f"{tmp_path} has no index.json: give the directory"):
-            RecordStore(tmp_path)
+        refused(records.MissingIndexError, f"{tmp_path} has no index.json: give the directory", RecordStore, tmp_path)
 
     @pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": "touchr1-records", "version": 1}'])
     def test_a_damaged_index(self, path, text):
         (path / "index.json").write_text(text)
-        with pytest.raises(records.CorruptRecordsError, match=r"index.json is damaged"):
-            RecordStore(path)
+        refused(records.CorruptRecordsError, r"index.json is damaged", RecordStore, path)
 
     def test_another_version(self, path):
         text = (path / "index.json").read_text().replace('"version":2', '"version":3')
         (path / "index.json").write_text(text)
-        with pytest.raises(records.RecordsVersionError, match="version 3, this code reads 'touchr1-records' versions"):
-            RecordStore(path)
+        refused(records.RecordsVersionError, "version 3, this code reads 'touchr1-records' versions", RecordStore, path)
 
     def test_a_missing_shard(self, path):
         shards(path)[1].unlink()
-        with pytest.raises(records.CorruptRecordsError, match=r"contacts-00001.arrayrecord is missing: copy it again"):
-            RecordStore(path)
+        refused(records.CorruptRecordsError, r"contacts-00001.arrayrecord is missing: copy it again", RecordStore, path)
 
     @pytest.mark.parametrize("keep", [0, 100, -1])
     def test_a_truncated_shard(self, path, keep):
         shard = shards(path)[1]
         shard.write_bytes(shard.read_bytes()[:keep])
-        with pytest.raises(records.CorruptRecordsError, match=r"contacts-00001.arrayrecord has \d+ bytes where \d+"):
-            RecordStore(path)
+        refused(records.CorruptRecordsError, r"contacts-00001.arrayrecord has \d+ bytes where \d+", RecordStore, path)
 
     def test_bytes_flipped_on_disk(self, path):
         shard = shards(path)[0]

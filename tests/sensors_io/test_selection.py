@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from sensors_io.schema import ContactKey, Flag, SchemaError
 from sensors_io.selection import FIELD_MM_PER_COUNT, choose_frames, field_images, nearest_increasing, pick_frames
+from tests.sensors_io.checks import refused
 from tests.sensors_io.fakes import sequence
 
 REJECTED = (Flag.STRAIN_LIMIT, Flag.NOT_CONVERGED, Flag.SATURATED)
@@ -29,8 +30,7 @@ def filmed(change, **changes):
 
 
 @hypothesis.given(
-    value=st.lists(st.floats(-9, 9), min_size=1, max_size=8),
-    level=st.lists(st.floats(-9, 9), min_size=1, max_size=5),
+    value=st.lists(st.floats(-9, 9), min_size=1, max_size=8), level=st.lists(st.floats(-9, 9), min_size=1, max_size=5)
 )
 def test_the_nearest_increasing_positions_are_the_best_of_all(value, level):
     hypothesis.assume(len(level) <= len(value))
@@ -134,8 +134,7 @@ def test_rejected_frames_are_left_out_while_others_remain():
 
 
 def test_a_sequence_without_frames_is_refused():
-    with pytest.raises(SchemaError, match="has no frame; drop the empty sequence"):
-        choose_frames(pressed([]), 8, REJECTED)
+    refused(SchemaError, "has no frame; drop the empty sequence", lambda: choose_frames(pressed([]), 8, REJECTED))
 
 
 def test_field_images_have_one_fixed_scale():

@@ -24,10 +24,7 @@ def press_ball(
     background = np.full((*shape, 3), GREY)
     to_bytes = lambda image: np.clip(image, 0, 255).round().astype(np.uint8)
     return BallPresses(
-        pictures=to_bytes(np.stack(pictures)),
-        background=to_bytes(background),
-        radius_mm=radius_mm,
-        mm_per_px=mm_per_px,
+        pictures=to_bytes(np.stack(pictures)), background=to_bytes(background), radius_mm=radius_mm, mm_per_px=mm_per_px
     )
 
 

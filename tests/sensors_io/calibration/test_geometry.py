@@ -6,12 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sensors_io.calibration.geometry import (
-    CameraGeometry,
-    GeometryError,
-    find_pins,
-    fit_geometry,
-)
+from sensors_io.calibration.geometry import CameraGeometry, GeometryError, find_pins, fit_geometry
+from tests.sensors_io.checks import refused
 
 BOARD = pathlib.Path(__file__).parents[2] / "data" / "9DTact"
 SIZE = (240, 320)
@@ -86,20 +82,15 @@ def test_a_geometry_is_saved_and_loaded(tmp_path):
     point = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(loaded.to_mm(point), lens().to_mm(point))
     (tmp_path / "g.json").write_text("{}")
-    with pytest.raises(GeometryError, match="is no geometry"):
-        CameraGeometry.load(tmp_path / "g.json")
+    refused(GeometryError, "is no geometry", CameraGeometry.load, tmp_path / "g.json")
 
 
 def test_bad_boards_are_refused():
     empty = np.full(SIZE, 150, np.uint8)
     points = pins(lens())
-    with pytest.raises(GeometryError, match="must be of the background's"):
-        find_pins(empty, empty[:-1], rows=7, columns=9)
-    with pytest.raises(GeometryError, match="of 63 pins"):
-        find_pins(picture(points[:4]), empty, rows=7, columns=9)
-    with pytest.raises(GeometryError, match="press the board"):
-        find_pins(picture(points), empty, rows=9, columns=7)
-    with pytest.raises(GeometryError, match="must be ≥ 4×4"):
-        fit_geometry(points[:3], pitch_mm=1.6, size_px=SIZE)
+    refused(GeometryError, "must be of the background's", find_pins, empty, empty[:-1], rows=7, columns=9)
+    refused(GeometryError, "of 63 pins", lambda: find_pins(picture(points[:4]), empty, rows=7, columns=9))
+    refused(GeometryError, "press the board", lambda: find_pins(picture(points), empty, rows=9, columns=7))
+    refused(GeometryError, "must be ≥ 4×4", fit_geometry, points[:3], pitch_mm=1.6, size_px=SIZE)
     with pytest.raises(GeometryError, match="measure the geometry in this mode"):
         lens().view(mm_per_px=0.1, size_px=(10, 10))(empty[:-1])

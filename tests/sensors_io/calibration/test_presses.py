@@ -8,6 +8,7 @@ import pytest
 from sensors_io.calibration.presses import indentation, shrink
 from sensors_io.fields.types import CalibrationError
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
+from tests.sensors_io.checks import refused
 
 RADIUS, CONTACT = 3.0, 1.2
 
@@ -61,5 +62,4 @@ def test_shrinking_takes_means() -> None:
     ],
 )
 def test_bad_presses_are_refused(change: dict, message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        dataclasses.replace(press_ball(spread_touches(2)), **change)
+    refused(CalibrationError, message, lambda: dataclasses.replace(press_ball(spread_touches(2)), **change))

@@ -9,6 +9,7 @@ from sensors_io.calibration.scale import approach_mm, contact_radius_mm, measure
 from sensors_io.layer import Layer
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 from tests.sensors_io.calibration.test_calibrate import CLIPS
+from tests.sensors_io.checks import refused
 
 THICK = Layer(modulus_mpa=1.0, poisson=0.48, thickness_mm=1e4)
 GEL = Layer(modulus_mpa=1.0, poisson=0.48, thickness_mm=4.5)
@@ -30,8 +31,7 @@ def test_thin_gel_lies_between_clinging_and_sinking() -> None:
     contact = contact_radius_mm(0.5, 3.0, GEL)
     assert approach_mm(contact, 3.0, GEL) == pytest.approx(0.5, abs=1e-4)
     assert contact_radius_mm(0.5, 3.0, THICK) < contact < np.sqrt(2 * 3 * 0.5 - 0.5**2)
-    with pytest.raises(GeometryError, match="measure it from first touch"):
-        contact_radius_mm(9.0, 3.0, GEL)
+    refused(GeometryError, "measure it from first touch", contact_radius_mm, 9.0, 3.0, GEL)
 
 
 def test_contact_circles_at_known_depths_give_the_scale() -> None:

@@ -8,6 +8,7 @@ from sensors_io.commands.straightening import Straightening
 from sensors_io.fields.slopes import ColourMap, colour_terms, position_terms
 from sensors_io.fields.types import Calibration, CalibrationError
 from tests.sensors_io.calibration.test_geometry import SIZE, lens, picture, pins
+from tests.sensors_io.checks import refused
 
 ROWS, COLUMNS, PITCH_MM = 7, 9, 1.6
 
@@ -54,15 +55,12 @@ def test_a_calibration_asks_for_its_own_geometry(geometry, calibration, tmp_path
     signed = straight.signed(calibration)
     signed.save(tmp_path / "cal.npz")
     straight.check(Calibration.load(tmp_path / "cal.npz"))
-    with pytest.raises(CalibrationError, match=r"geometry is none: must be [0-9a-f]{16}"):
-        none.check(signed)
-    with pytest.raises(CalibrationError, match="must be none"):
-        straight.check(calibration)
+    refused(CalibrationError, r"geometry is none: must be [0-9a-f]{16}", none.check, signed)
+    refused(CalibrationError, "must be none", straight.check, calibration)
     lens(radial=(1.9, 0.2)).save(tmp_path / "other.json")
     with pytest.raises(CalibrationError, match="give --geometry that file"):
         Straightening.of(tmp_path / "other.json", 0.06, SIZE).check(signed)
 
 
 def test_a_pitch_must_come_from_somewhere():
-    with pytest.raises(CalibrationError, match="set --mm-per-px"):
-        Straightening.of(None, None, SIZE)
+    refused(CalibrationError, "set --mm-per-px", Straightening.of, None, None, SIZE)

@@ -15,6 +15,7 @@ import pytest
 from sensors_io.devices import bridge
 from sensors_io.devices.bridge_server import pack
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from tests.sensors_io.checks import refused
 
 SDK = "tests.sensors_io.devices.vendor_sdk:frames"
 
@@ -27,8 +28,7 @@ def test_frames_cross_though_the_sdk_prints(monkeypatch, request):
     monkeypatch.chdir(request.config.rootpath)
     with config("3").open() as device:
         samples = [device.read(10.0) for _ in range(3)]
-        with pytest.raises(DeviceLostError, match=r"has ended.*vendor banner"):
-            device.read(10.0)
+        refused(DeviceLostError, r"has ended.*vendor banner", device.read, 10.0)
     assert [s.index for s in samples] == [0, 1, 2]
     assert samples[1].frame[0, 0].tolist() == [200, 1, 1]
     assert samples[2].arrays["depth_mm"].dtype == np.float32
@@ -53,8 +53,7 @@ def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
         pass
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
-    with pytest.raises(DeviceLostError, match="not open"):
-        config("3").open().read(0.1)
+    refused(DeviceLostError, "not open", lambda: config("3").open().read(0.1))
     assert issubclass(DeviceTimeoutError, RuntimeError)
 
 
@@ -91,8 +90,7 @@ def test_any_array_comes_back():
     ],
 )
 def test_damaged_frames_are_refused(header, payload, message):
-    with pytest.raises(DeviceDataError, match=message):
-        bridge.unpack(header, payload)
+    refused(DeviceDataError, message, bridge.unpack, header, payload)
 
 
 XENSESDK = '''

@@ -9,6 +9,7 @@ import pytest
 
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from sensors_io.devices.netft import CALIBRATION, COMMAND, HEADER, RECORD, Command, NetFtConfig, parse_calibration
+from tests.sensors_io.checks import refused
 
 NEWTONS = CALIBRATION.pack(HEADER, 2, 3, 1_000_000, 1_000_000, *[1] * 6)
 
@@ -77,12 +78,9 @@ def test_status_and_damage_are_told():
     broken = record(2, 0, 0, 0, 0, 0, 0, status=0x8000_0004)
     with sensor([out_of_range, broken, b"\0" * 35]) as (config, _), config.open() as device:
         assert device.read(5.0).arrays["out_of_range"]
-        with pytest.raises(DeviceDataError, match="broken gauge"):
-            device.read(5.0)
-        with pytest.raises(DeviceDataError, match="35 bytes: must be records of 36"):
-            device.read(5.0)
-        with pytest.raises(DeviceTimeoutError, match="sent nothing"):
-            device.read(0.01)
+        refused(DeviceDataError, "broken gauge", device.read, 5.0)
+        refused(DeviceDataError, "35 bytes: must be records of 36", device.read, 5.0)
+        refused(DeviceTimeoutError, "sent nothing", device.read, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -95,8 +93,7 @@ def test_status_and_damage_are_told():
     ],
 )
 def test_damaged_calibrations_are_refused(answer, message):
-    with pytest.raises(DeviceDataError, match=message):
-        parse_calibration(answer)
+    refused(DeviceDataError, message, parse_calibration, answer)
 
 
 def test_pounds_are_converted():
@@ -111,7 +108,5 @@ def test_an_absent_sensor_is_named():
     config = NetFtConfig(host="127.0.0.1", tcp_port=port, wait_s=0.5)
     with pytest.raises(DeviceNotFoundError, match="does not answer"), config.open():
         pass
-    with pytest.raises(DeviceLostError, match="not open"):
-        config.open().read(0.1)
-    with pytest.raises(ValueError, match="rate_hz is 0"):
-        NetFtConfig(rate_hz=0)
+    refused(DeviceLostError, "not open", lambda: config.open().read(0.1))
+    refused(ValueError, "rate_hz is 0", NetFtConfig, rate_hz=0)

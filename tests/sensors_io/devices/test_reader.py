@@ -20,6 +20,7 @@ from sensors_io.devices.errors import (
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Pump, Reader, ReaderConfig
 from sensors_io.devices.replay import Disconnect, Faults, Replay
+from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import MS, Ramp, Scripted, sample
 
 
@@ -71,13 +72,11 @@ def test_an_overflowing_ring_counts_what_it_overwrites_and_says_so():
 def test_latest_refuses_an_old_sample_and_names_its_age():
     clock = JumpingClock()
     intake = Intake(capacity=4, clock=clock)
-    with pytest.raises(StaleFrameError, match="no sample has arrived"):
-        intake.latest(1.0)
+    refused(StaleFrameError, "no sample has arrived", intake.latest, 1.0)
     intake.offer(sample(0, time_ms=0))
     clock.sleep_until(300 * MS)
     assert intake.latest(0.5).index == 0
-    with pytest.raises(StaleFrameError, match=r"0\.300 s old: at most 0\.1 s"):
-        intake.latest(0.1)
+    refused(StaleFrameError, r"0\.300 s old: at most 0\.1 s", intake.latest, 0.1)
 
 
 def test_fresh_waits_for_a_sample_grabbed_after_the_call():
@@ -120,8 +119,7 @@ def test_a_lost_device_is_opened_again_with_growing_waits():
 
 def test_a_device_that_stays_away_ends_the_stream_with_a_reason():
     intake = pumped(Scripted([DeviceLostError("x"), sample(1)], refusals=1000), give_up_after_s=10)
-    with pytest.raises(DeviceLostError, match=r"given up after .* absent"):
-        intake.next(0.0)
+    refused(DeviceLostError, r"given up after .* absent", intake.next, 0.0)
 
 
 def test_a_silent_device_is_taken_as_lost():
@@ -225,8 +223,7 @@ def test_a_bug_in_a_driver_reaches_the_reader():
 
 @pytest.mark.parametrize("field", ["capacity", "timeout_s", "give_up_after_s"])
 def test_configs_are_checked(field):
-    with pytest.raises(ValueError, match=f"{field} is 0: must be > 0"):
-        ReaderConfig(**{field: 0})
+    refused(ValueError, f"{field} is 0: must be > 0", ReaderConfig, **{field: 0})
 
 
 def test_reopening_forgets_nothing_of_the_first_identity():

@@ -5,6 +5,7 @@ import pytest
 
 from sensors_io.devices.errors import DeviceDataError, DeviceTimeoutError, StreamEndedError
 from sensors_io.devices.rgbd import Intrinsics, Rgbd, RgbdConfig, contact_region
+from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import Scripted, sample
 
 CAMERA = Intrinsics(width=6, height=4, fx=100.0, fy=100.0, cx=3.0, cy=2.0)
@@ -61,7 +62,5 @@ def test_a_window_shows_at_its_place_and_size():
 
 @pytest.mark.parametrize("centre", [(0, 0, -10.0), (900.0, 0, 300.0)])
 def test_a_contact_out_of_view_is_refused(centre):
-    with pytest.raises(ValueError, match="must lie in the view"):
-        contact_region(VIEW, np.array(centre), 20.0)
-    with pytest.raises(ValueError, match="fx is 0"):
-        Intrinsics(width=6, height=4, fx=0, fy=1, cx=0, cy=0)
+    refused(ValueError, "must lie in the view", lambda: contact_region(VIEW, np.array(centre), 20.0))
+    refused(ValueError, "fx is 0", Intrinsics, width=6, height=4, fx=0, fy=1, cx=0, cy=0)

@@ -11,6 +11,7 @@ from sensors_io.devices.scene import SceneDeviceConfig
 from sensors_io.devices.scene_source import SceneSource
 from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes as records
+from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import Ramp
 
 
@@ -66,15 +67,13 @@ def test_a_generated_sensor_is_a_device():
     assert samples[0].frame is None
     assert samples[2].arrays["force_n"][2] < samples[0].arrays["force_n"][2] < 0
     assert round((samples[2].host_time_ns - samples[1].host_time_ns) / 1e5) == 327
-    with pytest.raises(DeviceNotFoundError, match="sensor is 'digit'"):
-        SceneSource(sensor="digit")
+    refused(DeviceNotFoundError, "sensor is 'digit'", SceneSource, sensor="digit")
 
 
 def test_nothing_to_replay_is_named(tmp_path):
     with pytest.raises(DeviceNotFoundError, match="holds no picture"):
         everything(ReplayConfig(path=tmp_path).open(JumpingClock()))
-    with pytest.raises(DeviceNotFoundError, match="does not exist"):
-        ReplayConfig(path=tmp_path / "x").open()
+    refused(DeviceNotFoundError, "does not exist", lambda: ReplayConfig(path=tmp_path / "x").open())
     (tmp_path / "a.avi").write_bytes(b"broken")
     with pytest.raises(DeviceNotFoundError, match="does not open as a video"):
         everything(ReplayConfig(path=tmp_path / "a.avi").open(JumpingClock()))
@@ -92,8 +91,7 @@ def test_nothing_to_replay_is_named(tmp_path):
     ],
 )
 def test_faults_are_checked(faults, message):
-    with pytest.raises(ValueError, match=message):
-        Faults(**faults)
+    refused(ValueError, message, Faults, **faults)
 
 
 def test_the_same_seed_gives_the_same_faults():

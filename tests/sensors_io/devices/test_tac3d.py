@@ -9,6 +9,7 @@ import pytest
 from sensors_io.devices import tac3d, tac3d_messages
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from sensors_io.devices.sources import Tac3dRecording
+from tests.sensors_io.checks import refused
 
 NAMES = {"3D_Displacements": (400, 3), "3D_Forces": (400, 3), "3D_ResultantForce": (1, 3), "3D_ResultantMoment": (1, 3)}
 
@@ -93,8 +94,7 @@ def test_what_is_never_completed_is_counted_and_forgotten():
     ],
 )
 def test_damaged_datagrams_are_refused(datagram, message):
-    with pytest.raises(DeviceDataError, match=message):
-        tac3d_messages.Assembler().add(datagram)
+    refused(DeviceDataError, message, lambda: tac3d_messages.Assembler().add(datagram))
 
 
 GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
@@ -115,8 +115,7 @@ GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
     ],
 )
 def test_damaged_layouts_are_refused(bad, data, message):
-    with pytest.raises(DeviceDataError, match=message):
-        tac3d_messages.Tac3dDecoder().decode(bad, data)
+    refused(DeviceDataError, message, lambda: tac3d_messages.Tac3dDecoder().decode(bad, data))
 
 
 def pushed(force, move):
@@ -161,14 +160,11 @@ def test_a_recording_is_read_from_a_folder_and_from_an_archive(tmp_path):
 
 
 def test_an_incomplete_recording_is_refused(tmp_path):
-    with pytest.raises(DeviceNotFoundError, match="neither a folder"):
-        tac3d_messages.load_recording(tmp_path / "nowhere")
+    refused(DeviceNotFoundError, "neither a folder", tac3d_messages.load_recording, tmp_path / "nowhere")
     np.savez(tmp_path / "a.npz", index=np.arange(3))
-    with pytest.raises(DeviceDataError, match="sendTimestamp must be among them"):
-        tac3d_messages.load_recording(tmp_path / "a.npz")
+    refused(DeviceDataError, "sendTimestamp must be among them", tac3d_messages.load_recording, tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", index=np.arange(3), sendTimestamp=np.arange(2.0))
-    with pytest.raises(DeviceDataError, match="one length"):
-        tac3d_messages.load_recording(tmp_path / "b.npz")
+    refused(DeviceDataError, "one length", tac3d_messages.load_recording, tmp_path / "b.npz")
 
 
 @pytest.fixture
@@ -233,8 +229,6 @@ def test_silence_and_a_taken_port_are_named(vendor):
         other.bind(("127.0.0.1", port))
         with pytest.raises(DeviceNotFoundError, match="cannot be listened on"), listening(port):
             pass
-    with pytest.raises(DeviceLostError, match="not open"):
-        listening(port).read(0.1)
-    with pytest.raises(DeviceLostError, match="not open"):
-        listening(port).take_zero()
+    refused(DeviceLostError, "not open", lambda: listening(port).read(0.1))
+    refused(DeviceLostError, "not open", lambda: listening(port).take_zero())
     assert issubclass(DeviceTimeoutError, RuntimeError)

@@ -10,6 +10,7 @@ from sensors_io.devices.cameras import CameraInfo, find_cameras
 from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, SettingRefusedWarning
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.uvc import Lock, Uvc, UvcConfig, wait_for_frame
+from tests.sensors_io.checks import refused
 
 
 def plug(root, number, *, index="0", usb=None, name="camera", at=None):
@@ -66,10 +67,8 @@ def test_a_camera_is_chosen_by_serial_product_or_explicit_index():
     ],
 )
 def test_an_ambiguous_or_absent_camera_is_named(config, message):
-    with pytest.raises(DeviceNotFoundError, match=message):
-        config.choose(CAMERAS)
-    with pytest.raises(DeviceNotFoundError, match="there are: none"):
-        UvcConfig(serial="nope").choose(())
+    refused(DeviceNotFoundError, message, config.choose, CAMERAS)
+    refused(DeviceNotFoundError, "there are: none", lambda: UvcConfig(serial="nope").choose(()))
 
 
 class FakeCapture:
@@ -154,17 +153,14 @@ def test_a_camera_that_stops_is_lost_and_may_be_opened_again():
     device = camera(FakeCapture(frames=1))
     with device:
         device.read(1.0)
-        with pytest.raises(DeviceLostError, match="gives no more frames"):
-            device.read(1.0)
-    with pytest.raises(DeviceLostError, match="not open"):
-        device.read(1.0)
+        refused(DeviceLostError, "gives no more frames", device.read, 1.0)
+    refused(DeviceLostError, "not open", device.read, 1.0)
 
 
 def test_a_camera_that_stalls_is_a_timeout_when_it_is_told_to():
     with camera(FakeCapture(stalls_after=0)) as device:
         began = time.monotonic()
-        with pytest.raises(DeviceTimeoutError, match=r"no frame in 0\.05 s"):
-            device.read(0.05)
+        refused(DeviceTimeoutError, r"no frame in 0\.05 s", device.read, 0.05)
     assert time.monotonic() - began < 1
 
 
@@ -187,8 +183,7 @@ def test_opencv_has_the_wait_and_takes_what_it_is_given(tmp_path):
     writer.write(np.zeros((12, 16, 3), np.uint8))
     writer.release()
     capture = cv2.VideoCapture(path)
-    with pytest.raises(cv2.error, match="V4L"):
-        wait_for_frame(capture, 0.01)
+    refused(cv2.error, "V4L", wait_for_frame, capture, 0.01)
     capture.release()
     assert wait_for_frame(capture, 0.01)
 
@@ -205,15 +200,12 @@ def test_the_cameras_of_one_device_are_told_apart_by_their_interfaces(tmp_path):
     found = find_cameras(tmp_path / "class")
     assert [c.interface for c in found] == [0, 3]
     assert UvcConfig(product="D435", interface=3).choose(found).node == "/dev/video4"
-    with pytest.raises(DeviceNotFoundError, match=r"several cameras .* interface 0\)"):
-        UvcConfig(product="D435").choose(found)
-    with pytest.raises(DeviceNotFoundError, match="interface 7: no camera"):
-        UvcConfig(product="D435", interface=7).choose(found)
+    refused(DeviceNotFoundError, r"several cameras .* interface 0\)", lambda: UvcConfig(product="D435").choose(found))
+    refused(DeviceNotFoundError, "interface 7: no camera", lambda: UvcConfig(product="D435", interface=7).choose(found))
 
 
 def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
-    with pytest.raises(DeviceNotFoundError, match="does not open"):
-        camera(FakeCapture(opens=False)).__enter__()
+    refused(DeviceNotFoundError, "does not open", lambda: camera(FakeCapture(opens=False)).__enter__())
 
     class Fixed(FakeCapture):
         def set(self, prop, value):
@@ -233,5 +225,4 @@ def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
     ],
 )
 def test_configs_are_checked(changes, message):
-    with pytest.raises(ValueError, match=message):
-        UvcConfig(**changes)
+    refused(ValueError, message, UvcConfig, **changes)

@@ -16,10 +16,5 @@ def frames(serial):
         yield (
             time.monotonic_ns(),
             n,
-            {
-                "frame_bgr": picture,
-                "depth_mm": np.full((2, 3), 0.5 * n),
-                "resultant": np.arange(6.0),
-                "shear_mm": None,
-            },
+            {"frame_bgr": picture, "depth_mm": np.full((2, 3), 0.5 * n), "resultant": np.arange(6.0), "shear_mm": None},
         )

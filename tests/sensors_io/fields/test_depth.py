@@ -2,7 +2,6 @@
 
 import pathlib
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,6 +9,7 @@ from sensors_io.calibration.presses import indentation
 from sensors_io.fields.contact import ContactConfig, changed_contacts, find_contacts, steepest_change
 from sensors_io.fields.depth import ZeroConfig, untouched_cells, zero_level
 from sensors_io.fields.sources import read_picture
+from tests.sensors_io.checks import refused
 
 PITCH = 0.0634
 DATA = pathlib.Path(__file__).parents[2] / "data"
@@ -32,16 +32,27 @@ def test_a_tilted_and_bent_zero_is_taken_out() -> None:
     np.testing.assert_allclose(found, clean, atol=2e-3)
 
 
-def test_untouched_gel_is_zero() -> None:
-    tilted = np.linspace(-1, 1, 320)[None].repeat(240, 0)
-    tilt = (0.02 * tilted + 0.1).astype(np.float32)
+@pytest.mark.parametrize("height", [240, 4])
+def test_untouched_gel_is_zero(height: int) -> None:
+    tilt = np.tile(np.linspace(0.08, 0.12, 320, dtype=np.float32), (height, 1))
     assert np.abs(tilt - zero_level(tilt, np.zeros_like(tilt), PITCH, ZeroConfig())).max() < 1e-4
+
+
+@pytest.mark.parametrize(("columns", "degree"), [(20, 2), (19, 1), (8, 1), (7, 0)])
+def test_the_share_of_untouched_gel_sets_the_degree_of_its_zero(columns: int, degree: int) -> None:
+    """Of 50 columns of cells 40 % are enough for a quadratic, 15 % for a plane; less gives a constant."""
+    x = (np.arange(400) + 0.5) / 200 - 1
+    slope = np.tile((np.arange(400) >= 8 * columns).astype(np.float32), (80, 1))
+    for power in range(3):
+        depth = np.tile(x**power, (80, 1)).astype(np.float32)
+        left = depth - zero_level(depth, slope, 0.125, ZeroConfig(margin_mm=0))
+        assert (np.abs(left).max() < 1e-3) == (power <= degree)
 
 
 def test_a_contact_that_fills_the_window_takes_its_shallowest_part_for_zero() -> None:
     depth = np.tile(np.linspace(0.2, 1.0, 320, dtype=np.float32), (240, 1))
     level = zero_level(depth, np.ones_like(depth), PITCH, ZeroConfig())
-    assert np.ptp(level) < 1e-6
+    np.testing.assert_allclose(level, level[0, 0], atol=1e-6)
     assert level[0, 0] == pytest.approx(0.22, abs=0.02)
 
 
@@ -57,10 +68,8 @@ def test_cells_near_a_slope_are_not_untouched() -> None:
 @pytest.mark.parametrize("contact_mm", [0.8, 1.5, 2.0])
 def test_the_mask_is_the_contact(contact_mm: float) -> None:
     """At half the greatest depth, which is Hertz's edge."""
-    depth, _ = pressed(160, 120, contact_mm)
-    found = find_contacts(depth, PITCH)
-    assert found.count == 1
-    assert not found.at_border
+    found = find_contacts(pressed(160, 120, contact_mm)[0], PITCH)
+    assert (found.count, found.at_border) == (1, False)
     assert np.sqrt(found.mask.sum() / np.pi) * PITCH == pytest.approx(contact_mm, rel=0.05)
 
 
@@ -113,14 +122,29 @@ def test_real_contacts_are_contacts_and_drift_is_none(folder: str, press: str, p
     assert changed_contacts(drift, background, pitch).count == 0
 
 
+def step(levels: float) -> tuple[np.ndarray, np.ndarray]:
+    """A picture and its background: brighter by `levels` on the right, fading out towards the top."""
+    y, x = np.mgrid[:240, :320]
+    background = np.full((240, 320, 3), 100, np.uint8)
+    return background + np.round(levels * (x >= 160) * y / 239).astype(np.uint8)[..., None], background
+
+
+def test_a_step_is_as_steep_as_its_smoothing_makes_it() -> None:
+    """h / (σ √2π) at its foot, whatever pixels are averaged first."""
+    assert steepest_change(*step(80), PITCH) == pytest.approx(80 / (0.3 * np.sqrt(2 * np.pi)), rel=0.03)
+
+
+@pytest.mark.parametrize(("levels", "least_mm2", "count"), [(80, 0.05, 1), (6, 0.05, 0), (80, 200.0, 0)])
+def test_a_change_must_be_both_steep_and_large(levels: float, least_mm2: float, count: int) -> None:
+    assert changed_contacts(*step(levels), PITCH, ContactConfig(least_mm2=least_mm2)).count == count
+
+
 def test_contact_by_colour_is_where_the_ball_is() -> None:
     background = read_picture(DATA / "gelslam" / "background.png")
     found = changed_contacts(read_picture(DATA / "gelslam" / "press_9.png"), background, 0.1902)
-    y, x = cv2.moments(found.mask.astype(np.uint8))["m01"], cv2.moments(found.mask.astype(np.uint8))["m10"]
     assert found.count == 1
-    assert (x / found.mask.sum(), y / found.mask.sum()) == pytest.approx((222 / 3, 137 / 3), abs=3)
+    assert np.argwhere(found.mask).mean(0) == pytest.approx((137 / 3, 222 / 3), abs=3)
 
 
 def test_thresholds_in_the_wrong_order_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be 0 < low ≤ high"):
-        ContactConfig(low_mm=0.2, high_mm=0.1)
+    refused(ValueError, "must be 0 < low ≤ high", ContactConfig, low_mm=0.2, high_mm=0.1)

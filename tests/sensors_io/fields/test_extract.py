@@ -1,6 +1,5 @@
 """All fields at once: what a bare gel, a marker gel and a wrong input give."""
 
-import dataclasses
 import pathlib
 
 import cv2
@@ -15,6 +14,7 @@ from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.records import RecordWriter
 from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 SHAPE = (160, 214)
 
@@ -56,11 +56,11 @@ def calibration(background: np.ndarray, mm_per_px: float = 0.1) -> Calibration:
 
 def test_a_bare_gel_gives_depth_and_is_refused_shear() -> None:
     extractor = Extractor(bare(), 0.1, calibration(bare()))
+    assert Flag.NO_ZERO_LEVEL in extractor.judged
     fields = extractor.extract(np.stack([bare(), touched(bare())]))
     assert fields.depth_mm is not None
     assert fields.depth_mm.shape == fields.contact.shape == (2, *SHAPE)
-    assert fields.deformation_mm is None
-    assert fields.shear_mm is None
+    assert fields.deformation_mm is fields.shear_mm is None
     assert (fields.flags & np.uint32(Flag.REFUSED)).all()
     assert [bool(f & Flag.NO_CONTACT) for f in fields.flags.tolist()] == [True, False]
     assert "deformation_mm, shear_mm" in extractor.refused[0]
@@ -77,18 +77,15 @@ def test_a_picture_that_leaves_no_gel_untouched_has_no_zero_level() -> None:
 def test_a_marker_gel_without_calibration_gives_its_motion_and_is_refused_depth() -> None:
     extractor = Extractor(dotted(), 0.1)
     assert extractor.evidence.pattern is Pattern.MARKERS
+    assert Flag.NO_ZERO_LEVEL not in extractor.judged
     fields = extractor.extract(np.stack([dotted(), dotted(1.0)]))
-    assert fields.depth_mm is None
-    assert fields.shear_mm is None
+    assert fields.depth_mm is fields.shear_mm is None
     assert fields.deformation_mm is not None
     moved = fields.deformation_mm[1]
-    np.testing.assert_allclose(np.median(moved[..., 0]), 0.1, atol=0.01)
-    np.testing.assert_allclose(np.median(moved[..., 1]), 0.0, atol=0.01)
+    np.testing.assert_allclose(np.median(moved, (0, 1)), [0.1, 0.0], atol=0.01)
     assert fields.grid_mm is not None
-    height, width = moved.shape[:2]
-    np.testing.assert_allclose(
-        [fields.grid_mm[0] * width, fields.grid_mm[1] * height], [0.1 * SHAPE[1], 0.1 * SHAPE[0]], rtol=1e-6
-    )
+    window = np.multiply(fields.grid_mm, moved.shape[1::-1])
+    np.testing.assert_allclose(window, [0.1 * SHAPE[1], 0.1 * SHAPE[0]], rtol=1e-6)
 
 
 def test_a_marker_gel_with_calibration_gives_everything() -> None:
@@ -103,9 +100,17 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
     assert not np.allclose(noisy.read(dotted(0.5)).shear_mm, fields.shear_mm, atol=1e-3)  # type: ignore[arg-type]
 
 
-def test_a_calibration_of_another_camera_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="must be equal; calibrate this camera"):
-        Extractor(bare(), 0.2, calibration(bare(), 0.1))
+def test_what_does_not_fit_together_is_refused() -> None:
+    refused(
+        CalibrationError, "must be equal; calibrate this camera", lambda: Extractor(bare(), 0.2, calibration(bare()))
+    )
+    contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
+    wrong = np.zeros((2, 4, 6), np.float32)
+    refused(SchemaError, "depth_mm", Fields, contact=contact, flags=flags, mm_per_px=0.1, depth_mm=wrong)
+    wrong = np.zeros((2, 3, 3, 2), np.float32)
+    refused(SchemaError, "grid_mm is None", Fields, contact=contact, flags=flags, mm_per_px=0.1, shear_mm=wrong)
+    with pytest.raises(SchemaError, match=r"shape \[80, 214, 3\]: must be \[160, 214, 3\]"):
+        Extractor(bare(), 0.1).read(bare()[:80])
 
 
 def test_frames_are_joined_in_order() -> None:
@@ -116,23 +121,11 @@ def test_frames_are_joined_in_order() -> None:
     assert len(both) == 2
 
 
-def test_fields_of_wrong_shapes_are_refused() -> None:
-    contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
-    with pytest.raises(SchemaError, match="depth_mm"):
-        Fields(contact=contact, flags=flags, mm_per_px=0.1, depth_mm=np.zeros((2, 4, 6), np.float32))
-    with pytest.raises(SchemaError, match="grid_mm is None"):
-        Fields(contact=contact, flags=flags, mm_per_px=0.1, shear_mm=np.zeros((2, 3, 3, 2), np.float32))
-    assert dataclasses.replace(Fields(contact=contact, flags=flags, mm_per_px=0.1)).depth_mm is None
-
-
-def test_a_gap_is_flagged_and_the_markers_are_looked_for_anywhere() -> None:
+def test_a_gap_is_flagged_and_a_still_is_not() -> None:
     extractor = Extractor(dotted(), 0.1)
-    far = dotted(11.0)  # more than half a pitch: without the gap the nearest dots would do
-    assert extractor.read(dotted()).flags[0] & Flag.TIME_GAP == 0
-    late = extractor.read(far, gap=True)
-    assert late.flags[0] & Flag.TIME_GAP
-    still = extractor.read(far, apart=True)
-    assert still.flags[0] & Flag.TIME_GAP == 0
+    far = dotted(11.0)
+    found = [extractor.read(dotted()), extractor.read(far, gap=True), extractor.read(far, apart=True)]
+    assert [bool(f.flags[0] & Flag.TIME_GAP) for f in found] == [False, True, False]
 
 
 def test_times_tell_the_gaps_of_a_run() -> None:
@@ -167,8 +160,7 @@ def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path
     assert not found.gap.any()
     assert found.chosen(np.array([1])).names == ("10.png",)
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((9, 8, 3), np.uint8))
-    with pytest.raises(SourceError, match="different sizes"):
-        read_pictures([tmp_path], "x")
+    refused(SourceError, "different sizes", read_pictures, [tmp_path], "x")
 
 
 def test_videos_are_read_whole(tmp_path: pathlib.Path) -> None:
@@ -182,20 +174,16 @@ def test_videos_are_read_whole(tmp_path: pathlib.Path) -> None:
     assert found.names == ("press.avi#0", "press.avi#1", "press.avi#2")
     assert found.apart.tolist() == [True, False, False]
     path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(SourceError, match="convert or replace it"):
-        read_pictures([path], "x")
+    refused(SourceError, "convert or replace it", read_pictures, [path], "x")
 
 
 def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     (tmp_path / "a.png").write_text("no picture")
-    with pytest.raises(SourceError, match="does not open as a picture: must be a whole picture"):
-        read_pictures([tmp_path], "x")
-    with pytest.raises(SourceError, match="is absent"):
-        read_pictures([tmp_path / "none.png"], "x")
+    refused(SourceError, "does not open as a picture: must be a whole picture", read_pictures, [tmp_path], "x")
+    refused(SourceError, "is absent", read_pictures, [tmp_path / "none.png"], "x")
     cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8))
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-200])
-    with pytest.raises(SourceError, match="is cut off"):
-        read_pictures([tmp_path], "x")
+    refused(SourceError, "is cut off", read_pictures, [tmp_path], "x")
 
 
 @pytest.mark.parametrize(
@@ -209,10 +197,4 @@ def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
 )
 def test_a_gel_that_is_too_small_or_no_picture_is_named(shape: tuple[int, ...], mm_per_px: float, said: str) -> None:
     rest = np.full(shape, 128, np.uint8)
-    with pytest.raises(SchemaError, match=said):
-        Extractor(rest, mm_per_px).read(rest)
-
-
-def test_a_picture_of_another_size_than_the_gel_is_named() -> None:
-    with pytest.raises(SchemaError, match=r"shape \[80, 214, 3\]: must be \[160, 214, 3\]"):
-        Extractor(bare(), 0.1).read(bare()[:80])
+    refused(SchemaError, said, lambda: Extractor(rest, mm_per_px).read(rest))

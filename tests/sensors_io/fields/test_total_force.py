@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sensors_io.fields.total_force import ForceFitError, fit
+from tests.sensors_io.checks import refused
 
 RNG = np.random.default_rng(0)
 LAW = RNG.normal(0, 1, (60, 3))
@@ -35,8 +36,17 @@ def test_a_contact_that_changes_is_told_by_the_held_out_error():
 
 
 def test_noise_alone_predicts_the_mean():
-    model = fit(FIELDS, RNG.normal(0, 1, (200, 3)))
-    assert model.held_out_rmse.max() < 1.25
+    assert fit(FIELDS, RNG.normal(0, 1, (200, 3))).held_out_rmse.max() < 1.25
+
+
+@pytest.mark.parametrize(("frames", "same"), [(slice(0, 43), True), (slice(43, 44), False)])
+def test_a_block_is_predicted_without_itself_and_without_the_gap_behind_it(frames, same):
+    """The first 40 frames and the three behind them choose neither weights nor penalty of their prediction."""
+    noisy = FORCE + np.random.default_rng(1).normal(0, 0.2, FORCE.shape)
+    changed = noisy.copy()
+    changed[frames] += 30
+    first, second = (fit(FIELDS, force).held_out[:40] for force in (noisy, changed))
+    assert np.array_equal(first, second) == same
 
 
 @pytest.mark.parametrize(
@@ -50,10 +60,8 @@ def test_noise_alone_predicts_the_mean():
     ],
 )
 def test_what_cannot_be_fitted_is_refused(fields, force, blocks, match):
-    with pytest.raises(ForceFitError, match=match):
-        fit(fields, force, blocks=blocks)
+    refused(ForceFitError, match, fit, fields, force, blocks=blocks)
 
 
 def test_fields_of_another_size_are_refused():
-    with pytest.raises(ValueError, match="must have 60"):
-        fit(FIELDS, FORCE).predict(np.zeros((3, 5)))
+    refused(ValueError, "must have 60", lambda: fit(FIELDS, FORCE).predict(np.zeros((3, 5))))

@@ -7,6 +7,7 @@ from sensors_io.fields.deformation import DeformationReader, NoPatternError
 from sensors_io.fields.patches import Patches
 from sensors_io.fields.tracking import Tracker, TrackingConfig
 from sensors_io.schema import Flag
+from tests.sensors_io.checks import refused
 from tests.sensors_io.fields import gels
 
 POINTS = gels.lattice()
@@ -56,10 +57,8 @@ def test_a_jump_past_half_a_pitch_is_caught(tracker):
 
 
 def test_lost_dots_are_flagged_placed_and_found_again(tracker):
-    gone = np.flatnonzero(INNER)[[10, 11, 25]]
-    peak = 4.0
-    picture = gels.exposed(gels.dots(np.delete(moved(POINTS, peak), gone, axis=0)), seed=2)
-    found = tracker.track(picture)
+    gone, peak = np.flatnonzero(INNER)[[10, 11, 25]], 4.0
+    found = tracker.track(gels.exposed(gels.dots(np.delete(moved(POINTS, peak), gone, axis=0)), seed=2))
     lost = np.isin(np.flatnonzero(INNER), gone)
     error = np.hypot(*(found.points_px - moved(POINTS, peak)[INNER]).T)
     assert np.array_equal(~found.found, lost)
@@ -68,17 +67,31 @@ def test_lost_dots_are_flagged_placed_and_found_again(tracker):
 
 
 def test_a_black_picture_finds_nothing_and_the_next_one_everything(tracker):
-    assert not tracker.track(np.zeros_like(REST)).found.any()
+    black = tracker.track(np.zeros_like(REST))
+    assert (black.found.any(), black.reseeded) == (False, True)
     assert follow(2.0, tracker).found.all()
 
 
+def test_a_picture_of_a_third_of_the_light_is_followed(tracker):
+    found = tracker.track(gels.exposed(0.3 * gels.dots(moved(POINTS, 3.0))))
+    assert found.found.all()
+    assert np.hypot(*(found.points_px - moved(POINTS, 3.0)[INNER]).T).max() < 0.15
+
+
+def test_the_spread_follows_the_noise_as_documented():
+    """√(1/ρ² − 1) times what the window itself allows."""
+    patches, rest = Patches(REST, POINTS[INNER], 7), gels.dots(POINTS)
+    per_noise = []
+    for level in (3.0, 20.0):
+        found = patches.find(gels.exposed(rest, noise=level), POINTS[INNER])
+        per_noise.append(found.spread_px / np.sqrt(1 / found.likeness.astype(float) ** 2 - 1))
+    np.testing.assert_allclose(*per_noise, rtol=0.02)
+
+
 def test_wrong_pictures_are_refused(tracker):
-    with pytest.raises(ValueError, match=r"must be uint8\[160, 200\]"):
-        tracker.track(REST[:-1])
-    with pytest.raises(ValueError, match="must lie inside the picture"):
-        Patches(REST, np.array([[3.0, 50.0]]), 7)
-    with pytest.raises(ValueError, match="back_px is 0"):
-        TrackingConfig(back_px=0)
+    refused(ValueError, r"must be uint8\[160, 200\]", tracker.track, REST[:-1])
+    refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[3.0, 50.0]]), 7))
+    refused(ValueError, "back_px is 0", TrackingConfig, back_px=0)
 
 
 def test_light_does_not_move_the_points(tracker):
@@ -99,14 +112,16 @@ def test_a_field_in_millimetres():
     np.testing.assert_allclose(read.displacement_mm, np.broadcast_to([0.2, -0.1], (16, 20, 2)), atol=0.008)
 
 
-def test_every_pixel_when_no_shape_is_given():
-    reader = DeformationReader(gels.rgb(REST), mm_per_px=0.1)
-    read = reader.read(gels.rgb(gels.exposed(gels.dots(moved(POINTS, 5.0)))))
-    y, x = np.mgrid[30:130, 40:160]
-    pixels = np.stack([x, y], -1).reshape(-1, 2).astype(float)
+def test_every_pixel_when_no_shape_is_given_else_means_of_cells():
+    every, coarse = (DeformationReader(gels.rgb(REST), mm_per_px=0.1, shape=shape) for shape in (None, (16, 20)))
+    picture = gels.rgb(gels.exposed(gels.dots(moved(POINTS, 5.0))))
+    found = every.read(picture).displacement_mm
+    pixels = np.stack(np.meshgrid(np.arange(40, 160), np.arange(30, 130)), -1).reshape(-1, 2).astype(float)
     true = 0.1 * (moved(pixels, 5.0) - pixels)
-    assert read.displacement_mm.shape == (160, 200, 2)
-    assert np.hypot(*(read.displacement_mm[30:130, 40:160].reshape(-1, 2) - true).T).mean() < 0.008
+    assert found.shape == (160, 200, 2)
+    assert np.hypot(*(found[30:130, 40:160].reshape(-1, 2) - true).T).mean() < 0.008
+    cells = found.reshape(16, 10, 20, 10, 2).mean((1, 3))
+    np.testing.assert_allclose(coarse.read(picture).displacement_mm, cells, atol=0.005)
 
 
 def test_lost_markers_flag_the_frame_and_their_nodes():
@@ -133,7 +148,5 @@ def test_a_bare_gel_is_refused(rest):
 
 
 def test_pictures_must_be_rgb_of_known_scale():
-    with pytest.raises(ValueError, match="convert it to RGB"):
-        DeformationReader(REST, mm_per_px=0.1)
-    with pytest.raises(ValueError, match="mm_per_px is 0"):
-        DeformationReader(gels.rgb(REST), mm_per_px=0.0)
+    refused(ValueError, "convert it to RGB", DeformationReader, REST, mm_per_px=0.1)
+    refused(ValueError, "mm_per_px is 0", lambda: DeformationReader(gels.rgb(REST), mm_per_px=0.0))

@@ -16,6 +16,7 @@ from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Ski
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, ContactKey
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import picture
 
 
@@ -153,5 +154,4 @@ def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
     ],
 )
 def test_bad_options_are_named(bad, message):
-    with pytest.raises(ImportSourceError, match=message):
-        ImportConfig(**bad)
+    refused(ImportSourceError, message, ImportConfig, **bad)

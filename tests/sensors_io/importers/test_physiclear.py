@@ -11,6 +11,7 @@ from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import entry, film, folder, labels
 
 KEEP = PhysiclearConfig(height=0, max_frames=0, test_share=0)
@@ -113,20 +114,17 @@ class TestNamedErrors:
         return import_physiclear(source, source.parent / "out", config=KEEP)
 
     def test_no_labels(self, tmp_path):
-        with pytest.raises(ImportSourceError, match=r"labels.json is missing: give the directory that holds"):
-            self.run(tmp_path / "in")
+        refused(ImportSourceError, r"labels.json is missing: give the directory that holds", self.run, tmp_path / "in")
 
     def test_an_empty_folder(self, tmp_path):
         (tmp_path / "in" / "videos").mkdir(parents=True)
         labels(tmp_path / "in", entry("ball"))
-        with pytest.raises(ImportSourceError, match="videos is missing or empty: put the videos there"):
-            self.run(tmp_path / "in")
+        refused(ImportSourceError, "videos is missing or empty: put the videos there", self.run, tmp_path / "in")
 
     def test_no_readable_video(self, tmp_path):
         source = folder(tmp_path / "in", entry("ball", videos=1))
         (source / "videos" / "ball_0.avi").write_bytes(b"broken")
-        with pytest.raises(ImportSourceError, match=r"no contact can be read; the first: .*ball_0.avi.*does not open"):
-            self.run(source)
+        refused(ImportSourceError, r"no contact can be read; the first: .*ball_0.avi.*does not open", self.run, source)
         assert not (tmp_path / "out" / "index.json").exists()
 
     @pytest.mark.parametrize(
@@ -142,18 +140,15 @@ class TestNamedErrors:
     )
     def test_labels_out_of_range(self, tmp_path, change, message):
         labels(tmp_path, entry("ball") | change)
-        with pytest.raises(ImportSourceError, match=message):
-            read_labels(tmp_path / "labels.json")
+        refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
 
     def test_missing_keys_and_no_json(self, tmp_path):
         item = entry("ball")
         del item["bumps"]
         labels(tmp_path, item)
-        with pytest.raises(ImportSourceError, match="'bumps'"):
-            read_labels(tmp_path / "labels.json")
+        refused(ImportSourceError, "'bumps'", read_labels, tmp_path / "labels.json")
         (tmp_path / "labels.json").write_text("{")
-        with pytest.raises(ImportSourceError, match="correct the entry"):
-            read_labels(tmp_path / "labels.json")
+        refused(ImportSourceError, "correct the entry", read_labels, tmp_path / "labels.json")
 
     @pytest.mark.parametrize(
         ("items", "message"),
@@ -164,13 +159,11 @@ class TestNamedErrors:
     )
     def test_splits_cannot_share_an_object_or_a_video(self, tmp_path, items, message):
         labels(tmp_path, *items)
-        with pytest.raises(ImportSourceError, match=message):
-            read_labels(tmp_path / "labels.json")
+        refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
 
     @pytest.mark.parametrize("bad", [{"stride": 0}, {"height": -1}, {"max_frames": -1}, {"test_share": 1.0}])
     def test_bad_options(self, bad):
-        with pytest.raises(ImportSourceError, match=f"{next(iter(bad))} is "):
-            PhysiclearConfig(**bad)
+        refused(ImportSourceError, f"{next(iter(bad))} is ", PhysiclearConfig, **bad)
 
 
 @pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sensors_io.importers.pickles import PickleError, read_pickle
+from tests.sensors_io.checks import refused
 
 
 class Program:
@@ -31,18 +32,15 @@ def test_programs_are_refused(tmp_path):
     with pytest.raises(PickleError, match=r"asks for (os|posix)\.getenv: only numbers, text and arrays are read"):
         read_pickle(tmp_path / "a.pkl")
     np.save(tmp_path / "a.npy", np.array(Program(), object), allow_pickle=True)
-    with pytest.raises(PickleError, match="getenv"):
-        read_pickle(tmp_path / "a.npy")
+    refused(PickleError, "getenv", read_pickle, tmp_path / "a.npy")
 
 
 def test_damage_is_named(tmp_path):
     whole = pickle.dumps(np.arange(99.0))
     for data in (b"", b"text", whole[: len(whole) // 2]):
         (tmp_path / "a.pkl").write_bytes(data)
-        with pytest.raises(PickleError, match=r"a\.pkl is damaged"):
-            read_pickle(tmp_path / "a.pkl")
-    with pytest.raises(PickleError, match=r"b\.pkl is absent"):
-        read_pickle(tmp_path / "b.pkl")
+        refused(PickleError, r"a\.pkl is damaged", read_pickle, tmp_path / "a.pkl")
+    refused(PickleError, r"b\.pkl is absent", read_pickle, tmp_path / "b.pkl")
     np.save(tmp_path / "plain.npy", np.arange(3))
     with pytest.raises(PickleError, match="holds an array of int64"):
         read_pickle(tmp_path / "plain.npy")

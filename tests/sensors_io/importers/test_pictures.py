@@ -5,6 +5,7 @@ import pytest
 
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.pictures import PictureError, natural, nominal_ns, numbered, read_picture, read_pictures
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
 
 WHOLE = Keep(height=0, max_frames=0)
@@ -20,17 +21,14 @@ def test_colours_are_rgb(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
 def test_a_picture_that_was_cut_off_is_refused(tmp_path, name):
-    with pytest.raises(PictureError, match="is cut off"):
-        read_picture(cut(picture(tmp_path / name)))
+    refused(PictureError, "is cut off", lambda: read_picture(cut(picture(tmp_path / name))))
 
 
 def test_what_is_no_picture_is_refused(tmp_path):
-    with pytest.raises(PictureError, match="is absent"):
-        read_picture(tmp_path / "a.png")
+    refused(PictureError, "is absent", read_picture, tmp_path / "a.png")
     for data in (b"", b"text"):
         (tmp_path / "a.png").write_bytes(data)
-        with pytest.raises(PictureError, match="does not open as a picture"):
-            read_picture(tmp_path / "a.png")
+        refused(PictureError, "does not open as a picture", read_picture, tmp_path / "a.png")
 
 
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):

@@ -11,6 +11,7 @@ from sensors_io.importers.keep import ImportSourceError, Shares
 from sensors_io.importers.tac3d import SIDE, list_tac3d
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut
 
 ALL_TRAIN = Shares(val_share=0, test_share=0)
@@ -102,17 +103,14 @@ def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
     ],
 )
 def test_another_layout_is_refused(tmp_path, changes, reason):
-    with pytest.raises(ImportSourceError, match=reason):
-        imported(write(tmp_path / "in", **changes), tmp_path / "out")
+    refused(ImportSourceError, reason, lambda: imported(write(tmp_path / "in", **changes), tmp_path / "out"))
 
 
 def test_damage_and_a_wrong_directory_are_named(tmp_path):
     source = write(tmp_path / "in")
     cut(source / "example_1_AD2-0065L.npz")
-    with pytest.raises(ImportSourceError, match="is damaged"):
-        imported(source, tmp_path / "out")
-    with pytest.raises(ImportSourceError, match=r"expected <name>_<serial>.npz"):
-        list_tac3d(tmp_path, ALL_TRAIN)
+    refused(ImportSourceError, "is damaged", imported, source, tmp_path / "out")
+    refused(ImportSourceError, r"expected <name>_<serial>.npz", list_tac3d, tmp_path, ALL_TRAIN)
 
 
 @pytest.mark.skipif("TOUCHR1_TAC3D" not in os.environ, reason="TOUCHR1_TAC3D does not name the vendor's recordings")

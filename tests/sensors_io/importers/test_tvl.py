@@ -6,6 +6,7 @@ from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.tvl import list_tvl
 from sensors_io.records import RecordStore
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
 
 KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
@@ -67,11 +68,9 @@ def test_a_row_that_leads_elsewhere_is_skipped(source):
 
 
 def test_wrong_directories_and_tables_are_named(source, tmp_path):
-    with pytest.raises(ImportSourceError, match=r"expected train.csv or test.csv, in it or in data1"):
-        list_tvl(tmp_path, KEEP)
+    refused(ImportSourceError, r"expected train.csv or test.csv, in it or in data1", list_tvl, tmp_path, KEEP)
     (source / "data1" / "train.csv").write_text("a,b\n1,2\n")
     with pytest.raises(ImportSourceError, match=r"train.csv has the columns \['a', 'b'\]: must have url, tactile"):
         list_tvl(source, KEEP)
     (source / "data1" / "train.csv").write_bytes(b"\xff\xfe\xff")
-    with pytest.raises(ImportSourceError, match=r"train.csv cannot be read"):
-        list_tvl(source, KEEP)
+    refused(ImportSourceError, r"train.csv cannot be read", list_tvl, source, KEEP)

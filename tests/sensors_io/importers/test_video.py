@@ -6,6 +6,7 @@ import pytest
 
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import film
 
 WHOLE = {"height": 0, "stride": 1, "max_frames": 0}
@@ -54,10 +55,8 @@ def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
 def test_broken_files_are_named(tmp_path):
     for name, data in (("empty", b""), ("text", b"no video at all" * 99)):
         (tmp_path / name).write_bytes(data)
-        with pytest.raises(VideoError, match="does not open as a video"):
-            read_video(tmp_path / name, Keep(**WHOLE))
-    with pytest.raises(VideoError, match="does not open as a video"):
-        read_video(tmp_path / "absent.avi", Keep(**WHOLE))
+        refused(VideoError, "does not open as a video", read_video, tmp_path / name, Keep(**WHOLE))
+    refused(VideoError, "does not open as a video", lambda: read_video(tmp_path / "absent.avi", Keep(**WHOLE)))
 
 
 def test_a_film_cut_short_is_named(tmp_path):
@@ -91,5 +90,4 @@ def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, mes
             return stated.get(what, self.capture.get(what))
 
     monkeypatch.setattr(cv2, "VideoCapture", Capture)
-    with pytest.raises(VideoError, match=message):
-        read_video(tmp_path / "a.avi", Keep(**WHOLE))
+    refused(VideoError, message, lambda: read_video(tmp_path / "a.avi", Keep(**WHOLE)))

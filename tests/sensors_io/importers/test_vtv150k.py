@@ -1,11 +1,10 @@
 """VTV150K: flat videos of a sensor that the user names."""
 
-import pytest
-
 from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
 from sensors_io.records import RecordStore
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, film
 
 KEEP = VTVConfig(height=0, max_frames=0, val_share=0, test_share=0, sensor="digit")
@@ -37,5 +36,4 @@ def test_videos_become_records(tmp_path):
 
 
 def test_a_wrong_directory_says_what_was_expected(tmp_path):
-    with pytest.raises(ImportSourceError, match=r"holds none: expected <object>_<n>.mp4"):
-        list_vtv150k(tmp_path, KEEP)
+    refused(ImportSourceError, r"holds none: expected <object>_<n>.mp4", list_vtv150k, tmp_path, KEEP)

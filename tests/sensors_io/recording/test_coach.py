@@ -5,6 +5,7 @@ import pytest
 
 from sensors_io.recording.coach import Coach, CoachConfig, ContactStage, protocol
 from sensors_io.schema import Phase
+from tests.sensors_io.checks import refused
 
 CONFIG = CoachConfig(clear_s=0.1, settle_s=0.1, hold_s=0.2, move_s=0.2)
 
@@ -59,5 +60,4 @@ def test_the_protocol_is_a_press_and_six_motions_at_three_forces():
 
 
 def test_thresholds_are_checked():
-    with pytest.raises(ValueError, match="touch_n is 0: must be > 0"):
-        CoachConfig(touch_n=0)
+    refused(ValueError, "touch_n is 0: must be > 0", CoachConfig, touch_n=0)

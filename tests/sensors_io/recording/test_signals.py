@@ -7,6 +7,7 @@ from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.intake import Counts
 from sensors_io.offsets import OffsetsError
 from sensors_io.recording.signals import Listener, measure_offsets
+from tests.sensors_io.checks import refused
 
 AT = np.cumsum([1.0, 1.3, 0.9, 1.7, 1.1, 1.45])
 
@@ -66,8 +67,7 @@ def test_a_sensor_that_felt_nothing_is_named():
         measure_offsets(reference, {"tac3d": heard(silent)}, "netft", "taps")
     empty = Feed("tac3d", 100)
     empty.samples = []
-    with pytest.raises(OffsetsError, match="tac3d gave 0 samples"):
-        heard(empty)
+    refused(OffsetsError, "tac3d gave 0 samples", heard, empty)
 
 
 def test_repeated_stamps_are_left_out_and_bare_samples_refused():
@@ -77,8 +77,7 @@ def test_repeated_stamps_are_left_out_and_bare_samples_refused():
     assert len(heard(feed).time_ns) == count
     bare = Feed("tac3d", 100)
     bare.samples = [Sample(host_time_ns=0)]
-    with pytest.raises(OffsetsError, match="nothing tells a touch"):
-        heard(bare)
+    refused(OffsetsError, "nothing tells a touch", heard, bare)
 
 
 def test_fields_are_numbers_too():

@@ -7,6 +7,7 @@ import pytest
 
 from sensors_io.layer import Layer
 from sensors_io.scenes.adhesion import Adhesion, adhesive_ramp, plane_modulus_mpa, work_left
+from tests.sensors_io.checks import refused
 
 GEL_MODULUS = 0.3 / (1 - 0.48**2)
 SOFT = Adhesion(radius_mm=8.0, plane_modulus_mpa=GEL_MODULUS, work_n_per_mm=5e-5)  # 0.05 J/m²
@@ -109,14 +110,9 @@ def test_the_ramp_finds_the_pull_off() -> None:
 
 
 def test_impossible_input_is_refused() -> None:
-    with pytest.raises(ValueError, match="radius_mm is 0"):
-        dataclasses.replace(SOFT, radius_mm=0)
-    with pytest.raises(ValueError, match="work_n_per_mm is -1"):
-        dataclasses.replace(SOFT, work_n_per_mm=-1)
-    with pytest.raises(ValueError, match=r"tolerance is 0\.0: must be > 0"):
-        SOFT.least_force_n(0.0)
+    refused(ValueError, "radius_mm is 0", dataclasses.replace, SOFT, radius_mm=0)
+    refused(ValueError, "work_n_per_mm is -1", dataclasses.replace, SOFT, work_n_per_mm=-1)
+    refused(ValueError, r"tolerance is 0\.0: must be > 0", SOFT.least_force_n, 0.0)
     hertz, depth, area = _sphere_ramp(50)
-    with pytest.raises(ValueError, match="must stiffen"):
-        adhesive_ramp(np.sqrt(hertz), depth, area, 5e-5)
-    with pytest.raises(ValueError, match="must not shrink"):
-        adhesive_ramp(hertz, depth, area[::-1], 5e-5)
+    refused(ValueError, "must stiffen", lambda: adhesive_ramp(np.sqrt(hertz), depth, area, 5e-5))
+    refused(ValueError, "must not shrink", adhesive_ramp, hertz, depth, area[::-1], 5e-5)

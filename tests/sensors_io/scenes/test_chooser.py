@@ -14,6 +14,7 @@ from sensors_io.scenes.batching import CHUNK, chunks, gather, map_live
 from sensors_io.scenes.chooser_law import LAW, LOOK, MENU, SLACK, Setting
 from sensors_io.scenes.chooser_survey import FEATURES, PLAIN, survey
 from sensors_io.scenes.sensors import BODY, TAC3D
+from tests.sensors_io.checks import refused
 
 WINDOW_MM, GEL = TAC3D.window_mm, TAC3D.gel
 STAGE = chooser.ContactScene(gel=GEL, body=BODY, window_mm=WINDOW_MM)
@@ -56,9 +57,6 @@ def _survey(gap, force_n: float = 2.0):
     return surveyed(found.pressure_mpa, found.displacement_mm, gaps, one, WINDOW_MM, GEL.thickness_mm)
 
 
-# The menu ------------------------------------------------------------------------------------------------------------
-
-
 def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
     costs = [s.cost for s in MENU]
     assert costs == sorted(costs)
@@ -68,9 +66,6 @@ def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
         assert s.grid % 2 == 0
         assert s.padded >= s.grid
         assert s.padded % 2 == 0
-
-
-# The law -------------------------------------------------------------------------------------------------------------
 
 
 def test_errors_add_in_quadrature() -> None:
@@ -127,9 +122,6 @@ def test_the_first_setting_that_promises_enough_is_picked() -> None:
     assert (int(index), bool(met)) == (2, False)
 
 
-# The survey ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_survey_by_hand() -> None:
     """A square punch of 4 × 4 of 8 pixels under a flat gap: no detail, 32 edges of 16 pixels, an extent of a half."""
     pressure = jnp.zeros((8, 8)).at[2:6, 2:6].set(1.0)
@@ -160,9 +152,6 @@ def test_a_survey_is_finite_where_little_or_all_touches() -> None:
         for leaf in jax.tree.leaves(_survey(gap, 1e-3)):
             assert np.all(np.isfinite(leaf))
     assert len(PLAIN) < len(FEATURES) == len(LAW.grid)
-
-
-# The choice ----------------------------------------------------------------------------------------------------------
 
 
 def test_less_error_costs_more() -> None:
@@ -221,9 +210,6 @@ def test_many_scenes_are_solved_as_each_alone() -> None:
             np.testing.assert_allclose(bucket.contacts.displacement_mm[at], alone.displacement_mm, atol=1e-3 * scale)
 
 
-# Resuming ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("grid", [24, 32, *(pytest.param(n, marks=pytest.mark.slow) for n in (48, 64))])
 def test_resuming_ends_where_solving_does(grid) -> None:
     soft = _spectrum(36, 24)
@@ -252,9 +238,6 @@ def test_resampling_keeps_planes_and_doubles_as_refining_does() -> None:
     np.testing.assert_allclose(nested.resample(plane, 16)[1:-1, 1:-1], np.add.outer(at, 2 * at)[1:-1, 1:-1], atol=1e-4)
 
 
-# Chunks --------------------------------------------------------------------------------------------------------------
-
-
 def test_chunks_hold_every_row_once() -> None:
     rows = np.arange(100, 100 + CHUNK + 3)
     parts = list(chunks(rows))
@@ -271,22 +254,16 @@ def test_what_fills_up_a_chunk_is_dropped() -> None:
     np.testing.assert_array_equal(gather(parts, len(rows))["y"], rows.astype(np.float32) ** 2)
 
 
-# Bad input -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("error", [0.0, -0.1, 1.5, float("nan")])
 def test_an_error_out_of_range_is_refused(error) -> None:
-    with pytest.raises(ValueError, match=r"error is .*: must lie in \(0, 1\]"):
-        _choose(error)
+    refused(ValueError, r"error is .*: must lie in \(0, 1\]", _choose, error)
 
 
 @pytest.mark.parametrize(("field", "force", "window"), [("force_n", 0.0, 20.0), ("window_mm", 1.0, 0.0)])
 def test_what_is_not_positive_is_refused(field, force, window) -> None:
-    with pytest.raises(ValueError, match=f"{field} is .*0.*: must be > 0"):
-        chooser.choose(0.1, _ball, force, GEL, None, window)
+    refused(ValueError, f"{field} is .*0.*: must be > 0", chooser.choose, 0.1, _ball, force, GEL, None, window)
 
 
 @pytest.mark.parametrize("shape", [(50, 50), (48, 96), (48,)])
 def test_a_gap_that_does_not_fit_is_refused(shape) -> None:
-    with pytest.raises(ValueError, match=r"gap is .*multiple of"):
-        _choose(0.1, jnp.zeros(shape))
+    refused(ValueError, r"gap is .*multiple of", lambda: _choose(0.1, jnp.zeros(shape)))

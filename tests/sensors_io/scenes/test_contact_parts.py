@@ -27,9 +27,6 @@ def _problem(gap: np.ndarray, force: float) -> spg.Problem:
     )
 
 
-# The bed of springs --------------------------------------------------------------------------------------------------
-
-
 def test_springs_carry_the_force_at_one_level() -> None:
     p = winkler.pressure(jnp.asarray(R2 / 16), jnp.float32(9.0), jnp.float32(0.1))
     assert float(p.sum()) == pytest.approx(9.0, rel=1e-5)
@@ -60,9 +57,6 @@ def test_springs_are_never_empty() -> None:
     assert float(winkler.pressure(gap, jnp.float32(1e-6), jnp.float32(10.0)).sum()) == pytest.approx(1e-6, rel=1e-5)
 
 
-# Nested grids --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("points", "padded", "found"),
     [(128, 216, (4, 2)), (128, 180, (4, 2)), (48, 72, (2,)), (64, 90, (2,)), (24, 36, ()), (64, 65, ())],
@@ -83,9 +77,6 @@ def test_refining_a_plane_is_exact_inside_and_coarsening_undoes_it() -> None:
     fine = (np.arange(2 * N) + 0.5) * SPACING / 2 - N * SPACING / 2
     np.testing.assert_allclose(up[2:-2, 2:-2], (fine[None] * 0.3 - fine[:, None] * 0.1 + 1)[2:-2, 2:-2], atol=1e-5)
     np.testing.assert_allclose(np.asarray(nested.coarsen(jnp.asarray(up), 2))[1:-1, 1:-1], plane[1:-1, 1:-1], atol=1e-5)
-
-
-# The step ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(N, N), (3, N, N)])

@@ -12,6 +12,7 @@ from sensors_io.scenes.draws import draw
 from sensors_io.scenes.sensors import TAC3D
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import Flag
+from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=2, sites=1, frames=3, max_force_n=4.0)
 ORDER = 2  # Tac3D, which has no picture to render
@@ -68,5 +69,4 @@ def test_without_an_error_nothing_changes():
 
 @pytest.mark.parametrize("error", [0.0, 1.5])
 def test_an_error_out_of_range_is_refused(error):
-    with pytest.raises(ValueError, match=r"error is .*must lie in \(0, 1\]"):
-        SceneConfig(error=error)
+    refused(ValueError, r"error is .*must lie in \(0, 1\]", SceneConfig, error=error)

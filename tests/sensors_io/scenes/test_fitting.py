@@ -9,6 +9,7 @@ from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.fitting import BallPictures
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
+from tests.sensors_io.checks import refused
 
 RADIUS_MM, PX = 3.155, 64
 SCALE = GELSIGHT_MINI.window_mm / PX
@@ -86,5 +87,4 @@ def test_noise_and_grain_are_found_again(presses: BallPictures) -> None:
 
 
 def test_pictures_must_be_square_and_like_the_background(presses: BallPictures) -> None:
-    with pytest.raises(ValueError, match=r"must be \[P, N, N, 3\]"):
-        dataclasses.replace(presses, pictures=presses.pictures[:, :, 2:])
+    refused(ValueError, r"must be \[P, N, N, 3\]", dataclasses.replace, presses, pictures=presses.pictures[:, :, 2:])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from sensors_io.layer import Layer
 from sensors_io.scenes import history, properties
+from tests.sensors_io.checks import refused
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 RAMP = np.linspace(0, 5, 4001)
@@ -105,13 +106,8 @@ def test_the_share_of_energy_is_that_of_the_contact(modulus: float, radius: floa
 
 
 def test_impossible_input_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"loss is 1\.0: must lie in"):
-        history.elastic_force(RAMP, 1.0)
-    with pytest.raises(ValueError, match=r"force_n is -1\.0: must be ≥ 0"):
-        history.elastic_force(np.array([0.0, -1.0]), 0.1)
-    with pytest.raises(ValueError, match=r"body is 1\.2"):
-        history.Loss(gel=0.1, body=1.2)
-    with pytest.raises(ValueError, match=r"body_share is 1\.5"):
-        history.Loss(gel=0.1, body=0.2).of_contact(1.5)
-    with pytest.raises(ValueError, match="must do work"):
-        history.returned_share(np.zeros(3), np.zeros(3))
+    refused(ValueError, r"loss is 1\.0: must lie in", history.elastic_force, RAMP, 1.0)
+    refused(ValueError, r"force_n is -1\.0: must be ≥ 0", lambda: history.elastic_force(np.array([0.0, -1.0]), 0.1))
+    refused(ValueError, r"body is 1\.2", history.Loss, gel=0.1, body=1.2)
+    refused(ValueError, r"body_share is 1\.5", lambda: history.Loss(gel=0.1, body=0.2).of_contact(1.5))
+    refused(ValueError, "must do work", lambda: history.returned_share(np.zeros(3), np.zeros(3)))

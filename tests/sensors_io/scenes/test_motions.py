@@ -12,6 +12,7 @@ from sensors_io.scenes import surface
 from sensors_io.scenes.motions import Pace, moved, plan
 from sensors_io.scenes.objects import sample
 from sensors_io.schema import EXPLORATORY, FORCES_N, MOTIONS, PRESS_FORCE_N, Phase
+from tests.sensors_io.checks import refused
 
 ALL = [("press", PRESS_FORCE_N), *itertools.product(EXPLORATORY, FORCES_N)]
 X = (np.arange(40) + 0.5) * 0.4 - 8.0
@@ -127,13 +128,8 @@ def test_a_tilt_is_a_slope() -> None:
 
 
 def test_impossible_requests_are_refused() -> None:
-    with pytest.raises(ValueError, match="motion is 'wave': must be one of press, slide_x"):
-        plan("wave", 5.0)
-    with pytest.raises(ValueError, match=r"force_n is 0\.0: must be > 0"):
-        plan("press", 0.0)
-    with pytest.raises(ValueError, match="frames is 30: must be ≥ 36"):
-        Pace(frames=30)
-    with pytest.raises(ValueError, match="taps is 20"):
-        Pace(taps=20)
-    with pytest.raises(ValueError, match="slide_mm_per_s is 0"):
-        Pace(slide_mm_per_s=0)
+    refused(ValueError, "motion is 'wave': must be one of press, slide_x", plan, "wave", 5.0)
+    refused(ValueError, r"force_n is 0\.0: must be > 0", plan, "press", 0.0)
+    refused(ValueError, "frames is 30: must be ≥ 36", Pace, frames=30)
+    refused(ValueError, "taps is 20", Pace, taps=20)
+    refused(ValueError, "slide_mm_per_s is 0", Pace, slide_mm_per_s=0)

@@ -15,6 +15,7 @@ from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import contacts, make_contact
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
+from tests.sensors_io.checks import refused
 
 SMALL = SceneConfig(objects=130, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
 
@@ -49,8 +50,7 @@ def test_generation_resumes_anywhere_with_the_same_values(some: list[list[Sequen
 def test_generation_ends_and_refuses_a_start_outside() -> None:
     assert len(list(contacts(SMALL, start=SMALL.contact_count - 2))) == 2
     assert list(contacts(SMALL, start=SMALL.contact_count)) == []
-    with pytest.raises(ValueError, match=r"start is 261: must lie in \[0, 260\]"):
-        contacts(SMALL, start=261)
+    refused(ValueError, r"start is 261: must lie in \[0, 260\]", contacts, SMALL, start=261)
 
 
 def test_each_contact_holds_the_four_sensors_in_order(some: list[list[Sequence]]) -> None:
@@ -171,8 +171,7 @@ def test_hash_tells_configs_apart() -> None:
     ],
 )
 def test_bad_configs_are_refused_by_name(field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=f"{field} is .*must"):
-        dataclasses.replace(SMALL, **{field: value})
+    refused(ValueError, f"{field} is .*must", dataclasses.replace, SMALL, **{field: value})
 
 
 def test_padding_is_two_thicknesses_and_smooth() -> None:

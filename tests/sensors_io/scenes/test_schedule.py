@@ -10,6 +10,7 @@ from sensors_io.scenes import motions, schedule
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.strength import Limits
 from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N
+from tests.sensors_io.checks import refused
 
 OBJECTS = 360
 CONFIG = SceneConfig(objects=OBJECTS, sequences=4 * 1323, frames=40)
@@ -97,8 +98,7 @@ def test_the_schedule_follows_the_seed(made, limits):
 
 def test_weak_objects_are_refused_by_name(limits):
     weak = Limits(actual_n=np.full(OBJECTS, 4.0), rigid_n=np.full(OBJECTS, 4.0))
-    with pytest.raises(ValueError, match="objects is 360: none of them bears 10 N"):
-        schedule.protocol(CONFIG, weak, _cell())
+    refused(ValueError, "objects is 360: none of them bears 10 N", lambda: schedule.protocol(CONFIG, weak, _cell()))
 
 
 @pytest.mark.parametrize("frames", [20, 40, 90, 137])
@@ -125,8 +125,7 @@ def test_presses_alone_go_object_by_object():
     ],
 )
 def test_bad_sizes_are_refused(sequences, frames, message):
-    with pytest.raises(ValueError, match=message):
-        SceneConfig(objects=10, sequences=sequences, frames=frames)
+    refused(ValueError, message, SceneConfig, objects=10, sequences=sequences, frames=frames)
 
 
 def test_frames_default_to_the_kind_of_set():

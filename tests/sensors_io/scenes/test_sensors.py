@@ -8,6 +8,7 @@ import pytest
 from sensors_io.scenes import sensors
 from sensors_io.scenes.readout import FIELD_GRID
 from sensors_io.schema import SENSORS
+from tests.sensors_io.checks import refused
 
 PUBLISHED_MM = {
     "gelsight_mini": [(20.3, 15.2)],
@@ -36,5 +37,4 @@ def test_only_printed_or_grained_gels_have_a_texture() -> None:
 
 
 def test_a_window_without_size_is_refused() -> None:
-    with pytest.raises(ValueError, match="xense: window_mm is 0: must be > 0"):
-        dataclasses.replace(sensors.XENSE, window_mm=0)
+    refused(ValueError, "xense: window_mm is 0: must be > 0", dataclasses.replace, sensors.XENSE, window_mm=0)

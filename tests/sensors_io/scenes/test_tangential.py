@@ -65,9 +65,6 @@ def _rough_pressure(seed: int = 0) -> np.ndarray:
     return 0.15 * np.maximum(1 - RADIUS**2 / 25 + 0.8 * wavy, 0) * (RADIUS < 6)
 
 
-# Closed forms --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
 def test_cattaneo_and_mindlin(share: float) -> None:
     most, a = FRICTION * SPHERE.force_n, SPHERE.contact_radius_mm
@@ -127,9 +124,6 @@ def test_full_twist_torque() -> None:
     assert moment == pytest.approx(expected, rel=0.01)
 
 
-# Limits --------------------------------------------------------------------------------------------------------------
-
-
 def test_a_long_slide_slips_everywhere() -> None:
     limit = _rough_pressure()
     solved = _slide(limit, 30 * np.exp(0.7j), _layer())
@@ -171,9 +165,6 @@ def test_no_motion_no_traction() -> None:
     solved = _slide(_rough_pressure(), 0.0, _layer())
     assert solved.converged
     np.testing.assert_array_equal(solved.traction_mpa, 0)
-
-
-# Reference -----------------------------------------------------------------------------------------------------------
 
 
 def _reference(limit: np.ndarray, target: np.ndarray, layer: Layer, points: int = 2 * N) -> np.ndarray:
@@ -240,9 +231,6 @@ def test_the_residual_is_the_gap_of_the_friction_law(name: str) -> None:
     gap = np.sum(limit * np.abs(slip) - (slip.conj() * solved.traction_mpa).real) / np.sum(limit * np.abs(target))
     assert gap == pytest.approx(float(solved.residual), abs=1e-5)
     assert bool(solved.converged) == (solved.residual < tangential.TOLERANCE)
-
-
-# Failure cases -------------------------------------------------------------------------------------------------------
 
 
 def _one_pixel() -> np.ndarray:

@@ -5,14 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.layer import (
-    Layer,
-    depth_response,
-    longitudinal_compliance,
-    shear_compliance,
-    wave_numbers,
-)
+from sensors_io.layer import Layer, depth_response, longitudinal_compliance, shear_compliance, wave_numbers
 from sensors_io.scenes import traction
+from tests.sensors_io.checks import refused
 
 N, M, SPACING = 24, 36, 0.5
 X = (np.arange(N) + 0.5) * SPACING - N * SPACING / 2
@@ -130,5 +125,4 @@ def test_resultant_of_two_point_loads() -> None:
 
 
 def test_markers_outside_the_layer_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"depth_mm is 5\.0: must lie in"):
-        traction.make_response(GEL, M, SPACING, 5.0)
+    refused(ValueError, r"depth_mm is 5\.0: must lie in", traction.make_response, GEL, M, SPACING, 5.0)

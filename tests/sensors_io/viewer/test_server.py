@@ -16,6 +16,7 @@ import pytest
 from sensors_io.devices.base import Sample
 from sensors_io.viewer.panels import arrows, coloured, panels
 from sensors_io.viewer.server import LiveView, Numbers
+from tests.sensors_io.checks import refused
 
 NUMBERS = Numbers(
     title="gelsight_mini R0B", time_s=1.5, force_n=(0.0, 0.1, -2.0), tables={"gelsight_mini": {"rate": "25.0 Hz"}}
@@ -52,8 +53,7 @@ def test_page_numbers_and_pictures():
             assert (again["version"], again["alarm"]) == (said["version"] + 1, "overload")
         assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
         for path in ("panel/shear", "etc/passwd"):
-            with pytest.raises(urllib.error.HTTPError, match="404"):
-                ask(view, path)
+            refused(urllib.error.HTTPError, "404", ask, view, path)
 
 
 def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
