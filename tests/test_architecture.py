@@ -185,6 +185,29 @@ def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
         yield from ((module, n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
+MUTABLE = {
+    "touchr1_jax.training.loop.LoopTime": "sums grow with every step",
+    "sensors_io.devices.intake.Counts": "grow with every sample, under the lock of the intake",
+    "sensors_io.devices.replay.Truth": "grows with every sample",
+    "sensors_io.importers.catalogue._Run": "collects what an import leaves out",
+    "sensors_io.index.Index": "grows with every shard",
+    "sensors_io.recording.book.Report": "grows with every contact",
+}
+"""Dataclasses that change, and why."""
+
+
+def classes() -> Iterator[tuple[str, ast.ClassDef]]:
+    for module, tree in TREES.items():
+        yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
+
+
+def test_dataclasses_are_frozen():
+    """Those of Flax are; `dataclasses.dataclass` says so, or its class is listed with a reason."""
+    made = {name: [ast.unparse(d) for d in node.decorator_list] for name, node in classes()}
+    plain = {name for name, by in made.items() if any("dataclasses.dataclass" in d for d in by)}
+    assert {name for name in plain if not any("frozen=True" in d for d in made[name])} == MUTABLE.keys()
+
+
 def test_docstrings_open_with_a_noun_or_a_verb():
     """Only the question of an experiment may open with What, Whether or How."""
     wrong = []

@@ -24,8 +24,9 @@ def test_contrast_is_that_of_the_dots():
     assert find_markers(gels.dots(gels.lattice(24), 5.0, contrast=60.0)).contrast == pytest.approx(60, rel=0.15)
 
 
-def test_nothing_is_found_on_a_flat_picture():
-    assert find_markers(np.full(gels.SIDE, 100, np.uint8)) is None
+@pytest.mark.parametrize("picture", [np.full(gels.SIDE, 100, np.uint8), gels.dots(gels.lattice(48), 14.0)])
+def test_nothing_is_found_on_a_flat_picture_nor_dots_of_a_sixth_of_it(picture):
+    assert find_markers(picture) is None
 
 
 def test_inside_leaves_a_margin():

@@ -5,6 +5,17 @@ import json
 import cv2
 import numpy as np
 
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.keep import ImportConfig
+from sensors_io.records import RecordStore
+
+EVERYTHING = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
+
+
+def imported(catalogue, out):
+    """Report of an import, and its records."""
+    return import_catalogue(catalogue, out), RecordStore(out)
+
 
 def film(path, frames=12, size=(24, 32), rate=25.0):
     """A Motion-JPEG video whose frame n is a grey of 20 + 10 n (mod 220), with a red corner."""

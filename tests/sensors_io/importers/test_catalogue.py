@@ -12,12 +12,21 @@ import numpy as np
 import pytest
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, import_catalogue
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Skip, UnreadableError
+from sensors_io.importers.estimate_modulus import list_estimate_modulus
+from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Shares, Skip, UnreadableError
+from sensors_io.importers.octopi import list_octopi
+from sensors_io.importers.tac3d import list_tac3d
+from sensors_io.importers.tacquad import list_tacquad
+from sensors_io.importers.touch_and_go import list_touch_and_go
+from sensors_io.importers.tvl import list_tvl
+from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
+from sensors_io.importers.ycb_slide import list_ycb_slide
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, ContactKey
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import picture
+from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 
 def take(n, key):
@@ -49,21 +58,15 @@ def catalogue(count=9, view=None):
 
 
 def test_what_is_left_out_is_reported(tmp_path):
-    report = import_catalogue(catalogue(), tmp_path)
-    assert report.contacts == 8
+    report, store = imported(catalogue(), tmp_path / "nine")
+    assert report.contacts == len(store) == 8
     assert dict(report.objects) == {"train": 2, "val": 1, "test": 0, "unlabelled": 0}
     assert [skip.name for skip in report.skipped] == ["stray", "contact 6", "frame of 2", "frame of 5", "frame of 8"]
     assert report.unannotated == ATTRIBUTES[1:]
-    store = RecordStore(tmp_path)
-    assert len(store) == 8
     assert store.meta.notes["report"]["skipped"] == [dataclasses.asdict(skip) for skip in report.skipped]
-
-
-def test_an_object_without_a_readable_contact_is_reported(tmp_path):
-    listing = catalogue(7)  # contact 6 is the only one of object_2
-    report = import_catalogue(listing, tmp_path)
+    report, store = imported(catalogue(7), tmp_path / "seven")  # contact 6 is the only one of object_2
     assert Skip(name="object_2", reason="object without a readable contact") in report.skipped
-    assert set(RecordStore(tmp_path).objects) == {"object_0", "object_1"}
+    assert set(store.objects) == {"object_0", "object_1"}
 
 
 @pytest.mark.parametrize("stop", [1, 2, 5, 6, 7, 9])
@@ -92,37 +95,31 @@ def test_a_killed_import_goes_on(tmp_path):
     child = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], cwd=os.getcwd(), check=False)
     assert child.returncode == -signal.SIGKILL
     assert len(RecordStore(tmp_path / "parts", allow_incomplete=True)) == 64
-    whole = import_catalogue(catalogue(150), tmp_path / "whole")
-    assert import_catalogue(catalogue(150), tmp_path / "parts") == whole
-    stores = [RecordStore(tmp_path / name) for name in ("parts", "whole")]
-    assert stores[0].contacts == stores[1].contacts
-    for i in (0, 63, 64, 100, len(stores[0]) - 1):
-        a, b = (store.contact(i)["gelsight_mini"].frames for store in stores)
-        np.testing.assert_array_equal(a, b)
+    (whole, a), (parts, b) = (imported(catalogue(150), tmp_path / name) for name in ("whole", "parts"))
+    assert parts == whole
+    assert a.contacts == b.contacts
+    for i in (0, 63, 64, 100, len(a) - 1):
+        np.testing.assert_array_equal(a.contact(i)["gelsight_mini"].frames, b.contact(i)["gelsight_mini"].frames)
 
 
 def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
     listing = catalogue(7)
     broken = dataclasses.replace(listing, contacts=listing.contacts[6:], skipped=())
-    with pytest.raises(ImportSourceError, match=r"fake: no contact can be read; the first: .*contact 6.*is broken"):
-        import_catalogue(broken, tmp_path)
+    said = r"fake: no contact can be read; the first: .*contact 6.*is broken"
+    refused(ImportSourceError, said, import_catalogue, broken, tmp_path)
     assert not (tmp_path / "index.json").exists()
-
-
-def test_other_records_are_not_touched(tmp_path):
     import_catalogue(catalogue(), tmp_path)
-    with pytest.raises(RecordsExistError, match="made by config 'c0ffee', not 'abcd'"):
-        import_catalogue(dataclasses.replace(catalogue(), identity="abcd"), tmp_path)
+    other = dataclasses.replace(catalogue(), identity="abcd")
+    refused(RecordsExistError, "made by config 'c0ffee', not 'abcd'", import_catalogue, other, tmp_path)
 
 
 def test_the_view_of_the_first_contact_is_stored(tmp_path):
     path = picture(tmp_path / "in" / "view.png", shape=(480, 640))
-    import_catalogue(catalogue(3, view=path), tmp_path / "out")
-    assert RecordStore(tmp_path / "out").objects["object_0"].view.shape == (240, 320, 3)
+    assert imported(catalogue(3, view=path), tmp_path / "out")[1].objects["object_0"].view.shape == (240, 320, 3)
     path.write_bytes(b"broken")
-    report = import_catalogue(catalogue(3, view=path), tmp_path / "again")
+    report, store = imported(catalogue(3, view=path), tmp_path / "again")
     assert Skip(name="view.png", reason="view does not open as a picture") in report.skipped
-    assert RecordStore(tmp_path / "again").objects["object_0"].view is None
+    assert store.objects["object_0"].view is None
 
 
 def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
@@ -151,7 +148,26 @@ def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
         ({"val_share": 0.5, "test_share": 0.5}, "must be < 1; keep some for training"),
         ({"stride": 0}, "stride is 0: must be ≥ 1; raise it"),
         ({"height": -1}, "height is -1: must be ≥ 0"),
+        ({"max_frames": -1}, "max_frames is -1"),
     ],
 )
 def test_bad_options_are_named(bad, message):
     refused(ImportSourceError, message, ImportConfig, **bad)
+
+
+@pytest.mark.parametrize(
+    ("listing", "config", "expected"),
+    [
+        (list_estimate_modulus, EVERYTHING, r"<object>_<n>.avi with <object>_<n>_forces.pkl"),
+        (list_feelanyforce, FeelAnyForceConfig(), r"<table>.csv with the columns tactile, depth, FT"),
+        (list_octopi, Keep(), r"<sample>/data.json and <sample>/tactile"),
+        (list_tac3d, Shares(), r"<name>_<serial>.npz"),
+        (list_tacquad, EVERYTHING, r"one of contact_indoor.csv, .* with its data_indoor"),
+        (list_touch_and_go, EVERYTHING, r"one of label.txt, .* and dataset/<session>/gelsight_frame"),
+        (list_tvl, EVERYTHING, r"train.csv or test.csv, in it or in data1"),
+        (list_vtv150k, VTVConfig(sensor="digit"), r"<object>_<n>.mp4"),
+        (list_ycb_slide, EVERYTHING, r"<object>/dataset_<k>/frames/frame_<7 digits>.jpg"),
+    ],
+)
+def test_a_wrong_directory_says_what_was_expected(tmp_path, listing, config, expected):
+    refused(ImportSourceError, f"expected {expected}", listing, tmp_path, config)

@@ -3,15 +3,10 @@
 import pickle
 
 import numpy as np
-import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.estimate_modulus import list_estimate_modulus
-from sensors_io.importers.keep import ImportConfig, ImportSourceError
-from sensors_io.records import RecordStore
-from tests.sensors_io.importers.films import film
-
-KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
+from sensors_io.importers.keep import ImportConfig
+from tests.sensors_io.importers.films import EVERYTHING, film, imported
 
 
 def grasp(folder, name="golf_ball_1", force=None, width=None):
@@ -23,16 +18,12 @@ def grasp(folder, name="golf_ball_1", force=None, width=None):
     return folder
 
 
-def imported(source, out, config=KEEP):
-    return import_catalogue(list_estimate_modulus(source, config), out), RecordStore(out)
-
-
 def test_a_known_grasp_presses(tmp_path):
     grasp(tmp_path / "in" / "2023-12-06", force=np.linspace(-0.1, 24, 12), width=np.linspace(0.05, 0.04, 12))
-    report, store = imported(tmp_path / "in", tmp_path / "out", ImportConfig(max_frames=3, val_share=0, test_share=0))
+    three = ImportConfig(max_frames=3, val_share=0, test_share=0)
+    report, store = imported(list_estimate_modulus(tmp_path / "in", three), tmp_path / "out")
     assert (report.contacts, report.skipped) == (1, ())
-    sequence = store.contact(0)["gelsight_wedge"]
-    kept = [0, 6, 11]
+    sequence, kept = store.contact(0)["gelsight_wedge"], [0, 6, 11]
     np.testing.assert_allclose(sequence.force_n[:, 2], -np.linspace(-0.1, 24, 12)[kept], atol=1e-3)
     assert not sequence.force_n[:, :2].any()
     np.testing.assert_allclose(sequence.camera["gripper_width_m"], np.linspace(0.05, 0.04, 12)[kept])
@@ -48,7 +39,7 @@ def test_grasps_whose_files_do_not_fit_are_left_out_by_name(tmp_path):
     grasp(source, "ball_4", force=["a"] * 12)
     grasp(source, "ball_1_other")
     grasp(source, "nameless", force=np.ones(12))
-    report, store = imported(source, tmp_path / "out")
+    report, store = imported(list_estimate_modulus(source, EVERYTHING), tmp_path / "out")
     assert len(store) == 1
     found = {skip.name: skip.reason for skip in report.skipped}
     assert found.pop("ball_4.avi").startswith("ball_4_forces.pkl holds no numbers")
@@ -60,8 +51,3 @@ def test_grasps_whose_files_do_not_fit_are_left_out_by_name(tmp_path):
         "ball_1_widths.pkl": "ball_1_widths.pkl is absent",
     }
     assert "gripper_width_m" not in store.contact(0)["gelsight_wedge"].camera
-
-
-def test_a_wrong_directory_says_what_was_expected(tmp_path):
-    with pytest.raises(ImportSourceError, match=r"expected <object>_<n>.avi with <object>_<n>_forces.pkl"):
-        list_estimate_modulus(tmp_path, KEEP)

@@ -6,13 +6,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.feelanyforce import NO_ROW, FeelAnyForceConfig, list_feelanyforce, pressing_sign
 from sensors_io.importers.keep import ImportSourceError
-from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import picture
+from tests.sensors_io.importers.films import imported, picture
 
 KEEP = FeelAnyForceConfig(height=0, max_frames=0, val_share=0, test_share=0)
 HEAD = "tactile,depth,FT\n"
@@ -31,8 +29,8 @@ def write(root, *rows):
     return root
 
 
-def imported(source, out, config=KEEP):
-    return import_catalogue(list_feelanyforce(source, config), out), RecordStore(out)
+def feel(source, out, config=KEEP):
+    return imported(list_feelanyforce(source, config), out)
 
 
 @pytest.mark.parametrize(("pushes", "sign"), [("4.5", -1), ("-4.5", 1)])
@@ -40,18 +38,19 @@ def test_a_known_push_presses_whatever_sign_the_file_has(tmp_path, pushes, sign)
     """1 N along x and 4.5 N of pressing, as a sensor says that measures the push or its reaction."""
     root = tmp_path / "in"
     source = write(root, row(root, 1000, "0 0 0.1 0 0 0"), row(root, 2500, f"1 0 {pushes} 0 0 0.2"))
-    _, store = imported(source, tmp_path / "out")
+    _, store = feel(source, tmp_path / "out")
     sequence = store.contact(0)["gelsight_mini"]
     np.testing.assert_allclose(sequence.force_n, [[0, 0, sign * 0.1], [sign, 0, -4.5]], atol=1e-3)
     assert sequence.host_time_ns.tolist() == [1_000_000_000, 2_500_000_000]
     assert sequence.moment_nmm is None
 
 
-def test_the_sign_can_be_told_and_is_left_alone_without_a_push(tmp_path):
-    assert pressing_sign([0.15, -0.1], "infer") == 1
-    assert pressing_sign([0.1, 9.0, -2.0], "infer") == -1
-    assert pressing_sign([9.0], "negative") == 1
-    assert pressing_sign([-9.0], "positive") == -1
+@pytest.mark.parametrize(
+    ("readings", "told", "sign"),
+    [([0.15, -0.1], "infer", 1), ([0.1, 9.0, -2.0], "infer", -1), ([9.0], "negative", 1), ([-9.0], "positive", -1)],
+)
+def test_the_sign_can_be_told_and_is_left_alone_without_a_push(readings, told, sign):
+    assert pressing_sign(readings, told) == sign
 
 
 def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
@@ -65,7 +64,7 @@ def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
         "records/sphere/tactile/background.png,,0 0 0 0 0 0\n",
         row(root, 6000, "0 0 -2 0 0 0"),
     ]
-    report, store = imported(write(root, *rows), tmp_path / "out")
+    report, store = feel(write(root, *rows), tmp_path / "out")
     assert {skip.name: skip.reason for skip in report.skipped} == {
         "20250414.csv, line 3": "has no six readings, and its picture is absent",
         "20250414.csv, line 4": "has no six readings",
@@ -81,7 +80,7 @@ def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
 def test_a_table_is_cut_into_pieces_and_nothing_is_lost(tmp_path):
     root = tmp_path / "in"
     rows = [row(root, 1000 * n, f"0 0 -{n} 0 0 0", "cube" if n % 2 else "ball") for n in range(1, 8)]
-    report, store = imported(write(root, *rows), tmp_path / "out", dataclasses.replace(KEEP, max_frames=3))
+    report, store = feel(write(root, *rows), tmp_path / "out", dataclasses.replace(KEEP, max_frames=3))
     assert report.contacts == 3
     pieces = {(k.object_id, k.trial): store.contact(i)["gelsight_mini"] for i, k in enumerate(store.contacts)}
     forces = {key: sequence.force_n[:, 2].tolist() for key, sequence in pieces.items()}
@@ -89,25 +88,23 @@ def test_a_table_is_cut_into_pieces_and_nothing_is_lost(tmp_path):
 
 
 def test_pictures_beside_the_table_are_found(tmp_path):
-    root = tmp_path / "in"
-    source = write(root, row(root, 1000, "0 0 -3 0 0 0", write=False))
+    source = write(tmp_path / "in", row(tmp_path / "in", 1000, "0 0 -3 0 0 0", write=False))
     picture(source / "tactile" / "1000.png", 40)
-    _, store = imported(source, tmp_path / "out")
-    assert store.contacts[0].object_id == "sphere"
-
-
-def test_wrong_directories_and_tables_are_named(tmp_path):
-    with pytest.raises(ImportSourceError, match=r"expected <table>.csv with the columns tactile, depth, FT"):
-        list_feelanyforce(tmp_path, KEEP)
-    (tmp_path / "a.csv").write_text("tactile,force\n")
-    refused(ImportSourceError, "must have tactile, FT", list_feelanyforce, tmp_path, KEEP)
-    (tmp_path / "a.csv").write_text(HEAD + "x,,\n")
-    refused(ImportSourceError, "no row with a picture and six readings", list_feelanyforce, tmp_path, KEEP)
+    assert feel(source, tmp_path / "out")[1].contacts[0].object_id == "sphere"
 
 
 def test_every_empty_row_is_left_out_as_incomplete(tmp_path):
     """As in the published table, most of which is empty."""
     source = write(tmp_path / "in", row(tmp_path / "in", 1000, "0 0 -3 0 0 0"), *[",,\n"] * 7)
-    report, store = imported(source, tmp_path / "out")
+    report, store = feel(source, tmp_path / "out")
     assert collections.Counter(skip.reason for skip in report.skipped) == {NO_ROW: 7}
     assert store.frames == {"gelsight_mini": 1}
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [("tactile,force\n", "must have tactile, FT"), (HEAD + "x,,\n", "no row with a picture and six readings")],
+)
+def test_wrong_tables_are_named(tmp_path, table, said):
+    (tmp_path / "a.csv").write_text(table)
+    refused(ImportSourceError, said, list_feelanyforce, tmp_path, KEEP)

@@ -5,14 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
-from sensors_io.importers.keep import ImportSourceError, Keep, Skip
+from sensors_io.importers.keep import Skip
 from sensors_io.importers.octopi import level_of, list_octopi
-from sensors_io.records import RecordStore
 from sensors_io.schema import UNKNOWN, Flag
-from tests.sensors_io.importers.films import cut, picture
+from tests.sensors_io.importers.films import EVERYTHING, cut, imported, picture
 
-KEEP = Keep(height=0, max_frames=0)
 POTATO = {
     "object_id": "physiclear_potato",
     "object": "an unpeeled, raw potato",
@@ -39,10 +36,9 @@ def source(tmp_path):
 
 
 def test_samples_become_records(source, tmp_path):
-    report = import_catalogue(list_octopi(source, KEEP), tmp_path / "out")
+    report, store = imported(list_octopi(source, EVERYTHING), tmp_path / "out")
     assert (report.contacts, report.skipped, report.unlabelled) == (3, (), ())
     assert report.unannotated == ("protrusion", "material")
-    store = RecordStore(tmp_path / "out")
     assert [(k.object_id, k.motion, k.trial) for k in store.contacts] == [
         ("objectfolder_1", "free", 0),
         ("potato", "free", 0),
@@ -61,9 +57,9 @@ def test_samples_become_records(source, tmp_path):
 
 def test_a_cut_picture_is_left_out_and_marked(source, tmp_path):
     cut(source / "physiclear_2" / "tactile" / "0000000004.jpg")
-    report = import_catalogue(list_octopi(source, KEEP), tmp_path / "out")
+    report, store = imported(list_octopi(source, EVERYTHING), tmp_path / "out")
     assert report.skipped == (Skip(name="tactile/0000000004.jpg", reason="is cut off"),)
-    assert RecordStore(tmp_path / "out").contact(1)["gelsight_mini"].flags.tolist() == [0, int(Flag.TIME_GAP)]
+    assert store.contact(1)["gelsight_mini"].flags.tolist() == [0, int(Flag.TIME_GAP)]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +74,7 @@ def test_a_cut_picture_is_left_out_and_marked(source, tmp_path):
 )
 def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
     sample(source, "physiclear_99", data)
-    catalogue = list_octopi(source, KEEP)
+    catalogue = list_octopi(source, EVERYTHING)
     assert len(catalogue.contacts) == 3
     assert [skip.name for skip in catalogue.skipped] == ["physiclear_99"]
     assert reason in catalogue.skipped[0].reason
@@ -86,8 +82,3 @@ def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
 
 def test_ratings_are_cut_into_thirds():
     assert [level_of(r) for r in (0, 3.33, 3.34, 6.66, 6.67, 10)] == [0, 0, 1, 1, 2, 2]
-
-
-def test_a_wrong_directory_says_what_was_expected(tmp_path):
-    with pytest.raises(ImportSourceError, match=r"holds none: expected <sample>/data.json and <sample>/tactile"):
-        list_octopi(tmp_path, KEEP)

@@ -109,61 +109,47 @@ def test_an_interrupted_import_goes_on(tmp_path):
         import_physiclear(source, tmp_path / "parts", config=dataclasses.replace(KEEP, stride=2))
 
 
-class TestNamedErrors:
-    def run(self, source):
-        return import_physiclear(source, source.parent / "out", config=KEEP)
+def run(source):
+    return import_physiclear(source, source.parent / "out", config=KEEP)
 
-    def test_no_labels(self, tmp_path):
-        refused(ImportSourceError, r"labels.json is missing: give the directory that holds", self.run, tmp_path / "in")
 
-    def test_an_empty_folder(self, tmp_path):
-        (tmp_path / "in" / "videos").mkdir(parents=True)
-        labels(tmp_path / "in", entry("ball"))
-        refused(ImportSourceError, "videos is missing or empty: put the videos there", self.run, tmp_path / "in")
+def test_no_labels_and_no_videos_are_named(tmp_path):
+    source = tmp_path / "in"
+    refused(ImportSourceError, "labels.json is missing: give the directory that holds", run, source)
+    (source / "videos").mkdir(parents=True)
+    labels(source, entry("ball"))
+    refused(ImportSourceError, "videos is missing or empty: put the videos there", run, source)
+    (source / "videos" / "ball_0.avi").write_bytes(b"broken")
+    refused(ImportSourceError, r"no contact can be read; the first: .*ball_0.avi.*does not open", run, source)
+    assert not (tmp_path / "out" / "index.json").exists()
 
-    def test_no_readable_video(self, tmp_path):
-        source = folder(tmp_path / "in", entry("ball", videos=1))
-        (source / "videos" / "ball_0.avi").write_bytes(b"broken")
-        refused(ImportSourceError, r"no contact can be read; the first: .*ball_0.avi.*does not open", self.run, source)
-        assert not (tmp_path / "out" / "index.json").exists()
 
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"hardness": 3}, r"labels\[hardness\] is 3: must lie in 0..2"),
-            ({"material": "cheese"}, "material 'cheese' must be one of plastic"),
-            ({"split": "dev"}, "split is 'dev'"),
-            ({"object": "a ball"}, "object_id is 'a ball'"),
-            ({"videos": ["../ball_0.avi"]}, "must be a file name without a directory"),
-            ({"hardness": "soft"}, "invalid literal"),
-        ],
-    )
-    def test_labels_out_of_range(self, tmp_path, change, message):
-        labels(tmp_path, entry("ball") | change)
-        refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
+BALL = entry("ball")
 
-    def test_missing_keys_and_no_json(self, tmp_path):
-        item = entry("ball")
-        del item["bumps"]
-        labels(tmp_path, item)
-        refused(ImportSourceError, "'bumps'", read_labels, tmp_path / "labels.json")
-        (tmp_path / "labels.json").write_text("{")
-        refused(ImportSourceError, "correct the entry", read_labels, tmp_path / "labels.json")
 
-    @pytest.mark.parametrize(
-        ("items", "message"),
-        [
-            ([entry("ball"), entry("ball", videos=0)], "object 'ball' appears twice"),
-            ([entry("ball"), entry("cup") | {"videos": ["ball_0.avi"]}], "video 'ball_0.avi' appears twice; splits"),
-        ],
-    )
-    def test_splits_cannot_share_an_object_or_a_video(self, tmp_path, items, message):
-        labels(tmp_path, *items)
-        refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
+@pytest.mark.parametrize(
+    ("items", "message"),
+    [
+        ([BALL | {"hardness": 3}], r"labels\[hardness\] is 3: must lie in 0..2"),
+        ([BALL | {"material": "cheese"}], "material 'cheese' must be one of plastic"),
+        ([BALL | {"split": "dev"}], "split is 'dev'"),
+        ([BALL | {"object": "a ball"}], "object_id is 'a ball'"),
+        ([BALL | {"videos": ["../ball_0.avi"]}], "must be a file name without a directory"),
+        ([BALL | {"hardness": "soft"}], "invalid literal"),
+        ([{key: value for key, value in BALL.items() if key != "bumps"}], "'bumps'"),
+        ([BALL, entry("ball", videos=0)], "object 'ball' appears twice"),
+        ([BALL, entry("cup") | {"videos": ["ball_0.avi"]}], "video 'ball_0.avi' appears twice; splits"),
+        (None, "correct the entry"),
+    ],
+)
+def test_labels_that_cannot_be_used_are_named(tmp_path, items, message):
+    labels(tmp_path, *items) if items else (tmp_path / "labels.json").write_text("{")
+    refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
 
-    @pytest.mark.parametrize("bad", [{"stride": 0}, {"height": -1}, {"max_frames": -1}, {"test_share": 1.0}])
-    def test_bad_options(self, bad):
-        refused(ImportSourceError, f"{next(iter(bad))} is ", PhysiclearConfig, **bad)
+
+@pytest.mark.parametrize("bad", [{"stride": 0}, {"height": -1}, {"max_frames": -1}, {"test_share": 1.0}])
+def test_bad_options_are_named(bad):
+    refused(ImportSourceError, f"{next(iter(bad))} is ", PhysiclearConfig, **bad)
 
 
 @pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")

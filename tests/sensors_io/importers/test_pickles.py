@@ -20,9 +20,6 @@ def test_arrays_and_dictionaries_come_back(tmp_path, protocol):
     data = {"start_time": "2022-03-20", "timestamps": [0.0, 0.5], "poses": {"DIGIT": np.eye(3)}, "one": np.float64(2.5)}
     (tmp_path / "a.pkl").write_bytes(pickle.dumps(data, protocol))
     np.testing.assert_equal(read_pickle(tmp_path / "a.pkl"), data)
-
-
-def test_a_pickled_object_in_npy(tmp_path):
     np.save(tmp_path / "a.npy", {"timestamps": [1.0]}, allow_pickle=True)
     assert read_pickle(tmp_path / "a.npy") == {"timestamps": [1.0]}
 

@@ -12,23 +12,23 @@ WHOLE = Keep(height=0, max_frames=0)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
-def test_colours_are_rgb(tmp_path, name):
-    image = read_picture(picture(tmp_path / name))
+def test_colours_are_rgb_and_a_picture_that_was_cut_off_is_refused(tmp_path, name):
+    path = picture(tmp_path / name)
+    image = read_picture(path)
     assert image.shape == (24, 32, 3)
     red, green, blue = image[2, 2].astype(int)
     assert red > 200 > 80 > max(green, blue)
+    refused(PictureError, "is cut off", read_picture, cut(path))
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
-def test_a_picture_that_was_cut_off_is_refused(tmp_path, name):
-    refused(PictureError, "is cut off", lambda: read_picture(cut(picture(tmp_path / name))))
-
-
-def test_what_is_no_picture_is_refused(tmp_path):
-    refused(PictureError, "is absent", read_picture, tmp_path / "a.png")
-    for data in (b"", b"text"):
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [(None, "is absent"), (b"", "does not open as a picture"), (b"text", "does not open as a picture")],
+)
+def test_what_is_no_picture_is_refused(tmp_path, data, said):
+    if data is not None:
         (tmp_path / "a.png").write_bytes(data)
-        refused(PictureError, "does not open as a picture", read_picture, tmp_path / "a.png")
+    refused(PictureError, said, read_picture, tmp_path / "a.png")
 
 
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
@@ -61,9 +61,8 @@ def test_no_readable_picture_is_an_error(tmp_path):
 
 
 def test_names_are_ordered_by_their_numbers(tmp_path):
-    for n in (10, 9, 100):
-        picture(tmp_path / f"frame_{n}.png")
-    (tmp_path / "notes.txt").touch()
+    for name in ("frame_10.png", "frame_9.png", "frame_100.png", "notes.txt"):
+        (tmp_path / name).touch()
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")

@@ -6,13 +6,11 @@ import pathlib
 import numpy as np
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportSourceError, Shares
 from sensors_io.importers.tac3d import SIDE, list_tac3d
-from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import cut
+from tests.sensors_io.importers.films import cut, imported
 
 ALL_TRAIN = Shares(val_share=0, test_share=0)
 
@@ -45,12 +43,12 @@ def write(folder, name="example_1_AD2-0065L", **changes):
     return folder
 
 
-def imported(source, out):
-    return import_catalogue(list_tac3d(source, ALL_TRAIN), out), RecordStore(out)
+def read(source, out):
+    return imported(list_tac3d(source, ALL_TRAIN), out)
 
 
 def test_a_known_push_lies_where_and_as_it_was_made(tmp_path):
-    _, store = imported(write(tmp_path / "in"), tmp_path / "out")
+    _, store = read(write(tmp_path / "in"), tmp_path / "out")
     sequence = store.contact(0)["tac3d"]
     row, column = np.unravel_index(sequence.depth_mm[1].argmax(), (SIDE, SIDE))
     axis = np.linspace(-10, 10, SIDE)  # x rises with the column, y with the row
@@ -65,7 +63,7 @@ def test_a_known_push_lies_where_and_as_it_was_made(tmp_path):
 
 
 def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
-    _, store = imported(write(tmp_path / "in", index=(7, 8, 11, 12, 20)), tmp_path / "out")
+    _, store = read(write(tmp_path / "in", index=(7, 8, 11, 12, 20)), tmp_path / "out")
     sequence = store.contact(0)["tac3d"]
     assert np.flatnonzero(sequence.flags & int(Flag.TIME_GAP)).tolist() == [2, 4]
     assert sequence.camera["missing_frames"] == 9
@@ -75,7 +73,7 @@ def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
     write(tmp_path / "in", "a_S1")
     write(tmp_path / "in", "b_S2", recvTimestamp=np.array([0.04, 0.07, 0.52]))
     write(tmp_path / "in", "c_S3", recvTimestamp=np.array([0.04, 0.03, 0.52]))
-    report, store = imported(tmp_path / "in", tmp_path / "out")
+    report, store = read(tmp_path / "in", tmp_path / "out")
     sent, received = (store.contact(i)["tac3d"] for i in range(2))
     np.testing.assert_array_equal(sent.host_time_ns, sent.device_time_ns)
     assert received.host_time_ns.tolist() == [40_000_000, 70_000_000, 520_000_000]
@@ -86,11 +84,9 @@ def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
 def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
     arrays = recording()
     arrays["3D_ResultantForce"][1, 0, 2] = np.nan
-    report, store = imported(write(tmp_path / "in", **arrays), tmp_path / "out")
+    report, store = read(write(tmp_path / "in", **arrays), tmp_path / "out")
     assert [skip.name for skip in report.skipped] == ["example_1_AD2-0065L.npz, frame 1"]
-    sequence = store.contact(0)["tac3d"]
-    assert len(sequence) == 2
-    assert sequence.flags.tolist() == [0, int(Flag.TIME_GAP)]
+    assert store.contact(0)["tac3d"].flags.tolist() == [0, int(Flag.TIME_GAP)]
 
 
 @pytest.mark.parametrize(
@@ -103,19 +99,18 @@ def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
     ],
 )
 def test_another_layout_is_refused(tmp_path, changes, reason):
-    refused(ImportSourceError, reason, lambda: imported(write(tmp_path / "in", **changes), tmp_path / "out"))
+    refused(ImportSourceError, reason, read, write(tmp_path / "in", **changes), tmp_path / "out")
 
 
-def test_damage_and_a_wrong_directory_are_named(tmp_path):
+def test_damage_is_named(tmp_path):
     source = write(tmp_path / "in")
     cut(source / "example_1_AD2-0065L.npz")
-    refused(ImportSourceError, "is damaged", imported, source, tmp_path / "out")
-    refused(ImportSourceError, r"expected <name>_<serial>.npz", list_tac3d, tmp_path, ALL_TRAIN)
+    refused(ImportSourceError, "is damaged", read, source, tmp_path / "out")
 
 
 @pytest.mark.skipif("TOUCHR1_TAC3D" not in os.environ, reason="TOUCHR1_TAC3D does not name the vendor's recordings")
 def test_the_real_recordings(tmp_path):
-    _, store = imported(pathlib.Path(os.environ["TOUCHR1_TAC3D"]), tmp_path)
+    _, store = read(pathlib.Path(os.environ["TOUCHR1_TAC3D"]), tmp_path)
     missing = {k.object_id: store.contact(i)["tac3d"].camera["missing_frames"] for i, k in enumerate(store.contacts)}
     assert missing == {"example_1_AD2-0065L": 9, "example_2_HDL1-GWH0021": 61}
     hardest = store.contact(0)["tac3d"].force_n[:, 2].argmin()

@@ -4,13 +4,9 @@ import shutil
 
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.keep import Skip
 from sensors_io.importers.tacquad import list_tacquad
-from sensors_io.records import RecordStore
-from tests.sensors_io.importers.films import picture
-
-KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
+from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 
 @pytest.fixture
@@ -27,9 +23,8 @@ def source(tmp_path):
 
 
 def test_rows_become_paired_records(source, tmp_path):
-    report = import_catalogue(list_tacquad(source, KEEP), tmp_path / "out")
+    report, store = imported(list_tacquad(source, EVERYTHING), tmp_path / "out")
     assert (report.contacts, report.skipped) == (3, ())
-    store = RecordStore(tmp_path / "out")
     assert [(k.object_id, k.motion, k.trial) for k in store.contacts] == [
         ("indoor-paper_box", "free", 0),
         ("fine-ball", "press", 0),
@@ -50,9 +45,9 @@ def test_a_sensor_that_is_missing_does_not_take_the_others_with_it(source, tmp_p
     (source / "data_indoor" / "paper box" / "duragel" / "3.png").unlink()
     with (source / "contact_indoor.csv").open("a") as file:
         file.write("gone,1,3,0,1,2,4\nshort,1\nodd,a,b,c,d,e,f\n")
-    report = import_catalogue(list_tacquad(source, KEEP), tmp_path / "out")
+    report, store = imported(list_tacquad(source, EVERYTHING), tmp_path / "out")
     assert report.contacts == 3
-    assert set(RecordStore(tmp_path / "out").contact(0)) == {"gelsight_mini", "duragel"}
+    assert set(store.contact(0)) == {"gelsight_mini", "duragel"}
     found = {skip.name: skip.reason for skip in report.skipped}
     assert found["paper box/digit"] == "has no folder"
     assert found["paper box/duragel/3.png"] == "is absent"
@@ -60,9 +55,3 @@ def test_a_sensor_that_is_missing_does_not_take_the_others_with_it(source, tmp_p
     assert "invalid literal" in found["contact_indoor.csv: odd,a,b,c,d,e,f"]
     assert "gone/gelsight_mini has no folder" in found["data_indoor/gone"]
     assert Skip(name="indoor-gone", reason="object without a readable contact") in report.skipped
-
-
-def test_a_wrong_directory_says_what_was_expected(tmp_path):
-    (tmp_path / "contact_indoor.csv").write_text("")
-    with pytest.raises(ImportSourceError, match=r"expected one of contact_indoor.csv, .* with its data_indoor"):
-        list_tacquad(tmp_path, KEEP)

@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.touch_and_go import list_touch_and_go, touches
-from sensors_io.records import RecordStore
 from sensors_io.schema import MATERIALS, UNKNOWN, Flag
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import picture
+from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
-KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
 FIRST, SECOND = "20220318_021048", "20220318_022003"
 
 
@@ -36,9 +33,8 @@ def source(tmp_path):
 
 
 def test_touches_become_records(source, tmp_path):
-    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
+    report, store = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "out")
     assert (report.contacts, report.skipped) == (3, ())
-    store = RecordStore(tmp_path / "out")
     assert [k.object_id for k in store.contacts] == [f"{FIRST}-natural_fabric", f"{FIRST}-tree", f"{SECOND}-wood"]
     materials = [MATERIALS[store.objects[k.object_id].labels["material"]] for k in store.contacts]
     assert materials == ["fabric", "other", "wood"]
@@ -54,8 +50,7 @@ def test_touches_become_records(source, tmp_path):
 def test_recorded_times_are_used_where_they_are(source, tmp_path):
     np.save(source / "dataset" / FIRST / "time2.npy", 1647.0 + np.arange(62) ** 2 / 100)
     np.save(source / "dataset" / SECOND / "time2.npy", np.arange(2.0))
-    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
-    store = RecordStore(tmp_path / "out")
+    report, store = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "out")
     sequence = store.contact(0)["gelsight"]
     np.testing.assert_allclose(sequence.host_time_ns, [250_000_000, 360_000_000, 490_000_000], atol=100)
     assert sequence.camera["clock"] == "time2.npy"
@@ -66,16 +61,13 @@ def test_lines_and_frames_that_say_nothing_certain_are_skipped(source, tmp_path)
     bad = [f"{FIRST}/61.jpg,3", f"{FIRST}/0000000061.jpg,20", f"{FIRST}/0000000005.jpg,2", "nonsense"]
     (source / "train.txt").write_text("\n".join(bad))
     (source / "dataset" / FIRST / "gelsight_frame" / "0000000006.jpg").unlink()
-    report = import_catalogue(list_touch_and_go(source, KEEP), tmp_path / "out")
+    report, store = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "out")
     assert set(report.skipped) == {
-        *(
-            Skip(name=f"train.txt: {b}", reason="is no <session>/<10 digits>.jpg,<class>")
-            for b in (bad[0], bad[1], bad[3])
-        ),
+        *(Skip(name=f"train.txt: {bad[n]}", reason="is no <session>/<10 digits>.jpg,<class>") for n in (0, 1, 3)),
         Skip(name=f"{FIRST}/0000000005.jpg", reason="is listed with several classes"),
         Skip(name="gelsight_frame/0000000006.jpg", reason="is absent"),
     }
-    assert RecordStore(tmp_path / "out").contact(0)["gelsight"].flags.tolist() == [int(Flag.TIME_GAP)]
+    assert store.contact(0)["gelsight"].flags.tolist() == [int(Flag.TIME_GAP)]
 
 
 def test_a_pause_a_class_or_a_session_ends_a_touch():
@@ -94,8 +86,7 @@ def test_sessions_are_not_torn_apart(tmp_path):
     assert sorted(min(found) for found in splits.values()) == ["test"] * 3 + ["train"] * 5 + ["val"] * 2
 
 
-def test_a_wrong_directory_says_what_was_expected(tmp_path):
-    with pytest.raises(ImportSourceError, match=r"expected one of label.txt, .* and dataset/<session>/gelsight_frame"):
-        list_touch_and_go(tmp_path, KEEP)
+def test_an_empty_list_is_named(tmp_path):
     (tmp_path / "label.txt").write_text("")
-    refused(ImportSourceError, r"label.txt names no frame: expected lines <session>", list_touch_and_go, tmp_path, KEEP)
+    said = r"label.txt names no frame: expected lines <session>"
+    refused(ImportSourceError, said, list_touch_and_go, tmp_path, EVERYTHING)

@@ -2,14 +2,11 @@
 
 import pytest
 
-from sensors_io.importers.catalogue import import_catalogue
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.tvl import list_tvl
-from sensors_io.records import RecordStore
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import cut, picture
+from tests.sensors_io.importers.films import EVERYTHING, cut, imported, picture
 
-KEEP = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
 DIGIT, WEBCAM = (320, 240), (90, 160)
 HEAD = "url,tactile,tactile_background,caption\n"
 
@@ -33,10 +30,8 @@ def source(tmp_path):
 
 
 def test_trajectories_become_records(source, tmp_path):
-    report = import_catalogue(list_tvl(source, KEEP), tmp_path / "out")
-    assert (report.contacts, report.skipped) == (2, ())
-    assert len(report.unannotated) == 4
-    store = RecordStore(tmp_path / "out")
+    report, store = imported(list_tvl(source, EVERYTHING), tmp_path / "out")
+    assert (report.contacts, report.skipped, len(report.unannotated)) == (2, (), 4)
     assert {k.object_id for k in store.contacts} == {"data1-0-1702507215.6", "data1-1-1702507300.1"}
     whole, swapped = sorted((store.contact(i)["digit"] for i in range(2)), key=lambda s: s.key.object_id)
     assert whole.frames[:, -1, -1, 0].tolist() == [9, 10, 11]
@@ -50,15 +45,15 @@ def test_trajectories_become_records(source, tmp_path):
 
 def test_one_part_alone_and_a_cut_picture(source, tmp_path):
     cut(source / "data1" / "0-1702507215.6" / "tactile" / "10-0.02.png")
-    report = import_catalogue(list_tvl(source / "data1", KEEP), tmp_path / "out")
+    report, store = imported(list_tvl(source / "data1", EVERYTHING), tmp_path / "out")
     assert report.skipped == (Skip(name="tactile/10-0.02.png", reason="is cut off"),)
-    assert {k.object_id for k in RecordStore(tmp_path / "out").contacts} == {"0-1702507215.6", "1-1702507300.1"}
+    assert {k.object_id for k in store.contacts} == {"0-1702507215.6", "1-1702507300.1"}
 
 
 def test_a_row_that_leads_elsewhere_is_skipped(source):
     with (source / "data1" / "train.csv").open("a") as file:
         file.write("../a/b,../a/b,,x\nshort\na/vision/b.jpg,a/tactile/b.jpg,,x\n")
-    catalogue = list_tvl(source, KEEP)
+    catalogue = list_tvl(source, EVERYTHING)
     reason = "is no <trajectory>/{tactile,vision}/<i>-<gap>.jpg"
     assert [(skip.name, skip.reason) for skip in catalogue.skipped] == [
         ("data1/train.csv: ../a/b", reason),
@@ -67,10 +62,10 @@ def test_a_row_that_leads_elsewhere_is_skipped(source):
     ]
 
 
-def test_wrong_directories_and_tables_are_named(source, tmp_path):
-    refused(ImportSourceError, r"expected train.csv or test.csv, in it or in data1", list_tvl, tmp_path, KEEP)
-    (source / "data1" / "train.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ImportSourceError, match=r"train.csv has the columns \['a', 'b'\]: must have url, tactile"):
-        list_tvl(source, KEEP)
-    (source / "data1" / "train.csv").write_bytes(b"\xff\xfe\xff")
-    refused(ImportSourceError, r"train.csv cannot be read", list_tvl, source, KEEP)
+def test_wrong_tables_are_named(source):
+    table = source / "data1" / "train.csv"
+    table.write_text("a,b\n1,2\n")
+    said = r"train.csv has the columns \['a', 'b'\]: must have url, tactile"
+    refused(ImportSourceError, said, list_tvl, source, EVERYTHING)
+    table.write_bytes(b"\xff\xfe\xff")
+    refused(ImportSourceError, "train.csv cannot be read", list_tvl, source, EVERYTHING)

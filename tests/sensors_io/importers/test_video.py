@@ -7,7 +7,7 @@ import pytest
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import film
+from tests.sensors_io.importers.films import cut, film
 
 WHOLE = {"height": 0, "stride": 1, "max_frames": 0}
 
@@ -42,28 +42,24 @@ def test_frames_are_thinned_as_asked(tmp_path, options, index):
 
 
 def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
-    film(tmp_path / "a.avi", 3)
-    every, small = (
-        read_video(tmp_path / "a.avi", Keep(**WHOLE)),
-        read_video(tmp_path / "a.avi", Keep(**WHOLE | {"height": 12})),
-    )
+    path = film(tmp_path / "a.avi", 3)
+    every, small = (read_video(path, Keep(**WHOLE | {"height": height})) for height in (0, 12))
     assert small.frames.shape == (3, 12, 16, 3)
     assert small.size_px == (24, 32)
     np.testing.assert_allclose(small.frames, every.frames.reshape(3, 12, 2, 16, 2, 3).mean(axis=(2, 4)), atol=0.51)
 
 
-def test_broken_files_are_named(tmp_path):
-    for name, data in (("empty", b""), ("text", b"no video at all" * 99)):
-        (tmp_path / name).write_bytes(data)
-        refused(VideoError, "does not open as a video", read_video, tmp_path / name, Keep(**WHOLE))
-    refused(VideoError, "does not open as a video", lambda: read_video(tmp_path / "absent.avi", Keep(**WHOLE)))
+@pytest.mark.parametrize("data", [None, b"", b"no video at all" * 99])
+def test_broken_files_are_named(tmp_path, data):
+    path = tmp_path / "a.avi"
+    if data is not None:
+        path.write_bytes(data)
+    refused(VideoError, "does not open as a video", read_video, path, Keep(**WHOLE))
 
 
 def test_a_film_cut_short_is_named(tmp_path):
-    data = film(tmp_path / "a.avi", 40).read_bytes()
-    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    with pytest.raises(VideoError, match=r"is cut off: \d+ of 40 frames|holds no frame|does not open"):
-        read_video(tmp_path / "cut.avi", Keep(**WHOLE))
+    said = r"is cut off: \d+ of 40 frames|holds no frame|does not open"
+    refused(VideoError, said, read_video, cut(film(tmp_path / "a.avi", 40)), Keep(**WHOLE))
 
 
 @pytest.mark.parametrize(
