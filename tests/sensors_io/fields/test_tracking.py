@@ -111,7 +111,7 @@ def test_a_dot_at_the_border_is_not_followed():
 
 def test_a_field_in_millimetres():
     reader = DeformationReader(gels.rgb(REST), mm_per_px=0.1, shape=(16, 20))
-    read = reader.read(gels.rgb(gels.exposed(gels.dots(POINTS + [2.0, -1.0]))))
+    read = reader.read(gels.rgb(gels.exposed(gels.dots(np.add(POINTS, [2.0, -1.0])))))
     assert read.flags == Flag.NONE
     assert read.valid.all()
     np.testing.assert_allclose(read.displacement_mm, np.broadcast_to([0.2, -0.1], (16, 20, 2)), atol=0.008)
