@@ -8,7 +8,7 @@ import pytest
 
 from sensors_io import generate
 from sensors_io.codec import encode_sequence
-from sensors_io.records import IncompleteRecordsError, RecordsExistError, RecordStore
+from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes
 
@@ -41,26 +41,6 @@ def test_all_contacts_are_written_once(tmp_path, asked):
     generate.generate_records(CONFIG, tmp_path)
     assert asked == [0, 5]
     assert len(RecordStore(tmp_path)) == 5
-
-
-def test_an_interrupted_generation_goes_on(tmp_path, asked):
-    def stop(done, total):
-        if done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        generate.generate_records(CONFIG, tmp_path, progress=stop)
-    with pytest.raises(IncompleteRecordsError):
-        RecordStore(tmp_path)
-    generate.generate_records(CONFIG, tmp_path)
-    assert asked == [0, 3]
-    assert [key.object_id for key in RecordStore(tmp_path).contacts] == [f"object_{n}" for n in range(5)]
-
-
-def test_another_config_does_not_mix_in(tmp_path, asked):
-    generate.generate_records(CONFIG, tmp_path)
-    with pytest.raises(RecordsExistError, match="made by config"):
-        generate.generate_records(SceneConfig(objects=5, sites=1, seed=1), tmp_path)
 
 
 _CHILD = """

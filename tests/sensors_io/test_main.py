@@ -153,12 +153,6 @@ sys.exit(bool({set(heavy.split())} & set(sys.modules)))
         assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0
 
 
-def test_devices_are_for_commands_that_take_them(run, tmp_path):
-    status, _, err = run("list", tmp_path, "+", "tac3d")
-    assert status == 1
-    assert err.startswith("DeviceNotFoundError: list takes no device after a +")
-
-
 def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
     def stop(*args, **kwargs):
         raise KeyboardInterrupt

@@ -71,26 +71,14 @@ def test_any_array_comes_back():
         np.testing.assert_array_equal(found[name], a)
 
 
-@pytest.mark.parametrize(
-    ("header", "payload", "message"),
-    [
-        (b"{", b"", "cannot be read"),
-        (b"{}", b"", "cannot be read"),
-        (json.dumps({"number": 1, "stamp_ns": 2, "arrays": []}).encode(), b"x", "1 bytes of arrays"),
-        (
-            json.dumps({"number": 1, "stamp_ns": 2, "arrays": [{"name": "a", "dtype": "O", "shape": [1]}]}).encode(),
-            b"x" * 8,
-            "of type object",
-        ),
-        (
-            json.dumps({"number": 1, "stamp_ns": 2, "arrays": [{"name": "a", "dtype": "<f8", "shape": [9]}]}).encode(),
-            b"x" * 8,
-            "cannot be read",
-        ),
-    ],
-)
-def test_damaged_frames_are_refused(header, payload, message):
-    refused(DeviceDataError, message, bridge.unpack, header, payload)
+def test_damaged_frames_are_refused():
+    header = lambda *arrays: json.dumps({"number": 1, "stamp_ns": 2, "arrays": arrays}).encode()
+    kind = lambda dtype, count: header({"name": "a", "dtype": dtype, "shape": [count]})
+    refused(DeviceDataError, "cannot be read", bridge.unpack, b"{", b"")
+    refused(DeviceDataError, "cannot be read", bridge.unpack, b"{}", b"")
+    refused(DeviceDataError, "1 bytes of arrays", lambda: bridge.unpack(header(), b"x"))
+    refused(DeviceDataError, "of type object", lambda: bridge.unpack(kind("O", 1), b"x" * 8))
+    refused(DeviceDataError, "cannot be read", lambda: bridge.unpack(kind("<f8", 9), b"x" * 8))
 
 
 XENSESDK = '''

@@ -83,17 +83,13 @@ def test_status_and_damage_are_told():
         refused(DeviceTimeoutError, "sent nothing", device.read, 0.01)
 
 
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        (NEWTONS[:10], "of 10 bytes: must have 24"),
-        (CALIBRATION.pack(HEADER, 9, 3, 1, 1, *[1] * 6), "header or unit is unknown"),
-        (CALIBRATION.pack(7, 2, 3, 1, 1, *[1] * 6), "header or unit is unknown"),
-        (CALIBRATION.pack(HEADER, 2, 3, 0, 1, *[1] * 6), "no counts per unit"),
-    ],
-)
-def test_damaged_calibrations_are_refused(answer, message):
-    refused(DeviceDataError, message, parse_calibration, answer)
+def test_damaged_calibrations_are_refused():
+    refused(DeviceDataError, "of 10 bytes: must have 24", parse_calibration, NEWTONS[:10])
+    refused(
+        DeviceDataError, "header or unit is unknown", parse_calibration, CALIBRATION.pack(HEADER, 9, 3, 1, 1, *[1] * 6)
+    )
+    refused(DeviceDataError, "header or unit is unknown", parse_calibration, CALIBRATION.pack(7, 2, 3, 1, 1, *[1] * 6))
+    refused(DeviceDataError, "no counts per unit", parse_calibration, CALIBRATION.pack(HEADER, 2, 3, 0, 1, *[1] * 6))
 
 
 def test_pounds_are_converted():

@@ -49,18 +49,12 @@ def test_a_block_is_predicted_without_itself_and_without_the_gap_behind_it(frame
     assert np.array_equal(first, second) == same
 
 
-@pytest.mark.parametrize(
-    ("fields", "force", "blocks", "match"),
-    [
-        (FIELDS, FORCE[:10], 5, "one per frame"),
-        (FIELDS, FORCE, 2, "blocks is 2"),
-        (FIELDS[:30], FORCE[:30], 5, "record more"),
-        (FIELDS, np.full_like(FORCE, np.nan), 5, "drop incomplete"),
-        (FIELDS, np.ones_like(FORCE), 5, "press while recording"),
-    ],
-)
-def test_what_cannot_be_fitted_is_refused(fields, force, blocks, match):
-    refused(ForceFitError, match, fit, fields, force, blocks=blocks)
+def test_what_cannot_be_fitted_is_refused():
+    refused(ForceFitError, "one per frame", fit, FIELDS, FORCE[:10], blocks=5)
+    refused(ForceFitError, "blocks is 2", fit, FIELDS, FORCE, blocks=2)
+    refused(ForceFitError, "record more", fit, FIELDS[:30], FORCE[:30], blocks=5)
+    refused(ForceFitError, "drop incomplete", fit, FIELDS, np.full_like(FORCE, np.nan), blocks=5)
+    refused(ForceFitError, "press while recording", fit, FIELDS, np.ones_like(FORCE), blocks=5)
 
 
 def test_fields_of_another_size_are_refused():

@@ -1,6 +1,5 @@
 """The PhysiCLeAR importer: what comes in, and a named error or a listed skip for everything that does not."""
 
-import dataclasses
 import os
 import pathlib
 
@@ -9,7 +8,7 @@ import pytest
 
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
-from sensors_io.records import RecordsExistError, RecordStore
+from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import entry, film, folder, labels
@@ -92,23 +91,6 @@ def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
     assert len(store.meta.notes["report"]["skipped"]) == 7
 
 
-def test_an_interrupted_import_goes_on(tmp_path):
-    source = folder(tmp_path / "in", entry("ball", videos=3), entry("cup", videos=2))
-    whole = import_physiclear(source, tmp_path / "whole", config=KEEP)
-
-    def stop(done, total):
-        if done == 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        import_physiclear(source, tmp_path / "parts", config=KEEP, progress=stop)
-    assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole
-    assert import_physiclear(source, tmp_path / "parts", config=KEEP) == whole  # a finished one is kept
-    assert RecordStore(tmp_path / "parts").contacts == RecordStore(tmp_path / "whole").contacts
-    with pytest.raises(RecordsExistError, match="made by config"):
-        import_physiclear(source, tmp_path / "parts", config=dataclasses.replace(KEEP, stride=2))
-
-
 def run(source):
     return import_physiclear(source, source.parent / "out", config=KEEP)
 
@@ -145,11 +127,6 @@ BALL = entry("ball")
 def test_labels_that_cannot_be_used_are_named(tmp_path, items, message):
     labels(tmp_path, *items) if items else (tmp_path / "labels.json").write_text("{")
     refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
-
-
-@pytest.mark.parametrize("bad", [{"stride": 0}, {"height": -1}, {"max_frames": -1}, {"test_share": 1.0}])
-def test_bad_options_are_named(bad):
-    refused(ImportSourceError, f"{next(iter(bad))} is ", PhysiclearConfig, **bad)
 
 
 @pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")

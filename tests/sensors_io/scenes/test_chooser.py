@@ -62,10 +62,7 @@ def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
     assert costs == sorted(costs)
     assert MENU[0] == LOOK
     assert len(set(MENU)) == len(MENU)
-    for s in MENU:
-        assert s.grid % 2 == 0
-        assert s.padded >= s.grid
-        assert s.padded % 2 == 0
+    assert all(s.grid % 2 == 0 == s.padded % 2 and s.padded >= s.grid for s in MENU)
 
 
 def test_errors_add_in_quadrature() -> None:
@@ -76,22 +73,20 @@ def test_errors_add_in_quadrature() -> None:
 
 
 def test_each_part_follows_its_formula() -> None:
-    seen, menu = _survey(_ball), MENU[:5]
-    first = np.eye(len(FEATURES))[0]
-    silent = jax.tree.map(np.zeros_like, LAW)
-    never = -50.0  # e⁻⁵⁰ is nothing beside the part under test
+    """The two others are e⁻⁵⁰, nothing beside it."""
+    seen, menu, first = _survey(_ball), MENU[:5], np.eye(len(FEATURES))[0]
     silent = dataclasses.replace(
-        silent, grid=never * first, stop=np.append(never * first, [0, 0]), wrap=never * np.eye(5)[0]
+        jax.tree.map(np.zeros_like, LAW), grid=-50 * first, stop=np.append(-50 * first, [0, 0]), wrap=-50 * np.eye(5)[0]
     )
-    by_grid = dataclasses.replace(silent, grid=0 * first, rate=-first, bend=0.5 * first)
     x = np.log(np.array([s.grid for s in menu]) / 48)
-    np.testing.assert_allclose(log_error(seen, by_grid, menu), -x + x**2 / 2, rtol=1e-4, atol=1e-6)
-    by_stop = dataclasses.replace(silent, stop=np.append(0 * first, [0, 1.0]))
-    tolerances = np.log([s.tolerance for s in menu])
-    np.testing.assert_allclose(log_error(seen, by_stop, menu), tolerances, rtol=1e-4)
-    by_wrap = dataclasses.replace(silent, wrap=np.array([0.0, 1.0, 0.0, 0.0, 0.0]))
     clearance = [(WINDOW_MM * s.padded / s.grid - 2 * float(seen.radius_mm)) / GEL.thickness_mm for s in menu]
-    np.testing.assert_allclose(log_error(seen, by_wrap, menu), clearance, rtol=1e-4)
+    for part, wanted in (
+        ({"grid": 0 * first, "rate": -first, "bend": 0.5 * first}, -x + x**2 / 2),
+        ({"stop": np.append(0 * first, [0, 1.0])}, np.log([s.tolerance for s in menu])),
+        ({"wrap": np.array([0.0, 1.0, 0.0, 0.0, 0.0])}, clearance),
+    ):
+        found = log_error(seen, dataclasses.replace(silent, **part), menu)
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
 
 
 def test_many_surveys_have_the_errors_of_each() -> None:
@@ -108,18 +103,20 @@ def test_finer_grids_promise_less_error_where_the_contact_is_rough() -> None:
     assert tight == sorted(tight, reverse=True)
 
 
-def test_the_first_setting_that_promises_enough_is_picked() -> None:
+@pytest.mark.parametrize(
+    ("expected", "index", "promised", "met"),
+    [
+        ([0.2, 0.09, 0.05], 1, 1.5 * 0.09, True),
+        ([0.3, 0.11, 0.12], 1, 0.165, True),  # doubtful: 1.2 × .11 is within .15, 1.5 × .11 is not
+        ([0.3, 0.2, 0.19], 2, 1.5 * 0.19, False),
+    ],
+)
+def test_the_first_setting_that_promises_enough_is_picked(expected, index, promised, met) -> None:
     """By hand: margin 3 · (10 % / 5 %)^−1 = 1.5 and a slack of 1.5 ask for ê ≤ the error."""
     law = dataclasses.replace(LAW, margin=np.array(3.0), ease=np.array(1.0), doubt=np.array(1.2))
-    pick = lambda error, expected: chooser_law.pick(error, jnp.log(jnp.asarray(expected)), law)
-    index, promised, met = pick(0.1, [0.2, 0.09, 0.05])
-    assert (int(index), bool(met)) == (1, True)
-    assert float(promised) == pytest.approx(1.5 * 0.09, rel=1e-5)
-    index, promised, met = pick(0.1, [0.3, 0.11, 0.12])  # doubtful: 1.2 × .11 is within .15, 1.5 × .11 is not
-    assert (int(index), bool(met)) == (1, True)
-    assert float(promised) == pytest.approx(0.165, rel=1e-5)
-    index, _, met = pick(0.1, [0.3, 0.2, 0.19])
-    assert (int(index), bool(met)) == (2, False)
+    found = chooser_law.pick(0.1, jnp.log(jnp.asarray(expected)), law)
+    assert (int(found[0]), bool(found[2])) == (index, met)
+    assert float(found[1]) == pytest.approx(promised, rel=1e-5)
 
 
 def test_a_survey_by_hand() -> None:
@@ -154,13 +151,10 @@ def test_a_survey_is_finite_where_little_or_all_touches() -> None:
     assert len(PLAIN) < len(FEATURES) == len(LAW.grid)
 
 
-def test_less_error_costs_more() -> None:
+def test_less_error_costs_more_and_what_cannot_be_met_is_said() -> None:
     costs = [_setting(_choose(error, _bumps)).cost for error in (0.4, 0.1, 0.03)]
     assert costs == sorted(costs)
     assert costs[0] < costs[-1]
-
-
-def test_what_cannot_be_met_is_said() -> None:
     choice = _choose(1e-4, _bumps)
     assert not choice.met
     assert choice.promised_error > SLACK * 1e-4
@@ -224,11 +218,16 @@ def test_resuming_ends_where_solving_does(grid) -> None:
     assert float(resumed.pressure_mpa.sum()) * spacing**2 == pytest.approx(3.0, rel=1e-4)
 
 
-def test_resuming_on_a_coarser_grid_is_refused() -> None:
-    soft = _spectrum(36, 24)
-    known = contact.Known(gap_mm=_ball(48), pressure_mpa=_ball(48))
-    with pytest.raises(ValueError, match="known is on 48²: must be no finer than gap_mm on 24²"):
-        contact.resume(known, _ball(24), 1.0, soft, 0 * soft, WINDOW_MM / 24)
+def test_bad_input_is_refused() -> None:
+    soft, known = _spectrum(36, 24), contact.Known(gap_mm=_ball(48), pressure_mpa=_ball(48))
+    said = "known is on 48²: must be no finer than gap_mm on 24²"
+    refused(ValueError, said, contact.resume, known, _ball(24), 1.0, soft, 0 * soft, WINDOW_MM / 24)
+    for error in (0.0, -0.1, 1.5, float("nan")):
+        refused(ValueError, r"error is .*: must lie in \(0, 1\]", _choose, error)
+    for field, force, window in (("force_n", 0.0, 20.0), ("window_mm", 1.0, 0.0)):
+        refused(ValueError, f"{field} is .*0.*: must be > 0", chooser.choose, 0.1, _ball, force, GEL, None, window)
+    for shape in ((50, 50), (48, 96), (48,)):
+        refused(ValueError, r"gap is .*multiple of", _choose, 0.1, np.zeros(shape))
 
 
 def test_resampling_keeps_planes_and_doubles_as_refining_does() -> None:
@@ -238,32 +237,13 @@ def test_resampling_keeps_planes_and_doubles_as_refining_does() -> None:
     np.testing.assert_allclose(nested.resample(plane, 16)[1:-1, 1:-1], np.add.outer(at, 2 * at)[1:-1, 1:-1], atol=1e-4)
 
 
-def test_chunks_hold_every_row_once() -> None:
-    rows = np.arange(100, 100 + CHUNK + 3)
+def test_chunks_hold_every_row_once_and_what_fills_one_up_is_dropped() -> None:
+    rows = np.arange(1, CHUNK + 4)
     parts = list(chunks(rows))
     assert [len(chunk) for chunk, _ in parts] == [CHUNK, CHUNK]
     np.testing.assert_array_equal(np.concatenate([chunk[live] for chunk, live in parts]), rows)
     assert [len(chunk) for chunk, _ in chunks(rows[:1])] == [1]
-
-
-def test_what_fills_up_a_chunk_is_dropped() -> None:
     square = jax.jit(lambda live, x: map_live(lambda v: {"y": v**2}, live, x))
-    rows = np.arange(1, CHUNK + 4)
-    parts = [square(live, chunk.astype(np.float32)) for chunk, live in chunks(rows)]
-    assert float(parts[-1]["y"][-1]) == 0  # never computed
-    np.testing.assert_array_equal(gather(parts, len(rows))["y"], rows.astype(np.float32) ** 2)
-
-
-@pytest.mark.parametrize("error", [0.0, -0.1, 1.5, float("nan")])
-def test_an_error_out_of_range_is_refused(error) -> None:
-    refused(ValueError, r"error is .*: must lie in \(0, 1\]", _choose, error)
-
-
-@pytest.mark.parametrize(("field", "force", "window"), [("force_n", 0.0, 20.0), ("window_mm", 1.0, 0.0)])
-def test_what_is_not_positive_is_refused(field, force, window) -> None:
-    refused(ValueError, f"{field} is .*0.*: must be > 0", chooser.choose, 0.1, _ball, force, GEL, None, window)
-
-
-@pytest.mark.parametrize("shape", [(50, 50), (48, 96), (48,)])
-def test_a_gap_that_does_not_fit_is_refused(shape) -> None:
-    refused(ValueError, r"gap is .*multiple of", lambda: _choose(0.1, jnp.zeros(shape)))
+    squares = [square(live, chunk.astype(np.float32)) for chunk, live in parts]
+    assert float(squares[-1]["y"][-1]) == 0  # never computed
+    np.testing.assert_array_equal(gather(squares, len(rows))["y"], rows.astype(np.float32) ** 2)

@@ -9,8 +9,9 @@ import pytest
 
 from sensors_io.layer import Layer
 from sensors_io.scenes import drag, tangential, traction
-from sensors_io.scenes.hertz import Hertz, half_space_spectrum
+from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.motions import plan
+from tests.sensors_io.scenes.references import half_space
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N
@@ -28,9 +29,7 @@ def _pressure(force: float, x: float = 0.0) -> np.ndarray:
 
 @functools.cache
 def _half_space() -> drag.Bodies:
-    half = half_space_spectrum(N, SPACING, 2 * SHEAR_MODULUS)
-    even = np.concatenate([half, np.roll(half[::-1], 1, 0)[:, N - 1 : 0 : -1]], 1)
-    compliance = traction.Compliance(even=jnp.asarray(even, jnp.float32), odd=jnp.zeros((M, M), jnp.complex64))
+    compliance = half_space(N, SPACING, 2 * SHEAR_MODULUS)
     return drag.Bodies(compliance=compliance, coupling=None, response=traction.make_response(GEL, M, SPACING, 0.5))
 
 

@@ -10,13 +10,9 @@ from sensors_io.scenes.friction import dot, onto_discs, shift_to_total
 SHIFT = jax.jit(shift_to_total)
 
 
-def test_projection_by_hand() -> None:
-    traction = np.array([[3 + 4j, 0.3 + 0.4j], [0, -2.0]])
-    limit = np.array([[1.0, 1.0], [1.0, 0.0]])
-    np.testing.assert_allclose(onto_discs(traction, limit), [[0.6 + 0.8j, 0.3 + 0.4j], [0, 0]], rtol=1e-6)
-
-
-def test_scalar_product() -> None:
+def test_projection_and_scalar_product_by_hand() -> None:
+    tangential, limit = np.array([[3 + 4j, 0.3 + 0.4j], [0, -2.0]]), np.array([[1.0, 1.0], [1.0, 0.0]])
+    np.testing.assert_allclose(onto_discs(tangential, limit), [[0.6 + 0.8j, 0.3 + 0.4j], [0, 0]], rtol=1e-6)
     assert dot(jnp.complex64(1 + 2j), jnp.complex64(3 - 1j)) == 1.0
 
 

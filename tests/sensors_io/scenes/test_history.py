@@ -75,23 +75,15 @@ def test_an_inner_loop_closes() -> None:
     np.testing.assert_allclose(elastic[200:301], elastic[400:501])
 
 
-def test_elasticity_can_be_read_from_load_against_unload() -> None:
-    levels = {}
-    for loss in (0.7, 0.4, 0.05):
-        elastic = history.elastic_force(THERE_AND_BACK, loss)
-        share = history.returned_share(THERE_AND_BACK, _depth(elastic))
-        levels[loss] = (properties.ELASTICITY.level(1 - loss), properties.ELASTICITY.level(share))
-    assert levels == {0.7: (0, 0), 0.4: (1, 1), 0.05: (2, 2)}
+@pytest.mark.parametrize(("loss", "level"), [(0.7, 0), (0.4, 1), (0.05, 2)])
+def test_elasticity_can_be_read_from_load_against_unload(loss: float, level: int) -> None:
+    share = history.returned_share(THERE_AND_BACK, _depth(history.elastic_force(THERE_AND_BACK, loss)))
+    assert properties.ELASTICITY.level(1 - loss) == properties.ELASTICITY.level(share) == level
 
 
-def test_losses_mix_by_stored_energy() -> None:
+def test_losses_mix_by_stored_energy_and_a_hard_object_stores_nothing() -> None:
     loss = history.Loss(gel=0.05, body=0.45)
-    assert loss.of_contact(0.0) == 0.05
-    assert loss.of_contact(1.0) == 0.45
-    assert loss.of_contact(0.25) == pytest.approx(0.15)
-
-
-def test_a_hard_object_stores_nothing() -> None:
+    assert [loss.of_contact(share) for share in (0.0, 1.0, 0.25)] == pytest.approx([0.05, 0.45, 0.15])
     soft, hard = (Layer(modulus_mpa=e, poisson=0.4, thickness_mm=20.0) for e in (0.3, 300.0))
     assert history.body_share(GEL, hard, 4.0) < 0.003
     assert history.body_share(GEL, soft, 4.0) > 0.5

@@ -31,10 +31,8 @@ def test_pictures_stay_in_range(name: str) -> None:
     bump = np.exp(-(X[None] ** 2 + X[:, None] ** 2) / 4)
     image = RENDERERS[name](_gel(2 * bump, 0.3 * bump, -0.3 * bump, 2 * bump), _light())
     assert image.shape == (PX, PX, 3)
-    assert np.all(np.isfinite(image))
-    assert float(image.min()) >= 0
-    pixels = optics.expose(image, jnp.full(image.shape, 50.0), 0.01, 0.01)
-    assert pixels.dtype == jnp.uint8
+    assert np.all(np.isfinite(image) & (image >= 0))
+    assert optics.expose(image, jnp.full(image.shape, 50.0), 0.01, 0.01).dtype == jnp.uint8
 
 
 @pytest.mark.parametrize("render", [optics.dots, optics.speckle])

@@ -153,25 +153,19 @@ def test_hash_tells_configs_apart() -> None:
     assert hashes[0] == config_hash(dataclasses.replace(SMALL))
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("objects", 0),
-        ("sites", 0),
-        ("frames", 0),
-        ("contact_grid", 20),
-        ("contact_grid", 41),
-        ("image_px", 8),
-        ("visual_lie_share", 1.2),
-        ("min_force_n", 0.0),
-        ("min_force_n", 30.0),
-        ("split_shares", (0.5, 0.2, 0.2)),
-        ("solver_tolerance", 0.0),
-        ("force_jitter", 0.5),
-    ],
-)
-def test_bad_configs_are_refused_by_name(field: str, value: object) -> None:
-    refused(ValueError, f"{field} is .*must", dataclasses.replace, SMALL, **{field: value})
+def test_bad_configs_are_refused_by_name() -> None:
+    refused(ValueError, "objects is .*must", dataclasses.replace, SMALL, objects=0)
+    refused(ValueError, "sites is .*must", dataclasses.replace, SMALL, sites=0)
+    refused(ValueError, "frames is .*must", dataclasses.replace, SMALL, frames=0)
+    refused(ValueError, "contact_grid is .*must", dataclasses.replace, SMALL, contact_grid=20)
+    refused(ValueError, "contact_grid is .*must", dataclasses.replace, SMALL, contact_grid=41)
+    refused(ValueError, "image_px is .*must", dataclasses.replace, SMALL, image_px=8)
+    refused(ValueError, "visual_lie_share is .*must", dataclasses.replace, SMALL, visual_lie_share=1.2)
+    refused(ValueError, "min_force_n is .*must", dataclasses.replace, SMALL, min_force_n=0.0)
+    refused(ValueError, "min_force_n is .*must", dataclasses.replace, SMALL, min_force_n=30.0)
+    refused(ValueError, "split_shares is .*must", dataclasses.replace, SMALL, split_shares=(0.5, 0.2, 0.2))
+    refused(ValueError, "solver_tolerance is .*must", dataclasses.replace, SMALL, solver_tolerance=0.0)
+    refused(ValueError, "force_jitter is .*must", dataclasses.replace, SMALL, force_jitter=0.5)
 
 
 def test_padding_is_two_thicknesses_and_smooth() -> None:

@@ -42,16 +42,16 @@ def test_every_object_is_pressed_once_and_motions_and_forces_are_balanced(made):
     assert len(made.slots) == CONFIG.contact_count
 
 
-def test_sites_of_an_object_are_numbered_through(made):
+def test_sites_are_numbered_through_forces_are_borne_and_prefixes_are_fair(made, limits):
+    """No force is asked that a rigid object of this shape would not bear; the seed alone decides."""
     sites = collections.defaultdict(list)
     for slot in made.slots:
         sites[slot.object_index].append(slot.site)
-    assert all(sorted(found) == list(range(len(found))) for found in sites.values())
-
-
-def test_nothing_is_asked_that_a_rigid_object_of_this_shape_would_not_bear(made, limits):
-    for slot in made.slots:
         assert slot.force_n <= limits.rigid_n[slot.object_index] * (1 + 1e-9)
+    assert all(sorted(found) == list(range(len(found))) for found in sites.values())
+    half = made.slots[: len(made.slots) // 2]
+    assert np.mean([s.motion == "press" for s in half]) == pytest.approx(OBJECTS / len(made.slots), abs=0.05)
+    assert schedule.protocol(CONFIG, limits, _cell()).slots == made.slots
 
 
 def test_every_cell_gets_the_same_forces(made):
@@ -75,11 +75,6 @@ def test_the_ceiling_is_the_worst_cells_quantile_and_never_above_the_own_limit(l
     assert ceiling.max() <= worst
 
 
-def test_prefixes_are_fair_samples(made):
-    half = made.slots[: len(made.slots) // 2]
-    assert np.mean([s.motion == "press" for s in half]) == pytest.approx(OBJECTS / len(made.slots), abs=0.05)
-
-
 def test_left_out_frames_are_counted(made, limits):
     counts = made.left_out
     touched = sum((motions.plan(s.motion, 1.0, schedule.pace(40)).force_n > 0).sum() for s in made.slots)
@@ -89,16 +84,6 @@ def test_left_out_frames_are_counted(made, limits):
     strong = limits.actual_n > 20
     assert counts.past_limit[strong].sum() == 0
     assert counts.past_limit[limits.actual_n < 9][:, 3:].sum() > 0
-
-
-def test_the_schedule_follows_the_seed(made, limits):
-    again = schedule.protocol(CONFIG, limits, _cell())
-    assert again.slots == made.slots
-
-
-def test_weak_objects_are_refused_by_name(limits):
-    weak = Limits(actual_n=np.full(OBJECTS, 4.0), rigid_n=np.full(OBJECTS, 4.0))
-    refused(ValueError, "objects is 360: none of them bears 10 N", lambda: schedule.protocol(CONFIG, weak, _cell()))
 
 
 @pytest.mark.parametrize("frames", [20, 40, 90, 137])
@@ -116,16 +101,15 @@ def test_presses_alone_go_object_by_object():
     assert [s.site for s in slots] == [0, 1, 2] * 4
 
 
-@pytest.mark.parametrize(
-    ("sequences", "frames", "message"),
-    [
+def test_weak_objects_and_bad_sizes_are_refused_by_name():
+    weak = Limits(actual_n=np.full(OBJECTS, 4.0), rigid_n=np.full(OBJECTS, 4.0))
+    refused(ValueError, "objects is 360: none of them bears 10 N", schedule.protocol, CONFIG, weak, _cell())
+    for sequences, frames, message in (
         (30, None, "sequences is 30: must be a multiple of 4"),
         (36, None, "sequences is 36: must be ≥ 40: every one of 10 objects is pressed by all sensors"),
         (80, 19, "frames is 19: must be ≥ 20"),
-    ],
-)
-def test_bad_sizes_are_refused(sequences, frames, message):
-    refused(ValueError, message, SceneConfig, objects=10, sequences=sequences, frames=frames)
+    ):
+        refused(ValueError, message, SceneConfig, objects=10, sequences=sequences, frames=frames)
 
 
 def test_frames_default_to_the_kind_of_set():

@@ -26,12 +26,9 @@ def test_the_window_is_the_square_of_a_published_one(model: sensors.SensorModel)
     assert 1000 / model.frame_period_ms == pytest.approx(RATE_HZ[model.name], rel=0.01)
 
 
-def test_the_nodes_of_the_tac3d_are_its_markers() -> None:
+def test_the_nodes_of_the_tac3d_are_its_markers_and_only_other_gels_are_grained_or_printed() -> None:
     assert sensors.TAC3D.window_mm / FIELD_GRID == pytest.approx(1.0)
     assert sensors.TAC3D.render is None
-
-
-def test_only_printed_or_grained_gels_have_a_texture() -> None:
     shapes = {m.name: m.draw_texture(np.random.default_rng(0)).shape for m in sensors.MODELS}
     assert shapes == {"gelsight_mini": (3, 112, 112), "xense": (2, 2), "tac3d": (2, 2), "dmtac_x": (288, 288)}
 

@@ -7,7 +7,7 @@ import pytest
 
 from sensors_io.layer import Layer, depth_response, longitudinal_compliance, shear_compliance, wave_numbers
 from sensors_io.scenes import traction
-from tests.sensors_io.checks import refused
+from tests.sensors_io.scenes.references import directions, shear_tensor
 
 N, M, SPACING = 24, 36, 0.5
 X = (np.arange(N) + 0.5) * SPACING - N * SPACING / 2
@@ -27,12 +27,9 @@ def _real(spectrum: np.ndarray, field: np.ndarray) -> np.ndarray:
 def _by_components(depth_mm: float) -> tuple[np.ndarray, np.ndarray]:
     """u_x + iu_y and u_z from five real spectra on the half plane, one product per pair of components."""
     q_y, q_x = wave_numbers(M, SPACING)
-    q = np.hypot(q_y, q_x)
-    at = depth_response(q, GEL, depth_mm)
-    inner = (np.abs(q_y) < np.pi / SPACING * 0.999) & (q_x < np.pi / SPACING * 0.999) & (q > 0)
-    c, s = np.where(inner, q_x / np.where(q > 0, q, 1), 0), np.where(inner, q_y / np.where(q > 0, q, 1), 0)
-    even, odd = (at.lateral_shear + at.transverse) / 2, (at.lateral_shear - at.transverse) / 2
-    xx, yy, xy = even + odd * (c**2 - s**2), even - odd * (c**2 - s**2), 2 * odd * c * s
+    at = depth_response(np.hypot(q_y, q_x), GEL, depth_mm)
+    (xx, xy), (_, yy) = shear_tensor(GEL, M, SPACING, depth_mm)
+    c, s = directions(M, SPACING)
     t_x, t_y = TRACTION.real, TRACTION.imag
     u_x = _real(xx, t_x) + _real(xy, t_y) + _real(1j * c * at.lateral_pressure, PRESSURE)
     u_y = _real(xy, t_x) + _real(yy, t_y) + _real(1j * s * at.lateral_pressure, PRESSURE)
@@ -122,7 +119,3 @@ def test_resultant_of_two_point_loads() -> None:
     np.testing.assert_allclose(force, [1.0, -3.0, -2.0], rtol=1e-6)
     by_hand = np.cross([X[5], X[3], 0], [0, 0, -2.0]) + np.cross([X[2], X[7], 0], [1.0, -3.0, 0])
     np.testing.assert_allclose(moment, by_hand, atol=1e-5)
-
-
-def test_markers_outside_the_layer_are_refused() -> None:
-    refused(ValueError, r"depth_mm is 5\.0: must lie in", traction.make_response, GEL, M, SPACING, 5.0)

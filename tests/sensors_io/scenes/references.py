@@ -1,0 +1,37 @@
+"""Float64 references that tests of friction share."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from sensors_io.layer import Layer, depth_response, wave_numbers
+from sensors_io.scenes import traction
+from sensors_io.scenes.hertz import half_space_spectrum
+
+
+def off(found: np.ndarray, true: np.ndarray) -> float:
+    """Distance of a field from the true one, over the length of that."""
+    return float(np.linalg.norm(found - true) / np.linalg.norm(true))
+
+
+def half_space(points: int, spacing: float, modulus_mpa: float) -> traction.Compliance:
+    """Of ν = 0: the tangential compliance is isotropic, and equals the normal one."""
+    half = half_space_spectrum(points, spacing, modulus_mpa)
+    even = np.concatenate([half, np.roll(half[::-1], 1, 0)[:, points - 1 : 0 : -1]], 1)
+    return traction.Compliance(even=jnp.asarray(even, jnp.float32), odd=jnp.zeros(even.shape, jnp.complex64))
+
+
+def directions(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cosine and sine of every wave vector of the half plane, 0 at rest and at the Nyquist wave number."""
+    q_y, q_x = wave_numbers(points, spacing)
+    q = np.hypot(q_y, q_x)
+    inner = (np.abs(q_y) < np.pi / spacing * 0.999) & (q_x < np.pi / spacing * 0.999) & (q > 0)
+    c, s = (np.where(inner, part / np.where(q > 0, q, 1), 0) for part in (q_x, q_y))
+    return c, s
+
+
+def shear_tensor(layer: Layer, points: int, spacing: float, depth_mm: float = 0.0) -> np.ndarray:
+    """Displacement along x and y by traction along x and y, per wave vector [2, 2, points, points // 2 + 1]."""
+    at = depth_response(np.hypot(*wave_numbers(points, spacing)), layer, depth_mm)
+    c, s = directions(points, spacing)
+    even, odd = (at.lateral_shear + at.transverse) / 2, (at.lateral_shear - at.transverse) / 2
+    return np.array([[even + odd * (c**2 - s**2), 2 * odd * c * s], [2 * odd * c * s, even - odd * (c**2 - s**2)]])
