@@ -15,7 +15,11 @@ RECORDS_PER_SHARD = 2880
 
 
 def generate_records(
-    config: SceneConfig, out: pathlib.Path, *, progress: Callable[[int, int], None] | None = None
+    config: SceneConfig,
+    out: pathlib.Path,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+    records_per_shard: int = RECORDS_PER_SHARD,
 ) -> None:
     """Write the generated scenes of `config` as records in `out`; contacts that are there already are kept.
 
@@ -23,6 +27,7 @@ def generate_records(
       config: what to generate.
       out: directory of the records.
       progress: called with the number of contacts done and their total, first with those of an earlier run.
+      records_per_shard: frames of all sensors in one file.
 
     Raises:
       RecordsExistError: `out` holds records of another config.
@@ -34,7 +39,7 @@ def generate_records(
         sensors=SENSORS,
         notes={"config": dataclasses.asdict(config)},
     )
-    per_shard = max(1, RECORDS_PER_SHARD // (len(SENSORS) * config.frame_count))
+    per_shard = max(1, records_per_shard // (len(SENSORS) * config.frame_count))
     with RecordWriter(out, meta=meta, contacts_per_shard=per_shard, resume=True) as writer:
         for card in object_cards(config):
             if card.object_id not in writer.objects_done:

@@ -190,6 +190,7 @@ MUTABLE = {
     "sensors_io.devices.intake.Counts": "grow with every sample, under the lock of the intake",
     "sensors_io.devices.replay.Truth": "grows with every sample",
     "sensors_io.importers.catalogue._Run": "collects what an import leaves out",
+    "sensors_io.importers.pickles._Array": "a pickle makes an array first and fills it afterwards",
     "sensors_io.index.Index": "grows with every shard",
     "sensors_io.recording.book.Report": "grows with every contact",
 }

@@ -113,7 +113,7 @@ def protocol(config: SceneConfig, limits: strength.Limits, cell: np.ndarray) -> 
     """
     rng = stream(config.seed, "schedule")
     bears = limits.rigid_n if config.replaces else np.full(len(cell), np.inf)
-    ceiling = np.minimum(_ceilings(bears, cell, rng), PRESS_FORCE_N)
+    ceiling = np.minimum(ceilings(bears, cell, rng), PRESS_FORCE_N)
     asked, given = _deal(config.contact_count - config.objects, bears, cell, rng)
     press = [Slot(object_index=i, site=0, motion="press", force_n=float(c)) for i, c in enumerate(ceiling)]
     sites = collections.Counter(dict.fromkeys(range(config.objects), 1))
@@ -127,7 +127,7 @@ def protocol(config: SceneConfig, limits: strength.Limits, cell: np.ndarray) -> 
     return Schedule(slots=tuple(slots[i] for i in order), limits=limits, left_out=counts)
 
 
-def _ceilings(limit: np.ndarray, cell: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def ceilings(limit: np.ndarray, cell: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """C(u) of every object: u is random within its rank in the cell, Q_cell(u) = sorted limits[⌊u n⌋]."""
     u = np.empty(len(limit))
     quantiles = []

@@ -46,7 +46,7 @@ def make_sequence(config: SceneConfig, index: int, what: schedule.Slot, order: i
         host_time_ns=time_ns,
         force_time_ns=time_ns - _FORCE_LEAD_NS,
         phase=hand.phase,
-        flags=_flags(made, chosen) | _light(config, sensor, drawn.site, drawn.force_n),
+        flags=_flags(made, chosen) | light_touches(config, sensor, drawn.site, drawn.force_n),
         contact_grid=None if config.error is None else np.full(len(hand), chosen.grid, np.uint16),
     )
 
@@ -83,7 +83,7 @@ def _flags(made: Any, chosen: Effort) -> np.ndarray:
     return flags
 
 
-def _light(config: SceneConfig, sensor: SensorModel, site: Site, force_n: np.ndarray) -> np.ndarray:
+def light_touches(config: SceneConfig, sensor: SensorModel, site: Site, force_n: np.ndarray) -> np.ndarray:
     """Frames that touch so lightly that adhesion, which is left out, would count: bits [F] uint32.
 
     Of the body's mean curvature and its roughness at the site; relief, which makes narrower contacts, is left out.

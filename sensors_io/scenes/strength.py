@@ -34,20 +34,26 @@ class Limits:
     rigid_n: np.ndarray
 
 
-def look(skins: list[surface.Skin], turn_rad: np.ndarray, modulus_mpa: np.ndarray) -> Limits:
+def look(
+    skins: list[surface.Skin],
+    turn_rad: np.ndarray,
+    modulus_mpa: np.ndarray,
+    models: tuple[SensorModel, ...] = MODELS,
+) -> Limits:
     """Limits of n contacts.
 
     Args:
       skins: at their sites.
       turn_rad: direction of each contact, [n].
       modulus_mpa: effective modulus of each object, [n].
+      models: sensors that press.
     """
     found = []
     for start in range(0, len(skins), _BATCH):
         rows = np.minimum(np.arange(start, start + _BATCH), len(skins) - 1)
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[skins[i] for i in rows])
         turn, modulus = (jnp.asarray(a[rows], jnp.float32) for a in (turn_rad, modulus_mpa))
-        strain = [np.asarray(_strains(stacked, turn, modulus, *_spectra(s), s)) for s in MODELS]
+        strain = [np.asarray(_strains(stacked, turn, modulus, *_spectra(s), s)) for s in models]
         found.append(np.max(strain, 0)[: len(skins) - start])
     limits = _limit(np.concatenate(found))
     return Limits(actual_n=limits[:, 0], rigid_n=limits[:, 1])

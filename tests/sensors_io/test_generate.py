@@ -24,7 +24,6 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(generate, "object_cards", lambda config: [fakes.card(n) for n in range(config.objects)])
     monkeypatch.setattr(generate, "contacts", contacts)
-    monkeypatch.setattr(generate, "RECORDS_PER_SHARD", 64)
     return starts
 
 
@@ -63,7 +62,6 @@ for module in (cards, config, protocol):  # without JAX, which takes seconds to 
 from sensors_io import generate, index, shards
 
 out, place, count = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-generate.RECORDS_PER_SHARD = 64
 seen = 0
 
 def die(at):
@@ -85,7 +83,7 @@ killing(shards.ShardWriter, "write", "before write", "after write")
 killing(shards.ShardWriter, "publish", "before publish", "after publish")
 killing(index.Index, "write", "before index", "after index")
 killing(os, "fsync", "before sync", "after sync")
-generate.generate_records(SceneConfig(), out)
+generate.generate_records(SceneConfig(), out, records_per_shard=64)
 """
 
 

@@ -59,6 +59,7 @@ def test_a_sensor_that_never_rests_has_no_pose():
 
 
 def test_the_same_pose_held_again_is_not_another():
+    refused(ValueError, "still_n is 0", PoseConfig, still_n=0)
     times, force, moment, _ = turned(count=1, hold_s=5)
     assert len(found_in(times, force, moment)) == 1
     refused(ForceError, "span no sphere", lambda: fit_poses(found_in(times, force, moment)))
@@ -81,7 +82,3 @@ def test_a_file_without_a_zero_is_named(tmp_path, change):
     tree = [] if change is None else json.loads(path.read_text()) | change
     path.write_text(json.dumps(tree))
     refused(ForceError, "make one with `force-zero`", ForceZero.load, path)
-
-
-def test_configs_are_checked():
-    refused(ValueError, "still_n is 0", PoseConfig, still_n=0)

@@ -15,7 +15,6 @@ import pytest
 
 from sensors_io import __main__ as cli
 from sensors_io.calibration.geometry import CameraGeometry
-from sensors_io.devices.tac3d_messages import load_recording
 from sensors_io.offsets import Offset, Offsets
 from sensors_io.poses import ForceZero
 from sensors_io.records import RecordStore
@@ -23,21 +22,21 @@ from sensors_io.records import RecordStore
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 
 
+def save(path, rate_hz, force, moment=None):
+    """A Tac3D recording of total forces [N, 3] on an untouched field."""
+    n = len(force)
+    arrays = {"3D_Displacements": np.zeros((n, 400, 3)), "3D_ResultantForce": force[:, None]}
+    if moment is not None:
+        arrays["3D_ResultantMoment"] = moment[:, None]
+    np.savez(path, index=np.arange(n), sendTimestamp=np.arange(n) / rate_hz, **arrays)
+    return path
+
+
 @pytest.fixture
 def press(tmp_path):
     """A Tac3D recording of 1.2 s: untouched, then a press to 3 N."""
     load = np.concatenate([np.zeros(70), np.linspace(0, 3, 50)])
-    resultant = np.zeros((120, 1, 3))
-    resultant[:, 0, 2] = -load
-    path = tmp_path / "A1.npz"
-    np.savez(
-        path,
-        index=np.arange(120),
-        sendTimestamp=np.arange(120) * 0.01,
-        **{"3D_Displacements": np.zeros((120, 400, 3)), "3D_ResultantForce": resultant},
-    )
-    assert len(load_recording(path).index) == 120
-    return path
+    return save(tmp_path / "A1.npz", 100, np.outer(load, [0, 0, -1.0]))
 
 
 def test_free_motion_is_recorded_from_a_replay(tmp_path, press, capsys):
@@ -101,19 +100,11 @@ def test_devices_says_what_is_absent(capsys):
 
 def test_a_pin_board_gives_a_geometry(tmp_path):
     board = ROOT / "tests" / "data" / "9DTact"
-    args = [
-        "geometry",
-        board / "board_sample.png",
-        "--background",
-        board / "board_ref.png",
-        "--rows",
-        7,
-        "--columns",
-        9,
-    ]
-    assert cli.main([*map(str, args), "--pitch-mm", "2.5", "--out", str(tmp_path / "g.json")]) == 0
+    pins = ["--background", board / "board_ref.png", "--rows", 7, "--columns", 9]
+    args = ["geometry", board / "board_sample.png", *pins]
+    assert run(*args, "--pitch-mm", 2.5, "--out", tmp_path / "g.json") == 0
     assert CameraGeometry.load(tmp_path / "g.json").held_out_mm < 0.07
-    assert cli.main([*map(str, args), "--pitch-mm", "-1", "--out", str(tmp_path / "h.json")]) == 1
+    assert run(*args, "--pitch-mm", -1, "--out", tmp_path / "h.json") == 1
     assert not (tmp_path / "h.json").exists()
 
 
@@ -186,19 +177,8 @@ def poses(tmp_path):
     """A recording of a force sensor held in eight directions, 200 ms each, at 1 kHz; 1.5 N hang on it."""
     down = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
     down = down[[0, 1, 3, 2, 6, 7, 5, 4]].repeat(200, 0)
-    force = [1.0, -2.0, 3.0] + 1.5 * down
-    path = tmp_path / "HDL1.npz"
-    np.savez(
-        path,
-        index=np.arange(len(down)),
-        sendTimestamp=np.arange(len(down)) * 0.001,
-        **{
-            "3D_Displacements": np.zeros((len(down), 400, 3)),
-            "3D_ResultantForce": force[:, None],
-            "3D_ResultantMoment": np.cross([0, 0, 15.0], 1.5 * down)[:, None],
-        },
-    )
-    return path
+    moment = np.cross([0, 0, 15.0], 1.5 * down)
+    return save(tmp_path / "HDL1.npz", 1000, [1.0, -2.0, 3.0] + 1.5 * down, moment)
 
 
 def test_force_zero_from_static_poses(tmp_path, poses, capsys):
@@ -219,10 +199,7 @@ def test_sync_and_its_check(tmp_path, capsys):
     time_s = np.arange(0, 1.9, 0.005)
     past = time_s[:, None] - at
     load = (np.clip(past / 0.02, 0, 1) * np.exp(-np.clip(past - 0.02, 0, None) / 0.05)).sum(-1)
-    force = np.zeros((len(load), 1, 3))
-    force[:, 0, 2] = -5 * load
-    arrays = {"3D_Displacements": np.zeros((len(load), 400, 3)), "3D_ResultantForce": force}
-    np.savez(tmp_path / "A1.npz", index=np.arange(len(load)), sendTimestamp=time_s, **arrays)
+    save(tmp_path / "A1.npz", 200, np.outer(load, [0, 0, -5.0]))
     film = pictures(tmp_path / "film", np.clip(60 + 150 * load, 0, 255).astype(int)[::2])
     bench = ["replay", "--path", tmp_path / "A1.npz", "+", "replay", "--path", film, "--rate-hz", 100]
     assert run("sync", "--seconds", 4, "--out", tmp_path / "s.json", *bench) == 0

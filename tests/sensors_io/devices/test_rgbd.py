@@ -39,28 +39,18 @@ def test_pictures_without_a_partner_are_passed_over():
     assert device.identity.settings["intrinsics"]["fx"] == 100
 
 
-def test_pictures_that_never_meet_are_an_error():
-    apart = joined(
-        [colour(k, 33 * k) for k in range(400)], [depth(k, 33 * k + 16) for k in range(400)], max_apart_s=0.005
-    )
-    with apart, pytest.raises(DeviceTimeoutError, match=r"within 0\.005 s"):
-        apart.read(1.0)
-
-
-def test_a_depth_picture_of_another_kind_is_refused():
-    wrong = joined([colour(0, 0)], [sample(0, 0, frame=np.zeros((4, 6, 3), np.uint8))])
-    with wrong, pytest.raises(DeviceDataError, match="must be uint16 of 4×6"):
-        wrong.read(1.0)
+def test_pictures_that_never_meet_or_are_of_another_kind_are_refused():
+    colours, depths = [colour(k, 33 * k) for k in range(400)], [depth(k, 33 * k + 16) for k in range(400)]
+    with joined(colours, depths, max_apart_s=0.005) as device:
+        refused(DeviceTimeoutError, r"within 0\.005 s", device.read, 1.0)
+    with joined([colour(0, 0)], [sample(0, 0, frame=np.zeros((4, 6, 3), np.uint8))]) as device:
+        refused(DeviceDataError, "must be uint16 of 4×6", device.read, 1.0)
 
 
 def test_a_window_shows_at_its_place_and_size():
-    """20 mm at 300 mm and f = 600 px: 40 px about the principal point."""
-    assert contact_region(VIEW, np.array([0.0, 0.0, 300.0]), 20.0) == (300, 220, 40, 40)
-    x, y, w, h = contact_region(VIEW, np.array([-160.0, 0.0, 300.0]), 20.0)
-    assert (x, y, w, h) == (0, 220, 20, 40)
-
-
-@pytest.mark.parametrize("centre", [(0, 0, -10.0), (900.0, 0, 300.0)])
-def test_a_contact_out_of_view_is_refused(centre):
-    refused(ValueError, "must lie in the view", lambda: contact_region(VIEW, np.array(centre), 20.0))
+    """20 mm at 300 mm and f = 600 px: 40 px about the principal point, cut at the picture's edge."""
+    for centre, region in ((0.0, (300, 220, 40, 40)), (-160.0, (0, 220, 20, 40))):
+        assert contact_region(VIEW, np.array([centre, 0.0, 300.0]), 20.0) == region
+    for out in ((0, 0, -10.0), (900.0, 0, 300.0)):
+        refused(ValueError, "must lie in the view", contact_region, VIEW, np.array(out), 20.0)
     refused(ValueError, "fx is 0", Intrinsics, width=6, height=4, fx=0, fy=1, cx=0, cy=0)

@@ -13,13 +13,11 @@ PINHOLE = {"fx": 10.0, "fy": 10.0, "cx": 4.0, "cy": 3.0, "width": 8, "height": 6
 
 
 def test_two_folders_are_one_camera(tmp_path):
+    for name in ("colour", "depth"):
+        (tmp_path / name).mkdir()
     for n in range(3):
-        for name, picture in (
-            ("colour", np.full((6, 8, 3), n, np.uint8)),
-            ("depth", np.full((6, 8), 250 + n, np.uint16)),
-        ):
-            (tmp_path / name).mkdir(exist_ok=True)
-            cv2.imwrite(str(tmp_path / name / f"{n}.png"), picture)
+        cv2.imwrite(str(tmp_path / "colour" / f"{n}.png"), np.full((6, 8, 3), n, np.uint8))
+        cv2.imwrite(str(tmp_path / "depth" / f"{n}.png"), np.full((6, 8), 250 + n, np.uint16))
     camera = RgbdCameraConfig(replay=tmp_path, depth_unit_mm=2.0, **PINHOLE)
     with camera.open(JumpingClock()) as device:
         samples = [device.read(1.0) for _ in range(3)]

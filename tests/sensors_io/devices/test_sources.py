@@ -71,15 +71,14 @@ def test_a_generated_sensor_is_a_device():
 
 
 def test_nothing_to_replay_is_named(tmp_path):
-    with pytest.raises(DeviceNotFoundError, match="holds no picture"):
-        everything(ReplayConfig(path=tmp_path).open(JumpingClock()))
-    refused(DeviceNotFoundError, "does not exist", lambda: ReplayConfig(path=tmp_path / "x").open())
-    (tmp_path / "a.avi").write_bytes(b"broken")
-    with pytest.raises(DeviceNotFoundError, match="does not open as a video"):
-        everything(ReplayConfig(path=tmp_path / "a.avi").open(JumpingClock()))
-    (tmp_path / "b.png").write_bytes(b"broken")
-    with pytest.raises(DeviceNotFoundError, match="cannot be decoded"):
-        everything(ReplayConfig(path=tmp_path).open(JumpingClock()))
+    def replayed(path):
+        everything(ReplayConfig(path=path).open(JumpingClock()))
+
+    refused(DeviceNotFoundError, "holds no picture", replayed, tmp_path)
+    refused(DeviceNotFoundError, "does not exist", replayed, tmp_path / "x")
+    for name, said in (("a.avi", "does not open as a video"), ("b.png", "cannot be decoded")):
+        (tmp_path / name).write_bytes(b"broken")
+        refused(DeviceNotFoundError, said, replayed, tmp_path / name if name == "a.avi" else tmp_path)
 
 
 def test_faults_are_checked():

@@ -72,10 +72,8 @@ def test_a_contact_let_go_too_early_is_kept_and_asked_for_again(tmp_path):
 
 def test_a_stopped_session_goes_on_behind_what_is_done(tmp_path):
     hand = Hand()
-    first = session(tmp_path, hand, stop=lambda: hand.contacts >= 4)
-    second = session(tmp_path, Hand())
-    assert first.contacts == 4
-    assert second.contacts == 15
+    assert session(tmp_path, hand, stop=lambda: hand.contacts >= 4).contacts == 4
+    assert session(tmp_path, Hand()).contacts == 15
     assert len(RecordStore(tmp_path)) == 19
 
 
@@ -98,21 +96,14 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
     assert [(k.motion, k.trial) for k in store.contacts] == [("press", 0), ("press", 1), ("slide_x", 0)]
 
 
-def test_a_protocol_without_any_force_is_refused(tmp_path):
+def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     hand = Hand()
-    with pytest.raises(ForceError, match="gelsight_mini tells no force"):
-        record_session(tmp_path, SHORT, [Camera(hand)], None, show=hand.show)
-
-
-def test_free_motion_needs_no_force_sensor(tmp_path):
-    hand = Hand()
+    said = "gelsight_mini tells no force"
+    refused(ForceError, said, record_session, tmp_path / "x", SHORT, [Camera(hand)], None, show=hand.show)
     config = dataclasses.replace(CONFIG, free_s=0.5)
-    report = record_session(tmp_path, config, [Camera(hand)], None, show=hand.show)
+    assert record_session(tmp_path, config, [Camera(hand)], None, show=hand.show).contacts == 1
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
-    assert report.contacts == 1
-    assert made.key.motion == "free"
-    assert len(made) == 51
-    assert made.force_n is None
+    assert (made.key.motion, len(made), made.force_n) == ("free", 51, None)
 
 
 def test_a_gap_of_the_camera_is_flagged(tmp_path):
@@ -215,23 +206,19 @@ def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
     refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
 
 
-def test_the_gel_at_rest_is_kept_beside_the_records(tmp_path):
-    """Before each contact, where the force says that nothing touches; extraction finds it by its name."""
-    session(tmp_path, Hand(), SHORT)
-    made = RecordStore(tmp_path).contact(1)["gelsight_mini"]
-    name = made.camera["recording"]["background"]
-    assert name == "backgrounds/cup-0-slide_x-0-gelsight_mini.png"
-    picture = cv2.imread(str(tmp_path / name))
-    assert picture.shape == made.frames.shape[1:]
-    assert np.all(picture[1:] == 0)
-
-
-def test_the_object_is_seen_once_with_the_place_of_its_contact(tmp_path):
+def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
+    """The gel before each contact, where the force says that nothing touches; extraction finds it by its name."""
     view = ObjectView(
         picture=np.full((6, 8, 3), 90, np.uint8), depth_mm=np.full((6, 8), 300.5, np.float32), region_px=(2, 1, 3, 4)
     )
     session(tmp_path, Hand(), SHORT, view=view)
     store = RecordStore(tmp_path)
+    made = store.contact(1)["gelsight_mini"]
+    name = made.camera["recording"]["background"]
+    assert name == "backgrounds/cup-0-slide_x-0-gelsight_mini.png"
+    picture = cv2.imread(str(tmp_path / name))
+    assert picture.shape == made.frames.shape[1:]
+    assert np.all(picture[1:] == 0)
     assert store.objects["cup"].view.tolist() == view.picture.tolist()
     assert store.objects["cup"].view_depth_mm[0, 0] == 300.5
     assert store.contact(0)["gelsight_mini"].contact_region_px == (2, 1, 3, 4)

@@ -59,30 +59,24 @@ def test_what_is_stamped_late_is_late(by, rise_s):
     assert found.sensors["tac3d"].by == by
 
 
+def of(*samples, sensor="tac3d"):
+    """A feed of these samples."""
+    feed = Feed(sensor, 100)
+    feed.samples = list(samples)
+    return feed
+
+
 def test_a_sensor_that_felt_nothing_is_named():
-    reference = heard(Feed("netft", 500))
-    silent = Feed("tac3d", 100)
-    silent.samples = [Sample(host_time_ns=s.host_time_ns, arrays={"force_n": np.zeros(3)}) for s in silent.samples]
-    with pytest.raises(OffsetsError, match=r"tac3d against netft: signal b shows 0 taps"):
-        measure_offsets(reference, {"tac3d": heard(silent)}, "netft", "taps")
-    empty = Feed("tac3d", 100)
-    empty.samples = []
-    refused(OffsetsError, "tac3d gave 0 samples", heard, empty)
+    silent = of(*(Sample(host_time_ns=10**7 * n, arrays={"force_n": np.zeros(3)}) for n in range(900)))
+    late = {"tac3d": heard(silent)}
+    said = r"tac3d against netft: signal b shows 0 taps"
+    refused(OffsetsError, said, measure_offsets, heard(Feed("netft", 500)), late, "netft", "taps")
+    refused(OffsetsError, "tac3d gave 0 samples", heard, of())
+    refused(OffsetsError, "nothing tells a touch", heard, of(Sample(host_time_ns=0)))
 
 
-def test_repeated_stamps_are_left_out_and_bare_samples_refused():
-    feed = Feed("tac3d", 100)
-    count = len(feed.samples)
-    feed.samples = [s for s in feed.samples for _ in range(2)]
-    assert len(heard(feed).time_ns) == count
-    bare = Feed("tac3d", 100)
-    bare.samples = [Sample(host_time_ns=0)]
-    refused(OffsetsError, "nothing tells a touch", heard, bare)
-
-
-def test_fields_are_numbers_too():
-    feed = Feed("dmtac_x", 100)
-    feed.samples = [
-        Sample(host_time_ns=i, arrays={"deformation_mm": np.full((2, 2, 2), 3.0 * i) * [1, 4 / 3]}) for i in range(20)
-    ]
-    np.testing.assert_allclose(heard(feed).value, 5.0 * np.arange(20))
+def test_repeated_stamps_are_left_out_and_fields_are_numbers_too():
+    fields = [np.full((2, 2, 2), 3.0 * i) * [1, 4 / 3] for i in range(20)]
+    samples = [Sample(host_time_ns=i, arrays={"deformation_mm": field}) for i, field in enumerate(fields)]
+    twice = of(*(s for s in samples for _ in range(2)), sensor="dmtac_x")
+    np.testing.assert_allclose(heard(twice).value, 5.0 * np.arange(20))

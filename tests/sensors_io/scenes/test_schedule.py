@@ -69,7 +69,7 @@ def test_every_cell_gets_the_same_forces(made):
 
 
 def test_the_ceiling_is_the_worst_cells_quantile_and_never_above_the_own_limit(limits):
-    ceiling = schedule._ceilings(limits.rigid_n, _cell(), np.random.default_rng(1))
+    ceiling = schedule.ceilings(limits.rigid_n, _cell(), np.random.default_rng(1))
     assert np.all(ceiling <= limits.rigid_n + 1e-12)
     worst = min(np.sort(limits.rigid_n[_cell() == c])[-1] for c in range(9))
     assert ceiling.max() <= worst

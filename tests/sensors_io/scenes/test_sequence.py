@@ -10,7 +10,7 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw, site_of
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.scenes.sequence import _light, make_sequence
+from sensors_io.scenes.sequence import light_touches, make_sequence
 from sensors_io.schema import SENSORS, Flag, Phase
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
@@ -98,7 +98,7 @@ def test_adhesion_counts_in_the_lightest_touches_of_smooth_objects():
     found = []
     for index in range(config.objects):
         site = site_of(config, index, 0, 0)
-        found.append(_light(config, MODELS[TAC3D], site, force) > 0)
+        found.append(light_touches(config, MODELS[TAC3D], site, force) > 0)
         if site.solid.rms_mm > 0.03:
             assert not found[-1].any()
     share = np.mean(found, 0)
@@ -150,13 +150,11 @@ def test_another_attempt_is_another_site():
     assert np.abs(first.place_mm - second.place_mm).max() > 0.1
 
 
-def test_limits_lie_where_the_strain_does(monkeypatch):
+def test_limits_lie_where_the_strain_does():
     """The look's limit, on one sensor and a coarse grid, against presses at that force."""
-    monkeypatch.setattr(strength, "MODELS", strength.MODELS[TAC3D : TAC3D + 1])
     sites = [site_of(CONFIG, i, 0, 0) for i in range(10)]
-    limits = strength.look(
-        [s.skin for s in sites], np.array([s.turn_rad for s in sites]), np.array([s.solid.modulus_mpa for s in sites])
-    )
+    turns, moduli = np.array([(s.turn_rad, s.solid.modulus_mpa) for s in sites]).T
+    limits = strength.look([s.skin for s in sites], turns, moduli, MODELS[TAC3D : TAC3D + 1])
     assert np.all(limits.rigid_n <= limits.actual_n * 1.02)
     for factor, past in ((0.8, False), (1.6, True)):
         for i in range(10):

@@ -62,8 +62,12 @@ def test_two_sensors_and_a_force_on_one_page(live):
 
 def test_nothing_new_is_not_shown_again(live):
     presenter = Presenter([Channel(Watched("tac3d", {"depth_mm": np.zeros((4, 4))}))], None, live)
-    assert presenter.step()
-    assert not presenter.step()
+    assert (presenter.step(), presenter.step()) == (True, False)
+
+
+def test_a_session_puts_its_prompt_on_the_page(live):
+    said = shown(Presenter([Channel(Watched("tac3d"))], None, live, lambda: ("hold 5 N", "out of range")), live)
+    assert (said["prompt"], said["alarm"]) == ("hold 5 N", "out of range")
 
 
 def test_alarms_are_told_worst_first(live):
@@ -78,12 +82,6 @@ def test_alarms_are_told_worst_first(live):
     assert "too slowly" in shown(presenter, live)["alarm"]
     skin.newest = StaleFrameError("old")
     assert not presenter.step()
-
-
-def test_a_session_puts_its_prompt_on_the_page(live):
-    presenter = Presenter([Channel(Watched("tac3d"))], None, live, lambda: ("hold 5 N", "out of range"))
-    said = shown(presenter, live)
-    assert (said["prompt"], said["alarm"]) == ("hold 5 N", "out of range")
 
 
 def test_the_background_of_a_camera_is_refreshed_where_nothing_touches(live):
