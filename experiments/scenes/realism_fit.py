@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import jax.numpy as jnp
@@ -24,12 +25,13 @@ BY_EYE = (
 )
 """The earlier optics of the generator: lamps set by eye to published pictures, with the noise below."""
 
+BALL, DIAMETER_MM, MM_PER_PX = "6.310mm", 6.31, 0.0634
+"""Folder and diameter of the ball of the recordings, and their pixel."""
 
 BY_EYE_NOISE = Noise(read=(0.004,) * 3, shot=(0.008,) * 3, grain=(0.0,) * 3, shared=0.0)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderCandidate:
+class RenderCandidate(NamedTuple):
     """A renderer and its noise."""
 
     render: Renderer
@@ -48,15 +50,8 @@ class PressFit:
     noise: Noise
 
 
-def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: float, image_px: int) -> BallPictures:
-    """The square middles of the recordings, shrunk by area.
-
-    Args:
-      data_dir: holds `background.png` and `<ball>/<i>/gelsight.png`.
-      ball: folder of the presses.
-      diameter_mm: of the ball.
-      mm_per_px: of the recordings.
-      image_px: side of the pictures afterwards.
+def read(data_dir: Path | None, image_px: int) -> BallPictures:
+    """The square middles of the recordings in `data_dir`, shrunk by area to `image_px` pixels a side.
 
     Raises:
       ResultsError: no directory, a file that is missing or no picture, too few presses, frames that are not landscape.
@@ -64,16 +59,16 @@ def read(data_dir: Path | None, *, ball: str, diameter_mm: float, mm_per_px: flo
     fix = "give --data-dir the folder that holds background.png"
     if data_dir is None:
         raise ResultsError(f"data_dir is None: must name the folder of the recordings; {fix}")
-    paths = sorted((data_dir / ball).glob("*/gelsight.png"), key=lambda path: int(path.parent.name))
-    found = f"{len(paths)} pictures {ball}/<i>/gelsight.png"
+    paths = sorted((data_dir / BALL).glob("*/gelsight.png"), key=lambda path: int(path.parent.name))
+    found = f"{len(paths)} pictures {BALL}/<i>/gelsight.png"
     require(len(paths) >= 16, f"data_dir {data_dir}", found, "must hold at least 16", fix)
     pictures = [_square(path, image_px) for path in [data_dir / "background.png", *paths]]
     height = _read(paths[0]).shape[0]
     return BallPictures(
         pictures=np.stack(pictures[1:]),
         background=pictures[0],
-        radius_mm=diameter_mm / 2,
-        mm_per_px=mm_per_px * height / image_px,
+        radius_mm=DIAMETER_MM / 2,
+        mm_per_px=MM_PER_PX * height / image_px,
     )
 
 
@@ -123,16 +118,11 @@ def candidates(study: PressFit) -> dict[str, RenderCandidate]:
     by_eye = lambda gel, light: optics.shade(gel, light, BY_EYE, slope_gain=2.0)
     fitted = lambda gel, light: photometric.shade(gel, light, study.fitted)
     return {
-        "lamps by eye": RenderCandidate(render=by_eye, noise=BY_EYE_NOISE),
-        "fitted optics, old noise": RenderCandidate(render=fitted, noise=BY_EYE_NOISE),
-        "fitted optics and noise": RenderCandidate(
-            render=fitted, noise=dataclasses.replace(study.noise, grain=(0.0,) * 3)
-        ),
-        "fitted, with grain": RenderCandidate(render=fitted, noise=study.noise),
-        "as stored in the generator": RenderCandidate(
-            render=photometric.gelsight_mini,
-            noise=stored,
-        ),
+        "lamps by eye": RenderCandidate(by_eye, BY_EYE_NOISE),
+        "fitted optics, old noise": RenderCandidate(fitted, BY_EYE_NOISE),
+        "fitted optics and noise": RenderCandidate(fitted, dataclasses.replace(study.noise, grain=(0.0,) * 3)),
+        "fitted, with grain": RenderCandidate(fitted, study.noise),
+        "as stored in the generator": RenderCandidate(photometric.gelsight_mini, stored),
     }
 
 
@@ -170,21 +160,14 @@ def clean(study: PressFit, model: PhotometricOptics) -> np.ndarray:
 
 def source(fitted: PhotometricOptics, noise: Noise, presses: BallPictures) -> str:
     """The constants as a Python module."""
-    scalars: dict[str, object] = {
-        "HALF_WINDOW_MM": round(fitted.half_window_mm, 4),
-        "MAX_TILT": round(fitted.max_tilt, 4),
-    }
-    scalars |= {"READ_NOISE": noise.read, "SHOT_NOISE": noise.shot}
-    scalars |= {"GRAIN": noise.grain, "GRAIN_SHARED": noise.shared}
+    scalars: dict[str, object] = {"HALF_WINDOW_MM": fitted.half_window_mm, "MAX_TILT": fitted.max_tilt}
+    scalars |= {"READ_NOISE": noise.read, "SHOT_NOISE": noise.shot, "GRAIN": noise.grain, "GRAIN_SHARED": noise.shared}
     lines = [f"{name} = {round(v, 4) if isinstance(v, float) else v}" for name, v in scalars.items()]
     for name in ("depth", "slope", "flat"):
         rows = "".join(f"    {row},\n" for row in getattr(fitted, name))
         lines.append(f"{name.upper()} = (\n{rows})")
-    return (
-        SOURCE_DOC.format(presses=(len(presses.pictures) + 1) // 2, ball=2 * presses.radius_mm)
-        + "\n".join(lines)
-        + "\n"
-    )
+    doc = SOURCE_DOC.format(presses=(len(presses.pictures) + 1) // 2, ball=2 * presses.radius_mm)
+    return doc + "\n".join(lines) + "\n"
 
 
 SOURCE_DOC = '''"""Constants of a real GelSight Mini, fitted by `python -m experiments scene_realism`; not to be edited.

@@ -2,13 +2,13 @@
 
     python -m experiments scene_gallery
 
-Draws sheets of pictures: views of objects by material, honest and lying; presses over force by every sensor; every
+Draws sheets of pictures: views of objects by material, true and false; presses over force by every sensor; every
 exploratory motion over time; objects that vary over their surface; and the ranges of the five properties by material,
-with a table of what the material alone tells of each.
+with a table of the levels of each property by material.
 
 Cost: under two minutes on two cores.
 
-Expected: the pictures are to be looked at; a material alone tells a level right in half of the objects.
+Expected: the pictures are to be looked at; a level predicted from the material alone is right for half of the objects.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ class GalleryConfig:
     """Sizes of the sheets.
 
     Args:
-      views: objects per material, the last two of which lie.
+      views: objects per material; the pictures of the last two show another material.
       presses: objects that are pressed.
       columns: frames per row of a touch.
       varied: objects of two parts, and as many graded ones.
@@ -61,19 +61,11 @@ class GalleryConfig:
 
 def run(config: GalleryConfig, context: Context) -> Results:
     """Draw all sheets."""
-    sheets = {
-        "views": lambda: [views(config)],
-        "presses": lambda: presses(config),
-        "motions": lambda: [motions(config)],
-        "varied": lambda: [varied(config)],
-        "properties": lambda: [ranges()],
-    }
+    sheets = {"views": views, "presses": presses, "motions": motions, "varied": varied, "properties": ranges}
     pictures: list[Picture] = []
-    with context.progress("drawing", len(sheets)) as advance:
-        for name, draw in sheets.items():
-            with context.timed(name):
-                pictures += draw()
-            advance(1)
+    for name, sheet in context.each("drawing", sheets.items()):
+        with context.timed(name):
+            pictures += sheet(config)
     return Results(
         verdict=(f"{len(pictures)} sheets, drawn from seed {config.seed}.",),
         tables=(odds(),),
@@ -82,7 +74,7 @@ def run(config: GalleryConfig, context: Context) -> Results:
     )
 
 
-def views(config: GalleryConfig) -> Picture:
+def views(config: GalleryConfig) -> list[Picture]:
     """RGB views of objects by true material; the two last columns lie."""
     rows = {}
     for material, name in enumerate(MATERIALS):
@@ -90,13 +82,8 @@ def views(config: GalleryConfig) -> Picture:
         lies = rng.choice(objects.lie_materials(material), 2)
         shown = [material] * (config.views - 2) + [int(other) for other in lies]
         rows[name] = [appearance.view(look, VIEW_PX, rng)[0] for look in shown]
-    return Picture(
-        name="views",
-        title="Views by material",
-        caption="One row per material. The two objects on the right lie: they look like another material.",
-        content=image_grid(rows, ["honest"] * (config.views - 2) + ["lie"] * 2, cell_inch=0.95),
-        kind="png",
-    )
+    caption = "One row per material. The two objects on the right lie: they look like another material."
+    return [_sheet("views", "Views by material", caption, rows, ["honest"] * (config.views - 2) + ["lie"] * 2, 0.95)]
 
 
 def presses(config: GalleryConfig) -> list[Picture]:
@@ -112,7 +99,7 @@ def presses(config: GalleryConfig) -> list[Picture]:
     return [press_sheet(make_contact(scenes, index), index) for index in range(config.presses)]
 
 
-def motions(config: GalleryConfig) -> Picture:
+def motions(config: GalleryConfig) -> list[Picture]:
     """The first contact of every motion of the protocol, over time, by the marker sensors' fields and one picture."""
     scenes = dataclasses.replace(config.protocol, image_px=config.image_px, seed=config.seed)
     first: dict[str, int] = {}
@@ -123,45 +110,37 @@ def motions(config: GalleryConfig) -> Picture:
         by_sensor = {s.sensor: s for s in make_contact(scenes, index)}
         rows[f"{motion}\ngelsight_mini"] = _frames(by_sensor["gelsight_mini"], config.columns, amplify=True)
         rows[f"{motion}\ntac3d"] = _frames(by_sensor["tac3d"], config.columns)
-    return Picture(
-        name="motions",
-        title="Motions over time",
-        caption="Each motion by two sensors, from left to right in time: change of the Mini's picture, three times, "
-        "and depth and marker displacement of the Tac3D.",
-        content=image_grid(rows, cell_inch=0.95),
-        kind="png",
+    caption = (
+        "Each motion by two sensors, from left to right in time: change of the Mini's picture, three times, and depth "
+        "and marker displacement of the Tac3D."
     )
+    return [_sheet("motions", "Motions over time", caption, rows, cell_inch=0.95)]
 
 
-def varied(config: GalleryConfig) -> Picture:
+def varied(config: GalleryConfig) -> list[Picture]:
     """Height maps of objects that change over their surface, with the level of hardness where a press would land."""
     x = jnp.linspace(-12, 12, 320)
     pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.zeros(()), tilt=jnp.zeros(2))
-    rows = {}
+    rows: dict[str, list[np.ndarray]] = {}
     for kind, shares in (("two parts", (1.0, 0.0)), ("graded", (0.0, 1.0))):
-        cells = []
+        rows[kind] = []
         for i in range(config.varied):
             solid = objects.sample(np.random.default_rng([config.seed, 7, i]), 0.0, 0.8, *shares)
-            skin = surface.make_skin(solid, np.zeros(2), 0.0)
-            picture = depth_picture(-np.asarray(surface.gap(skin, pose, x)))
-            cells.append(mark_levels(picture, solid))
-        rows[kind] = cells
-    return Picture(
-        name="varied",
-        title="Objects that vary over their surface",
-        caption="Relief and roughness of 24 mm, bodies flattened; the letters are the hardness (s, m, h) where a press "
-        "would land.",
-        content=image_grid(rows, cell_inch=1.9),
-        kind="png",
+            height = -np.asarray(surface.gap(surface.make_skin(solid, np.zeros(2), 0.0), pose, x))
+            picture = _coloured((height - height.min()) / max(float(np.ptp(height)), 1e-9))
+            rows[kind].append(mark_levels(picture, solid))
+    caption = (
+        "Relief and roughness of 24 mm, bodies flattened; the letters are the hardness (s, m, h) where a press would "
+        "land."
     )
+    return [_sheet("varied", "Objects that vary over their surface", caption, rows, cell_inch=1.9)]
 
 
-def ranges() -> Picture:
+def ranges(_: GalleryConfig) -> list[Picture]:
     """Where 90 % of the objects of each material lie, for every property, with the thresholds of the levels."""
     panels: list[Panel] = []
     for name, prop in {**properties.PROPERTIES, **properties.DYNAMIC}.items():
-        spans = [[prop.value(mean + prop.spread * z) for mean in prop.means] for z in (-1.645, 0.0, 1.645)]
-        low, middle, high = spans
+        low, middle, high = ([prop.value(mean + prop.spread * z) for mean in prop.means] for z in (-1.645, 0.0, 1.645))
         panels.append(
             Panel(
                 [Series(x=middle, low=low, high=high)],
@@ -171,53 +150,37 @@ def ranges() -> Picture:
                 rules=[Rule(x=threshold, line="--", colour=SHARED, width=0.8) for threshold in prop.thresholds],
             )
         )
-    return Picture(
-        name="properties",
-        title="Properties by material",
-        caption="From the 5th to the 95th percentile, dot at the median; lines are the thresholds between the levels. "
-        "Every material reaches every level.",
-        content=draw(panels, columns=len(panels), size=(2.2 * len(panels), 2.6)),
+    caption = (
+        "From the 5th to the 95th percentile, dot at the median; lines are the thresholds between the levels. Every "
+        "material reaches every level."
     )
+    content = draw(panels, columns=len(panels), size=(2.2 * len(panels), 2.6))
+    return [Picture(name="properties", title="Properties by material", caption=caption, content=content)]
 
 
 def odds() -> Table:
     """Odds of each level by material, which bound the accuracy from an honest picture alone."""
     every = {**properties.PROPERTIES, **properties.DYNAMIC}
     chances = {name: 100 * properties.level_odds(prop) for name, prop in every.items()}
-    cells = lambda shares: {name: " · ".join(f"{share:.0f}" for share in found) for name, found in shares.items()}
     rows: list[dict[str, Cell]] = [
-        {"material": material, **cells({name: found[i] for name, found in chances.items()})}
+        {"material": material, **{n: " · ".join(f"{share:.0f}" for share in c[i]) for n, c in chances.items()}}
         for i, material in enumerate(MATERIALS)
     ]
-    rows.append(
-        {
-            "material": "right by the likeliest level",
-            **{name: f"{found.max(1).mean():.0f}" for name, found in chances.items()},
-        }
-    )
+    best = {name: f"{found.max(1).mean():.0f}" for name, found in chances.items()}
+    rows.append({"material": "right by the likeliest level", **best})
     return named_table(
         "Levels by material",
         rows,
         units=dict.fromkeys(every, "%"),
         meanings=dict.fromkeys(every, "levels 0 · 1 · 2"),
-        note="Materials are drawn evenly.  Pictures lie about three objects in ten, so that they tell less.",
+        note="Materials are drawn evenly.  Pictures lie about three objects in ten, so their accuracy is lower.",
     )
 
 
-def depth_picture(depth: np.ndarray) -> np.ndarray:
-    """A height map in colour, uint8 RGB, from its least to its greatest value."""
-    scaled = (depth - depth.min()) / max(float(np.ptp(depth)), 1e-9)
-    return _coloured(scaled)
-
-
 def field_picture(depth_mm: np.ndarray, displacement_mm: np.ndarray, top_mm: float, px: int = 160) -> np.ndarray:
-    """Depth in colour and displacement as arrows four times their length, uint8 RGB [px, px, 3].
+    """Depth [h, w] in colour, brightest at `top_mm`, displacement [h, w, 2] as arrows, uint8 RGB [px, px, 3].
 
-    Args:
-      depth_mm: [h, w], black at 0 and brightest at `top_mm`.
-      displacement_mm: [h, w, 2], in units of a node of 1 mm.
-      top_mm: brightest depth.
-      px: side of the picture.
+    Arrows are four times as long as the displacement, in units of a node of 1 mm.
     """
     field = cv2.resize(np.clip(depth_mm / max(top_mm, 1e-9), 0, 1), (px, px), interpolation=cv2.INTER_CUBIC)
     picture = _coloured(np.clip(field, 0, 1))
@@ -237,20 +200,30 @@ def _coloured(scaled: np.ndarray) -> np.ndarray:
 
 
 def press_sheet(sequences: list[Sequence], index: int) -> Picture:
+    """One object pressed by all sensors, over force."""
     forces = sequences[0].target_force_n
     assert forces is not None
     rows = {s.sensor: _frames(s, len(forces)) for s in sequences}
     change = {"its change × 3": _frames(sequences[0], len(forces), amplify=True)}
-    dense = {"its fields": _fields(sequences[-1], np.arange(len(forces)))}  # no eye follows its pattern
+    dense = {"its fields": _fields(sequences[-1], np.arange(len(forces)))}  # its pattern is too fine to see
     rows = {SENSORS[0]: rows.pop(SENSORS[0])} | change | rows | dense
-    return Picture(
-        name=f"press-{index}",
-        title=f"Object {index} pressed",
-        caption="The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers, as of "
-        "the dense pattern below; dark dots are nodes that were not read.",
-        content=image_grid(rows, [f"{force:.1f} N" for force in forces]),
-        kind="png",
+    caption = (
+        "The same patch by all sensors. Tac3D exposes no camera: depth, and displacement of its markers, as of the "
+        "dense pattern below; dark dots are nodes that were not read."
     )
+    return _sheet(f"press-{index}", f"Object {index} pressed", caption, rows, [f"{force:.1f} N" for force in forces])
+
+
+def _sheet(
+    name: str,
+    title: str,
+    caption: str,
+    rows: dict[str, list[np.ndarray]],
+    columns: list[str] | None = None,
+    cell_inch: float = 1.25,
+) -> Picture:
+    content = image_grid(rows, columns or (), cell_inch=cell_inch)
+    return Picture(name=name, title=title, caption=caption, content=content, kind="png")
 
 
 def _frames(sequence: Sequence, columns: int, amplify: bool = False) -> list[np.ndarray]:

@@ -1,6 +1,7 @@
 """Lossless codecs of camera frames behind one interface, and their size, rates and exactness on some clips."""
 
 import dataclasses
+import functools
 import struct
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -23,14 +24,7 @@ _SHAPE = struct.Struct("<4I16s")  # N, H, W, 3 and the name of a filter
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Codec:
-    """A way to keep clips.
-
-    Args:
-      name: of one point of the chart.
-      kind: what it is a variant of.
-      store: writes clips into a folder.
-      load: reads them again.
-    """
+    """Functions that write clips into a folder and read them again; `kind` groups variants in the chart."""
 
     name: str
     kind: str
@@ -38,34 +32,30 @@ class Codec:
     load: Callable[[Path], list[np.ndarray]]
 
 
+OWN, PLAIN = "chosen zstd-1", "zstd-1"
+"""Codec of the records, and that of their version 1."""
+
+Transform = tuple[Callable[[np.ndarray, str], np.ndarray], Callable[[np.ndarray, tuple[int, ...], str], np.ndarray]]
+"""Clip and filter → array to store; flat values, shape of the clip and filter → clip."""
+
+
 def all_codecs() -> tuple[Codec, ...]:
     """Every codec, the records' own one under `OWN`."""
     return (
-        _entries("raw", "raw", "uncompressed", _plain, _unplain),
-        *(_entries(f"zstd-{n}", "zstd", f"zstd:{n}", _plain, _unplain) for n in (1, 3, 9)),
-        _entries("brotli-3", "other", "brotli:3", _plain, _unplain),
-        _entries("snappy", "other", "snappy", _plain, _unplain),
-        *(_entries(f"shuffle zstd-{n}", "shuffle + zstd", f"zstd:{n}", _planes, _unplanes) for n in (1, 3)),
-        *(_entries(f"{d} zstd-1", "difference + zstd", "zstd:1", *_differences(d)) for d in _FIXED),
-        _entries("columns zstd-1", "difference + zstd", "zstd:1", _columns, _uncolumns),
-        _entries(OWN, "chosen difference + zstd", "zstd:1", _chosen, _unchosen),
-        _entries("chosen zstd-3", "chosen difference + zstd", "zstd:3", _chosen, _unchosen),
+        _arrays("raw", "raw", "uncompressed", _UNCHANGED),
+        *(_arrays(f"zstd-{n}", "zstd", f"zstd:{n}", _UNCHANGED) for n in (1, 3, 9)),
+        _arrays("brotli-3", "other", "brotli:3", _UNCHANGED),
+        _arrays("snappy", "other", "snappy", _UNCHANGED),
+        *(_arrays(f"shuffle zstd-{n}", "shuffle + zstd", f"zstd:{n}", _PLANES) for n in (1, 3)),
+        *(_arrays(f"{d} zstd-1", "difference + zstd", "zstd:1", _DELTAS, d) for d in ("time", "rows", "time+rows")),
+        _arrays("columns zstd-1", "difference + zstd", "zstd:1", _COLUMNS),
+        _arrays(OWN, "chosen difference + zstd", "zstd:1", _DELTAS, choose_filter),
+        _arrays("chosen zstd-3", "chosen difference + zstd", "zstd:3", _DELTAS, choose_filter),
         *(_pictures(f"PNG-{n}", "PNG", ".png", (cv2.IMWRITE_PNG_COMPRESSION, n)) for n in (1, 3, 6)),
         _pictures("WebP", "WebP", ".webp", (cv2.IMWRITE_WEBP_QUALITY, 101)),  # above 100 is lossless
         _video("HuffYUV", "HFYU", ".avi"),
         _video("FFV1", "FFV1", ".mkv"),
     )
-
-
-OWN, PLAIN = "chosen zstd-1", "zstd-1"
-"""Codec of the records, and that of their version 1."""
-
-_FIXED = ("time", "rows", "time+rows")
-
-
-def stored_bytes(folder: Path) -> int:
-    """Size of everything in a folder."""
-    return sum(file.stat().st_size for file in folder.iterdir())
 
 
 def _entries(
@@ -92,60 +82,41 @@ def _entries(
     return Codec(name=name, kind=kind, store=store, load=load)
 
 
-def _header(clip: np.ndarray, note: str = "") -> bytes:
-    return _SHAPE.pack(*clip.shape, note.encode())
+def _arrays(
+    name: str, kind: str, options: str, transform: Transform, filter_of: str | Callable[[np.ndarray], str] = ""
+) -> Codec:
+    """Entries of transformed clips, behind their shape and filter, one filter for all or one chosen for each clip."""
+    forward, backward = transform
+
+    def encode(clip: np.ndarray) -> bytes:
+        chosen = filter_of if isinstance(filter_of, str) else filter_of(clip)
+        return _SHAPE.pack(*clip.shape, chosen.encode()) + forward(clip, chosen).tobytes()
+
+    def decode(data: bytes) -> np.ndarray:
+        *shape, chosen = _SHAPE.unpack_from(data)
+        values = np.frombuffer(data, np.uint8, offset=_SHAPE.size)
+        return backward(values, tuple(shape), chosen.rstrip(b"\0").decode())
+
+    return _entries(name, kind, options, encode, decode)
 
 
-def _parts(data: bytes) -> tuple[np.ndarray, str, tuple[int, ...]]:
-    *shape, note = _SHAPE.unpack_from(data)
-    return np.frombuffer(data, np.uint8, offset=_SHAPE.size), note.rstrip(b"\0").decode(), tuple(shape)
-
-
-def _plain(clip: np.ndarray) -> bytes:
-    return _header(clip) + clip.tobytes()
-
-
-def _unplain(data: bytes) -> np.ndarray:
-    values, _, shape = _parts(data)
-    return values.reshape(shape)
-
-
-def _planes(clip: np.ndarray) -> bytes:
-    """Blosc's byte shuffle for pixels of three bytes: all first bytes, all second, all third."""
-    return _header(clip) + np.moveaxis(clip, -1, 0).tobytes()
-
-
-def _unplanes(data: bytes) -> np.ndarray:
-    values, _, shape = _parts(data)
-    return np.ascontiguousarray(np.moveaxis(values.reshape(3, *shape[:3]), 0, -1))
-
-
-def _differences(name: str) -> tuple[Callable[[np.ndarray], bytes], Callable[[bytes], np.ndarray]]:
-    """A fixed filter of `sensors_io.deltas`."""
-    return lambda clip: _header(clip, name) + difference(clip, name).tobytes(), _unchosen
-
-
-def _chosen(clip: np.ndarray) -> bytes:
-    """The filter that the clip wants, as in records."""
-    name = choose_filter(clip)
-    return _header(clip, name) + difference(clip, name).tobytes()
-
-
-def _unchosen(data: bytes) -> np.ndarray:
-    values, name, shape = _parts(data)
-    return accumulate(values.reshape(shape), name)
-
-
-def _columns(clip: np.ndarray) -> bytes:
+def _left_differences(clip: np.ndarray, _: str) -> np.ndarray:
     """Each pixel less the one to its left."""
     residual = clip.copy()
     residual[:, :, 1:] -= clip[:, :, :-1]
-    return _header(clip) + residual.tobytes()
+    return residual
 
 
-def _uncolumns(data: bytes) -> np.ndarray:
-    values, _, shape = _parts(data)
-    return np.cumsum(values.reshape(shape), axis=2, dtype=np.uint8)
+_UNCHANGED: Transform = (lambda clip, _: clip, lambda flat, shape, _: flat.reshape(shape))
+_DELTAS: Transform = (difference, lambda flat, shape, name: accumulate(flat.reshape(shape), name))
+_COLUMNS: Transform = (
+    _left_differences,
+    lambda flat, shape, _: np.cumsum(flat.reshape(shape), axis=2, dtype=np.uint8),
+)
+_PLANES: Transform = (  # Blosc's byte shuffle for pixels of three bytes: all first bytes, all second, all third
+    lambda clip, _: np.moveaxis(clip, -1, 0),
+    lambda flat, shape, _: np.ascontiguousarray(np.moveaxis(flat.reshape(3, *shape[:3]), 0, -1)),
+)
 
 
 def _pictures(name: str, kind: str, suffix: str, settings: tuple[int, int]) -> Codec:
@@ -214,14 +185,7 @@ class CodecMeasurement:
 def measure(
     codecs: Sequence[Codec], clips: Clips, rounds: int, context: Context
 ) -> tuple[list[CodecMeasurement], dict[str, str]]:
-    """Every codec over the same clips, in turn within each round; and why a codec is missing, by name.
-
-    Args:
-      codecs: what to measure.
-      clips: what they store.
-      rounds: of timing; rates are medians.
-      context: shows how far it is.
-    """
+    """Every codec over the same clips, in interleaved rounds of timing; and why a codec is missing, by name."""
     frames = sum(map(len, clips))
     with tempfile.TemporaryDirectory() as root:
         folders = {codec.name: Path(root) / str(n) for n, codec in enumerate(codecs)}
@@ -233,18 +197,19 @@ def measure(
             except RuntimeError as error:
                 missing[codec.name] = str(error)
                 continue
-            exact[codec.name] = _same(codec.load(folders[codec.name]), clips)
+            loaded = codec.load(folders[codec.name])
+            exact[codec.name] = len(loaded) == len(clips) and all(map(np.array_equal, loaded, clips))
             present.append(codec)
         calls: dict[str, Callable[[], Any]] = {}
         for codec in present:
-            calls[f"write {codec.name}"] = _bind(codec.store, clips, folders[codec.name])
-            calls[f"read {codec.name}"] = _bind(codec.load, folders[codec.name])
+            calls[f"write {codec.name}"] = functools.partial(codec.store, clips, folders[codec.name])
+            calls[f"read {codec.name}"] = functools.partial(codec.load, folders[codec.name])
         timed = interleaved(calls, context.rounds("timing codecs", rounds))
         seconds = {name: float(np.median(s)) for name, s in timed.items()}
         rows = [
             CodecMeasurement(
                 codec=codec,
-                bytes=stored_bytes(folders[codec.name]) / frames,
+                bytes=sum(file.stat().st_size for file in folders[codec.name].iterdir()) / frames,
                 write_fps=frames / seconds[f"write {codec.name}"],
                 read_fps=frames / seconds[f"read {codec.name}"],
                 exact=exact[codec.name],
@@ -257,23 +222,11 @@ def measure(
 def front(rows: Sequence[CodecMeasurement]) -> list[CodecMeasurement]:
     """Those that no other one beats in size and in read rate, by size."""
     ordered = sorted(rows, key=lambda row: (row.bytes, -row.read_fps))
-    best, kept = 0.0, []
-    for row in ordered:
-        if row.read_fps > best:
-            kept.append(row)
-            best = row.read_fps
-    return kept
+    fastest = np.maximum.accumulate([0.0, *(row.read_fps for row in ordered)])
+    return [row for row, best in zip(ordered, fastest, strict=False) if row.read_fps > best]
 
 
 def chosen_filters(clips: Iterable[np.ndarray]) -> dict[str, int]:
-    """Number of clips for which each filter is chosen."""
+    """Number of clips that choose each filter."""
     names = [choose_filter(clip) for clip in clips]
     return {name: names.count(name) for name in FILTERS}
-
-
-def _bind(call: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    return lambda: call(*arguments)
-
-
-def _same(loaded: Sequence[np.ndarray], clips: Clips) -> bool:
-    return len(loaded) == len(clips) and all(map(np.array_equal, loaded, clips))

@@ -1,9 +1,14 @@
-"""Rates of the generator: feeds without disk, written sets, the parts of a record, and the machine's own rates."""
+"""Rates of the generator (fed, written, by part), the machine's own rates, and a writer that is killed and resumed."""
 
 import dataclasses
 import functools
+import os
+import shutil
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +16,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.core.context import Context
+from experiments.core.timing import interleaved
 from sensors_io.generate import generate_records
 from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
+from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.scenes import contact, surface
-from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.press import GridSizes, Kernels, Press, make_kernels, record
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.schedule import Slot
 from sensors_io.scenes.sensors import MODELS, SensorModel
-from sensors_io.schema import FORCES_N, SENSORS
+from sensors_io.schema import FORCES_N, SENSORS, Flag, Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,16 +51,12 @@ class RecordRate:
         return 1e3 * self.cpu_seconds / self.records
 
 
-class Stopwatch:
-    """Wall and processor time of this process since it was made."""
-
-    def __init__(self) -> None:
-        self._begin = (time.perf_counter(), time.process_time())
-
-    def rate(self, records: int) -> RecordRate:
-        """The rate of `records` made since then."""
-        wall, cpu = time.perf_counter() - self._begin[0], time.process_time() - self._begin[1]
-        return RecordRate(records=records, seconds=wall, cpu_seconds=cpu)
+def start_clock() -> Callable[[int], RecordRate]:
+    """A function that gives the rate of some records made since the clock was started."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    return lambda records: RecordRate(
+        records=records, seconds=time.perf_counter() - wall, cpu_seconds=time.process_time() - cpu
+    )
 
 
 def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callable[[int], None]) -> RecordRate:
@@ -63,29 +67,24 @@ def feed_rate(config: SceneConfig, contacts: int, threads: int, advance: Callabl
         make_contact(config, row)
     order = np.arange(contacts) % len(scenes)
     batches = clip_batches(scenes, order, clip, batch_size=1, seed=0, repeat=False, threads=threads)
-    watch = Stopwatch()
+    rate_of = start_clock()
     for batch in batches:
         advance(len(batch["contact"]))
-    return watch.rate(contacts * len(SENSORS) * config.frame_count)
+    return rate_of(contacts * len(SENSORS) * config.frame_count)
 
 
-def write_rate(config: SceneConfig, out: Path, advance: Callable[[int], None]) -> tuple[RecordRate, float]:
+def write_rate(config: SceneConfig, out: Path, report: Callable[[int, int], None]) -> tuple[RecordRate, float]:
     """Rate of a written set and its bytes per record; compiling and looking at objects are left out."""
     for row in _one_of_each_program(config):
         make_contact(config, row)
-    watch, seen = Stopwatch(), [0]
-
-    def report(done: int, total: int) -> None:
-        advance(done - seen[0])
-        seen[0] = done
-
+    rate_of = start_clock()
     generate_records(config, out, progress=report)
     records = config.contact_count * len(SENSORS) * config.frame_count
-    return watch.rate(records), sum(f.stat().st_size for f in out.iterdir()) / records
+    return rate_of(records), sum(f.stat().st_size for f in out.iterdir()) / records
 
 
 def _one_of_each_program(config: SceneConfig) -> Iterator[int]:
-    """A contact for every program that is compiled: one that stands, one that moves."""
+    """A contact for every compiled program: one that stands, one that moves."""
     moves = [key.motion.startswith("slide") for key in LiveScenes(config).contacts]
     yield moves.index(False)
     if True in moves:
@@ -95,18 +94,11 @@ def _one_of_each_program(config: SceneConfig) -> Iterator[int]:
 _Scene = tuple[Press, Any, np.ndarray]  # object, sensor unit, key of the noise
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StageCosts:
-    """Milliseconds of one core per record of one sensor: of the contact solver, of friction, of fields, of pictures."""
+def part_costs(config: SceneConfig, order: int, objects: int) -> dict[str, float]:
+    """Milliseconds of one core per record of sensor number `order`, by part of the compiled program.
 
-    normal: float
-    friction: float
-    fields: float
-    picture: float
-
-
-def stage_costs(config: SceneConfig, order: int, objects: int) -> StageCosts:
-    """Costs of the parts of the compiled program, by timing it with and without them, over `objects` objects."""
+    The program is timed with and without each part, over `objects` objects.
+    """
     sensor = MODELS[order]
     blind = dataclasses.replace(sensor, render=None)
     still = [_scene(config, i, order, "hold") for i in range(objects)]
@@ -115,7 +107,7 @@ def stage_costs(config: SceneConfig, order: int, objects: int) -> StageCosts:
     fields = _cpu_ms(config, blind, still, _record)
     whole = _cpu_ms(config, sensor, still, _record) if sensor.render is not None else fields
     slid = _cpu_ms(config, blind, moved, functools.partial(_record, moving=True))
-    return StageCosts(normal=normal, friction=slid - fields, fields=fields - normal, picture=whole - fields)
+    return {"pressure": normal, "friction": slid - fields, "fields": fields - normal, "picture": whole - fields}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,14 +133,9 @@ def measure_machine(padded: int, grid: int, image_px: int) -> MachineRates:
     )
 
 
-def _seconds(call: Callable[[], Any], times: int = 40) -> float:
-    """Least time of one call, which other load does not affect."""
-    found = []
-    for _ in range(times):
-        begin = time.perf_counter()
-        jax.block_until_ready(call())
-        found.append(time.perf_counter() - begin)
-    return min(found)
+def _seconds(call: Callable[[], Any]) -> float:
+    """Least time of one call of forty, which other load does not affect."""
+    return float(interleaved({"": call}, range(40))[""].min())
 
 
 def _scene(config: SceneConfig, index: int, order: int, motion: str) -> _Scene:
@@ -161,21 +148,14 @@ def _cpu_ms(config: SceneConfig, sensor: SensorModel, scenes: list[_Scene], run:
     grid = GridSizes(contact_grid=config.contact_grid, image_px=config.image_px)
     kernels = make_kernels(sensor, grid)
     jax.block_until_ready(run(*scenes[0], kernels, sensor, grid))
-    watch = Stopwatch()
+    rate_of = start_clock()
     for scene in scenes:
         jax.block_until_ready(run(*scene, kernels, sensor, grid))
-    return watch.rate(len(scenes) * config.frame_count).cpu_ms
+    return rate_of(len(scenes) * config.frame_count).cpu_ms
 
 
-def _record(
-    press: Press,
-    unit: Any,
-    key: np.ndarray,
-    kernels: Kernels,
-    sensor: SensorModel,
-    grid: GridSizes,
-    moving: bool = False,
-) -> Any:
+def _record(press: Press, unit: Any, key: np.ndarray, *given: Any, moving: bool = False) -> Any:
+    kernels, sensor, grid = given
     return record(press, unit, kernels, key, sensor, grid, moving=moving)
 
 
@@ -194,3 +174,136 @@ def _pressures(
         return found.pressure_mpa, found.displacement_mm
 
     return jax.lax.map(solve, press.path.force_n)
+
+
+# A killed writer -----------------------------------------------------------------------------------------------------
+
+_POLL_S = 0.05  # a shard takes seconds
+_SIGKILL = -int(signal.SIGKILL)  # return code of a process that it ended
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ResumedSet:
+    """A set that was written with interruptions, compared with one that was not.
+
+    `records` that can be read; contacts that are missing, repeated, or damaged by their checksums; readable contacts
+    that differ in a bit or in their place.
+    """
+
+    records: int
+    missing: int
+    repeated: int
+    damaged: int
+    differing: int
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WrittenSet:
+    """The written set: rate, bytes per record, frames past the strain limit; kills of its second writer, its result."""
+
+    rate: RecordRate
+    bytes: float
+    past_limit: int
+    kills: int
+    kept: ResumedSet
+
+
+def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int) -> WrittenSet:
+    """Write the set once undisturbed and once with kills; the copies are removed after the comparison."""
+    home = context.directory / "written"
+    shutil.rmtree(home, ignore_errors=True)
+    whole, killed = home / "whole", home / "killed"
+    with context.progress_callback("writing") as report:
+        rate, size = write_rate(scenes, whole, report)
+    shards = len(list(whole.glob("contacts-*")))
+    command = [sys.executable, "-m", "sensors_io", "generate", "--out", str(killed)]
+    for name in ("objects", "sequences", "frames", "image_px", "contact_grid"):
+        command += [f"--{name.replace('_', '-')}", str(getattr(scenes, name))]
+    with context.progress("killing and resuming", kills + 1) as advance:
+        shard_s = rate.seconds / shards
+        killed_times = killed_and_resumed(command, killed, kills, shards, shard_s, seed, advance)
+    with context.progress("comparing", scenes.contact_count) as advance:
+        kept = compare(whole, killed, advance)
+    store = RecordStore(whole)
+    rows = context.each("reading flags", range(len(store)))
+    flags = [s.flags for i in rows for s in store.contact(i, fields=False).values()]
+    past = int((np.concatenate(flags) & np.uint32(Flag.STRAIN_LIMIT) > 0).sum())
+    shutil.rmtree(home)
+    return WrittenSet(rate=rate, bytes=size, past_limit=past, kills=killed_times, kept=kept)
+
+
+def killed_and_resumed(
+    command: list[str],
+    out: Path,
+    kills: int,
+    shards: int,
+    shard_s: float,
+    seed: int,
+    advance: Callable[[], object] = lambda: None,
+) -> int:
+    """Run the command that writes records, kill it with SIGKILL at random moments, let the last run finish.
+
+    A moment is a random shard, another each time, and a random part of the time in which it is written; the first shard
+    takes in the start of the process and its compiling.
+
+    Args:
+      command: `python -m sensors_io generate …`.
+      out: directory of the records.
+      kills: number of kills, < `shards`.
+      shards: that the finished set has.
+      shard_s: seconds that an undisturbed writer takes for one.
+      seed: of the moments.
+      advance: called after each kill, and after the last run.
+
+    Returns:
+      Number of runs that were killed before they ended.
+
+    Raises:
+      ValueError: as many kills as shards, or more.
+    """
+    require(kills < shards, "kills", kills, f"must be < {shards}, the shards of the set, or more contacts be written")
+    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(out.parent / "compiled")}
+    rng = np.random.default_rng(seed)
+    killed = 0
+    for shard in np.sort(rng.choice(shards - 1, kills, replace=False)):
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            while process.poll() is None and len(list(out.glob("contacts-*"))) < shard:
+                time.sleep(_POLL_S)
+            time.sleep(rng.uniform(0, shard_s))
+        finally:
+            process.kill()
+            killed += process.wait() == _SIGKILL
+        advance()
+    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
+    advance()
+    return killed
+
+
+def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> ResumedSet:
+    """Read every entry of both sets; `advance` is called before each."""
+    left, right = RecordStore(whole), RecordStore(killed)
+    records = damaged = differing = 0
+    for i, key in enumerate(right.contacts):
+        advance()
+        try:
+            contact = right.contact(i)
+        except CorruptRecordsError:
+            damaged += 1
+            continue
+        records += sum(len(sequence) for sequence in contact.values())
+        differing += i >= len(left) or key != left.contacts[i] or not _same(contact, left.contact(i))
+    return ResumedSet(
+        records=records,
+        missing=len(set(left.contacts) - set(right.contacts)),
+        repeated=len(right) - len(set(right.contacts)),
+        damaged=damaged,
+        differing=differing,
+    )
+
+
+def _same(a: Mapping[str, Sequence], b: Mapping[str, Sequence]) -> bool:
+    if a.keys() != b.keys():
+        return False
+    pairs = ((vars(a[name]), vars(b[name])) for name in a)
+    return all(np.array_equal(x[field], y[field]) for x, y in pairs for field in x)

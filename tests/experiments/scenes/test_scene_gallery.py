@@ -26,9 +26,10 @@ TINY = dataclasses.replace(
 
 @pytest.mark.slow
 def test_sheets_without_a_solver_are_drawn() -> None:
-    for sheet in (scene_gallery.views(TINY), scene_gallery.varied(TINY)):
+    for sheet in (*scene_gallery.views(TINY), *scene_gallery.varied(TINY)):
         assert sheet.content.startswith(b"\x89PNG")
-    assert all(name.encode() in scene_gallery.ranges().content for name in ("hardness", "elasticity", "friction"))
+    (ranges,) = scene_gallery.ranges(TINY)
+    assert all(name.encode() in ranges.content for name in ("hardness", "elasticity", "friction"))
 
 
 def test_a_press_is_a_row_per_sensor(records: Path) -> None:
@@ -44,7 +45,7 @@ def test_every_sheet_is_drawn(tmp_path: Path) -> None:
     directory = run_shrunk(scene_gallery, TINY, tmp_path)
     names = {path.name for path in (directory / "plots").iterdir()}
     assert names == {"views.png", "press-0.png", "motions.png", "varied.png", "properties.svg"}
-    assert read_json(directory / "results.json")["verdict"] == ["5 sheets, drawn from seed 0."]
+    assert len(read_json(directory / "results.json")["tables"]) == 1
 
 
 def test_arrows_point_along_the_displacement() -> None:

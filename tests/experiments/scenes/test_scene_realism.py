@@ -1,6 +1,6 @@
-"""The whole experiment on recordings that were rendered: the fit finds the optics, the report is written."""
+"""The whole experiment on rendered recordings; distances of pictures and the accuracy of the classifier by hand."""
 
-import json
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -10,13 +10,16 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.context import Context
 from experiments.core.errors import ResultsError
-from experiments.core.runner import main
-from experiments.scenes import realism_fit
+from experiments.scenes import realism_fit, scene_realism
+from experiments.scenes.scene_realism import PatchClassifier, accuracy, distances
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
+from tests.experiments.shrunk import run_shrunk
 
 HEIGHT, WIDTH, SCALE, RADIUS_MM = 240, 320, 0.0634, 3.155
+P, N = 8, 48
+CENTRES = np.full((P, 2), N / 2)
 
 
 @pytest.fixture(scope="module")
@@ -42,37 +45,23 @@ def _write(path: Path, square: np.ndarray, rng: np.random.Generator) -> None:
     cv2.imwrite(str(path), np.clip(np.round(noisy), 0, 255).astype(np.uint8)[..., ::-1])
 
 
-@pytest.fixture(scope="module")
-def directory(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run at the smallest scale."""
-    home = tmp_path_factory.mktemp("runs")
-    overrides = ["--image-px", "64", "--judge.patches", "4", "--runs-dir", str(home)]
-    assert main(["scene_realism", "--scale", "smoke", "--data-dir", str(recordings), *overrides]) == 0
-    (found,) = (p for p in (home / "scene_realism").iterdir() if not p.is_symlink())
-    return found
-
-
 @pytest.mark.slow
-def test_the_fit_is_the_optics_that_made_the_pictures(directory: Path) -> None:
+def test_the_fit_finds_the_optics_that_made_the_pictures(recordings: Path, tmp_path: Path) -> None:
+    config = dataclasses.replace(
+        scene_realism.SMOKE, data_dir=recordings, image_px=64, judge=PatchClassifier(patches=4)
+    )
+    directory = run_shrunk(scene_realism, config, tmp_path)
     results = read_json(directory / "results.json")
     (stored,) = results["requirements"]
     assert stored["measured"] < 1.5  # levels; the lamps by eye are off by 13
-    fitted, held_out = results["tables"][1]["rows"]
-    assert min(fitted[1:4]) > 95
-    assert min(held_out[1:4]) > 95
-
-
-@pytest.mark.slow
-def test_fitted_pictures_are_nearer_than_those_by_eye(directory: Path) -> None:
-    rows = {row[0]: row[1:] for row in read_json(directory / "results.json")["tables"][0]["rows"]}
-    by_eye, fitted = rows["lamps by eye"], rows["fitted optics and noise"]
+    distance, fit = ({row[0]: row[1:] for row in table["rows"]} for table in results["tables"])
+    assert min(fit["fitted"][:3]) > 95
+    assert min(fit["held out"][:3]) > 95
+    by_eye, fitted = distance["lamps by eye"], distance["fitted optics and noise"]
     assert fitted[0] < 0.4 * by_eye[0]  # rms difference
-    assert fitted[4] < by_eye[4]  # told apart
-    assert rows["lamps by eye"][4] > 90
-
-
-@pytest.mark.slow
-def test_the_constants_are_written_as_a_module(directory: Path) -> None:
+    assert fitted[4] < by_eye[4]  # accuracy of the classifier
+    assert by_eye[4] > 90
+    assert (directory / "plots" / "presses.png").read_bytes().startswith(b"\x89PNG")
     made: dict[str, object] = {}
     exec((directory / "mini_optics.py").read_text(), made)
     fields = ("HALF_WINDOW_MM", "FLAT", "SLOPE", "DEPTH", "MAX_TILT")
@@ -82,26 +71,17 @@ def test_the_constants_are_written_as_a_module(directory: Path) -> None:
     assert len(made["READ_NOISE"]) == len(made["SHOT_NOISE"]) == len(made["GRAIN"]) == 3
 
 
-@pytest.mark.slow
-def test_the_report_shows_the_presses(directory: Path) -> None:
-    page = (directory / "report.html").read_text(encoding="utf-8")
-    assert all(name in page for name in ("lamps by eye", "fitted, with grain", "told apart", "Held-out presses"))
-    assert (directory / "plots" / "presses.png").read_bytes().startswith(b"\x89PNG")
-
-
 def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: Context) -> None:
-    presses = realism_fit.read(recordings, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+    presses = realism_fit.read(recordings, image_px=48)
     study = realism_fit.fit(presses, context)
-    found = realism_fit.shadow_gain(study, context)
-    assert found["explained"] < 0.05
-    assert json.dumps(found)
+    assert realism_fit.shadow_gain(study, context)["explained"] < 0.05
 
 
 @pytest.mark.parametrize(("data_dir", "message"), [(None, "data_dir is None"), ("empty", "0 pictures")])
 def test_a_folder_without_recordings_is_refused(data_dir: str | None, message: str, tmp_path: Path) -> None:
     where = None if data_dir is None else tmp_path / data_dir
     with pytest.raises(ResultsError, match=message):
-        realism_fit.read(where, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+        realism_fit.read(where, image_px=48)
 
 
 def test_a_broken_picture_is_named(recordings: Path, tmp_path: Path) -> None:
@@ -110,4 +90,45 @@ def test_a_broken_picture_is_named(recordings: Path, tmp_path: Path) -> None:
         path.parent.mkdir(parents=True)
         path.write_bytes((recordings / f"6.310mm/{i}/gelsight.png").read_bytes())
     with pytest.raises(ResultsError, match=r"background\.png: it is missing or no picture"):
-        realism_fit.read(tmp_path, ball="6.310mm", diameter_mm=6.31, mm_per_px=SCALE, image_px=48)
+        realism_fit.read(tmp_path, image_px=48)
+
+
+def pictures(seed: int, std: float = 3.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    smooth = 120 + 20 * np.sin(np.linspace(0, 3, N))[:, None, None] * np.ones((P, N, N, 3))
+    return np.clip(np.round(smooth + std * rng.standard_normal((P, N, N, 3))), 0, 255).astype(np.uint8)
+
+
+def test_equal_pictures_are_at_no_distance() -> None:
+    found = distances(pictures(0), pictures(0))
+    assert (found.pixel, found.intensity, found.gradient, found.spectrum_db) == (0, 0, 0, 0)
+
+
+def test_a_shift_of_brightness_is_its_own_distance() -> None:
+    found = distances(pictures(0), pictures(0) + np.uint8(7))
+    assert found.pixel == pytest.approx(7)
+    assert found.intensity == pytest.approx(7)
+    assert found.gradient == pytest.approx(0, abs=1e-9)
+    assert found.spectrum_db == pytest.approx(0, abs=1e-9)
+
+
+def test_twice_the_contrast_is_six_decibels() -> None:
+    real = pictures(0, 3.0).astype(np.float64)
+    doubled = 2 * (real - real.mean((1, 2), keepdims=True)) + real.mean((1, 2), keepdims=True)
+    assert distances(real, doubled).spectrum_db == pytest.approx(20 * np.log10(2), abs=1e-6)
+    assert distances(real, doubled).intensity > 1
+
+
+def test_the_classifier_is_at_chance_where_nothing_differs() -> None:
+    mean, error = accuracy(pictures(0), pictures(1), CENTRES, PatchClassifier(patches=16))
+    assert mean == pytest.approx(0.5, abs=4 * error + 0.02)
+
+
+def test_the_classifier_finds_a_fifth_more_noise() -> None:
+    mean, _ = accuracy(pictures(0), pictures(1, 3.6), CENTRES, PatchClassifier(patches=16))
+    assert mean > 0.9
+
+
+def test_the_classifier_needs_two_folds() -> None:
+    with pytest.raises(ValueError, match="real holds 3 pictures: must be ≥ 4"):
+        accuracy(pictures(0)[:3], pictures(1)[:3], CENTRES[:3], PatchClassifier())
