@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -12,8 +13,8 @@ from experiments.core.charts import speed_against_error
 from experiments.core.context import Context
 from experiments.core.results import Picture, Requirement, Table, at_least, at_most, named_table
 from experiments.core.timing import median_ms
-from experiments.fields.depth_methods import MAPS, Slopes, calibrated, depth_by
-from experiments.fields.generated_presses import Optics, fitted_optics, generated_presses, near_lamps
+from experiments.fields.depth_methods import MAPS, SlopeMap, calibrated, depth_by
+from experiments.fields.generated_presses import fitted_optics, generated_presses, near_lamps
 from experiments.fields.published import gelslam
 from experiments.fields.sections import FieldSection
 from sensors_io.calibration.circles import align_circles, find_circles
@@ -29,39 +30,46 @@ PACKAGE = "polynomial, varying"
 BALL_MM, OTHER_BALLS_MM = 6.31, (4.0, 9.5)
 """Diameters of the calibration's ball and of the other generated balls that it is scored on."""
 
-Bounds = tuple[float, float]
-"""Greatest depth rmse in µm, greatest error of the radius in %."""
-
 SAME_BALL, OTHER_BALL = (15.0, 4.0), (20.0, 5.0)
+"""Greatest depth rmse in µm and greatest error of the radius in %, for the calibration's ball and for others."""
 
 LEAST_HZ, SPEED_PX = 240.0, (240, 320)
 """Least number of pictures of this size, rows and columns, that become depth in a second."""
+
+ERRORS = {
+    "depth rmse": ("depth rmse median, um", "µm", ".1f"),
+    "p90": ("depth rmse p90, um", "µm", ".1f"),
+    "radius error": ("radius error median, %", "%", ".1f"),
+    "p90 of it": ("radius error p90, %", "%", ".1f"),
+    "bias of the radius": ("radius error of the median, %", "%", "+.1f"),
+    "tip depth": ("tip depth median, mm", "mm", ".2f"),
+}
+"""Column → figure of `BallErrors`, unit, format."""
 
 
 def generated_sections(
     presses: int, strange_lamps: bool, rounds: int, seed: int, context: Context
 ) -> list[FieldSection]:
-    """Generated presses: balls of other diameters than the calibration's, under both kinds of lamps; the speed.
+    """Balls of other diameters than the calibration's under the supposed and under near lamps, and the speed.
 
     Args:
       presses: of the calibration's ball; half as many of each other ball.
-      strange_lamps: whether lamps outside the calibration's model are tried too.
+      strange_lamps: measure lamps outside the calibration's model too.
       rounds: of timing.
       seed: of the presses.
       context: shows progress.
     """
-
-    def other_balls(optics: Optics, source: str) -> tuple[Calibration, FieldSection]:
-        made = calibrated(generated_presses(BALL_MM, presses, seed, optics), seed)
+    lamps = {"generated, supposed optics": fitted_optics}
+    lamps |= {"generated, near lamps": near_lamps} if strange_lamps else {}
+    calibrations, sections = [], []
+    for source, optics in lamps.items():
+        calibrations.append(calibrated(generated_presses(BALL_MM, presses, seed, optics), seed))
         others = {
             f"{diameter:g} mm": generated_presses(diameter, max(2, presses // 2), seed + 1, optics)
             for diameter in OTHER_BALLS_MM
         }
-        return made, other_ball_section(made, others, source, context)
-
-    made, usual = other_balls(fitted_optics, "generated, supposed optics")
-    strange = [other_balls(near_lamps, "generated, near lamps")[1]] if strange_lamps else []
-    return [usual, *strange, speed_section(made, rounds, "generated balls")]
+        sections.append(other_ball_section(calibrations[-1], others, source, context))
+    return [*sections, speed_section(calibrations[0], rounds, "generated balls")]
 
 
 def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, context: Context) -> list[FieldSection]:
@@ -80,9 +88,8 @@ def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, co
     return sections
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CalibrationFold:
-    """Presses left out of one calibration, the presses that it is made with, and the touches of both."""
+class CalibrationFold(NamedTuple):
+    """Presses of a calibration with their touches; the others with theirs [n, 3], and their indices [n]."""
 
     train: BallPresses
     train_touches: Touches
@@ -99,15 +106,12 @@ def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> l
         train, rest = presses.chosen(np.setdiff1d(order, out)), presses.chosen(out)
         circles = find_circles(train)
         touches = align_circles(rest, circles.optics).touches.stacked()
-        fold = CalibrationFold(
-            train=train, train_touches=circles.touches, rest=rest, rest_touches=touches, rest_index=out
-        )
-        found.append(fold)
+        found.append(CalibrationFold(train, circles.touches, rest, touches, out))
     return found
 
 
 def held_out_errors(
-    folds: Sequence[CalibrationFold], make: Callable[[BallPresses, Touches, int], Slopes], seed: int
+    folds: Sequence[CalibrationFold], make: Callable[[BallPresses, Touches, int], SlopeMap], seed: int
 ) -> BallErrors:
     """Errors of every press by a map that was made without it."""
     rows = np.full((3, sum(len(fold.rest_index) for fold in folds)), np.nan)
@@ -117,14 +121,6 @@ def held_out_errors(
             depth = depth_by(read, picture, fold.rest.mm_per_px)
             rows[:, i] = *score_ball(depth, touch, fold.rest.radius_mm, fold.rest.mm_per_px), depth.max()
     return BallErrors(depth_um=rows[0], radius_share=rows[1], tip_mm=rows[2])
-
-
-def frame_ms(made: Calibration, size: tuple[int, int], rounds: Iterable[object]) -> float:
-    """Milliseconds from one picture of a size (rows, columns) to depth, zero level and contact mask, on one core."""
-    background = cv2.resize(made.background, size[::-1], interpolation=cv2.INTER_AREA)
-    read = DepthReader(dataclasses.replace(made, background=background))
-    picture = cv2.add(background, np.full_like(background, 3))
-    return median_ms({"depth": lambda: read(picture)}, rounds)["depth"]
 
 
 def held_out_section(
@@ -138,17 +134,38 @@ def held_out_section(
         read = make(parts[0].train, parts[0].train_touches, seed)
         calls[kind] = functools.partial(depth_by, read, presses.pictures[0], presses.mm_per_px)
     ms = median_ms(calls, context.rounds("timing maps", rounds))
-    figures = errors[PACKAGE].figures()
+    figures = {kind: error.figures() for kind, error in errors.items()}
+    own = figures[PACKAGE]
+    table = _error_table(
+        f"Colour to slope, {name}: balls left out of the calibration",
+        [{"map": kind, **_error_cells(f), "time a frame": ms[kind]} for kind, f in figures.items()],
+        note=f"{folds} folds by press; all maps have the same circles, pixels and normals. The depth rmse holds within "
+        "0.7 contact radii, after a fit of the sphere's centre and offset; the error of the radius is from a second "
+        "fit, in which the radius is free.",
+    )
+    points = {
+        kind: [(label, ms[kind], f["depth rmse median, um"], f["depth rmse p90, um"])]
+        for kind, f in figures.items()
+        for label in [f"this: {kind}" if kind == PACKAGE else kind]
+    }
+    picture = Picture(
+        name=f"depth-{name}",
+        title=f"Picture to depth on real presses ({name})",
+        caption="Depth error inside the contact of a ball whose press was left out of the calibration: median over "
+        f"presses, bar to the 90th percentile. The dotted corner is the bound: {LEAST_HZ:g} Hz and "
+        f"{SAME_BALL[0]:g} µm.",
+        content=speed_against_error(points, "depth rmse, µm", (1e3 / LEAST_HZ, SAME_BALL[0]), legend=False),
+    )
     return FieldSection(
         verdict=(
-            f"On {int(figures['presses'])} real presses ({name}), with circles found without labels and {folds} folds "
-            f"by press, the median depth rmse is {figures['depth rmse median, um']:.1f} µm and the median error of the "
-            f"radius {figures['radius error median, %']:.1f} % (bias of the median radius "
-            f"{figures['radius error of the median, %']:+.1f} %).",
+            f"On {int(own['presses'])} real presses ({name}), with circles found without labels and {folds} folds "
+            f"by press, the median depth rmse is {own['depth rmse median, um']:.1f} µm and the median error of the "
+            f"radius {own['radius error median, %']:.1f} % (bias of the median radius "
+            f"{own['radius error of the median, %']:+.1f} %).",
         ),
-        requirements=ball_requirements(figures, f"{name}, held out by press", SAME_BALL),
-        tables=(_map_table(errors, ms, name, folds),),
-        pictures=(map_picture(errors, ms, name),),
+        requirements=ball_requirements(own, f"{name}, held out by press", SAME_BALL),
+        tables=(table,),
+        pictures=(picture,),
     )
 
 
@@ -156,38 +173,36 @@ def other_ball_section(
     made: Calibration, others: Mapping[str, BallPresses], source: str, context: Context
 ) -> FieldSection:
     """A calibration made with one ball, scored on balls of other diameters."""
-    rows = []
-    requirements: list[Requirement] = []
+    rows, requirements = [], list[Requirement]()
     for name, presses in context.each("balls", others.items()):
         figures = score_presses(made, presses, find_circles(presses).touches.stacked()).figures()
         requirements += ball_requirements(figures, f"{name}, {source}", OTHER_BALL)
-        errors = {key: value for key, value in _error_cells(figures).items() if key in _BALL_COLUMNS}
-        rows.append({"ball": name, "presses": figures["presses"], **errors})
-    table = named_table(
-        f"Balls of other diameters than the calibration's ({source})",
-        rows,
-        formats={"presses": ".0f"} | dict.fromkeys(_BALL_COLUMNS, ".1f"),
-        units={name: _UNITS[name] for name in _BALL_COLUMNS},
-        meanings={"depth rmse": "median", "radius error": "median of its size"},
-    )
+        rows.append({"ball": name, "presses": figures["presses"], **_error_cells(figures, list(ERRORS)[:4])})
+    table = _error_table(f"Balls of other diameters than the calibration's ({source})", rows)
     return FieldSection(requirements=tuple(requirements), tables=(table,))
 
 
 def speed_section(made: Calibration, rounds: int, source: str) -> FieldSection:
-    """Speed from a picture to depth and contact, by a calibration made from some source."""
-    ms, degrees, (height, width) = frame_ms(made, SPEED_PX, range(rounds)), made.colours, SPEED_PX
+    """Speed from a picture to depth, zero level and contact mask on one core, by a calibration from some source."""
+    height, width = SPEED_PX
+    background = cv2.resize(made.background, (width, height), interpolation=cv2.INTER_AREA)
+    read = DepthReader(dataclasses.replace(made, background=background))
+    picture = cv2.add(background, np.full_like(background, 3))
+    ms = median_ms({"depth": lambda: read(picture)}, range(rounds))["depth"]
     speed = at_least(
         f"picture to depth and contact, {width} × {height}, map of {source}",
         1e3 / ms,
         LEAST_HZ,
         "Hz",
-        note=f"{ms:.2f} ms, degree {degrees.degree} in colour, {degrees.position_degree} in place",
+        note=f"{ms:.2f} ms, degree {made.colours.degree} in colour, {made.colours.position_degree} in place",
     )
     sentence = f"Depth and contact come at {speed.measured:.0f} Hz from pictures of {width} × {height} on one core"
     return FieldSection(verdict=(f"{sentence}, by the map of {source}.",), requirements=(speed,))
 
 
-def ball_requirements(figures: Mapping[str, float], what: str, bounds: Bounds) -> tuple[Requirement, ...]:
+def ball_requirements(
+    figures: Mapping[str, float], what: str, bounds: tuple[float, float]
+) -> tuple[Requirement, Requirement]:
     """Bounds on the medians of the depth's and the radius' error over presses."""
     rmse, radius = figures["depth rmse median, um"], figures["radius error median, %"]
     p90 = [f"p90 {figures[key]:.1f}" for key in ("depth rmse p90, um", "radius error p90, %")]
@@ -197,57 +212,19 @@ def ball_requirements(figures: Mapping[str, float], what: str, bounds: Bounds) -
     )
 
 
-def map_picture(errors: Mapping[str, BallErrors], ms: Mapping[str, float], name: str) -> Picture:
-    """Depth error of every map against its time."""
-    points = {}
-    for kind, error in errors.items():
-        figures = error.figures()
-        label = f"this: {kind}" if kind == PACKAGE else kind
-        points[kind] = [(label, ms[kind], figures["depth rmse median, um"], figures["depth rmse p90, um"])]
-    return Picture(
-        name=f"depth-{name}",
-        title=f"Picture to depth on real presses ({name})",
-        caption="Depth error inside the contact of a ball whose press was left out of the calibration: median over "
-        f"presses, bar to the 90th percentile. The dotted corner is the bound: {LEAST_HZ:g} Hz and "
-        f"{SAME_BALL[0]:g} µm.",
-        content=speed_against_error(points, "depth rmse, µm", (1e3 / LEAST_HZ, SAME_BALL[0]), legend=False),
-    )
+def _error_cells(figures: Mapping[str, float], columns: Sequence[str] = tuple(ERRORS)) -> dict[str, float]:
+    return {column: figures[ERRORS[column][0]] for column in columns}
 
 
-def _error_cells(figures: Mapping[str, float]) -> dict[str, float]:
-    return {
-        "depth rmse": figures["depth rmse median, um"],
-        "p90": figures["depth rmse p90, um"],
-        "radius error": figures["radius error median, %"],
-        "p90 of it": figures["radius error p90, %"],
-        "bias of the radius": figures["radius error of the median, %"],
-        "tip depth": figures["tip depth median, mm"],
+def _error_table(title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Table:
+    units = {name: unit for name, (_, unit, _) in ERRORS.items()} | {"time a frame": "ms"}
+    formats = {name: form for name, (*_, form) in ERRORS.items()} | {"time a frame": ".2f", "presses": ".0f"}
+    meanings = {
+        "depth rmse": "median over presses",
+        "radius error": "median of its size over presses",
+        "bias of the radius": "of the median radius",
+        "tip depth": "median, relative to untouched gel",
+        "time a frame": "picture to depth, one core",
     }
-
-
-def _map_table(errors: Mapping[str, BallErrors], ms: Mapping[str, float], name: str, folds: int) -> Table:
-    rows = [{"map": kind, **_error_cells(e.figures()), "time a frame": ms[kind]} for kind, e in errors.items()]
-    return named_table(
-        f"Colour to slope, {name}: balls left out of the calibration",
-        rows,
-        formats=dict.fromkeys(_UNITS, ".1f")
-        | {"bias of the radius": "+.1f", "tip depth": ".2f", "time a frame": ".2f"},
-        units=_UNITS,
-        meanings={
-            "depth rmse": "median over presses",
-            "radius error": "median of its size over presses",
-            "bias of the radius": "of the median radius",
-            "tip depth": "median, relative to untouched gel",
-            "time a frame": "picture to depth, one core",
-        },
-        note=f"{folds} folds by press; all maps have the same circles, pixels and normals. The depth rmse holds within "
-        "0.7 contact radii, after a fit of the sphere's centre and offset; the error of the radius is from a second "
-        "fit, in which the radius is free.",
-    )
-
-
-_UNITS = {
-    "depth rmse": "µm", "p90": "µm", "radius error": "%", "p90 of it": "%", "bias of the radius": "%",
-    "tip depth": "mm", "time a frame": "ms",
-}  # fmt: skip
-_BALL_COLUMNS = ("depth rmse", "p90", "radius error", "p90 of it")
+    units, formats, meanings = ({k: v for k, v in d.items() if k in rows[0]} for d in (units, formats, meanings))
+    return named_table(title, rows, formats=formats, units=units, meanings=meanings, note=note)

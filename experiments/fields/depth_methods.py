@@ -5,8 +5,8 @@ kernel) and a small perceptron of colour and position (the size of gs_sdk's).  A
 presses with the same normals.  The integrators are the package's and those that gs_sdk, gsrobotics and GelSlim ship.
 """
 
-import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader, change, colour_powers, to_slopes
 from sensors_io.fields.types import Calibration
 
-Slopes = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+SlopeMap = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """From a picture, uint8 [H, W, 3], to ∂z/∂x and ∂z/∂y, float32 [H, W]."""
 
 Integrator = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
@@ -34,8 +34,7 @@ _RIDGE = 1e-3
 _STEPS, _BATCH, _RATE = 1500, 4096, 3e-3  # of the perceptron's training
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainingPixels:
+class TrainingPixels(NamedTuple):
     """Training pixels of a map: changes of colour [n, 3], positions in −1 … 1 [n, 2], in-plane normals [n, 2]."""
 
     change: np.ndarray
@@ -46,9 +45,7 @@ class TrainingPixels:
 def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> TrainingPixels:
     """Up to 1500 pixels of each contact and 500 of the flat gel far from it."""
     rng = np.random.default_rng(seed)
-    height, width = presses.shape
-    y, x = np.mgrid[:height, :width].astype(float)
-    place = np.stack([(x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1], -1)
+    place, (y, x) = _places(presses, float), np.mgrid[: presses.shape[0], : presses.shape[1]].astype(float)
     parts = []
     for picture, row in zip(presses.pictures, touches.stacked(), strict=True):
         seen = np.stack(change(picture, presses.background), -1)
@@ -58,29 +55,29 @@ def pixels_of(presses: BallPresses, touches: Touches, seed: int) -> TrainingPixe
         ball, flat = np.flatnonzero(away < row[2]), np.flatnonzero(away > 2.5 * row[2])
         index = np.concatenate([rng.permutation(ball)[:1500], rng.permutation(flat)[:500]])
         parts.append([a.reshape(-1, a.shape[-1])[index] for a in (seen, place, normal)])
-    seen, position, normal = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return TrainingPixels(change=seen, position=position, normal=normal)
+    return TrainingPixels(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def package_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+def _places(presses: BallPresses, kind: type) -> np.ndarray:
+    """Positions of the pixels in −1 … 1, [H, W, 2]."""
+    height, width = presses.shape
+    y, x = np.mgrid[:height, :width].astype(kind)
+    return np.stack([(x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1], -1)
+
+
+def package_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """The package's polynomial of colour, whose constants vary over the picture."""
-    colours, _, _ = fit_map(presses, touches, seed=seed)
-    return SlopeReader(colours, presses.background)
+    return SlopeReader(fit_map(presses, touches, seed=seed)[0], presses.background)
 
 
 def calibrated(presses: BallPresses, seed: int) -> Calibration:
     """The package's calibration, made with all presses, whose circles are found without labels."""
     colours, _, _ = fit_map(presses, find_circles(presses).touches, seed=seed)
-    return Calibration(
-        sensor="gelsight_mini",
-        background=presses.background,
-        mm_per_px=presses.mm_per_px,
-        colours=colours,
-        made_from={},
-    )
+    background, pitch = presses.background, presses.mm_per_px
+    return Calibration(sensor="gelsight_mini", background=background, mm_per_px=pitch, colours=colours, made_from={})
 
 
-def table_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+def table_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """A table of colours: each cell holds its mean normal, an empty cell that of the nearest full one."""
     pixels = pixels_of(presses, touches, seed)
     cell = _cells(pixels.change)
@@ -89,15 +86,10 @@ def table_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
     empty = (count == 0).reshape(_BINS, _BINS, _BINS)
     nearest = ndimage.distance_transform_edt(empty, return_distances=False, return_indices=True)
     filled = mean.reshape(_BINS, _BINS, _BINS, 2)[tuple(nearest)].reshape(-1, 2).astype(np.float32)
-
-    def normals(seen: np.ndarray, place: np.ndarray) -> np.ndarray:
-        del place
-        return filled[_cells(seen)]
-
-    return _reader(normals, presses)
+    return _reader(lambda seen, place: filled[_cells(seen)], presses)
 
 
-def colour_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+def colour_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """A cubic polynomial of colour, the same at every pixel."""
     pixels = pixels_of(presses, touches, seed)
     design = colour_powers(pixels.change.T.astype(np.float64), 3).T
@@ -105,7 +97,7 @@ def colour_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
     return _reader(lambda seen, place: colour_powers(seen.T, 3).T @ weights, presses)
 
 
-def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """Ridge on random Fourier features of a Gaussian kernel over colour and position (Rahimi & Recht 2007)."""
     pixels, rng = pixels_of(presses, touches, seed), np.random.default_rng(seed)
     directions = rng.standard_normal((5, _FEATURES)) * np.array([1.0, 1.0, 1.0, 0.8, 0.8])[:, None]
@@ -119,7 +111,7 @@ def kernel_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
     return _reader(lambda seen, place: features(seen, place) @ weights, presses)
 
 
-def perceptron_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
+def perceptron_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """A perceptron of colour and position with two hidden layers, trained by Adam on the normal's squared error."""
     pixels = pixels_of(presses, touches, seed)
     inputs = jnp.asarray(np.concatenate([pixels.change, pixels.position], -1), jnp.float32)
@@ -146,7 +138,7 @@ def perceptron_map(presses: BallPresses, touches: Touches, seed: int) -> Slopes:
     return _reader(lambda seen, place: np.asarray(infer(np.concatenate([seen, place], -1))), presses)
 
 
-MAPS: dict[str, Callable[[BallPresses, Touches, int], Slopes]] = {
+MAPS: dict[str, Callable[[BallPresses, Touches, int], SlopeMap]] = {
     "polynomial, varying": package_map,
     "polynomial, colour only": colour_map,
     "colour table": table_map,
@@ -188,21 +180,19 @@ INTEGRATORS: dict[str, Integrator] = {
 }
 
 
-def depth_by(read: Slopes, picture: np.ndarray, mm_per_px: float, integrate: Integrator = neumann) -> np.ndarray:
+def depth_by(read: SlopeMap, picture: np.ndarray, mm_per_px: float, integrate: Integrator = neumann) -> np.ndarray:
     """Depth of one picture by a map, an integrator and the package's zero level, mm [H, W]."""
     slope_x, slope_y = read(picture)
     depth = integrate(slope_x, slope_y, mm_per_px)
     return depth - zero_level(depth, np.hypot(slope_x, slope_y), mm_per_px, ZeroConfig())
 
 
-def _reader(normals: Callable[[np.ndarray, np.ndarray], np.ndarray], presses: BallPresses) -> Slopes:
-    height, width = presses.shape
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    place = np.stack([(x + 0.5) / width * 2 - 1, (y + 0.5) / height * 2 - 1], -1).reshape(-1, 2)
+def _reader(normals: Callable[[np.ndarray, np.ndarray], np.ndarray], presses: BallPresses) -> SlopeMap:
+    place = _places(presses, np.float32).reshape(-1, 2)
 
     def read(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         seen = np.stack(change(picture, presses.background), -1).reshape(-1, 3)
-        found = normals(seen, place).astype(np.float32).reshape(height, width, 2)
+        found = normals(seen, place).astype(np.float32).reshape(*presses.shape, 2)
         return to_slopes(np.ascontiguousarray(found[..., 0]), np.ascontiguousarray(found[..., 1]))
 
     return read
@@ -216,8 +206,7 @@ def _cells(seen: np.ndarray) -> np.ndarray:
 def _ridge(design: np.ndarray, targets: np.ndarray) -> np.ndarray:
     normal = design.T @ design
     ridge = _RIDGE * np.trace(normal) / len(normal) * np.eye(len(normal))
-    solved: np.ndarray = np.linalg.solve(normal + ridge, design.T @ targets)
-    return solved
+    return np.asarray(np.linalg.solve(normal + ridge, design.T @ targets))
 
 
 def _perceptron(params: list, x: jax.Array) -> jax.Array:

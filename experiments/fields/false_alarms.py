@@ -1,7 +1,6 @@
 """False alarms on real pictures: flags of tracking on loaded marker gels, and bare gels taken for marker gels."""
 
 import collections
-import dataclasses
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeVar
@@ -44,40 +43,31 @@ The limits of the flags were chosen without looking at the flags on these pictur
 """
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PatternFolder:
-    """Pictures of one gel: their pattern, what the gel carries, and the part of the picture that shows it.
-
-    `crop` is left, top, right and bottom, as shares of width and height.
-    """
-
-    pattern: str
-    truth: Pattern
-    crop: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
-
-
-PATTERNS = {
-    "FOTS, markers": PatternFolder(pattern="FOTS/marker_calib/data/*.png", truth=Pattern.MARKERS),
-    "GelSlim": PatternFolder(pattern="gelslim/**/*.jpg", truth=Pattern.MARKERS),
-    "GelSlim 2": PatternFolder(pattern="gelsight_heightmap/**/*.jpg", truth=Pattern.MARKERS),
-    "gripper": PatternFolder(pattern="letac_mpc/**/*.jpg", truth=Pattern.MARKERS),
-    "wedge": PatternFolder(
-        pattern="wyh5625_wedge/calibration/*.jpg", truth=Pattern.MARKERS, crop=(0.24, 0.24, 0.78, 0.72)
-    ),
-    "bench": PatternFolder(pattern="gelsight_driver/**/*.avi", truth=Pattern.MARKERS),
-    "GelSLAM": PatternFolder(pattern="gelslam/**/*.png", truth=Pattern.BARE),
-    "sim2real": PatternFolder(pattern="gelsight_sim2real/real/**/*.*g", truth=Pattern.BARE),
-    "FOTS, Mini": PatternFolder(pattern="FOTS/mlp_calib/gelsight/*.png", truth=Pattern.BARE),
-    "FOTS, DIGIT": PatternFolder(pattern="FOTS/mlp_calib/digit/*.png", truth=Pattern.BARE),
-    "FeelAnyForce": PatternFolder(pattern="feelanyforce/**/*.png", truth=Pattern.BARE),
-    "gs_sdk": PatternFolder(pattern="gs_sdk/data/*.png", truth=Pattern.BARE),
-    "NormalFlow": PatternFolder(pattern="normalflow/*.png", truth=Pattern.BARE),
-    "ShapeMap3D": PatternFolder(pattern="gsmini_shapemap/**/frame_*.*g", truth=Pattern.BARE),
-    "PhysiCLeAR": PatternFolder(pattern="physiclear/videos/*.mov", truth=Pattern.BARE),
-    "EstimateModulus": PatternFolder(pattern="EstimateModulus/**/*.avi", truth=Pattern.BARE),
-    "9DTact": PatternFolder(pattern="9DTact/**/depth_calibration/rectify_*.png", truth=Pattern.BARE),
+MARKER_GELS = {
+    "FOTS, markers": "FOTS/marker_calib/data/*.png",
+    "GelSlim": "gelslim/**/*.jpg",
+    "GelSlim 2": "gelsight_heightmap/**/*.jpg",
+    "gripper": "letac_mpc/**/*.jpg",
+    "wedge": "wyh5625_wedge/calibration/*.jpg",
+    "bench": "gelsight_driver/**/*.avi",
 }
-"""Name → folder that the data directory may hold; the thresholds were set on a tenth of each."""
+BARE_GELS = {
+    "GelSLAM": "gelslam/**/*.png",
+    "sim2real": "gelsight_sim2real/real/**/*.*g",
+    "FOTS, Mini": "FOTS/mlp_calib/gelsight/*.png",
+    "FOTS, DIGIT": "FOTS/mlp_calib/digit/*.png",
+    "FeelAnyForce": "feelanyforce/**/*.png",
+    "gs_sdk": "gs_sdk/data/*.png",
+    "NormalFlow": "normalflow/*.png",
+    "ShapeMap3D": "gsmini_shapemap/**/frame_*.*g",
+    "PhysiCLeAR": "physiclear/videos/*.mov",
+    "EstimateModulus": "EstimateModulus/**/*.avi",
+    "9DTact": "9DTact/**/depth_calibration/rectify_*.png",
+}
+"""Name → pattern of the pictures in the data directory; the thresholds were set on a tenth of each."""
+
+CROPS = {"wedge": (0.24, 0.24, 0.78, 0.72)}
+"""Left, top, right and bottom of the gel, as shares of width and height, where it does not fill the picture."""
 
 
 def flag_section(data_dir: pathlib.Path, context: Context) -> FieldSection:
@@ -89,14 +79,11 @@ def flag_section(data_dir: pathlib.Path, context: Context) -> FieldSection:
     every = {name: _flag_counts(data_dir, *LOADED[name]) for name in context.each("flags", LOADED)}
     counts = _present(every, data_dir, [pattern for _, pattern in LOADED.values()])
     total, flagged = (sum(count[key] for count in counts.values()) for key in ("frames", "flagged"))
-    rows = [
-        {"recording": name, "pictures": count["frames"]} | {str(f.name).lower(): count[str(f.name)] for f in SHOWN}
-        for name, count in counts.items()
-    ]
+    flags = [str(f.name) for f in SHOWN]
     table = named_table(
         "Flags on real pictures of marker gels under load",
-        rows,
-        formats=dict.fromkeys(list(rows[0])[1:], "d"),
+        [{"recording": n, "pictures": c["frames"]} | {f.lower(): c[f] for f in flags} for n, c in counts.items()],
+        formats=dict.fromkeys(("pictures", *map(str.lower, flags)), "d"),
         note="Which of them truly lost markers is unknown, so this is an upper bound on the false alarms.",
     )
     sentence = f"Of {total} real pictures of loaded marker gels {flagged} carry a flag of tracking."
@@ -109,23 +96,21 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> Fiel
     Raises:
       FileNotFoundError: none of the recordings is in the directory.
     """
-    every = {name: _pattern_counts(data_dir, PATTERNS[name], most) for name in context.each("patterns", PATTERNS)}
-    counts = _present(every, data_dir, [folder.pattern for folder in PATTERNS.values()])
+    patterns = MARKER_GELS | BARE_GELS
+    every = {name: _pattern_counts(data_dir, name, patterns[name], most) for name in context.each("patterns", patterns)}
+    counts = _present(every, data_dir, list(patterns.values()))
     verdict, requirements = [], []
-    for truth, what in ((Pattern.BARE, "bare gels taken for patterned ones"), (Pattern.MARKERS, "marker gels refused")):
-        of = [by for name, by in counts.items() if PATTERNS[name].truth is truth]
-        total, bare = sum(sum(by.values()) for by in of), sum(by[Pattern.BARE] for by in of)
-        wrong = total - bare if truth is Pattern.BARE else bare
+    for folders, what in ((BARE_GELS, "bare gels taken for patterned ones"), (MARKER_GELS, "marker gels refused")):
+        of = [by for name, by in counts.items() if name in folders]
+        total, bare = sum(by.total() for by in of), sum(by[Pattern.BARE] for by in of)
+        wrong = total - bare if folders is BARE_GELS else bare
         verdict.append(f"{what}: {wrong} of {total}.")
         if total:
             requirements.append(at_most(what, wrong / total, 0.01, note=f"{wrong} of {total}"))
-    rows = [
-        {"folder": name, "truth": PATTERNS[name].truth.value} | {p.value: by[p] for p in Pattern}
-        for name, by in counts.items()
-    ]
+    truth = dict.fromkeys(MARKER_GELS, Pattern.MARKERS) | dict.fromkeys(BARE_GELS, Pattern.BARE)
     table = named_table(
         "What each gel is taken for",
-        rows,
+        [{"folder": n, "truth": truth[n].value} | {p.value: by[p] for p in Pattern} for n, by in counts.items()],
         formats={p.value: "d" for p in Pattern},
         note="Every picture is classified as if it were the one at rest; most are under load, which is harder.",
     )
@@ -166,12 +151,12 @@ def _pictures(data_dir: pathlib.Path, pattern: str) -> Iterator[np.ndarray]:
             yield load(path)
 
 
-def _pattern_counts(data_dir: pathlib.Path, folder: PatternFolder, most: int) -> collections.Counter[Pattern]:
-    paths = sorted(data_dir.glob(folder.pattern))
+def _pattern_counts(data_dir: pathlib.Path, name: str, pattern: str, most: int) -> collections.Counter[Pattern]:
+    paths = sorted(data_dir.glob(pattern))
     counts: collections.Counter[Pattern] = collections.Counter()
     for path in paths[:: max(1, -(-len(paths) // most))]:
         grey = cv2.cvtColor(load(path), cv2.COLOR_RGB2GRAY)
-        (height, width), (left, top, right, bottom) = grey.shape, folder.crop
+        (height, width), (left, top, right, bottom) = grey.shape, CROPS.get(name, (0.0, 0.0, 1.0, 1.0))
         part = grey[int(top * height) : int(bottom * height), int(left * width) : int(right * width)]
         counts[examine(part).pattern] += 1
     return counts

@@ -1,9 +1,8 @@
 """Total force from displacement by ridge regression, on generated slides and on the vendor's Tac3D recordings."""
 
-import dataclasses
-import functools
 import pathlib
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,19 +32,18 @@ def recorded_rows(data_dir: pathlib.Path) -> list[RegressionRow]:
     """Regression on the vendor's recordings, whose force is the vendor's estimate, not a measured one.
 
     The force comes later than the displacement that it belongs to.  The lag is estimated on the *other* recordings, so
-    that the held-out blocks stay unseen; where none of them gives it, on the recording itself, and the row's name says
-    so.
+    that the held-out blocks stay unseen; where none of them gives it, on the recording itself, as the row's name says.
     """
-    recordings = [ForceRecording.load(path) for path in sorted((data_dir / "tac3d").glob("*.npz"))]
-    rows = []
-    for one in recordings:
-        others = [other.lag_s for other in recordings if other is not one and other.lag_s is not None]
-        inputs = {"": (one.displacement_mm, one.force_n), ", with the inverted load": (one.with_load(), one.force_n)}
+    recordings = [_load(path) for path in sorted((data_dir / "tac3d").glob("*.npz"))]
+    lags, rows = [_lag_s(one) for one in recordings], []
+    for one, own in zip(recordings, lags, strict=True):
+        others = [lag for other, lag in zip(recordings, lags, strict=True) if other is not one and lag is not None]
+        inputs = {"": (one.displacement_mm, one.force_n), ", with the inverted load": (_with_load(one), one.force_n)}
         if others:
             lag_s = float(np.mean(others))
-            inputs[f", force read {-1e3 * lag_s:.0f} ms later"] = one.aligned(lag_s)
-        elif one.lag_s is not None:
-            inputs[f", force read {-1e3 * one.lag_s:.0f} ms later, by its own lag"] = one.aligned(one.lag_s)
+            inputs[f", force read {-1e3 * lag_s:.0f} ms later"] = _aligned(one, lag_s)
+        elif own is not None:
+            inputs[f", force read {-1e3 * own:.0f} ms later, by its own lag"] = _aligned(one, own)
         rows += [_row(f"{one.name}{how}", f, total_force.fit(u, f)) for how, (u, f) in inputs.items()]
     return rows
 
@@ -70,8 +68,7 @@ def _row(name: str, force: np.ndarray, model: total_force.ForceModel) -> Regress
     return row | {f"{axis}: greatest": float(s) for axis, s in zip("xyz", sizes, strict=True)}
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ForceRecording:
+class ForceRecording(NamedTuple):
     """A vendor recording: displacement [N, 400, 3], resultant force [N, 3], times of the frames int64 [N]."""
 
     name: str
@@ -79,40 +76,38 @@ class ForceRecording:
     force_n: np.ndarray
     time_ns: np.ndarray
 
-    @classmethod
-    def load(cls, path: pathlib.Path) -> "ForceRecording":
-        """A recording as the vendor's program saves it."""
-        with np.load(path) as file:
-            return cls(
-                name=path.stem,
-                displacement_mm=file["3D_Displacements"],
-                force_n=file["3D_ResultantForce"].reshape(-1, 3),
-                time_ns=np.rint(file["sendTimestamp"].ravel() * NS_PER_S).astype(np.int64),
-            )
 
-    @functools.cached_property
-    def lag_s(self) -> float | None:
-        """Lag of displacement behind force, from their rates of change; `None` where these disagree."""
-        moved = np.sqrt((self.displacement_mm**2).mean((1, 2)))
-        try:
-            return estimate_lag(self.time_ns, moved, self.time_ns, np.linalg.norm(self.force_n, axis=1)).seconds
-        except ForceError:
-            return None
+def _load(path: pathlib.Path) -> ForceRecording:
+    with np.load(path) as file:
+        force = file["3D_ResultantForce"].reshape(-1, 3)
+        time_ns = np.rint(file["sendTimestamp"].ravel() * NS_PER_S).astype(np.int64)
+        return ForceRecording(path.stem, file["3D_Displacements"], force, time_ns)
 
-    def aligned(self, lag_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Displacement, and the force of its own time, where readings cover it."""
-        found = at_frames(self.time_ns, self.time_ns, self.force_n, lag_s=lag_s)
-        return self.displacement_mm[found.covered], found.value[found.covered]
 
-    def with_load(self) -> np.ndarray:
-        """Displacements [N, 400 · 3] and the total force that the layer's compliance gives them, with equal weight.
+def _lag_s(one: ForceRecording) -> float | None:
+    """Lag of displacement behind force, from their rates of change; `None` where these disagree."""
+    moved = np.sqrt((one.displacement_mm**2).mean((1, 2)))
+    try:
+        return estimate_lag(one.time_ns, moved, one.time_ns, np.linalg.norm(one.force_n, axis=1)).seconds
+    except ForceError:
+        return None
 
-        The gel is assumed to be the generated Tac3D's.  The recordings' grid runs against x and y, and u_z points out
-        of the gel: the picture is turned by half a turn, depth is −u_z.
-        """
-        inverse = LayerInverse(TAC3D.gel, node_grid(TAC3D))
-        fields = self.displacement_mm.reshape(len(self.displacement_mm), NODES, NODES, 3)[:, ::-1, ::-1]
-        load = [inverse.contact(f[..., :2], -f[..., 2]).traction_mpa for f in fields]
-        total = np.array([total_traction(traction, node_grid(TAC3D).pitch_mm) for traction in load])
-        flat = self.displacement_mm.reshape(len(self.displacement_mm), -1)
-        return np.hstack([flat, total * np.linalg.norm(flat) / np.linalg.norm(total)])
+
+def _aligned(one: ForceRecording, lag_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement, and the force of its own time, where readings cover it."""
+    found = at_frames(one.time_ns, one.time_ns, one.force_n, lag_s=lag_s)
+    return one.displacement_mm[found.covered], found.value[found.covered]
+
+
+def _with_load(one: ForceRecording) -> np.ndarray:
+    """Displacements [N, 400 · 3] and the total force that the layer's compliance gives them, with equal weight.
+
+    The gel is assumed to be the generated Tac3D's.  The recordings' grid runs against x and y, and u_z points out of
+    the gel: the picture is turned by half a turn, depth is −u_z.
+    """
+    inverse, count = LayerInverse(TAC3D.gel, node_grid(TAC3D)), len(one.displacement_mm)
+    fields = one.displacement_mm.reshape(count, NODES, NODES, 3)[:, ::-1, ::-1]
+    load = [inverse.contact(f[..., :2], -f[..., 2]).traction_mpa for f in fields]
+    total = np.array([total_traction(traction, node_grid(TAC3D).pitch_mm) for traction in load])
+    flat = one.displacement_mm.reshape(count, -1)
+    return np.hstack([flat, total * np.linalg.norm(flat) / np.linalg.norm(total)])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ class Slide:
     """One sequence of F frames on the node grid [F, h, w, …], measured and true.
 
     Args:
-      motion, kind: of the contact and of the object.
+      motion: of the contact.
       deformation_mm, depth_mm, valid: measured in the marker plane, with the sensor's noise and lost nodes.
       shear_mm: true, the part of the displacement that traction causes.
       traction_mpa: true, on the gel, (x, y, z).
@@ -34,7 +35,6 @@ class Slide:
     """
 
     motion: str
-    kind: str
     deformation_mm: np.ndarray
     depth_mm: np.ndarray
     valid: np.ndarray
@@ -56,8 +56,7 @@ def pressing(slide: Slide) -> np.ndarray:
 
 def node_grid(sensor: SensorModel) -> NodeGrid:
     """The nodes of a sensor's fields; displacement and depth are both those of its marker plane."""
-    pitch = sensor.window_mm / NODES
-    depth = sensor.marker_depth_mm
+    pitch, depth = sensor.window_mm / NODES, sensor.marker_depth_mm
     if depth is None:
         raise ValueError(f"{sensor.name} has no markers: its lateral field does not exist; choose another sensor")
     return NodeGrid(shape=(NODES, NODES), pitch_mm=(pitch, pitch), marker_depth_mm=depth, depth_mm=depth)
@@ -76,12 +75,29 @@ def make_slides(
       seed: of objects and noise.
     """
     kernels = scenes.friction_kernels(sensor, NODES * _PER_NODE)
+    noise_mm = np.array([sensor.lateral_noise_mm, sensor.lateral_noise_mm, sensor.depth_noise_mm])
     made = []
-    for i, (kind, name) in enumerate((k, m) for k in kinds for m in motions):
+    for i, (kind, motion) in enumerate(itertools.product(kinds, motions)):
         rng = np.random.default_rng([seed, i])
-        true = jax.device_get(_solve(kernels, scenes.make_motion(kernels, scenes.draw(rng, kind), name, frames)))
-        made.append(_measured(sensor, name, kind, true, rng))
+        true = jax.device_get(_solve(kernels, scenes.make_motion(kernels, scenes.draw(rng, kind), motion, frames)))
+        nodes = {key: _node_means(true[key]) for key in ("displacement", "shear", "load")}
+        seen = nodes["displacement"] + noise_mm * rng.standard_normal(nodes["displacement"].shape)
+        slide = Slide(
+            motion=motion,
+            deformation_mm=seen[..., :2],
+            depth_mm=seen[..., 2],
+            valid=rng.uniform(size=seen.shape[:-1]) >= _LOST_NODES,
+            shear_mm=nodes["shear"],
+            traction_mpa=nodes["load"],
+            force_n=true["force"],
+            moment_nmm=true["moment"],
+        )
+        made.append(slide)
     return made
+
+
+cached_slides = functools.lru_cache(maxsize=8)(make_slides)
+"""`make_slides`, computed once for the same arguments within a run."""
 
 
 @jax.jit
@@ -109,32 +125,9 @@ def _solve(kernels: scenes.FrictionKernels, motion: scenes.FrictionSequence) -> 
     return jax.lax.scan(advance, drag.at_rest(kernels.x_mm.shape[0]), (motion.pressure_mpa, motion.step))[1]
 
 
-def _measured(
-    sensor: SensorModel, name: str, kind: str, true: dict[str, np.ndarray], rng: np.random.Generator
-) -> Slide:
-    nodes = {key: _node_means(true[key]) for key in ("displacement", "shear", "load")}
-    noise_mm = np.array([sensor.lateral_noise_mm, sensor.lateral_noise_mm, sensor.depth_noise_mm])
-    seen = nodes["displacement"] + noise_mm * rng.standard_normal(nodes["displacement"].shape)
-    return Slide(
-        motion=name,
-        kind=kind,
-        deformation_mm=seen[..., :2],
-        depth_mm=seen[..., 2],
-        valid=rng.uniform(size=seen.shape[:-1]) >= _LOST_NODES,
-        shear_mm=nodes["shear"],
-        traction_mpa=nodes["load"],
-        force_n=true["force"],
-        moment_nmm=true["moment"],
-    )
-
-
 def _node_means(fields: np.ndarray) -> np.ndarray:
     """Means over the pixels of every node: [F, C, N, N] → [F, h, w, C]."""
     frames, channels, side, _ = fields.shape
     cells = side // _PER_NODE
     blocks = fields.reshape(frames, channels, cells, _PER_NODE, cells, _PER_NODE)
     return np.moveaxis(blocks.mean((3, 5), dtype=np.float64), 1, -1)
-
-
-cached_slides = functools.lru_cache(maxsize=8)(make_slides)
-"""`make_slides`, computed once for the same arguments within a run."""

@@ -7,6 +7,8 @@ cubic `remap` rounds coordinates to 1/32 pixel, which is as large as the errors 
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import jax.numpy as jnp
@@ -35,8 +37,6 @@ _FIXED_POINT, _UNCHANGED_PX = 80, 1e-9  # iterations of f = b(p + f) at most, an
 _LIGHT_GREY, _LIGHT_WIDTH = 25.0, 0.18  # coloured shading of a contact: grey levels, and share of the shorter side
 _CENTRE = 0.55, 0.45  # of the contact, over width and height
 
-MotionCoefficients = tuple[float, float, float, float, float, float]
-
 REAL_GELS = {
     "GelSight Mini": ("FOTS/marker_calib/data/1.png", 0),
     "GelSlim": ("gelslim/test_data/sample_13.jpg", 0),
@@ -51,8 +51,7 @@ the two `ref.jpg`, frame 0 of the video and the first picture of `letac_mpc/gel`
 """
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GelAtRest:
+class GelAtRest(NamedTuple):
     """A gel at rest: its name, RGB uint8 [H, W, 3], whether a camera took it."""
 
     name: str
@@ -67,13 +66,13 @@ def gels(data_dir: pathlib.Path | None) -> list[GelAtRest]:
       FileNotFoundError: a data directory that holds none of the pictures.
     """
     generated = [
-        GelAtRest(name="Xense, generated", picture=_generated(XENSE, 240, 1), real=False),
-        GelAtRest(name="DM-Tac, generated", picture=_generated(DMTAC_X, 240, 3), real=False),
+        GelAtRest("Xense, generated", _generated(XENSE, 240, 1), False),
+        GelAtRest("DM-Tac, generated", _generated(DMTAC_X, 240, 3), False),
     ]
     if data_dir is None:
         return generated
-    found = [(name, frame, sorted(data_dir.glob(pattern))) for name, (pattern, frame) in REAL_GELS.items()]
-    real = [GelAtRest(name=name, picture=load(paths[0], frame), real=True) for name, frame, paths in found if paths]
+    found = {name: (sorted(data_dir.glob(pattern)), frame) for name, (pattern, frame) in REAL_GELS.items()}
+    real = [GelAtRest(name, load(paths[0], frame), True) for name, (paths, frame) in found.items() if paths]
     if not real:
         wanted = ", ".join(pattern for pattern, _ in REAL_GELS.values())
         raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
@@ -84,10 +83,8 @@ def _generated(sensor: SensorModel, side_px: int, order: int) -> np.ndarray:
     """The gel of a generated sensor at rest, without noise."""
     if sensor.render is None:
         raise ValueError(f"{sensor.name} exposes no camera: it has no picture; choose another sensor")
-    still = jnp.zeros((side_px, side_px))
-    gel = optics.DeformedGel(
-        depth_mm=still, marker_x_mm=still, marker_y_mm=still, marker_depth_mm=still, window_mm=sensor.window_mm
-    )
+    still = dict.fromkeys(("depth_mm", "marker_x_mm", "marker_y_mm", "marker_depth_mm"), jnp.zeros((side_px, side_px)))
+    gel = optics.DeformedGel(**still, window_mm=sensor.window_mm)
     picture = np.asarray(sensor.render(gel, unit_of(0, order, 0).light))
     return np.round(255 * np.clip(picture, 0, 1)).astype(np.uint8)
 
@@ -113,7 +110,7 @@ class GelMotion:
 
     centre_px: tuple[float, float]
     width_px: float
-    bump: MotionCoefficients
+    bump: Sequence[float]
     drift: tuple[float, float]
     scale_px: float
 
@@ -121,10 +118,8 @@ class GelMotion:
         """b at points (x, y) […, 2]."""
         xi, eta = ((points[..., i] - self.centre_px[i]) / self.width_px for i in (0, 1))
         g = np.exp(-(xi**2 + eta**2) / 2)
-        c = self.bump
-        along = (c[0] + c[1] * xi + c[2] * eta) * g + self.drift[0]
-        across = (c[3] + c[4] * xi + c[5] * eta) * g + self.drift[1]
-        return self.scale_px * np.stack([along, across], -1)
+        parts = zip((self.bump[:3], self.bump[3:]), self.drift, strict=True)
+        return self.scale_px * np.stack([(c[0] + c[1] * xi + c[2] * eta) * g + drift for c, drift in parts], -1)
 
     def forward(self, points: np.ndarray) -> np.ndarray:
         """f at points (x, y) […, 2]."""
@@ -146,19 +141,19 @@ def pressed(shape: tuple[int, ...], peak_px: float, rng: np.random.Generator | N
     Args:
       shape: of the picture.
       peak_px: greatest |b| over the picture.
-      rng: draws place, width and coefficients; `None` takes those that published figures were measured with.
+      rng: draws place, width and coefficients; `None` takes those of the published figures.
     """
     height, width = shape[:2]
-    bump, drift, centre, share = (0.7, 0.25, -0.25, 0.4, 0.25, 0.25), (0.1, -0.05), _CENTRE, 0.22
+    drawn: Sequence[float] = (0.7, 0.25, -0.25, 0.4, 0.25, 0.25, 0.1, -0.05)
+    centre, share = _CENTRE, 0.22
     if rng is not None:
-        drawn = rng.normal(0, 1, 8) * (0.6, 0.3, 0.3, 0.6, 0.3, 0.3, 0.1, 0.1)
-        bump, drift = tuple(map(float, drawn[:6])), (float(drawn[6]), float(drawn[7]))  # type: ignore[assignment]
+        drawn = (rng.normal(0, 1, 8) * (0.6, 0.3, 0.3, 0.6, 0.3, 0.3, 0.1, 0.1)).tolist()
         centre, share = tuple(rng.uniform(0.35, 0.65, 2)), float(rng.uniform(0.18, 0.3))
     raw = GelMotion(
         centre_px=(centre[0] * width, centre[1] * height),
         width_px=share * min(height, width),
-        bump=bump,
-        drift=drift,
+        bump=drawn[:6],
+        drift=(drawn[6], drawn[7]),
         scale_px=1.0,
     )
     peak = np.linalg.norm(raw.backward(_pixels(shape)), axis=-1).max()
@@ -188,13 +183,7 @@ class GelCamera:
         return np.asarray(np.round(np.mean(seen, 0)), np.uint8)
 
     def under(self, motion: GelMotion, light: float = 1.0, exposure: float = 1.0) -> np.ndarray:
-        """The gel under a motion, RGB uint8.
-
-        Args:
-          motion: of the gel.
-          light: strength of the contact's coloured shading.
-          exposure: factor of all brightness.
-        """
+        """The gel under a motion, RGB uint8; `light` is the strength of the contact's coloured shading."""
         return self.exposed(exposure * self.clean(motion, light))
 
     def clean(self, motion: GelMotion, light: float) -> np.ndarray:
@@ -247,12 +236,8 @@ def tracked(rest: GelAtRest) -> TrackedGel:
     """The points, windows and dots that the package finds on a gel."""
     reader = DeformationReader(rest.picture, mm_per_px=1.0)
     dots, half = reader.evidence.markers, reader.tracker.half_px
-    return TrackedGel(
-        rest=rest,
-        points_px=reader.tracker.points_px,
-        half_px=half,
-        dot_radius_px=float(half) if dots is None else dots.radius_px,
-    )
+    radius = float(half) if dots is None else dots.radius_px
+    return TrackedGel(rest=rest, points_px=reader.tracker.points_px, half_px=half, dot_radius_px=radius)
 
 
 def _pixels(shape: tuple[int, ...]) -> np.ndarray:

@@ -8,13 +8,12 @@ has the same error on a pair of still pictures.  No unbiased reading of one wind
 only neighbours that move together add information.
 """
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
-from experiments.core.results import Picture, Requirement, Table, at_most, named_table
+from experiments.core.results import Picture, Table, at_most, named_table
 from experiments.fields.known_motion import NOISE_GREY, PEAK_PX, REST_PICTURES, GelCamera, TrackedGel, grey
 from experiments.fields.sections import FieldSection
 from experiments.fields.trackers import FOLLOWERS
@@ -24,46 +23,16 @@ MAIN, UNSMOOTHED, FRAME_TO_FRAME = METHODS[0], METHODS[1], METHODS[-1]
 PERIOD, PUBLISHED = 90, 10
 """Pictures of a cycle; cycles of the published figures."""
 
-BOUND_PX = 0.006
+CYCLES, OTHERS_CYCLES = (1, 2, 5, PUBLISHED, 30), (1, PUBLISHED)
+"""Numbers of cycles after which the first gel and the others are measured."""
+
+PAIRS, BOUND_PX = 10, 0.006
+"""Pairs of still pictures; bound of the published error and of its growth."""
 
 _FIRST_SEED = 450
 _LUMA = (0.299, 0.587, 0.114)  # weights of the colours in grey
 _ROUNDING = 1 / 12  # variance of rounding to whole grey levels
 _RAYLEIGH = float(np.sqrt(np.log(2)))  # median length of an isotropic plane Gaussian over its root mean square
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DriftConfig:
-    """Cycles after which the first gel is measured; those of the other gels; pairs of still pictures."""
-
-    cycles: tuple[int, ...] = (1, 2, 5, 10, 30)
-    cycles_of_others: tuple[int, ...] = (1, 10)
-    pairs: int = 10
-
-    def __post_init__(self) -> None:
-        for name in ("cycles", "cycles_of_others"):
-            cycles = getattr(self, name)
-            if not {1, PUBLISHED} <= set(cycles):
-                raise ValueError(f"{name} is {cycles}: must hold 1 and {PUBLISHED}, which are compared; add them")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StillErrors:
-    """Median errors on still pictures, px.
-
-    Args:
-      one, mean: of the smoothed points, with one picture at rest and with the mean of some.
-      alone_one, alone_mean: of each point without its neighbours, likewise.
-      bound_motion, bound_all: Cramér–Rao bounds of each point, with light and strain known and unknown.
-    """
-
-    one: float
-    mean: float
-    alone_one: float
-    alone_mean: float
-    bound_motion: float
-    bound_all: float
-
 
 DriftErrors = Mapping[str, Mapping[int, np.ndarray]]
 """Method → cycles → distance of every point from the truth [P], px of a picture 320 wide."""
@@ -86,18 +55,29 @@ def drift_errors(gel: TrackedGel, cycles: Sequence[int], methods: Sequence[str],
     return errors
 
 
-def still_errors(gel: TrackedGel, pairs: int) -> StillErrors:
-    """Errors of the package on pictures of a gel that does not move, and their lower bounds."""
+def still_errors(gel: TrackedGel, pairs: int) -> dict[str, float]:
+    """Median errors of the package on pictures of a gel that does not move, and their lower bounds, px."""
     camera = GelCamera(gel.rest.picture, NOISE_GREY, _FIRST_SEED + 1)
     (one, alone_one), (mean, alone_mean) = (_pair_errors(gel, camera, n, pairs) for n in (1, REST_PICTURES))
-    return StillErrors(
-        one=one,
-        mean=mean,
-        alone_one=alone_one,
-        alone_mean=alone_mean,
-        bound_motion=bound_px(gel, light_and_strain=False),
-        bound_all=bound_px(gel, light_and_strain=True),
-    )
+    return {
+        "still": one,
+        "still, mean at rest": mean,
+        "each alone, still": alone_one,
+        "each alone, mean at rest": alone_mean,
+        "bound of each alone": bound_px(gel, light_and_strain=False),
+        "the same, all unknown": bound_px(gel, light_and_strain=True),
+    }
+
+
+def _pair_errors(gel: TrackedGel, camera: GelCamera, at_rest: int, pairs: int) -> list[float]:
+    """Median errors with and without smoothing, with the mean of so many pictures at rest."""
+    errors: dict[str, list[np.ndarray]] = {MAIN: [], UNSMOOTHED: []}
+    for _ in range(pairs):
+        rest, still = grey(camera.at_rest(at_rest)), grey(camera.at_rest(1))
+        for name, found in errors.items():
+            points = FOLLOWERS[name](rest, gel.points_px, gel.half_px)(still)
+            found.append(np.hypot(*(points - gel.points_px).T) / gel.unit)
+    return [float(np.nanmedian(found)) for found in errors.values()]
 
 
 def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
@@ -107,7 +87,7 @@ def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
 
     Args:
       gel: sums run over the windows that the package takes.
-      light_and_strain: whether strain, brightness, its slope and contrast of the window are unknown too.
+      light_and_strain: strain, brightness, its slope and contrast of the window are unknown too.
 
     Source: Kay, Fundamentals of Statistical Signal Processing I, 1993, ch. 3.
     """
@@ -128,109 +108,78 @@ def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
     return float(_RAYLEIGH * np.median(spread)) / gel.unit
 
 
-def drift_section(config: DriftConfig, gels: Sequence[TrackedGel], period: int = PERIOD) -> FieldSection:
+def drift_section(
+    gels: Sequence[TrackedGel], cycles: Sequence[int] = CYCLES, pairs: int = PAIRS, period: int = PERIOD
+) -> FieldSection:
     """Drift on every gel, long on the first; the noise of still pictures and its bounds."""
     first = gels[0].rest.name
-    drift = {first: drift_errors(gels[0], config.cycles, METHODS, period)}
-    drift |= {g.rest.name: drift_errors(g, config.cycles_of_others, (MAIN,), period) for g in gels[1:]}
-    still = {g.rest.name: still_errors(g, config.pairs) for g in gels}
+    drift = {first: drift_errors(gels[0], cycles, METHODS, period)}
+    drift |= {g.rest.name: drift_errors(g, OTHERS_CYCLES, (MAIN,), period) for g in gels[1:]}
+    still = {g.rest.name: still_errors(g, pairs) for g in gels}
+    bound = still[first]["bound of each alone"]
+    medians = {m: [_median(drift[first], m, c) for c in (1, PUBLISHED, max(cycles))] for m in METHODS}
+    own, alone, peer = (medians[name] for name in (MAIN, UNSMOOTHED, FRAME_TO_FRAME))
+    pooled = lambda cycles: float(np.nanmedian(np.concatenate([errors[MAIN][cycles] for errors in drift.values()])))
     return FieldSection(
-        verdict=(_verdict(drift[first], still[first], first),),
-        requirements=_requirements(drift, still[first], first),
+        verdict=(
+            f"After 1, {PUBLISHED} and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f}, {own[1]:.4f} "
+            f"and {own[2]:.4f} px, without smoothing by {alone[0]:.4f}, {alone[1]:.4f} and {alone[2]:.4f} px. This is "
+            f"not drift but the noise of a pair of pictures, whose lower bound for a single marker is {bound:.4f} px. "
+            f"Tracked from frame to frame they are off by {peer[0]:.3f}, {peer[1]:.3f} and {peer[2]:.3f} px.",
+        ),
+        requirements=(
+            at_most(
+                f"off after 900 pictures, as published ({first}, one picture at rest)",
+                own[1],
+                BOUND_PX,
+                "px",
+                note=f"each marker alone {alone[1]:.4f}, with the mean of {REST_PICTURES} pictures at rest "
+                f"{still[first]['each alone, mean at rest']:.4f}",
+            ),
+            at_most(
+                "growth from the first cycle to the tenth, all gels' markers",
+                pooled(PUBLISHED) - pooled(1),
+                BOUND_PX,
+                "px",
+                note=f"after ten {pooled(PUBLISHED):.4f}",
+            ),
+        ),
         tables=(_cycle_table(drift[first], first), _noise_table(drift, still)),
-        pictures=(_picture(drift[first], still[first], first),),
+        pictures=(_picture(drift[first], bound, first),),
     )
-
-
-def _pair_errors(gel: TrackedGel, camera: GelCamera, at_rest: int, pairs: int) -> list[float]:
-    """Median errors with and without smoothing, with the mean of so many pictures at rest."""
-    errors: dict[str, list[np.ndarray]] = {MAIN: [], UNSMOOTHED: []}
-    for _ in range(pairs):
-        rest, still = grey(camera.at_rest(at_rest)), grey(camera.at_rest(1))
-        for name, found in errors.items():
-            points = FOLLOWERS[name](rest, gel.points_px, gel.half_px)(still)
-            found.append(np.hypot(*(points - gel.points_px).T) / gel.unit)
-    return [float(np.nanmedian(found)) for found in errors.values()]
 
 
 def _median(errors: DriftErrors, method: str, cycles: int) -> float:
     return float(np.nanmedian(errors[method][cycles]))
 
 
-def _verdict(errors: DriftErrors, still: StillErrors, gel: str) -> str:
-    last = max(errors[MAIN])
-    medians = {m: [_median(errors, m, c) for c in (1, PUBLISHED, last)] for m in (MAIN, UNSMOOTHED, FRAME_TO_FRAME)}
-    own, alone, peer = medians.values()
-    return (
-        f"After 1, {PUBLISHED} and {last} cycles {gel}'s markers are off by {own[0]:.4f}, {own[1]:.4f} and "
-        f"{own[2]:.4f} px, without smoothing by {alone[0]:.4f}, {alone[1]:.4f} and {alone[2]:.4f} px. This is not "
-        f"drift but the noise of a pair of pictures, whose lower bound for a single marker is "
-        f"{still.bound_motion:.4f} px. Tracked from frame to frame they are off by {peer[0]:.3f}, {peer[1]:.3f} and "
-        f"{peer[2]:.3f} px."
-    )
-
-
-def _requirements(drift: Mapping[str, DriftErrors], still: StillErrors, first: str) -> tuple[Requirement, ...]:
-    pooled = lambda cycles: float(np.nanmedian(np.concatenate([errors[MAIN][cycles] for errors in drift.values()])))
-    return (
-        at_most(
-            f"off after 900 pictures, as published ({first}, one picture at rest)",
-            _median(drift[first], MAIN, PUBLISHED),
-            BOUND_PX,
-            "px",
-            note=f"each marker alone {_median(drift[first], UNSMOOTHED, PUBLISHED):.4f}, with the mean of "
-            f"{REST_PICTURES} pictures at rest {still.alone_mean:.4f}",
-        ),
-        at_most(
-            "growth from the first cycle to the tenth, all gels' markers",
-            pooled(PUBLISHED) - pooled(1),
-            BOUND_PX,
-            "px",
-            note=f"after ten {pooled(PUBLISHED):.4f}",
-        ),
-    )
-
-
 def _cycle_table(errors: DriftErrors, gel: str) -> Table:
-    cycles = list(errors[MAIN])
-    high = f"{cycles[-1]}, 95 %"
+    last = max(errors[MAIN])
     rows = [
-        {"method": name, **{f"{c}": _median(errors, name, c) for c in cycles}}
-        | {high: float(np.nanquantile(by_cycle[cycles[-1]], 0.95))}
+        {f"{c}": _median(errors, name, c) for c in by_cycle}
+        | {f"{last}, 95 %": float(np.nanquantile(by_cycle[last], 0.95))}
         for name, by_cycle in errors.items()
     ]
-    columns = [*map(str, cycles), high]
     return named_table(
         f"Off after so many cycles of {PERIOD} pictures, {gel}",
-        rows,
-        formats=dict.fromkeys(columns, ".4f"),
-        units=dict.fromkeys(columns, "px"),
+        [{"method": name, **row} for name, row in zip(errors, rows, strict=True)],
+        formats=dict.fromkeys(rows[0], ".4f"),
+        units=dict.fromkeys(rows[0], "px"),
         note="Median over markers, the gel at rest again; none of the tracker's settings was chosen on this motion, "
         "noise or picture.",
     )
 
 
-def _noise_table(drift: Mapping[str, DriftErrors], still: Mapping[str, StillErrors]) -> Table:
+def _noise_table(drift: Mapping[str, DriftErrors], still: Mapping[str, Mapping[str, float]]) -> Table:
     rows = [
-        {
-            "gel": gel,
-            "1 cycle": _median(errors, MAIN, 1),
-            "10 cycles": _median(errors, MAIN, PUBLISHED),
-            "still": still[gel].one,
-            "still, mean at rest": still[gel].mean,
-            "each alone, still": still[gel].alone_one,
-            "each alone, mean at rest": still[gel].alone_mean,
-            "bound of each alone": still[gel].bound_motion,
-            "the same, all unknown": still[gel].bound_all,
-        }
+        {"1 cycle": _median(errors, MAIN, 1), "10 cycles": _median(errors, MAIN, PUBLISHED), **still[gel]}
         for gel, errors in drift.items()
     ]
-    columns = list(rows[0])[1:]
     return named_table(
         "What is drift and what is noise",
-        rows,
-        formats=dict.fromkeys(columns, ".4f"),
-        units=dict.fromkeys(columns, "px"),
+        [{"gel": gel, **row} for gel, row in zip(drift, rows, strict=True)],
+        formats=dict.fromkeys(rows[0], ".4f"),
+        units=dict.fromkeys(rows[0], "px"),
         meanings={
             "still": "pairs of still pictures, one of them at rest",
             "still, mean at rest": f"the picture at rest is the mean of {REST_PICTURES}; recordings keep that of up to "
@@ -243,19 +192,14 @@ def _noise_table(drift: Mapping[str, DriftErrors], still: Mapping[str, StillErro
     )
 
 
-def _picture(errors: DriftErrors, still: StillErrors, gel: str) -> Picture:
+def _picture(errors: DriftErrors, bound: float, gel: str) -> Picture:
     series = []
     for name, by_cycle in errors.items():
         low, middle, high = np.array([np.nanquantile(e, (0.25, 0.5, 0.75)) for e in by_cycle.values()]).T
         series.append(Series(name, x=list(by_cycle), y=middle, low=low, high=high, band=True, marker="o"))
-    panel = Panel(
-        series,
-        x_label=f"cycles of {PERIOD} pictures",
-        y_label="off, px",
-        x_scale="log",
-        y_scale="log",
-        rules=[Rule(y=still.bound_motion, name="Cramér–Rao bound of each marker alone")],
-    )
+    rules = [Rule(y=bound, name="Cramér–Rao bound of each marker alone")]
+    x_label = f"cycles of {PERIOD} pictures"
+    panel = Panel(series, x_label=x_label, y_label="off, px", x_scale="log", y_scale="log", rules=rules)
     return Picture(
         name="fields_drift",
         title=f"What grows with time, {gel}",

@@ -17,7 +17,6 @@ picture is as good as the perceptron and several times as fast; published integr
 """
 
 import dataclasses
-import functools
 import pathlib
 from collections.abc import Callable
 
@@ -28,10 +27,13 @@ from experiments.fields.depth_accuracy import generated_sections, recorded_secti
 from experiments.fields.depth_checks import contact_section, integrator_section, known_depth_section
 from experiments.fields.false_alarms import pattern_section
 from experiments.fields.known_motion import gels, tracked
-from experiments.fields.marker_drift import DriftConfig, drift_section
+from experiments.fields.marker_drift import drift_section
 from experiments.fields.sections import FieldSection, joined
-from experiments.fields.shear_accuracy import ShearConfig, layer_section, shear_section
-from experiments.fields.tracking_accuracy import MarkerConfig, dense_section, marker_section
+from experiments.fields.shear_accuracy import layer_section, shear_section
+from experiments.fields.tracking_accuracy import dense_section, marker_section
+
+PICTURES = 20
+"""Pictures of each folder for the recognition of marker gels."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,12 +45,8 @@ class FieldsConfig:
       rounds: of timing.
       folds: of the presses.
       generated_presses: of each generated ball.
-      strange_lamps: whether balls are also generated under lamps that the calibration's model does not cover.
-      motion: whether the fields of motion are measured too.
-      markers, drift: settings of the sections on markers and on their drift.
-      dense_motions: motions of the dense fields.
-      shear: settings of the sections on shear.
-      judged: pictures of each folder for the recognition of marker gels.
+      strange_lamps: measure balls under lamps that the calibration's model does not cover, too.
+      motion: measure the fields of motion, too.
       seed: of folds and generated presses.
     """
 
@@ -58,60 +56,37 @@ class FieldsConfig:
     generated_presses: int = 24
     strange_lamps: bool = True
     motion: bool = True
-    markers: MarkerConfig = MarkerConfig()
-    drift: DriftConfig = DriftConfig()
-    dense_motions: int = 4
-    shear: ShearConfig = ShearConfig()
-    judged: int = 20
     seed: int = 0
-
-
-Sections = dict[str, Callable[[], list[FieldSection]]]
-"""Name → function that measures sections of the report, in their order."""
 
 
 def run(config: FieldsConfig, context: Context) -> Results:
     """Measure section by section."""
+    root, rounds, seed = config.data_dir, config.rounds, config.seed
+    balls = config.generated_presses, config.strange_lamps, rounds, seed
+    measured: dict[str, Callable[[], list[FieldSection]]] = {
+        "integrators": lambda: [integrator_section(context.rounds("timing integrators", rounds))],
+        "generated balls": lambda: generated_sections(*balls, context),
+    }
+    if root is not None:
+        measured["real balls"] = lambda: recorded_sections(root, config.folds, rounds, seed, context)
+        measured["known depth"] = lambda: [known_depth_section(root, seed, context)]
+        measured["failed contact"] = lambda: [contact_section(root, seed)]
+    if config.motion:
+        subjects = [tracked(rest) for rest in gels(root)]
+        real = [gel for gel in subjects if gel.rest.real] or subjects[:1]
+        measured["markers"] = lambda: [marker_section(subjects, context)]
+        measured["drift"] = lambda: [drift_section(real)]
+        measured["dense fields"] = lambda: [dense_section(rounds, subjects, context)]
+        measured["shear"] = lambda: [shear_section(root, context)]
+        measured["wrong layers"] = lambda: [layer_section()]
+    if config.motion and root is not None:
+        measured["patterns"] = lambda: [pattern_section(root, PICTURES, context)]
     sections: list[FieldSection] = []
-    measured = depth_sections(config, context) | (motion_sections(config, context) if config.motion else {})
     for name, measure in context.each("sections", measured.items()):
         context.print(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
             sections += measure()
-    return joined(sections, {"recordings": "none" if config.data_dir is None else "read", "cores": 1})
-
-
-def depth_sections(config: FieldsConfig, context: Context) -> Sections:
-    """Integrators, generated and recorded balls, known depth, failed contact."""
-    root, seed = config.data_dir, config.seed
-    generated = functools.partial(generated_sections, config.generated_presses, config.strange_lamps)
-    sections: Sections = {
-        "integrators": lambda: [integrator_section(context.rounds("timing integrators", config.rounds))],
-        "generated balls": lambda: generated(config.rounds, seed, context),
-    }
-    if root is not None:
-        sections |= {
-            "real balls": lambda: recorded_sections(root, config.folds, config.rounds, seed, context),
-            "known depth": lambda: [known_depth_section(root, seed, context)],
-            "failed contact": lambda: [contact_section(root, seed)],
-        }
-    return sections
-
-
-def motion_sections(config: FieldsConfig, context: Context) -> Sections:
-    """Markers and their drift, dense fields, shear and force, recognition of marker gels."""
-    root, subjects = config.data_dir, [tracked(rest) for rest in gels(config.data_dir)]
-    real = [gel for gel in subjects if gel.rest.real] or subjects[:1]
-    sections: Sections = {
-        "markers": lambda: [marker_section(config.markers, subjects, context)],
-        "drift": lambda: [drift_section(config.drift, real)],
-        "dense fields": lambda: [dense_section(config.dense_motions, config.rounds, subjects, context)],
-        "shear": lambda: [shear_section(config.shear, root, context)],
-        "wrong layers": lambda: [layer_section(config.shear)],
-    }
-    if root is not None:
-        sections["patterns"] = lambda: [pattern_section(root, config.judged, context)]
-    return sections
+    return joined(sections, {"recordings": "none" if root is None else "read", "cores": 1})
 
 
 EXPERIMENT = Experiment(

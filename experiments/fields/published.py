@@ -22,15 +22,13 @@ _WIDEST_PX = 480  # wider pictures are reduced: their pixels are finer than thei
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordingFolder:
-    """Pictures of one sensor in one folder.
+    """Pictures of one sensor in one folder of the data directory.
 
     Args:
-      path: of the folder in the data directory.
-      pattern: glob of its pictures.
-      background: the picture of the gel at rest.
+      path, pattern, background: of the folder, of its pictures, and of the picture of the gel at rest.
       mm_per_px: pitch.
       ball_diameter_mm: of the ball that pressed the gel, `None` where other objects did.
-      remark: what the reader of its fields must know.
+      remark: limits of its fields.
     """
 
     path: str
@@ -142,12 +140,9 @@ def feelanyforce_rows(root: pathlib.Path) -> np.ndarray:
 
 def known_depths(root: pathlib.Path) -> dict[tuple[str, float], np.ndarray]:
     """(Shape, depth in mm) → picture, of the presses of gelsight_sim2real at known depth."""
-    found = {}
-    for path in sorted((root / SIM2REAL).glob("*_real.png")):
-        name = re.fullmatch(r"(sphere|prism|triangle)_([\d.]+)_real", path.stem)
-        if name:
-            found[name[1], float(name[2])] = read_picture(path)
-    return found
+    paths = {path.stem: path for path in sorted((root / SIM2REAL).glob("*_real.png"))}
+    names = [re.fullmatch(r"(sphere|prism|triangle)_([\d.]+)_real", stem) for stem in paths]
+    return {(name[1], float(name[2])): read_picture(paths[name[0]]) for name in names if name}
 
 
 def known_truth(shape: str, depth_mm: float, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -177,12 +172,10 @@ def load(path: pathlib.Path, frame: int = 0) -> np.ndarray:
     picture = cv2.imread(str(path))
     if picture is None:
         reader = cv2.VideoCapture(str(path))
-        try:
-            for _ in range(frame + 1):
-                read, picture = reader.read()
-        finally:
-            reader.release()
-        if not read or picture is None:
+        for _ in range(frame + 1):
+            _, picture = reader.read()
+        reader.release()
+        if picture is None:
             raise ValueError(f"{path} is no picture and no video of {frame + 1} frames that OpenCV reads; replace it")
     return cv2.cvtColor(reduced(picture), cv2.COLOR_BGR2RGB)
 

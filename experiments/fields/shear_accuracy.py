@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -30,6 +30,12 @@ gradient-free reading on seeds 700 and 800.
 LAYERS = ((1.0, 0.48), (1.0, 0.45), (0.7, 0.48), (0.7, 0.45), (1.3, 0.48), (1.3, 0.45))
 """True thickness over the assumed one, and true Poisson ratio; the readings assume (1, 0.48)."""
 
+KINDS, MOTIONS, FRAMES = ("sphere", "rough", "patterned"), ("press", "slide_x", "slide_y", "twist"), 36
+"""Objects, contacts and frames of the slides."""
+
+STRIDE, ROUNDS = 3, 9
+"""Every how many-th frame is scored; rounds of timing."""
+
 ShearMethod = Callable[[Slide, int], np.ndarray]
 """From a slide and the index of a frame to its shear [h, w, 2], mm."""
 
@@ -37,39 +43,20 @@ ShearErrors = Mapping[str, Mapping[str, float]]
 """Method → motion → root mean square distance from the true shear, µm."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ShearConfig:
-    """Slides that shear is read on.
-
-    Args:
-      kinds, motions: of the objects and of their contacts.
-      frames: of a slide.
-      stride: every how many-th frame is scored.
-      rounds: of timing.
-    """
-
-    kinds: tuple[str, ...] = ("sphere", "rough", "patterned")
-    motions: tuple[str, ...] = ("press", "slide_x", "slide_y", "twist")
-    frames: int = 36
-    stride: int = 3
-    rounds: int = 9
-
-
 @functools.lru_cache(maxsize=32)
-def shear_reader(sensor: SensorModel, gradient_free: bool) -> ShearReader:
-    """The package's reader for a generated sensor."""
+def shear_reader(sensor: SensorModel, gradient_free: bool) -> Callable[[Slide, int], ShearAndForce]:
+    """The package's reader for a generated sensor, called with a slide and the index of a frame."""
     config = InverseConfig(
         lateral_noise_mm=sensor.lateral_noise_mm, depth_noise_mm=sensor.depth_noise_mm, gradient_free=gradient_free
     )
-    return ShearReader(sensor.gel, node_grid(sensor), config)
+    reader = ShearReader(sensor.gel, node_grid(sensor), config)
+    return lambda slide, f: reader.read(slide.deformation_mm[f], slide.depth_mm[f], slide.valid[f])
 
 
 def shear_methods(sensor: SensorModel) -> dict[str, ShearMethod]:
     """All readings of shear that assume this sensor."""
     grid = node_grid(sensor)
-    split, whole = (
-        functools.partial(_read, shear_reader(sensor, gradient_free=gradient_free)) for gradient_free in (True, False)
-    )
+    split, whole = (shear_reader(sensor, gradient_free=gradient_free) for gradient_free in (True, False))
     return {
         MAIN: lambda slide, f: split(slide, f).shear_mm,
         WITH_GRADIENT: lambda slide, f: whole(slide, f).shear_mm,
@@ -80,29 +67,31 @@ def shear_methods(sensor: SensorModel) -> dict[str, ShearMethod]:
     }
 
 
-def shear_errors(sensor: SensorModel, slides: Sequence[Slide], stride: int) -> dict[str, dict[str, float]]:
+def scored_frames(slides: Sequence[Slide]) -> Iterator[tuple[Slide, int]]:
+    """Slides and indices of their frames that are scored."""
+    return ((slide, f) for slide in slides for f in pressing(slide)[::STRIDE])
+
+
+def shear_errors(sensor: SensorModel, slides: Sequence[Slide]) -> dict[str, dict[str, float]]:
     """Errors of all readings; see `ShearErrors`."""
     errors: dict[str, dict[str, list[float]]] = {}
     for name, shear in shear_methods(sensor).items():
-        for slide in slides:
-            for f in pressing(slide)[::stride]:
-                wrong = shear(slide, f) - slide.shear_mm[f]
-                square = float((wrong**2).sum(-1).mean())
-                errors.setdefault(name, {}).setdefault(slide.motion, []).append(square)
+        for slide, f in scored_frames(slides):
+            square = float(((shear(slide, f) - slide.shear_mm[f]) ** 2).sum(-1).mean())
+            errors.setdefault(name, {}).setdefault(slide.motion, []).append(square)
     return {name: {m: 1e3 * float(np.sqrt(np.mean(e))) for m, e in by.items()} for name, by in errors.items()}
 
 
-def force_errors(sensor: SensorModel, slides: Sequence[Slide], stride: int) -> dict[str, float]:
+def force_errors(sensor: SensorModel, slides: Sequence[Slide]) -> dict[str, float]:
     """Root mean square errors of force, moment and traction by inversion, and root mean squares of the true ones."""
     split = shear_reader(sensor, gradient_free=True)
     wrong, true = [], []
-    for slide in slides:
-        for f in pressing(slide)[::stride]:
-            found = _read(split, slide, f)
-            traction = np.linalg.norm(found.traction_mpa - slide.traction_mpa[f], axis=-1)
-            measured = (found.force_n - slide.force_n[f], found.moment_nmm - slide.moment_nmm[f], traction.ravel())
-            wrong.append([np.sum(m**2) for m in measured] + [(found.force_n[2] - slide.force_n[f, 2]) ** 2])
-            true.append([np.sum(m**2) for m in (slide.force_n[f], slide.moment_nmm[f], slide.traction_mpa[f])])
+    for slide, f in scored_frames(slides):
+        found = split(slide, f)
+        traction = np.linalg.norm(found.traction_mpa - slide.traction_mpa[f], axis=-1)
+        measured = (found.force_n - slide.force_n[f], found.moment_nmm - slide.moment_nmm[f], traction.ravel())
+        wrong.append([np.sum(m**2) for m in measured] + [(found.force_n[2] - slide.force_n[f, 2]) ** 2])
+        true.append([np.sum(m**2) for m in (slide.force_n[f], slide.moment_nmm[f], slide.traction_mpa[f])])
     error, size = (np.sqrt(np.mean(a, 0)) for a in (wrong, true))
     return {
         "force": float(error[0]),
@@ -114,31 +103,44 @@ def force_errors(sensor: SensorModel, slides: Sequence[Slide], stride: int) -> d
     }
 
 
-def unexplained(sensor: SensorModel, slides: Sequence[Slide], stride: int) -> float:
+def unexplained(sensor: SensorModel, slides: Sequence[Slide]) -> float:
     """Root mean square of the motion that no load on the assumed layer explains, over that of the noise."""
-    whole = shear_reader(sensor, gradient_free=False)
-    squares = []
-    for slide in slides:
-        for f in pressing(slide)[::stride]:
-            found = _read(whole, slide, f)
-            squares.append(((found.subtracted_mm - found.shear_mm)[slide.valid[f]] ** 2).mean())
+    whole, squares = shear_reader(sensor, gradient_free=False), []
+    for slide, f in scored_frames(slides):
+        found = whole(slide, f)
+        squares.append(((found.subtracted_mm - found.shear_mm)[slide.valid[f]] ** 2).mean())
     return float(np.sqrt(np.mean(squares)) / sensor.lateral_noise_mm)
 
 
-def shear_section(config: ShearConfig, data_dir: pathlib.Path | None, context: Context) -> FieldSection:
+def shear_section(data_dir: pathlib.Path | None, context: Context) -> FieldSection:
     """Shear of every method on every sensor with markers; total force by inversion and by regression."""
     slides, errors, forces = {}, {}, {}
     for s in context.each("sensors", SENSORS):
-        slides[s.name] = cached_slides(s, config.kinds, config.motions, config.frames, FIRST_SEED)
-        errors[s.name] = shear_errors(s, slides[s.name], config.stride)
-        forces[s.name] = force_errors(s, slides[s.name], config.stride)
+        slides[s.name] = cached_slides(s, KINDS, MOTIONS, FRAMES, FIRST_SEED)
+        errors[s.name] = shear_errors(s, slides[s.name])
+        forces[s.name] = force_errors(s, slides[s.name])
     timed = slides[TAC3D.name][0]
     frame = int(pressing(timed)[-1])
     calls = {name: functools.partial(shear, timed, frame) for name, shear in shear_methods(TAC3D).items()}
-    ms = median_ms(calls, range(config.rounds))
+    ms = median_ms(calls, range(ROUNDS))
     regressions = generated_rows(slides) + (recorded_rows(data_dir) if data_dir is not None else [])
     ratio = max(_mean(by[MAIN]) / _mean(by[BASELINE]) for by in errors.values())
     force = max(by["force"] / by["force, true"] for by in forces.values())
+    loads = named_table(
+        "Load by inversion of the layer's compliance",
+        [{"sensor": sensor, **by} for sensor, by in forces.items()],
+        formats=dict.fromkeys(forces[TAC3D.name], ".3f"),
+        note="Root mean squares: force in N, moment in N mm, traction over the true one.",
+    )
+    points: dict[str, list[Point]] = {
+        name: [(name, ms[name], _mean(by), max(by.values()))] for name, by in errors[TAC3D.name].items()
+    }
+    picture = Picture(
+        name="fields_shear",
+        title="Shear: speed against error, Tac3D's gel",
+        caption="Mean over the motions; bars reach to the worst motion.",
+        content=speed_against_error(points, "error, µm", None, legend=False),
+    )
     return FieldSection(
         verdict=tuple(
             f"{sensor}: shear by the layer's compliance is off by {_mean(by[MAIN]):.1f} µm "
@@ -150,22 +152,22 @@ def shear_section(config: ShearConfig, data_dir: pathlib.Path | None, context: C
             at_most("shear error over Helmholtz–Hodge's, worst sensor", ratio, 1.0),
             at_most("total force by inversion, relative, worst sensor", force, 0.15),
         ),
-        tables=(_shear_table(errors, ms), _force_table(forces), regression_table(regressions)),
-        pictures=(_picture(errors[TAC3D.name], ms),),
+        tables=(_shear_table(errors, ms), loads, regression_table(regressions)),
+        pictures=(picture,),
     )
 
 
-def layer_section(config: ShearConfig) -> FieldSection:
+def layer_section() -> FieldSection:
     """Errors of every reading that assumes the nominal layer, on slides of other layers."""
     means: dict[str, dict[str, float]] = {}
     for factor, poisson in LAYERS:
         gel = dataclasses.replace(TAC3D.gel, thickness_mm=factor * TAC3D.gel.thickness_mm, poisson=poisson)
-        true = dataclasses.replace(TAC3D, gel=gel)
-        slides = make_slides(true, config.kinds, config.motions, config.frames, LAYER_SEED)
-        by_method = {name: _mean(by) for name, by in shear_errors(TAC3D, slides, config.stride).items()}
+        slides = make_slides(dataclasses.replace(TAC3D, gel=gel), KINDS, MOTIONS, FRAMES, LAYER_SEED)
+        by_method = {name: _mean(by) for name, by in shear_errors(TAC3D, slides).items()}
         row = "unexplained over noise, layer model with all of the motion"
-        means[f"{factor:g} × thick, ν {poisson:g}"] = by_method | {row: unexplained(TAC3D, slides, config.stride)}
+        means[f"{factor:g} × thick, ν {poisson:g}"] = by_method | {row: unexplained(TAC3D, slides)}
     worst, baseline = (max(by[name] for by in means.values()) for name in (MAIN, BASELINE))
+    ratio = max(by[MAIN] / by[BASELINE] for by in means.values())
     table = named_table(
         "Shear with a gel that is not what it is taken for (Tac3D's, generated)",
         [{"method": name, **{layer: by[name] for layer, by in means.items()}} for name in next(iter(means.values()))],
@@ -179,19 +181,9 @@ def layer_section(config: ShearConfig) -> FieldSection:
             "With a gel up to 30 % thicker or thinner than assumed, and a Poisson ratio of 0.45 where 0.48 is assumed, "
             f"shear is off by {worst:.1f} µm at worst, by Helmholtz–Hodge {baseline:.1f} µm.",
         ),
-        requirements=(
-            at_most(
-                "shear error over Helmholtz–Hodge's, worst wrong layer",
-                max(by[MAIN] / by[BASELINE] for by in means.values()),
-                1.0,
-            ),
-        ),
+        requirements=(at_most("shear error over Helmholtz–Hodge's, worst wrong layer", ratio, 1.0),),
         tables=(table,),
     )
-
-
-def _read(reader: ShearReader, slide: Slide, f: int) -> ShearAndForce:
-    return reader.read(slide.deformation_mm[f], slide.depth_mm[f], slide.valid[f])
 
 
 def _mean(errors: Mapping[str, float]) -> float:
@@ -204,36 +196,10 @@ def _shear_table(errors: Mapping[str, ShearErrors], ms: Mapping[str, float]) -> 
         for sensor, by_method in errors.items()
         for motion in by_method[MAIN]
     }
-    rows = [
-        {"method": name, "time": time, **{column: by[name] for column, by in cells.items()}}
-        for name, time in ms.items()
-    ]
     return named_table(
         "Shear on generated presses, slides and twists",
-        rows,
+        [{"method": name, "time": time, **{c: by[name] for c, by in cells.items()}} for name, time in ms.items()],
         formats={"time": ".2f", **dict.fromkeys(cells, ".1f")},
         units={"time": "ms", **dict.fromkeys(cells, "µm")},
         note="Root mean square distance from the part of the displacement that traction causes.",
-    )
-
-
-def _force_table(forces: Mapping[str, Mapping[str, float]]) -> Table:
-    rows = [{"sensor": sensor, **by} for sensor, by in forces.items()]
-    return named_table(
-        "Load by inversion of the layer's compliance",
-        rows,
-        formats=dict.fromkeys(list(rows[0])[1:], ".3f"),
-        note="Root mean squares: force in N, moment in N mm, traction over the true one.",
-    )
-
-
-def _picture(errors: ShearErrors, ms: Mapping[str, float]) -> Picture:
-    points: dict[str, list[Point]] = {
-        name: [(name, ms[name], _mean(by), max(by.values()))] for name, by in errors.items()
-    }
-    return Picture(
-        name="fields_shear",
-        title="Shear: speed against error, Tac3D's gel",
-        caption="Mean over the motions; bars reach to the worst motion.",
-        content=speed_against_error(points, "error, µm", None, legend=False),
     )

@@ -22,24 +22,14 @@ import pathlib
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
-from experiments.fields.depth_stress import BROKEN_DEPTH, DEPTH_STRESSES, attempt_depth
 from experiments.fields.false_alarms import flag_section, pattern_section
-from experiments.fields.known_motion import GelAtRest, gels
+from experiments.fields.known_motion import gels
 from experiments.fields.sections import FieldSection, joined
-from experiments.fields.shear_stress import BROKEN_SHEAR, SHEAR_STRESSES, attempt_shear
-from experiments.fields.stress import StressOutcomes, gathered, silence, silent_frames, stress_section
-from experiments.fields.tracking_stress import OFF_PX, STRESSES, attempt_tracking
+from experiments.fields.stress import OURS, StressOutcomes, gathered, silent_frames, stress_section
+from experiments.fields.stressed_readings import DEPTH, SHEAR, TRACKING, attempt_depth, attempt_shear, attempt_tracking
+from touchr1_jax.validation import at_least
 
-METHODS = (
-    "this",
-    "this, LK alone",
-    "LK to rest",
-    "LK frame to frame",
-    "DIS medium",
-    "dots, nearest",
-    "mean shift",
-)
-OURS = METHODS[0]
+METHODS = (OURS, "this, LK alone", "LK to rest", "LK frame to frame", "DIS medium", "dots, nearest", "mean shift")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,9 +56,7 @@ class FieldStabilityConfig:
     seed: int = 900
 
     def __post_init__(self) -> None:
-        for name in ("gels", "seeds", "pictures"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
+        at_least(self, 1, "gels", "seeds", "pictures")
         if OURS not in self.methods:
             raise ValueError(f"methods is {self.methods}: must hold {OURS!r}, which the rest is compared with; add it")
 
@@ -76,72 +64,33 @@ class FieldStabilityConfig:
 def run(config: FieldStabilityConfig, context: Context) -> Results:
     """Stress tracking, shear and depth; count false alarms on real pictures."""
     chosen = gels(config.data_dir)[: config.gels]
-    tracking = tracking_outcomes(chosen, config, context)
-    shear = gathered(attempt_shear(config.slide_frames, config.seed, context))
-    depth = gathered(attempt_depth(config.ball_presses, config.seeds, config.seed, context))
-    sections = [tracking_section(tracking), shear_section(shear), depth_section(depth)]
-    if config.data_dir is not None:
-        sections += [
-            flag_section(config.data_dir, context),
-            pattern_section(config.data_dir, config.pictures, context),
-        ]
-    settings = {
-        "gels": [rest.name for rest in chosen],
-        "motions a gel": config.seeds,
-        "a point is wrong from": f"{OFF_PX} px",
-    }
-    return joined(sections, settings, {f"silent, {name}": silent_frames(by) for name, by in tracking.items()})
-
-
-def tracking_outcomes(chosen: list[GelAtRest], config: FieldStabilityConfig, context: Context) -> StressOutcomes:
-    """Outcomes of all methods under all motions of all gels."""
     motions = itertools.product(chosen, range(config.seed, config.seed + config.seeds))
-    return gathered(
+    tracking = gathered(
         attempt
         for rest, seed in context.each("motions", motions)
         for attempt in attempt_tracking(rest, config.methods, seed)
     )
+    shear = gathered(attempt_shear(config.slide_frames, config.seed, context))
+    depth = gathered(attempt_depth(config.ball_presses, config.seeds, config.seed, context))
+    sections = [tracking_section(tracking), stress_section(SHEAR, shear), stress_section(DEPTH, depth)]
+    if config.data_dir is not None:
+        sections.append(flag_section(config.data_dir, context))
+        sections.append(pattern_section(config.data_dir, config.pictures, context))
+    settings = {
+        "gels": [rest.name for rest in chosen],
+        "motions a gel": config.seeds,
+        "a point is wrong from": f"{TRACKING.tolerance} px",
+    }
+    return joined(sections, settings, {f"silent, {name}": silent_frames(by) for name, by in tracking.items()})
 
 
 def tracking_section(outcomes: StressOutcomes) -> FieldSection:
     """Curves and first breaks of tracking, silent failures, flags under the mildest stress."""
-    sentence, none_silent = silence(outcomes, OURS, "frames", "frames broken")
-    mild = [o for s in STRESSES for o in outcomes[OURS][s.name, s.levels[0]] if not o.broken]
+    section = stress_section(TRACKING, outcomes)
+    mild = [o for s in TRACKING.stresses for o in outcomes[OURS][s.name, s.levels[0]] if not o.broken]
     flagged = sum(bool(o.flags) for o in mild)
-    section = stress_section(
-        "tracking",
-        outcomes,
-        STRESSES,
-        OFF_PX,
-        "px",
-        "95th percentile of the distance from the truth, the worst of all gels and motions. A method breaks where more "
-        "than 5 % of all points are given wrongly; a frame is flagged where the method refuses more than 5 % of them, "
-        "or where the package calls the picture saturated.",
-    )
-    mild_sentence = f"{OURS}: {flagged} of {len(mild)} frames under the mildest level of each stress are flagged."
-    return dataclasses.replace(section, verdict=(sentence, mild_sentence), requirements=(none_silent,))
-
-
-def shear_section(outcomes: StressOutcomes) -> FieldSection:
-    """Curves and first breaks of shear."""
-    caption = "Error over the true shear, root mean squares over a generated slide."
-    return stress_section("shear", outcomes, SHEAR_STRESSES, BROKEN_SHEAR, "relative", caption)
-
-
-def depth_section(outcomes: StressOutcomes) -> FieldSection:
-    """Curves and first breaks of depth, silent failures."""
-    sentence, none_silent = silence(outcomes, OURS, "presses", "depth wrong")
-    section = stress_section(
-        "depth",
-        outcomes,
-        DEPTH_STRESSES,
-        BROKEN_DEPTH,
-        "share of the depth",
-        "Root mean square error over the contact of a generated press of a ball, as a share of its depth, the worst of "
-        f"all presses; from {BROKEN_DEPTH:g} on it is wrong. Exposure and lamps change after the gel at rest was "
-        "recorded.",
-    )
-    return dataclasses.replace(section, verdict=(sentence,), requirements=(none_silent,))
+    sentence = f"{OURS}: {flagged} of {len(mild)} frames under the mildest level of each stress are flagged."
+    return dataclasses.replace(section, verdict=(*section.verdict, sentence))
 
 
 DEFAULT = FieldStabilityConfig()

@@ -1,31 +1,31 @@
 """Methods under growing stress: the level at which each one breaks, and whether a flag warns of it."""
 
 import collections
-import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Picture, Requirement, Table, at_most, named_table
+from experiments.core.results import Picture, Table, at_most, named_table
 from experiments.fields.sections import FieldSection
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
 
+OURS = "this"
+"""The package's method."""
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Stress:
+
+class Stress(NamedTuple):
     """One kind of stress: its name with the unit, and its levels, mild to severe."""
 
     name: str
     levels: tuple[float, ...]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StressOutcome:
+class StressOutcome(NamedTuple):
     """One frame read by one method under one level of one stress.
 
     Args:
@@ -66,38 +66,46 @@ def silent_frames(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]])
     return sum(outcome.silent for frames in by_level.values() for outcome in frames)
 
 
-def silence(outcomes: StressOutcomes, ours: str, things: str, fault: str) -> tuple[str, Requirement]:
-    """A sentence on the silent failures of every method, and the requirement that `ours` has none."""
-    silent = {method: silent_frames(by_level) for method, by_level in outcomes.items()}
-    total = sum(map(len, outcomes[ours].values()))
-    counts = ", ".join(f"{method} {count}" for method, count in silent.items())
-    requirement = at_most(f"{ours}: {fault} and not flagged", silent[ours], 0)
-    return f"Of {total} {things} under stress, {fault} and not flagged: {counts}.", requirement
-
-
-def stress_section(
-    field: str, outcomes: StressOutcomes, stresses: Sequence[Stress], tolerance: float, unit: str, caption: str
-) -> FieldSection:
-    """Table of first breaks and curves of the error of all methods.
+class StressedField(NamedTuple):
+    """A field under stress.
 
     Args:
-      field: `tracking`, `shear` or `depth`.
-      outcomes: of every level of every stress.
+      name: `tracking`, `shear` or `depth`.
       stresses: one panel of the chart each.
       tolerance: error from which a reading is wrong.
       unit: of the errors.
       caption: of the chart.
+      failures: name of the readings and of their fault, where `OURS` must have no fault without a flag.
     """
-    picture = Picture(
-        name=f"stability_{field}",
-        title=f"Where {field} breaks",
-        caption=caption,
-        content=_curves(outcomes, stresses, tolerance, unit),
+
+    name: str
+    stresses: tuple[Stress, ...]
+    tolerance: float
+    unit: str
+    caption: str
+    failures: tuple[str, str] | None = None
+
+
+def stress_section(field: StressedField, outcomes: StressOutcomes) -> FieldSection:
+    """Table of first breaks and curves of the error of all methods; silent failures."""
+    verdict, requirements = [], []
+    if field.failures is not None:
+        (readings, fault), silent = field.failures, {name: silent_frames(of) for name, of in outcomes.items()}
+        counts = ", ".join(f"{method} {count}" for method, count in silent.items())
+        total = sum(map(len, outcomes[OURS].values()))
+        verdict.append(f"Of {total} {readings} under stress, {fault} and not flagged: {counts}.")
+        requirements.append(at_most(f"{OURS}: {fault} and not flagged", silent[OURS], 0))
+    title, chart = f"Where {field.name} breaks", _curves(field, outcomes)
+    picture = Picture(name=f"stability_{field.name}", title=title, caption=field.caption, content=chart)
+    return FieldSection(
+        verdict=tuple(verdict),
+        requirements=tuple(requirements),
+        tables=(break_table(field, outcomes),),
+        pictures=(picture,),
     )
-    return FieldSection(tables=(break_table(field, outcomes, stresses),), pictures=(picture,))
 
 
-def break_table(field: str, outcomes: StressOutcomes, stresses: Sequence[Stress]) -> Table:
+def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:
     """First broken level of every method under every stress, with the flags of the broken frames of all levels."""
 
     def cell(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]], stress: Stress) -> str:
@@ -109,19 +117,19 @@ def break_table(field: str, outcomes: StressOutcomes, stresses: Sequence[Stress]
         return f"{broken[0][0]:.3g}: " + ", ".join(f"{name} {count}" for name, count in counts.items())
 
     return named_table(
-        f"Where {field} breaks first",
-        [{"method": m, **{s.name: cell(by_level, s) for s in stresses}} for m, by_level in outcomes.items()],
+        f"Where {field.name} breaks first",
+        [{"method": m, **{s.name: cell(by_level, s) for s in field.stresses}} for m, by_level in outcomes.items()],
         note="First level at which any gel and motion breaks; then the number of broken frames over all levels by the "
         "flags that they carry.",
     )
 
 
-def _curves(outcomes: StressOutcomes, stresses: Sequence[Stress], tolerance: float, unit: str) -> bytes:
+def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
     """The worst error of every method by level, one panel a stress, clipped to two decades around the tolerance."""
     colours = dict(zip(outcomes, itertools.cycle((*PALETTE, SHARED)), strict=False))
-    first = next(iter(outcomes))
+    first, tolerance = next(iter(outcomes)), field.tolerance
     panels = []
-    for i, stress in enumerate(stresses):
+    for i, stress in enumerate(field.stresses):
         series, marks = [], collections.defaultdict[str, list[tuple[int, float, str]]](list)
         for method in reversed(tuple(outcomes)):  # the first method is drawn last, over the others
             levels = [outcomes[method][stress.name, level] for level in stress.levels]
@@ -144,15 +152,15 @@ def _curves(outcomes: StressOutcomes, stresses: Sequence[Stress], tolerance: flo
         panel = Panel(
             series,
             title=stress.name,
-            y_label="" if i % 4 else f"error, {unit}",
+            y_label="" if i % 4 else f"error, {field.unit}",
             y_scale="log",
             y_limits=(0.01 * tolerance, 130 * tolerance),
             x_ticks={x: f"{level:.3g}" for x, level in enumerate(stress.levels)},
             rules=[Rule(y=tolerance)],
         )
         panels.append(panel)
-    rows = -(-len(stresses) // 4)
-    return draw(panels, columns=4, size=(2.75 * min(4, len(stresses)) + 0.6, 2.45 * rows + 0.8), share_y=True)
+    rows = -(-len(panels) // 4)
+    return draw(panels, columns=4, size=(2.75 * min(4, len(panels)) + 0.6, 2.45 * rows + 0.8), share_y=True)
 
 
 _MARKS = {

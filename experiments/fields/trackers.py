@@ -4,8 +4,8 @@ A follower is made from the picture at rest and the points at rest.  Called with
 (x, y) [P, 2], NaN where it reports a point as lost.
 """
 
+import functools
 from collections.abc import Callable
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,19 +13,17 @@ import numpy as np
 from sensors_io.fields.markers import find_markers
 from sensors_io.fields.tracking import Tracker, TrackingConfig
 
+Follower = Callable[[np.ndarray], np.ndarray]
+"""From the next picture, uint8 [H, W], to the points in it."""
 
-class Follower(Protocol):
-    """Follows points through pictures."""
-
-    def __call__(self, grey: np.ndarray) -> np.ndarray:
-        """Points in the next picture, uint8 [H, W]."""
-
-
-Make = Callable[[np.ndarray, np.ndarray, int], Follower]
+MakeFollower = Callable[[np.ndarray, np.ndarray, int], Follower]
 """From the picture at rest, the points and the half side of the windows to a follower."""
 
+Flow = Callable[[np.ndarray], np.ndarray]
+"""From a picture, uint8 [H, W], to its displacement against the picture at rest, [H, W, 2]."""
 
-def ours(affine: bool, smooth: bool) -> Make:
+
+def package_tracker(affine: bool, smooth: bool) -> MakeFollower:
     """The package's tracker, with or without the affine fit and smoothing."""
 
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
@@ -43,11 +41,12 @@ def ours(affine: bool, smooth: bool) -> Make:
 def lucas_kanade_between_frames(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
     """Each picture matched to the one before."""
     del half_px
-    state = {"grey": rest, "points": points}
+    before, at = rest, points
 
     def follow(grey: np.ndarray) -> np.ndarray:
-        state.update(points=_lucas_kanade(state["grey"], grey, state["points"]), grey=grey)
-        return state["points"]
+        nonlocal before, at
+        before, at = grey, _lucas_kanade(before, grey, at)
+        return at
 
     return follow
 
@@ -58,47 +57,54 @@ def lucas_kanade_to_rest(rest: np.ndarray, points: np.ndarray, half_px: int) -> 
     return lambda grey: _lucas_kanade(rest, grey, points)
 
 
-def dense_inverse_search(preset: int) -> Make:
-    """DIS flow from the picture at rest, read at the points."""
+def dense_flow(make_flow: Callable[[np.ndarray], Flow]) -> MakeFollower:
+    """A dense flow from the picture at rest, read at the points."""
 
     def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
         del half_px
-        flow = cv2.DISOpticalFlow.create(preset)
-        return lambda grey: points + _at_points(flow.calc(rest, grey, None), points)  # type: ignore[call-overload]
+        flow = make_flow(rest)
+        return lambda grey: points + _at_points(flow(grey), points)
 
     return make
 
 
-def farneback(window_px: int) -> Make:
-    """Farnebäck's flow from the picture at rest, read at the points."""
-
-    def make(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
-        del half_px
-        return lambda grey: points + _at_points(farneback_flow(rest, grey, window_px), points)
-
-    return make
+def inverse_search(preset: int, rest: np.ndarray) -> Flow:
+    """DIS flow from the picture at rest."""
+    flow = cv2.DISOpticalFlow.create(preset)
+    return lambda grey: flow.calc(rest, grey, None)  # type: ignore[call-overload]
 
 
-def farneback_flow(rest: np.ndarray, grey: np.ndarray, window_px: int) -> np.ndarray:
-    """Farnebäck's flow with the settings that shear estimators commonly use, [H, W, 2]."""
-    start = np.zeros((*rest.shape, 2), np.float32)
-    return cv2.calcOpticalFlowFarneback(rest, grey, start, 0.5, 3, window_px, 3, 5, 1.2, 0)
+def farneback(window_px: int, rest: np.ndarray) -> Flow:
+    """Farnebäck's flow from the picture at rest with the settings that shear estimators commonly use."""
+    start = lambda: np.zeros((*rest.shape, 2), np.float32)
+    return lambda grey: cv2.calcOpticalFlowFarneback(rest, grey, start(), 0.5, 3, window_px, 3, 5, 1.2, 0)
+
+
+FLOWS: dict[str, Callable[[np.ndarray], Flow]] = {
+    "DIS ultrafast": functools.partial(inverse_search, cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
+    "DIS fast": functools.partial(inverse_search, cv2.DISOPTICAL_FLOW_PRESET_FAST),
+    "DIS medium": functools.partial(inverse_search, cv2.DISOPTICAL_FLOW_PRESET_MEDIUM),
+    "Farnebäck 15": functools.partial(farneback, 15),
+    "Farnebäck 45": functools.partial(farneback, 45),
+}
+"""Name → from the picture at rest to a dense flow."""
 
 
 def nearest_dot(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
     """Dots are detected in every picture; a point and a dot are paired where each is the other's nearest."""
     del rest, half_px
-    state = {"points": points.copy()}
+    at = points.copy()
 
     def follow(grey: np.ndarray) -> np.ndarray:
+        nonlocal at
         dots = find_markers(grey)
         if dots is None:
             return np.full_like(points, np.nan)
-        gaps = np.hypot(*(state["points"][:, None] - dots.points_px[None]).transpose(2, 0, 1))
+        gaps = np.hypot(*(at[:, None] - dots.points_px[None]).transpose(2, 0, 1))
         mine, theirs = gaps.argmin(1), gaps.argmin(0)
         mutual = theirs[mine] == np.arange(len(points))
-        state["points"] = np.where(mutual[:, None], dots.points_px[mine], state["points"]).astype(np.float32)
-        return np.where(mutual[:, None], state["points"], np.nan)
+        at = np.where(mutual[:, None], dots.points_px[mine], at).astype(np.float32)
+        return np.where(mutual[:, None], at, np.nan)
 
     return follow
 
@@ -109,13 +115,12 @@ def mean_shift(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
     The method of gsrobotics' `marker_tracker`, with windows of the dots' size in place of a fixed one.
     """
     del rest
-    state = {"points": points.copy()}
-    side = np.arange(-half_px, half_px + 1)
+    at, side = points.copy(), np.arange(-half_px, half_px + 1)
     dy, dx = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
 
     def follow(grey: np.ndarray) -> np.ndarray:
+        nonlocal at
         dark = (cv2.blur(grey, (31, 31)).astype(np.float32) - grey > 15).astype(np.float32)
-        at = state["points"]
         for _ in range(5):
             x = np.clip(np.round(at[:, :1]).astype(int) + dx, 0, grey.shape[1] - 1)
             y = np.clip(np.round(at[:, 1:]).astype(int) + dy, 0, grey.shape[0] - 1)
@@ -123,23 +128,18 @@ def mean_shift(rest: np.ndarray, points: np.ndarray, half_px: int) -> Follower:
             total = weight.sum(1)
             centroid = np.stack([(weight * x).sum(1), (weight * y).sum(1)], 1) / np.maximum(total, 1)[:, None]
             at = np.where(total[:, None] > 0, centroid, at).astype(np.float32)
-        state["points"] = at
         return at
 
     return follow
 
 
-FOLLOWERS: dict[str, Make] = {
-    "this": ours(affine=True, smooth=True),
-    "this, affine alone": ours(affine=True, smooth=False),
-    "this, LK alone": ours(affine=False, smooth=False),
+FOLLOWERS: dict[str, MakeFollower] = {
+    "this": package_tracker(affine=True, smooth=True),
+    "this, affine alone": package_tracker(affine=True, smooth=False),
+    "this, LK alone": package_tracker(affine=False, smooth=False),
     "LK to rest": lucas_kanade_to_rest,
     "LK frame to frame": lucas_kanade_between_frames,
-    "DIS ultrafast": dense_inverse_search(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
-    "DIS fast": dense_inverse_search(cv2.DISOPTICAL_FLOW_PRESET_FAST),
-    "DIS medium": dense_inverse_search(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM),
-    "Farnebäck 15": farneback(15),
-    "Farnebäck 45": farneback(45),
+    **{name: dense_flow(make_flow) for name, make_flow in FLOWS.items()},
     "dots, nearest": nearest_dot,
     "mean shift": mean_shift,
 }

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-import cv2
 import numpy as np
 
 from experiments.core.charts import Point, speed_against_error
@@ -22,13 +21,18 @@ from experiments.fields.known_motion import (
     grey,
 )
 from experiments.fields.sections import FieldSection
-from experiments.fields.trackers import FOLLOWERS, Follower, farneback_flow
+from experiments.fields.trackers import FLOWS, FOLLOWERS, Follower
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
 
 MARKER_DEFAULT, UNSMOOTHED = "this", "this, affine alone"
 DENSE_DEFAULT = "this: markers, affine, spline"
-LOST_PX = 1.0
+SEEDS = (None, *range(FIRST_SEED, FIRST_SEED + 4))
+"""Of the motions of each gel; `None` is the published one."""
+
+ROUNDS, LOST_PX = 15, 1.0
+"""Rounds of timing of the markers; distance from which a marker counts as lost."""
+
 _STEPS = 10  # pictures in which a motion is made, for methods that go from frame to frame
 _MARGIN = 0.1  # of height and width: within, the markers surround every pixel
 
@@ -36,23 +40,10 @@ DenseField = Callable[[np.ndarray], np.ndarray]
 """From a picture, RGB, to its displacement field in pixels, [H, W, 2]."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MarkerConfig:
-    """Motions drawn for each gel in addition to the published one; rounds of timing."""
-
-    motions: int = 4
-    rounds: int = 15
-
-    def __post_init__(self) -> None:
-        for name in ("motions", "rounds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
-
-
-def marker_errors(gel: TrackedGel, seeds: Sequence[int | None]) -> dict[str, np.ndarray]:
+def marker_errors(gel: TrackedGel) -> dict[str, np.ndarray]:
     """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost."""
     found: dict[str, list[np.ndarray]] = {name: [] for name in FOLLOWERS}
-    for seed in seeds:
+    for seed in SEEDS:
         motion = gel.motion(PEAK_PX, seed)
         camera = GelCamera(gel.rest.picture, NOISE_GREY, FIRST_SEED if seed is None else seed)
         rest = grey(camera.at_rest())
@@ -81,10 +72,10 @@ def marker_ms(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, float]:
     return {name: ms / len(pictures) for name, ms in median_ms(calls, rounds).items()}
 
 
-def jump_losses(gel: TrackedGel, seeds: Sequence[int | None]) -> dict[str, list[float]]:
+def jump_losses(gel: TrackedGel) -> dict[str, list[float]]:
     """Share of points that are lost or more than a pixel off after one jump from rest, by method and motion."""
     shares: dict[str, list[float]] = {name: [] for name in FOLLOWERS}
-    for seed in seeds:
+    for seed in SEEDS:
         motion = gel.motion(JUMP_PX, seed)
         camera = GelCamera(gel.rest.picture, NOISE_GREY, 3)
         rest, picture = grey(camera.at_rest()), grey(camera.under(motion))
@@ -98,30 +89,20 @@ def jump_losses(gel: TrackedGel, seeds: Sequence[int | None]) -> dict[str, list[
 def dense_fields(rest: np.ndarray) -> dict[str, DenseField]:
     """Every method of dense displacement from a picture at rest."""
     still, reader = grey(rest), DeformationReader(rest, mm_per_px=1.0)
-    methods: dict[str, DenseField] = {DENSE_DEFAULT: lambda picture: reader.read(picture).displacement_mm}
-    presets = {
-        "DIS ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-        "DIS fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-        "DIS medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
+    of_grey = lambda flow, picture: flow(grey(picture))
+    return {
+        DENSE_DEFAULT: lambda picture: reader.read(picture).displacement_mm,
+        **{name: functools.partial(of_grey, make_flow(still)) for name, make_flow in FLOWS.items()},
     }
-    inverse_search = lambda flow, picture: flow.calc(still, grey(picture), None)
-    for name, preset in presets.items():
-        methods[name] = functools.partial(inverse_search, cv2.DISOpticalFlow.create(preset))
-    polynomial = lambda window, picture: farneback_flow(still, grey(picture), window)
-    for window in (15, 45):
-        methods[f"Farnebäck {window}"] = functools.partial(polynomial, window)
-    return methods
 
 
-def dense_errors(
-    gel: TrackedGel, seeds: Sequence[int | None], rounds: Iterable[object]
-) -> dict[str, tuple[float, float, float]]:
+def dense_errors(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, tuple[float, float, float]]:
     """Mean error and 95th percentile in px within the margin, and milliseconds, of every dense method."""
     height, width = gel.rest.picture.shape[:2]
     rows, columns = (slice(int(_MARGIN * n), n - int(_MARGIN * n)) for n in (height, width))
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64)
     errors: dict[str, list[np.ndarray]] = {}
-    for seed in seeds:
+    for seed in SEEDS:
         motion = gel.motion(PEAK_PX, seed)
         camera = GelCamera(gel.rest.picture, NOISE_GREY, 4)
         methods, picture = dense_fields(camera.at_rest()), camera.under(motion)
@@ -134,22 +115,26 @@ def dense_errors(
     return {name: (float(e.mean()), float(np.quantile(e, 0.95)), ms[name]) for name, e in pooled.items()}
 
 
-def spline_hertz(gel: TrackedGel, rounds: int) -> float:
-    """Dense fields in a second from markers that are tracked already, at the picture's size."""
-    tracker = DeformationReader(gel.rest.picture, mm_per_px=1.0).tracker
-    densify = Densifier(tracker.spline, gel.rest.picture.shape[:2])
-    moved = gel.motion(PEAK_PX, None).forward(gel.points_px)
-    return 1e3 / median_ms({"": functools.partial(densify, moved)}, range(max(rounds, 30)))[""]
-
-
-def marker_section(config: MarkerConfig, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection:
     """Errors and speeds of every method on every gel; a jump."""
-    seeds = [None, *range(FIRST_SEED, FIRST_SEED + config.motions)]
-    errors = {g.rest.name: marker_errors(g, seeds) for g in context.each("following", gels)}
-    ms = {g.rest.name: marker_ms(g, context.rounds(f"timing on {g.rest.name}", config.rounds)) for g in gels}
-    losses = {g.rest.name: jump_losses(g, seeds) for g in context.each("jumping", gels)}
-    median, high = _quantiles(np.concatenate([errors[g.rest.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
-    first = gels[0].rest.name
+    errors = {g.rest.name: marker_errors(g) for g in context.each("following", gels)}
+    ms = {g.rest.name: marker_ms(g, context.rounds(f"timing on {g.rest.name}", ROUNDS)) for g in gels}
+    losses = {g.rest.name: jump_losses(g) for g in context.each("jumping", gels)}
+    median, high = quantiles(np.concatenate([errors[g.rest.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
+    worst_jump, first = max(shares[MARKER_DEFAULT][0] for shares in losses.values()), gels[0].rest.name
+    markers = _gel_table(
+        "Markers under known motion",
+        {g: {m: (*map(_finite, quantiles(e)), ms[g][m]) for m, e in by.items()} for g, by in errors.items()},
+        _accuracy_columns("median"),
+        note=f"Peak {PEAK_PX:g} px on a picture 320 wide, shading of a contact, noise of {NOISE_GREY:g} grey levels, "
+        f"at rest the mean of {REST_PICTURES} pictures; empty where a method reports more than 5 % as lost.",
+    )
+    lost = "markers lost or more than 1 px off, published motion"
+    jumps = _gel_table(
+        f"A jump of {JUMP_PX:g} px in one frame",
+        {gel: {m: (s[0], float(np.mean(s))) for m, s in by.items()} for gel, by in losses.items()},
+        (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
+    )
     return FieldSection(
         verdict=(
             f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px "
@@ -158,23 +143,38 @@ def marker_section(config: MarkerConfig, gels: Sequence[TrackedGel], context: Co
         requirements=(
             at_most("marker error, median", median, 0.04, "px"),
             at_most("marker error, 95th percentile", high, 0.11, "px"),
-            at_most(
-                "28 px jump: markers lost or > 1 px off, worst gel",
-                max(shares[MARKER_DEFAULT][0] for shares in losses.values()),
-                0.0,
-            ),
+            at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
         ),
-        tables=(_marker_table(errors, ms), _jump_table(losses)),
+        tables=(markers, jumps),
         pictures=(_marker_picture(errors[first], ms[first], first),),
     )
 
 
-def dense_section(motions: int, rounds: int, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], gel: str) -> Picture:
+    groups: dict[str, list[Point]] = {}
+    for method in FOLLOWERS:
+        median, high = quantiles(errors[method])
+        if np.isfinite(median) and method != UNSMOOTHED:  # which coincides with the smoothed one
+            kind = "this package" if method.startswith("this") else method.split(" ")[0].rstrip(",")
+            top = high if np.isfinite(high) else 10 * median
+            groups.setdefault(kind, []).append((method, ms[method], median, top))
+    return Picture(
+        name="fields_markers",
+        title=f"Markers: speed against error, {gel}",
+        caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile. "
+        "Without smoothing this package's point does not move.",
+        content=speed_against_error(groups, "error, px", None, legend=False),
+    )
+
+
+def dense_section(rounds: int, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
     """Errors and speeds of dense fields on every gel, and the speed of the spline alone."""
-    seeds: list[int | None] = [None, *range(FIRST_SEED, FIRST_SEED + motions)]
-    measured = {g.rest.name: dense_errors(g, seeds, range(rounds)) for g in context.each("gels", gels)}
+    measured = {g.rest.name: dense_errors(g, range(rounds)) for g in context.each("gels", gels)}
     error = float(np.mean([measured[g.rest.name][DENSE_DEFAULT][0] / g.unit for g in _real(gels)]))
-    hertz, first = spline_hertz(gels[0], rounds), gels[0].rest.name
+    tracker, first = DeformationReader(gels[0].rest.picture, mm_per_px=1.0).tracker, gels[0].rest.name
+    densify = Densifier(tracker.spline, gels[0].rest.picture.shape[:2])
+    moved = gels[0].motion(PEAK_PX, None).forward(gels[0].points_px)
+    spline_ms = median_ms({"": functools.partial(densify, moved)}, range(max(rounds, 30)))[""]
     points: dict[str, list[Point]] = {}
     for method, (mean, high, ms) in measured[first].items():
         points.setdefault(method.split(" ")[0].rstrip(":"), []).append((method, ms, mean, high))
@@ -190,28 +190,25 @@ def dense_section(motions: int, rounds: int, gels: Sequence[TrackedGel], context
         caption="Mean distance from the truth; bars reach to the 95th percentile.",
         content=speed_against_error(points, "error, px", None, legend=False),
     )
+    sentence = f"Between the markers the mean error of the thin-plate spline is {error:.3f} px; it takes"
     return FieldSection(
-        verdict=(
-            f"Between the markers the mean error of the thin-plate spline is {error:.3f} px; it takes "
-            f"{1e3 / hertz:.2f} ms.",
-        ),
+        verdict=(f"{sentence} {spline_ms:.2f} ms.",),
         requirements=(
             at_most("dense field, mean error", error, 0.05, "px"),
-            at_least("markers → dense field", hertz, 1000, "Hz"),
+            at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
         ),
         tables=(table,),
         pictures=(picture,),
     )
 
 
-def finite_quantiles(error: np.ndarray) -> tuple[float | None, float | None]:
-    """Median and 95th percentile, `None` where a method reports so many points as lost."""
-    median, high = (value if np.isfinite(value) else None for value in _quantiles(error))
-    return median, high
-
-
-def _quantiles(error: np.ndarray) -> tuple[float, float]:
+def quantiles(error: np.ndarray) -> tuple[float, float]:
+    """Median and 95th percentile, infinite where a method reports so many points as lost."""
     return float(np.median(error)), float(np.quantile(error, 0.95, method="lower"))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def _real(gels: Sequence[TrackedGel]) -> list[TrackedGel]:
@@ -219,31 +216,11 @@ def _real(gels: Sequence[TrackedGel]) -> list[TrackedGel]:
     return [g for g in gels if g.rest.real] or list(gels)
 
 
-def _marker_table(errors: Mapping[str, Mapping[str, np.ndarray]], ms: Mapping[str, Mapping[str, float]]) -> Table:
-    return _gel_table(
-        "Markers under known motion",
-        {gel: {m: (*finite_quantiles(e), ms[gel][m]) for m, e in by.items()} for gel, by in errors.items()},
-        _accuracy_columns("median"),
-        note=f"Peak {PEAK_PX:g} px on a picture 320 wide, shading of a contact, noise of {NOISE_GREY:g} grey levels, "
-        f"at rest the mean of {REST_PICTURES} pictures; empty where a method reports more than 5 % as lost.",
-    )
-
-
-def _jump_table(losses: Mapping[str, Mapping[str, list[float]]]) -> Table:
-    lost = "markers lost or more than 1 px off, published motion"
-    return _gel_table(
-        f"A jump of {JUMP_PX:g} px in one frame",
-        {gel: {m: (s[0], float(np.mean(s))) for m, s in by.items()} for gel, by in losses.items()},
-        (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
-    )
-
-
-def _accuracy_columns(middle: str) -> tuple[Column, ...]:
-    return (
-        Column(name=middle, unit="px", format=".3f"),
-        Column(name="95 %", unit="px", format=".3f"),
+def _accuracy_columns(middle: str) -> list[Column]:
+    return [
+        *(Column(name=name, unit="px", format=".3f") for name in (middle, "95 %")),
         Column(name="time", unit="ms", format=".2f"),
-    )
+    ]
 
 
 def _gel_table(
@@ -256,20 +233,3 @@ def _gel_table(
     methods = next(iter(cells.values()))
     rows = tuple((m, *(value for by_method in cells.values() for value in by_method[m])) for m in methods)
     return Table(title=title, columns=tuple(headings), rows=rows, note=note)
-
-
-def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], gel: str) -> Picture:
-    groups: dict[str, list[Point]] = {}
-    for method in FOLLOWERS:
-        median, high = _quantiles(errors[method])
-        if np.isfinite(median) and method != UNSMOOTHED:  # which coincides with the smoothed one
-            kind = "this package" if method.startswith("this") else method.split(" ")[0].rstrip(",")
-            top = high if np.isfinite(high) else 10 * median
-            groups.setdefault(kind, []).append((method, ms[method], median, top))
-    return Picture(
-        name="fields_markers",
-        title=f"Markers: speed against error, {gel}",
-        caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile. "
-        "Without smoothing this package's point does not move.",
-        content=speed_against_error(groups, "error, px", None, legend=False),
-    )

@@ -3,35 +3,33 @@
 import pytest
 
 from experiments.fields.stability_fields import FieldStabilityConfig
-from experiments.fields.stress import Stress, StressOutcome, break_table, gathered, silence
+from experiments.fields.stress import Stress, StressedField, StressOutcome, break_table, gathered, stress_section
 from sensors_io.schema import Flag
 
 GOOD = StressOutcome(error=0.1, wrong=0.0, flags=Flag.NONE)
 SILENT = StressOutcome(error=9.0, wrong=0.2, flags=Flag.NONE)
 FLAGGED = StressOutcome(error=9.0, wrong=0.2, flags=Flag.MARKER_LOSS)
 
-NOISE = Stress(name="noise", levels=(1, 2))
-OUTCOMES = gathered(
-    [("ours", "noise", 1, GOOD), ("ours", "noise", 2, FLAGGED)]
-    + [("theirs", "noise", level, outcome) for level in (1, 2) for outcome in (SILENT, GOOD)]
-)
+NOISE = StressedField("tracking", (Stress("noise", (1, 2)),), 1.0, "px", "", ("frames", "frames broken"))
+
+
+def outcomes(**frames):
+    return gathered((name, "noise", level, o) for name, of in frames.items() for level in of for o in of[level])
 
 
 def test_silent_is_broken_without_a_flag():
     assert [o.silent for o in (GOOD, SILENT, FLAGGED)] == [False, True, False]
 
 
-def test_silent_frames_are_counted_by_method():
-    _, ours = silence(OUTCOMES, "ours", "frames", "frames broken")
-    _, theirs = silence(OUTCOMES, "theirs", "frames", "frames broken")
-    assert (ours.measured, theirs.measured) == (0, 2)
+@pytest.mark.parametrize(("mild", "silent"), [(GOOD, 0), (SILENT, 1), (FLAGGED, 0)])
+def test_the_package_must_not_break_silently(mild, silent):
+    found = stress_section(NOISE, outcomes(other={1: [SILENT], 2: [SILENT]}, this={1: [mild], 2: [FLAGGED]}))
+    assert [(r.measured, r.bound) for r in found.requirements] == [(silent, 0)]
 
 
 def test_a_method_breaks_first_at_its_lowest_broken_level():
-    assert break_table("tracking", OUTCOMES, [NOISE]).rows == (
-        ("ours", "2: marker_loss 1"),
-        ("theirs", "1: silent 2"),
-    )
+    found = outcomes(this={1: [GOOD], 2: [FLAGGED]}, theirs={1: [SILENT, GOOD], 2: [SILENT, GOOD]})
+    assert break_table(NOISE, found).rows == (("this", "2: marker_loss 1"), ("theirs", "1: silent 2"))
 
 
 def test_a_configuration_without_the_package_is_refused():
