@@ -87,7 +87,7 @@ def run(config: FieldStabilityConfig, context: Context) -> Results:
 def tracking_section(outcomes: StressOutcomes) -> FieldSection:
     """Curves and first breaks of tracking, silent failures, flags under the mildest stress."""
     section = stress_section(TRACKING, outcomes)
-    mild = [o for s in TRACKING.stresses for o in outcomes[OURS][s.name, s.levels[0]] if not o.broken]
+    mild = [o for s, levels in TRACKING.stresses.items() for o in outcomes[OURS][s, levels[0]] if not o.broken]
     flagged = sum(bool(o.flags) for o in mild)
     sentence = f"{OURS}: {flagged} of {len(mild)} frames under the mildest level of each stress are flagged."
     return dataclasses.replace(section, verdict=(*section.verdict, sentence))

@@ -18,13 +18,6 @@ OURS = "this"
 """The package's method."""
 
 
-class Stress(NamedTuple):
-    """One kind of stress: its name with the unit, and its levels, mild to severe."""
-
-    name: str
-    levels: tuple[float, ...]
-
-
 class StressOutcome(NamedTuple):
     """One frame read by one method under one level of one stress.
 
@@ -71,7 +64,7 @@ class StressedField(NamedTuple):
 
     Args:
       name: `tracking`, `shear` or `depth`.
-      stresses: one panel of the chart each.
+      stresses: name with the unit → levels, mild to severe; one panel of the chart each.
       tolerance: error from which a reading is wrong.
       unit: of the errors.
       caption: of the chart.
@@ -79,11 +72,16 @@ class StressedField(NamedTuple):
     """
 
     name: str
-    stresses: tuple[Stress, ...]
+    stresses: Mapping[str, Sequence[float]]
     tolerance: float
     unit: str
     caption: str
     failures: tuple[str, str] | None = None
+
+    @property
+    def levels(self) -> list[tuple[str, float]]:
+        """Name and level of every stress."""
+        return [(stress, level) for stress, levels in self.stresses.items() for level in levels]
 
 
 def stress_section(field: StressedField, outcomes: StressOutcomes) -> FieldSection:
@@ -108,8 +106,8 @@ def stress_section(field: StressedField, outcomes: StressOutcomes) -> FieldSecti
 def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:
     """First broken level of every method under every stress, with the flags of the broken frames of all levels."""
 
-    def cell(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]], stress: Stress) -> str:
-        broken = [(level, o) for level in stress.levels for o in by_level[stress.name, level] if o.broken]
+    def cell(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]], stress: str) -> str:
+        broken = [(level, o) for level in field.stresses[stress] for o in by_level[stress, level] if o.broken]
         if not broken:
             return "–"
         names = (" + ".join(str(f.name).lower() for f in Flag if f & o.flags) or "silent" for _, o in broken)
@@ -118,7 +116,7 @@ def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:
 
     return named_table(
         f"Where {field.name} breaks first",
-        [{"method": m, **{s.name: cell(by_level, s) for s in field.stresses}} for m, by_level in outcomes.items()],
+        [{"method": m, **{s: cell(by_level, s) for s in field.stresses}} for m, by_level in outcomes.items()],
         note="First level at which any gel and motion breaks; then the number of broken frames over all levels by the "
         "flags that they carry.",
     )
@@ -129,19 +127,19 @@ def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
     colours = dict(zip(outcomes, itertools.cycle((*PALETTE, SHARED)), strict=False))
     first, tolerance = next(iter(outcomes)), field.tolerance
     panels = []
-    for i, stress in enumerate(field.stresses):
+    for i, (stress, levels) in enumerate(field.stresses.items()):
         series, marks = [], collections.defaultdict[str, list[tuple[int, float, str]]](list)
         for method in reversed(tuple(outcomes)):  # the first method is drawn last, over the others
-            levels = [outcomes[method][stress.name, level] for level in stress.levels]
-            error = np.clip([max(o.error for o in frames) for frames in levels], 0.01 * tolerance, 100 * tolerance)
+            found = [outcomes[method][stress, level] for level in levels]
+            error = np.clip([max(o.error for o in frames) for frames in found], 0.01 * tolerance, 100 * tolerance)
             width = 2.4 if method == first else 1.1
             series.append(Series(method, x=range(len(levels)), y=error, marker="", colour=colours[method], width=width))
-            for x, frames in enumerate(levels):
+            for x, frames in enumerate(found):
                 if all(o.flags for o in frames):
                     marks["flagged in every frame"].append((x, error[x], colours[method]))
-            broken = [x for x, frames in enumerate(levels) if any(o.broken for o in frames)]
+            broken = [x for x, frames in enumerate(found) if any(o.broken for o in frames)]
             if broken:
-                silent = any(o.silent for o in levels[broken[0]])
+                silent = any(o.silent for o in found[broken[0]])
                 name = "breaks here without a flag" if silent else "breaks here with a flag"
                 marks[name].append((broken[0], error[broken[0]], colours[method]))
         for name, (marker, size, hollow) in _MARKS.items():
@@ -151,11 +149,11 @@ def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
                 series.append(Series(name, x=at, y=height, colour=colour, **look))
         panel = Panel(
             series,
-            title=stress.name,
+            title=stress,
             y_label="" if i % 4 else f"error, {field.unit}",
             y_scale="log",
             y_limits=(0.01 * tolerance, 130 * tolerance),
-            x_ticks={x: f"{level:.3g}" for x, level in enumerate(stress.levels)},
+            x_ticks={x: f"{level:.3g}" for x, level in enumerate(levels)},
             rules=[Rule(y=tolerance)],
         )
         panels.append(panel)

@@ -27,7 +27,7 @@ from experiments.fields.generated_slides import Slide, cached_slides, pressing
 from experiments.fields.known_motion import NOISE_GREY as GEL_NOISE_GREY
 from experiments.fields.known_motion import GelAtRest, GelCamera, GelMotion, TrackedGel, grey, tracked
 from experiments.fields.shear_accuracy import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, shear_methods
-from experiments.fields.stress import Stress, StressedField, StressOutcome
+from experiments.fields.stress import StressedField, StressOutcome
 from experiments.fields.trackers import FOLLOWERS
 from sensors_io.calibration.circles import find_circles
 from sensors_io.fields.deformation import LOST_SHARE
@@ -43,15 +43,15 @@ Attempt = tuple[str, str, float, StressOutcome]
 
 TRACKING = StressedField(
     name="tracking",
-    stresses=(
-        Stress("displacement, px", (2, 8, 16, 24, 32, 48)),
-        Stress("gap: share of 24 px at once", (1 / 6, 1 / 4, 1 / 3, 1 / 2, 1)),
-        Stress("dots lost, share", (0.02, 0.1, 0.25, 0.5, 0.75, 0.9)),
-        Stress("noise, grey levels", (2, 5, 10, 20, 40, 80)),
-        Stress("exposure, down", (0.8, 0.5, 0.25, 0.12, 0.06, 0.03)),
-        Stress("exposure, up", (1.1, 1.3, 1.6, 2.0, 3.0, 5.0)),
-        Stress("contact from the border, width", (0.4, 0.2, 0.1, 0.0, -0.1)),
-    ),
+    stresses={
+        "displacement, px": (2, 8, 16, 24, 32, 48),
+        "gap: share of 24 px at once": (1 / 6, 1 / 4, 1 / 3, 1 / 2, 1),
+        "dots lost, share": (0.02, 0.1, 0.25, 0.5, 0.75, 0.9),
+        "noise, grey levels": (2, 5, 10, 20, 40, 80),
+        "exposure, down": (0.8, 0.5, 0.25, 0.12, 0.06, 0.03),
+        "exposure, up": (1.1, 1.3, 1.6, 2.0, 3.0, 5.0),
+        "contact from the border, width": (0.4, 0.2, 0.1, 0.0, -0.1),
+    },
     tolerance=1.0,
     unit="px",
     caption="95th percentile of the distance from the truth, the worst of all gels and motions. A method breaks where "
@@ -65,12 +65,12 @@ _ERASED_RADII = 1.6  # radius of what is painted over, in radii of a dot
 
 SHEAR = StressedField(
     name="shear",
-    stresses=(
-        Stress("noise, factor", (1, 2, 4, 8, 16)),
-        Stress("nodes lost, share", (0.0, 0.04, 0.2, 0.5, 0.8)),
-        Stress("thickness taken, factor", (0.5, 0.8, 1.0, 1.25, 2.0)),
-        Stress("Poisson ratio taken", (0.3, 0.4, 0.45, 0.48, 0.495)),
-    ),
+    stresses={
+        "noise, factor": (1, 2, 4, 8, 16),
+        "nodes lost, share": (0.0, 0.04, 0.2, 0.5, 0.8),
+        "thickness taken, factor": (0.5, 0.8, 1.0, 1.25, 2.0),
+        "Poisson ratio taken": (0.3, 0.4, 0.45, 0.48, 0.495),
+    },
     tolerance=0.5,
     unit="relative",
     caption="Error over the true shear, root mean squares over a generated slide.",
@@ -78,15 +78,15 @@ SHEAR = StressedField(
 
 DEPTH = StressedField(
     name="depth",
-    stresses=(
-        Stress("noise, grey levels", (1, 2, 5, 10, 20, 40)),
-        Stress("exposure, down", (0.98, 0.95, 0.9, 0.8, 0.6, 0.3)),
-        Stress("exposure, up", (1.02, 1.05, 1.1, 1.3, 2.0, 4.0)),
-        Stress("lamps drift, levels over the window", (2, 5, 10, 20, 40)),
-        Stress("contact from the border, mm", (4.0, 2.0, 1.0, 0.0, -1.0)),
-        Stress("contact radius, mm, ball of 30 mm", (1, 2, 3, 4, 5.5)),
-        Stress("contact, radii of a ball of 6.31 mm", (0.3, 0.5, 0.7, 0.8, 0.9)),
-    ),
+    stresses={
+        "noise, grey levels": (1, 2, 5, 10, 20, 40),
+        "exposure, down": (0.98, 0.95, 0.9, 0.8, 0.6, 0.3),
+        "exposure, up": (1.02, 1.05, 1.1, 1.3, 2.0, 4.0),
+        "lamps drift, levels over the window": (2, 5, 10, 20, 40),
+        "contact from the border, mm": (4.0, 2.0, 1.0, 0.0, -1.0),
+        "contact radius, mm, ball of 30 mm": (1, 2, 3, 4, 5.5),
+        "contact, radii of a ball of 6.31 mm": (0.3, 0.5, 0.7, 0.8, 0.9),
+    },
     tolerance=0.2,
     unit="share of the depth",
     caption="Root mean square error over the contact of a generated press of a ball, as a share of its depth, the "
@@ -96,11 +96,6 @@ DEPTH = StressedField(
 _SMALL_MM, _LARGE_MM, _CONTACT_MM = 6.31, 30.0, 1.6  # diameters of the balls; contact radius without stress
 
 
-def levels(field: StressedField) -> list[tuple[str, float]]:
-    """Name and level of every stress."""
-    return [(stress.name, level) for stress in field.stresses for level in stress.levels]
-
-
 def attempt_tracking(rest: GelAtRest, methods: Sequence[str], seed: int) -> Iterator[Attempt]:
     """All methods under all stresses on one gel.
 
@@ -108,7 +103,7 @@ def attempt_tracking(rest: GelAtRest, methods: Sequence[str], seed: int) -> Iter
     wrong is the share of all points that it gives and that are off by more than the tolerance.
     """
     gel = tracked(rest)
-    for stress, level in levels(TRACKING):
+    for stress, level in TRACKING.levels:
         camera, pictures, true = _moving_gel(gel, stress, level, seed)
         background = camera.at_rest()
         clipped = bool(saturated(pictures[-1][None], background, QualityConfig())[0])
@@ -170,7 +165,7 @@ def attempt_shear(frames: int, seed: int, context: Context) -> Iterator[Attempt]
     The error is relative: root mean squares over the moving frames, error over true shear.
     """
     (slide,) = cached_slides(TAC3D, ("patterned",), ("slide_x",), frames, seed)
-    for stress, level in context.each("shear", levels(SHEAR)):
+    for stress, level in context.each("shear", SHEAR.levels):
         kind = stress.split(",")[0].split(" ")[0]
         stressed, methods = _stressed_slide(slide, kind, level, seed), shear_methods(_assumed_sensor(kind, level))
         moving = [f for f in pressing(stressed) if stressed.moving[f]]
@@ -216,7 +211,7 @@ def attempt_depth(presses: int, seeds: int, seed: int, context: Context) -> Iter
       context: shows progress.
     """
     methods = _depth_methods(presses, seed)
-    for (stress, level), i in context.each("depth", itertools.product(levels(DEPTH), range(seeds))):
+    for (stress, level), i in context.each("depth", itertools.product(DEPTH.levels, range(seeds))):
         picture, truth, inside = _press_picture(stressed_press(stress, level, seed + i), seed + 1 + i)
         for name, read in methods.items():
             yield name, stress, level, depth_outcome(*read(picture), truth, inside)

@@ -33,29 +33,30 @@ SEEDS = (None, *range(FIRST_SEED, FIRST_SEED + 4))
 ROUNDS, LOST_PX = 15, 1.0
 """Rounds of timing of the markers; distance from which a marker counts as lost."""
 
-_STEPS = 10  # pictures in which a motion is made, for methods that go from frame to frame
 _MARGIN = 0.1  # of height and width: within, the markers surround every pixel
 
-DenseField = Callable[[np.ndarray], np.ndarray]
-"""From a picture, RGB, to its displacement field in pixels, [H, W, 2]."""
 
+def marker_errors(gel: TrackedGel, peak_px: float, steps: int, noise_seed: int | None) -> dict[str, list[np.ndarray]]:
+    """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost.
 
-def marker_errors(gel: TrackedGel) -> dict[str, np.ndarray]:
-    """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost."""
+    Args:
+      gel: the gel.
+      peak_px: greatest displacement.
+      steps: pictures in which a motion is made, for methods that go from frame to frame.
+      noise_seed: of the camera; `None` takes that of the motion.
+    """
     found: dict[str, list[np.ndarray]] = {name: [] for name in FOLLOWERS}
     for seed in SEEDS:
-        motion = gel.motion(PEAK_PX, seed)
-        camera = GelCamera(gel.rest.picture, NOISE_GREY, FIRST_SEED if seed is None else seed)
+        motion = gel.motion(peak_px, seed)
+        camera = GelCamera(gel.rest.picture, NOISE_GREY, noise_seed or seed or FIRST_SEED)
         rest = grey(camera.at_rest())
-        shares = [step / _STEPS for step in range(1, _STEPS + 1)]
-        pictures = [grey(camera.under(motion.times(share), share)) for share in shares]
+        pictures = [grey(camera.under(motion.times(step / steps), step / steps)) for step in range(1, steps + 1)]
         true = gel.points_px + motion.forward(gel.points_px)
         for name, make in FOLLOWERS.items():
             follow = make(rest, gel.points_px, gel.half_px)
-            points = [follow(picture) for picture in pictures][-1]
-            error = np.hypot(*(points - true).T)[gel.inside(true)]
+            error = np.hypot(*([follow(picture) for picture in pictures][-1] - true).T)[gel.inside(true)]
             found[name].append(np.where(np.isfinite(error), error, np.inf))
-    return {name: np.concatenate(errors) for name, errors in found.items()}
+    return found
 
 
 def marker_ms(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, float]:
@@ -72,22 +73,8 @@ def marker_ms(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, float]:
     return {name: ms / len(pictures) for name, ms in median_ms(calls, rounds).items()}
 
 
-def jump_losses(gel: TrackedGel) -> dict[str, list[float]]:
-    """Share of points that are lost or more than a pixel off after one jump from rest, by method and motion."""
-    shares: dict[str, list[float]] = {name: [] for name in FOLLOWERS}
-    for seed in SEEDS:
-        motion = gel.motion(JUMP_PX, seed)
-        camera = GelCamera(gel.rest.picture, NOISE_GREY, 3)
-        rest, picture = grey(camera.at_rest()), grey(camera.under(motion))
-        true = gel.points_px + motion.forward(gel.points_px)
-        for name, make in FOLLOWERS.items():
-            error = np.hypot(*(make(rest, gel.points_px, gel.half_px)(picture) - true).T)[gel.inside(true)]
-            shares[name].append(float(np.mean(~(error <= LOST_PX))))
-    return shares
-
-
-def dense_fields(rest: np.ndarray) -> dict[str, DenseField]:
-    """Every method of dense displacement from a picture at rest."""
+def dense_fields(rest: np.ndarray) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    """Every method of dense displacement from a picture at rest, from a picture, RGB, to its field in px [H, W, 2]."""
     still, reader = grey(rest), DeformationReader(rest, mm_per_px=1.0)
     of_grey = lambda flow, picture: flow(grey(picture))
     return {
@@ -117,9 +104,12 @@ def dense_errors(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, tuple[f
 
 def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection:
     """Errors and speeds of every method on every gel; a jump."""
-    errors = {g.rest.name: marker_errors(g) for g in context.each("following", gels)}
+    errors, losses = {}, {}
+    for g in context.each("following", gels):
+        errors[g.rest.name] = {m: np.concatenate(e) for m, e in marker_errors(g, PEAK_PX, 10, None).items()}
+        jumps = marker_errors(g, JUMP_PX, 1, 3)
+        losses[g.rest.name] = {m: [float(np.mean(~(e <= LOST_PX))) for e in of] for m, of in jumps.items()}
     ms = {g.rest.name: marker_ms(g, context.rounds(f"timing on {g.rest.name}", ROUNDS)) for g in gels}
-    losses = {g.rest.name: jump_losses(g) for g in context.each("jumping", gels)}
     median, high = quantiles(np.concatenate([errors[g.rest.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
     worst_jump, first = max(shares[MARKER_DEFAULT][0] for shares in losses.values()), gels[0].rest.name
     markers = _gel_table(
@@ -130,7 +120,7 @@ def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection
         f"at rest the mean of {REST_PICTURES} pictures; empty where a method reports more than 5 % as lost.",
     )
     lost = "markers lost or more than 1 px off, published motion"
-    jumps = _gel_table(
+    jump_table = _gel_table(
         f"A jump of {JUMP_PX:g} px in one frame",
         {gel: {m: (s[0], float(np.mean(s))) for m, s in by.items()} for gel, by in losses.items()},
         (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
@@ -145,7 +135,7 @@ def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection
             at_most("marker error, 95th percentile", high, 0.11, "px"),
             at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
         ),
-        tables=(markers, jumps),
+        tables=(markers, jump_table),
         pictures=(_marker_picture(errors[first], ms[first], first),),
     )
 

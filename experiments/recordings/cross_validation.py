@@ -89,9 +89,7 @@ class CrossValidation:
         }
         return {
             name: self.policy_answers(
-                dataclasses.replace(single, **change),
-                seed,
-                "ablation/" + name.replace(" ", "-").replace(",", ""),
+                dataclasses.replace(single, **change), seed, "ablation/" + name.replace(" ", "-").replace(",", "")
             )
             for name, change in changes.items()
         }

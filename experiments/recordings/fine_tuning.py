@@ -21,7 +21,7 @@ from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
-from touchr1_jax.training.loop import Batches, LoopConfig
+from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.questions import ONE_AT_A_TIME
 from touchr1_jax.training.sft import SFTState
@@ -89,9 +89,8 @@ def reading_lesson(families: int, others: int, rows: int, seed: int) -> Lesson:
 
     Args:
       families: M, probes whose evidence is read.
-      others: further inputs, which are independent of the answer here.
-      rows: examples.
-      seed: of the draws.
+      others: number of further inputs, which are independent of the answer.
+      rows, seed: examples and seed of the draws.
     """
     rng, attributes = np.random.default_rng(seed), len(LANGUAGE.attributes)
     p = rng.dirichlet(np.ones(LEVELS), (rows, families, attributes))
@@ -124,13 +123,7 @@ def tune(
 ) -> list[Params]:
     """Train the members of an ensemble on verified answers, each on its lesson; 0 steps leave them as they are.
 
-    Args:
-      policy: of all members.
-      config: steps, batches, optimizer.
-      members: parameters of each.
-      lessons, seeds: of each member.
-      context: keeps log and checkpoints; the loss is the mean over the members.
-      stage: name of the stage.
+    The context keeps checkpoints and the loss, the mean over the members, under the name of the stage.
     """
     if not config.steps:
         return list(members)
@@ -142,13 +135,9 @@ def tune(
         moved = [advance(state, key[t], lesson) for state, key, lesson in zip(states, keys, lessons, strict=True)]
         return tuple(state for state, _ in moved), {"loss": jnp.mean(jnp.stack([loss for _, loss in moved]))}
 
-    trained = run_loop(step, first, _feed(range(config.steps)), LoopConfig(steps=config.steps), context, stage)
+    numbers = iter(grain.MapDataset.range(config.steps).to_iter_dataset(ONE_AT_A_TIME))
+    trained = run_loop(step, first, numbers, LoopConfig(steps=config.steps), context, stage)
     return [state.params for state in trained]
-
-
-def _feed(batches: Any) -> Batches:
-    """Some batches, or what makes them, as an iterator that can go back to a state."""
-    return iter(grain.MapDataset.source(batches).to_iter_dataset(ONE_AT_A_TIME))
 
 
 @functools.cache
@@ -156,11 +145,11 @@ def _tune_program(policy: DescriptionPolicy, config: TuneConfig) -> tuple[optax.
     """Optimizer, and the compiled (state, key, lesson) → (state, loss), made once for all members and folds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
     answers = jnp.asarray(policy.answers)
-    counted = jnp.asarray(policy.answer(COMBINATIONS[0], COMBINATIONS[0])[1])
+    counted = jnp.asarray(policy.answer(COMBINATIONS[0], COMBINATIONS[0])[1])[None]
 
     def loss(params: Params, x: Array, tokens: Array) -> Array:
-        each = jax.vmap(lambda row, answer: policy.log_probs(params, row, answer[None])[0])(x, tokens)
-        return -masked.mean(each, counted[None])
+        each = jax.vmap(lambda row, answer: policy.log_probs(params, row, answer[None])[0])
+        return -masked.mean(each(x, tokens), counted)
 
     def advance(state: SFTState, key: Array, lesson: Lesson) -> tuple[SFTState, Array]:
         draw, change = jax.random.split(key)

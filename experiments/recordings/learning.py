@@ -88,24 +88,16 @@ class VideoAnswers:
 
 
 def learn(
-    config: LearnConfig,
-    training: DescribedVideos,
-    auxiliary: AuxiliaryData,
-    seed: int,
-    context: Context,
-    stage: str,
+    config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, seed: int, context: Context, stage: str
 ) -> TrainedEnsemble:
     """Train every member on labelled videos.
 
     Args:
-      config: the ensemble.
-      training: videos, all of known levels.
-      auxiliary: scenes and unlabelled videos.
+      config, training, auxiliary: the ensemble, its labelled videos, scenes and unlabelled videos.
       seed: of members and folds; member m has 1000 · seed + m, but its training on made-up evidence does not depend
         on it.
       context: keeps log, times and checkpoints.
-      stage: name of the stage; that of the training on made-up evidence begins with `reading`, that of GRPO with
-        `grpo`.
+      stage: name of the stage; training on made-up evidence is `reading/…`, GRPO `grpo/…`.
     """
     policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
     with context.timed(stage):

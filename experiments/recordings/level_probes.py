@@ -59,14 +59,7 @@ class AuxiliaryData:
 
 
 class ProbedVideos:
-    """Training videos and others with the predictions of scene probes, as the level probes read them.
-
-    Args:
-      training: labelled videos that the probes are fitted on.
-      auxiliary: scenes and unlabelled videos.
-      videos: videos to read.
-      config: the probes.
-    """
+    """Labelled training videos and others with the predictions of scene probes, as the level probes read them."""
 
     def __init__(
         self, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos, config: LevelProbeConfig
@@ -100,12 +93,7 @@ def probe(
 ) -> Float[np.ndarray, "n M A K"]:
     """Probabilities of every level of every attribute, by each family's probe, for all videos.
 
-    Args:
-      x: descriptions.
-      label: levels; those of videos with weight 0 are ignored.
-      weight: of each video in the fit; 0 leaves it out.
-      family: name of the family of each of the D numbers.
-      config: the probes.
+    A video of weight 0 is left out of the fit, and its label ignored; `family` [D] names the family of each number.
 
     Raises:
       ValueError: no video to fit on, or a family without numbers.
@@ -150,11 +138,7 @@ def sense(
 ) -> Float[np.ndarray, "n T"]:
     """Predictions of scene probes for videos: each level of hardness, roughness and protrusion, and each material.
 
-    Args:
-      scenes: the probes are fitted on them.
-      world: descriptions of real videos, by whose mean and deviation `x` is standardised; no label is needed.
-      x: descriptions of the videos to read.
-      config: its scene ridge is used.
+    `x` is standardised by mean and deviation of the descriptions of real videos in `world`, which need no label.
     """
     count = len(scenes.x)
     known = np.arange(len(world) + len(x)) < len(world)
@@ -171,15 +155,7 @@ def kernel_ridge(
     target: Float[np.ndarray, "m T"],
     ridge: float,
 ) -> Float[np.ndarray, "n T"]:
-    """Estimates of all rows from the m that are fitted on; see the module.
-
-    Args:
-      z: standardised inputs.
-      fit: which rows are fitted on.
-      share: their weights, of sum 1.
-      target: their targets.
-      ridge: λ.
-    """
+    """Estimates of all rows of z from the m of `fit`, with weights `share` of sum 1; the formula is the module's."""
     square = (z**2).sum(1)
     distance = np.sqrt(np.maximum(square[:, None] + square[fit] - 2 * z @ z[fit].T, 0))
     median = float(np.median(distance[fit]))

@@ -107,8 +107,7 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
     """Answer for a folder of videos with a trained policy."""
     path = config.policy or cached_policy(config, context)
     if config.data_dir is not None and not path.exists():
-        everything = describe_source(config.data_dir, config.frames, context, config.objects)
-        train_policy(config, everything.labelled(), auxiliary_data(config, everything, context), context)
+        train_policy(config, *read_data(config, config.data_dir, context)[:2], context)
     trained = load(path, config.learn)
     videos = describe_folder(folder, config.frames, context)
     answers = {
@@ -127,8 +126,7 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
 
 def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Results:
     """Cross-validate, measure contributions and limits, train and keep a policy of all objects."""
-    everything = describe_source(data_dir, config.frames, context, config.objects)
-    videos, auxiliary = everything.labelled(), auxiliary_data(config, everything, context)
+    videos, auxiliary, everything = read_data(config, data_dir, context)
     split = lambda seed: CrossValidation(
         config=config.learn,
         videos=videos,
@@ -148,6 +146,9 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     limits = elsewhere.label_limits()
     main = intervals(answers, videos.label, videos.objects)
     score = lambda title, rows, note: score_table(title, rows, videos.label, videos.objects, note)
+    policy = description_policy(config.learn.shape)
+    params = jax.eval_shape(lambda key: policy.fresh(key, config.learn.inputs), jax.random.key(0))
+    size = sum(int(np.prod(x.shape)) for x in jax.tree.leaves(params))
     return Results(
         verdict=verdict(main, curve, videos),
         requirements=requirements(main, spent),
@@ -162,7 +163,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
         settings={
             "folds": config.folds,
             "answers alike, pairs of videos of one object": f"{agreement(answers, videos.objects):.0f} %",
-            "policy": f"{config.learn.members} members, {_parameters(config.learn):,} parameters each",
+            "policy": f"{config.learn.members} members, {size:,} parameters each",
         },
         data={
             "objects": len(np.unique(videos.objects)),
@@ -187,10 +188,13 @@ def cached_policy(config: PhysiclearStudy, context: Context) -> Path:
     return context.cache_dir / f"physiclear-policy-{identity(config.learn)}.npz"
 
 
-def auxiliary_data(config: PhysiclearStudy, everything: DescribedVideos, context: Context) -> AuxiliaryData:
-    """Scenes, and the videos without labels."""
-    unlabelled = everything.x[(everything.label < 0).any(1)]
-    return AuxiliaryData(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled)
+def read_data(
+    config: PhysiclearStudy, data_dir: Path, context: Context
+) -> tuple[DescribedVideos, AuxiliaryData, DescribedVideos]:
+    """Labelled videos, scenes with the videos without labels, and all videos."""
+    every = describe_source(data_dir, config.frames, context, config.objects)
+    unlabelled = every.x[(every.label < 0).any(1)]
+    return every.labelled(), AuxiliaryData(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled), every
 
 
 def requirements(main: Mapping[str, Interval], spent: Mapping[str, float]) -> tuple[Requirement, ...]:
@@ -215,22 +219,19 @@ def verdict(
 ) -> tuple[str, ...]:
     """The scores on unseen objects, and the number of objects that the goals would need."""
     some, many = min(curve), max(curve)
-    right, mean = main["all right"], main["mean"]
+    right, mean, needed = main["all right"], main["mean"], dict[str, str]()
+    for name in ("all right", "mean"):
+        found = objects_for({n: 100 - at[name].mean for n, at in curve.items()}, 100 - GOALS[name])
+        needed[name] = f"{found:.0f}" if math.isfinite(found) else "more than any number"
     return (
         f"Of {len(videos.names)} videos of {len(np.unique(videos.objects))} objects that it never touched, the policy "
         f"answers {right.mean:.1f} % right in all three {bounds(right.low, right.high, '.1f')} and {mean.mean:.1f} % "
         f"of the levels {bounds(mean.low, mean.high, '.1f')}, {main['OMAE'].mean:.2f} levels off on average.",
         f"From {some} to {many} objects learned from, the levels answered right by the probes rise from "
         f"{curve[some]['mean'].mean:.0f} to {curve[many]['mean'].mean:.0f} %; by the power law through that curve, "
-        f"{GOALS['mean']:.0f} % takes {needed(curve, 'mean')} of them, {GOALS['all right']:.0f} % all right "
-        f"{needed(curve, 'all right')}.",
+        f"{GOALS['mean']:.0f} % takes {needed['mean']} of them, {GOALS['all right']:.0f} % all right "
+        f"{needed['all right']}.",
     )
-
-
-def needed(curve: Mapping[int, Mapping[str, Interval]], name: str) -> str:
-    """Objects to learn from for the goal of a share, in words."""
-    found = objects_for({n: 100 - at[name].mean for n, at in curve.items()}, 100 - GOALS[name])
-    return f"{found:.0f}" if math.isfinite(found) else "more than any number"
 
 
 def object_table(videos: DescribedVideos, answers: np.ndarray) -> Table:
@@ -273,13 +274,6 @@ def object_curves(curve: Mapping[int, Mapping[str, Interval]]) -> Picture:
         caption="Probes alone, on another partition; bars are 95 % intervals over objects, dots the goals.",
         content=draw([Panel(series, **axes)], size=(6.4, 3.6)),
     )
-
-
-def _parameters(config: LearnConfig) -> int:
-    """Number of parameters of a member."""
-    policy = description_policy(config.shape)
-    shapes = jax.eval_shape(lambda: policy.fresh(jax.random.key(0), config.inputs))
-    return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(shapes))
 
 
 DEFAULT = PhysiclearStudy()

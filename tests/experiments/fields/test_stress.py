@@ -3,14 +3,14 @@
 import pytest
 
 from experiments.fields.stability_fields import FieldStabilityConfig
-from experiments.fields.stress import Stress, StressedField, StressOutcome, break_table, gathered, stress_section
+from experiments.fields.stress import StressedField, StressOutcome, break_table, gathered, stress_section
 from sensors_io.schema import Flag
 
 GOOD = StressOutcome(error=0.1, wrong=0.0, flags=Flag.NONE)
 SILENT = StressOutcome(error=9.0, wrong=0.2, flags=Flag.NONE)
 FLAGGED = StressOutcome(error=9.0, wrong=0.2, flags=Flag.MARKER_LOSS)
 
-NOISE = StressedField("tracking", (Stress("noise", (1, 2)),), 1.0, "px", "", ("frames", "frames broken"))
+NOISE = StressedField("tracking", {"noise": (1, 2)}, 1.0, "px", "", ("frames", "frames broken"))
 
 
 def outcomes(**frames):

@@ -50,8 +50,7 @@ def test_a_kept_policy_answers_for_a_folder(run):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [(["--predict", "x"], "give both to predict"), ([], "data_dir is None")],
+    ("arguments", "message"), [(["--predict", "x"], "give both to predict"), ([], "data_dir is None")]
 )
 def test_half_a_question_is_refused(arguments, message, tmp_path, capsys):
     assert main(["physiclear", *arguments, "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "c")]) == 1
