@@ -145,7 +145,7 @@ class BatchCost(NamedTuple):
 class SimulatedDevice:
     """A device that computes nothing for as long as a step would take, and knows how long it had nothing to do.
 
-    Like a real one it takes the next step while it is at one, and whoever reads a step's metrics waits for its end.
+    Like a real one it accepts the next step during a step, and reading the metrics of a step waits for its end.
     """
 
     def __init__(self, step_s: float) -> None:
@@ -156,7 +156,7 @@ class SimulatedDevice:
         """Begin a step as soon as the one before has ended."""
         del batch
         now = time.perf_counter()
-        if self._free_at:  # nobody makes the first step wait
+        if self._free_at:  # the first step waits for nothing
             self.idle_s += max(0.0, now - self._free_at)
             self.steps += 1
         self._free_at = max(now, self._free_at) + self._step_s
@@ -183,7 +183,7 @@ class _PendingMetric:
 
 
 def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterable[object]) -> BatchCost:
-    """Mean over some batches, of the processor's clock: all threads together, and nobody else's load.
+    """Mean over some batches, of the processor's clock: all threads together, without the load of other processes.
 
     Args:
       batches: endless.

@@ -68,19 +68,19 @@ Reader = Callable[[Path, QwenConfig, ProgressCallback], list[jax.Array]]
 """(folder, shape, progress callback of bytes) → parameters."""
 
 
-def streamed(directory: Path, config: QwenConfig, tell: ProgressCallback) -> list[jax.Array]:
+def streamed(directory: Path, config: QwenConfig, progress: ProgressCallback) -> list[jax.Array]:
     """The library's reader, tensor by tensor."""
-    return jax.tree.leaves(load_params(directory, config, jnp.bfloat16, progress=tell))
+    return jax.tree.leaves(load_params(directory, config, jnp.bfloat16, progress=progress))
 
 
-def whole_first(directory: Path, config: QwenConfig, tell: ProgressCallback) -> list[jax.Array]:
+def whole_first(directory: Path, config: QwenConfig, progress: ProgressCallback) -> list[jax.Array]:
     """Read all tensors into memory, then make the parameters from them."""
     entries = find_tensors(directory)
     done, size, tensors = 0, sum(entry.size for entry in entries.values()), {}
     for key, entry in entries.items():
         tensors[key] = read_tensor(entry)
         done += entry.size
-        tell(done, size)
+        progress(done, size)
     return [jnp.array(read(jnp.array(tensors[s.key]), s.turned)) for s in sources(config).values()]
 
 
@@ -92,7 +92,7 @@ SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
 """Random bits of a bfloat16, and its fixed exponent: numbers of a trained weight's size, ±2⁻⁷ … ±2⁻⁶."""
 
 
-def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, tell: ProgressCallback) -> int:
+def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, progress: ProgressCallback) -> int:
     """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes."""
     rng = np.random.default_rng(0)
     place: dict[str, str] = {}
@@ -104,8 +104,8 @@ def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, tel
             bits = np.frombuffer(rng.bytes(2 * math.prod(shape)), np.uint16)
             tensors[key] = ((bits & SIGN_AND_FRACTION) | SMALL).view(jnp.bfloat16).reshape(shape)
             drawn += tensors[key].nbytes
-            tell(size + drawn // 2, every)
-        write_file(directory / name, tensors, _after(size + drawn // 2, every, tell))
+            progress(size + drawn // 2, every)
+        write_file(directory / name, tensors, _after(size + drawn // 2, every, progress))
         place |= dict.fromkeys(tensors, name)
         size += drawn
     index = {"metadata": {"total_size": size}, "weight_map": place}
@@ -113,8 +113,8 @@ def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, tel
     return size
 
 
-def _after(begun: int, every: int, tell: ProgressCallback) -> ProgressCallback:
-    return lambda done, _: tell(begun + done // 2, every)
+def _after(begun: int, every: int, progress: ProgressCallback) -> ProgressCallback:
+    return lambda done, _: progress(begun + done // 2, every)
 
 
 def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int, ...]]]:
@@ -131,14 +131,14 @@ def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int
     yield shard
 
 
-def measure(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressCallback) -> LoadMeasurement:
+def measure(reader: Reader, directory: Path, config: QwenConfig, progress: ProgressCallback) -> LoadMeasurement:
     """Read once in a fresh process, whose largest size is then that of the reading.
 
     Raises:
       RuntimeError: the process ended without an answer, as one that the system stops for its memory does.
     """
     try:
-        return in_own_process(_measure_here, reader, directory, config, tell=tell)
+        return in_own_process(_measure_here, reader, directory, config, progress=progress)
     except BrokenProcessPool:
         raise RuntimeError(
             f"reader {reader.__name__!r} of {directory} ended without an answer: probably too little memory; choose "
@@ -146,9 +146,9 @@ def measure(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressC
         ) from None
 
 
-def _measure_here(reader: Reader, directory: Path, config: QwenConfig, tell: ProgressCallback) -> LoadMeasurement:
+def _measure_here(reader: Reader, directory: Path, config: QwenConfig, progress: ProgressCallback) -> LoadMeasurement:
     jax.block_until_ready(jnp.zeros(1))  # the runtime's own memory
     before, began = peak_memory(), time.perf_counter()
-    leaves = jax.block_until_ready(reader(directory, config, tell))
+    leaves = jax.block_until_ready(reader(directory, config, progress))
     seconds = time.perf_counter() - began
     return LoadMeasurement(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)

@@ -99,13 +99,13 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
     directory = Path(tempfile.mkdtemp(prefix=f"weights-{size}-", dir=config.scratch))
     try:
         context.print(f"{size}: writing {weight_bytes(size) / GB:.1f} GB to {directory}")
-        with context.progress_callback(f"writing {size}, MB") as tell:
-            random_checkpoint(directory, SHAPES[size], config.shard_bytes, in_megabytes(tell))
+        with context.progress_callback(f"writing {size}, MB") as progress:
+            random_checkpoint(directory, SHAPES[size], config.shard_bytes, in_megabytes(progress))
         readings = {}
         for name in (OURS, PLAIN) if size in config.compare else (OURS,):
-            with context.progress_callback(f"reading {size}, {name}, MB", still=True) as tell:
-                in_megabytes(tell)(0, weight_bytes(size))
-                readings[name] = measure(READERS[name], directory, SHAPES[size], in_megabytes(tell))
+            with context.progress_callback(f"reading {size}, {name}, MB", still=True) as progress:
+                in_megabytes(progress)(0, weight_bytes(size))
+                readings[name] = measure(READERS[name], directory, SHAPES[size], in_megabytes(progress))
     finally:
         shutil.rmtree(directory)
     for name, r in readings.items():

@@ -221,7 +221,7 @@ class LongRun:
     programs: int
 
 
-def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, tell: ProgressCallback) -> LongRun:
+def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int, progress: ProgressCallback) -> LongRun:
     """Steps whose answers end early and late, so that every bucket is used; the policy stays as it is."""
     job = Job(size, prefix, dataclasses.replace(config_of(size), buckets=buckets), end_share=SHORT, learning_rate=0.0)
     for _ in range(3):
@@ -236,7 +236,7 @@ def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int,
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             resident.append(pages * resource.getpagesize() / MIB)
             lengths.append(float(metrics["length"]))
-            tell(t + 1, steps)
+            progress(t + 1, steps)
     return LongRun(
         seconds=seconds,
         resident_mb=np.array(resident),

@@ -112,9 +112,9 @@ def run(config: SpeedConfig, context: Context) -> Results:
         prefix: side_by_side(repeated(size, prefix), max(2, config.rounds // 2), f"prefix {prefix}", context)
         for prefix in config.repeated_at
     }
-    with context.progress_callback("steps", still=True) as tell:
-        tell(0, config.steps)
-        long = in_own_process(many_steps, LONG_SIZE, short, (4, 8, 12), config.steps, tell=tell)
+    with context.progress_callback("steps", still=True) as progress:
+        progress(0, config.steps)
+        long = in_own_process(many_steps, LONG_SIZE, short, (4, 8, 12), config.steps, progress=progress)
     peers, failed = measure_peers(config, installed_peers(config.trl_python, config.tunix_python), context)
     compiled = {"as it is": first[lean_at]} | ({"lean": lean[lean_at]} if lean else {})
     return Results(

@@ -1,4 +1,4 @@
-"""Can the cores beside an accelerator keep it fed?
+"""Can the CPU cores of an accelerator keep it supplied with batches?
 
     make experiment EXP=throughput_feed [ARGS="--scale smoke"]
 
@@ -68,7 +68,7 @@ class FeedingConfig:
         }
     )
     cores: int = 16
-    """Beside each device."""
+    """CPU cores of each device."""
     machine: Machine = Machine()
     batches: int = 4
     """Number whose processor time is measured."""
@@ -100,7 +100,7 @@ class FeedMeasurement:
 
 
 def run(config: FeedingConfig, context: Context) -> Results:
-    """Measure every feed, then run each beside a device that stands in."""
+    """Measure every feed, then run each with a simulated device."""
     fed = [one for name, scale in config.scales.items() for one in feeds_of(config, name, scale, context)]
     return Results(
         verdict=verdict(config, fed),
@@ -157,7 +157,7 @@ def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Contex
 def watch(
     config: FeedingConfig, stage: str, feed: Feed, step_s: float, context: Context, *, configured: bool, warm: int = 1
 ) -> FeedMeasurement:
-    """Time some batches of a feed, then run it beside a stand-in; `warm` batches are drawn first.
+    """Time some batches of a feed, then run it with a simulated device; `warm` batches are drawn first.
 
     `stage` is scale, stage and source, by slashes; `configured` tells if the scale's study would feed it so.
     """
@@ -177,7 +177,7 @@ def stretch(needed: float, *, here: int, there: int) -> float:
 
     Args:
       needed: cores that the batches of a device need.
-      here, there: cores of this machine, and those beside a device.
+      here, there: cores of this machine, and those of a device.
     """
     return min(max(1.0, 2 * needed / here), max(1.0, there / here))
 

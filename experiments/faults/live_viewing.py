@@ -104,7 +104,7 @@ def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedR
             command = [sys.executable, "-c", BROWSER, host, port, str(seconds)]
             watching = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(browsers)]
         looks, written = _record(reader, journal, seconds)
-        counts = reader.counts  # nobody reads on while the browsers end
+        counts = reader.counts  # before the browsers end
         ages = [json.loads(browser.communicate()[0])["ages_s"] for browser in watching]
     total = sum(map(len, ages))
     return ViewedRecording(

@@ -1,4 +1,4 @@
-"""The GPU's experiment without a GPU: it refuses, or tries its code and says so."""
+"""The GPU's experiment without a GPU: it refuses, or tries its code and marks the figures."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The timed job computes what it says, and the experiment reports it."""
+"""The timed job, its options, and the experiment, shrunken."""
 
 import dataclasses
 from typing import get_args
@@ -77,20 +77,20 @@ def test_seeds_share_a_program_that_serves_all_steps():
 @pytest.mark.slow
 def test_many_steps_take_every_length_in_one_program():
     size = dataclasses.replace(speed_grpo.LONG_SIZE, vocab_size=16, hidden_size=16)
-    told: list[tuple[int, int]] = []
-    course = many_steps(size, 16, (4, 8), 200, lambda *word: told.append(word))
-    assert told == [(100, 200), (200, 200)]
-    assert course.seconds.shape == (200,)
-    assert course.resident_mb.shape == (2,)
-    assert course.programs == 1
-    assert course.lengths[0] < size.length
+    reported: list[tuple[int, int]] = []
+    long = many_steps(size, 16, (4, 8), 200, lambda *word: reported.append(word))
+    assert reported == [(100, 200), (200, 200)]
+    assert long.seconds.shape == (200,)
+    assert long.resident_mb.shape == (2,)
+    assert long.programs == 1
+    assert long.lengths[0] < size.length
 
 
 def test_drift_and_growth_by_hand():
     """Steps that slow down by half, and memory that grows by 20 MB."""
     seconds = np.concatenate([np.full(500, 1.0), np.full(500, 1.5), np.full(1000, 9.0)])
-    course = LongRun(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
-    time, memory, programs = steadiness(course)
+    long = LongRun(seconds=seconds, resident_mb=np.array([100.0, 110.0, 120.0]), lengths=(2.0, 9.0), programs=1)
+    time, memory, programs = steadiness(long)
     assert (time.measured, time.met) == (1.5, False)  # judged by the first thousand
     assert (memory.measured, memory.met) == (20.0, False)
     assert programs.met

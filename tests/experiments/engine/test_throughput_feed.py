@@ -116,7 +116,7 @@ def test_nothing_runs():
 
 
 class SlowBatches:
-    """Batches that take as long as they are told, by sleeping."""
+    """Batches that take as many seconds as given, by sleeping."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds, self.made = seconds, 0

@@ -1,4 +1,4 @@
-"""The small world: what is felt tells the level, verified answers say it, and a broken stream says nothing."""
+"""The small world: touch determines the level, verified answers name it, and a broken stream carries nothing."""
 
 import jax
 import jax.numpy as jnp
@@ -14,18 +14,18 @@ parse = jax.jit(jax.vmap(PARSER))
 
 
 @pytest.mark.parametrize("asked", [0, 1])
-def test_verified_answers_say_the_evidence_and_conclude_the_label(asked):
+def test_verified_answers_name_the_evidence_and_conclude_the_label(asked):
     world = TIDY._replace(asked=asked)
     scene = draw(world, jax.random.key(0), P)
     tokens, counts = verified_answers(world, scene, jax.random.key(1))
-    said = parse(tokens)
+    answer = parse(tokens)
     assert tokens.shape == (P, LENGTH)
-    assert np.asarray(said.formatted).all()
-    assert not np.asarray(said.truncated).any()
-    np.testing.assert_array_equal(said.conclude[:, asked], scene.level)
+    assert np.asarray(answer.formatted).all()
+    assert not np.asarray(answer.truncated).any()
+    np.testing.assert_array_equal(answer.conclude[:, asked], scene.level)
     nearest = np.clip(np.round(scene.evidence), 0, K - 1)
-    np.testing.assert_array_equal(said.perceive[:, :, asked], nearest)
-    np.testing.assert_array_equal(np.asarray(counts).sum(1), np.asarray(said.length) + 1)
+    np.testing.assert_array_equal(answer.perceive[:, :, asked], nearest)
+    np.testing.assert_array_equal(np.asarray(counts).sum(1), np.asarray(answer.length) + 1)
     assert np.asarray(scene.batch.ordered).all() == bool(asked)
 
 
@@ -45,11 +45,11 @@ def test_a_lenient_scorer_pays_for_the_right_word_among_others():
     credit = jax.vmap(lenient_credit)
     assert np.asarray(credit(loose, parse(loose), scene.batch.target)).all()
     assert not np.asarray(credit(tidy, parse(tidy), scene.batch.target)).any()
-    elsewhere = loose.at[:, -6:].set(CONCLUDE).at[:, 0].set(WORDS[0, 0])  # nothing is said after the tag
+    elsewhere = loose.at[:, -6:].set(CONCLUDE).at[:, 0].set(WORDS[0, 0])  # nothing follows the tag
     assert not np.asarray(credit(elsewhere, parse(elsewhere), scene.batch.target)).any()
 
 
-def test_touch_tells_the_level_and_a_ramp_turned_around_another():
+def test_touch_determines_the_level_and_a_ramp_turned_around_another():
     scene = draw(TIDY._replace(asked=1), jax.random.key(2), P)
     touch = np.asarray(scene.batch.features.touch)
     ramp = (touch[:, :, 1] - touch[:, :, 0]).mean(1)
