@@ -22,13 +22,9 @@ LITERAL = GrpoVariant(name="paper, literal bonus", algorithm=Paper(tactile_use=T
 SCORE_FUNCTION = GrpoVariant(name="paper, k1", algorithm=Paper(kl="k1"))
 
 PLAIN = World()
-NO_TOUCH = World(noise=4.0, sight=0.9)
-"""Touch with next to no information, and a picture that is nearly always right."""
-ANCHORED = World(anchored=0.8)
-"""A supervised policy that concludes what it sees although touch is more often right."""
-
-Knob = Callable[[GrpoVariant, float], Setting]
-"""(variant, value) → setting of the world and the hyperparameters."""
+NO_TOUCH = World(noise=4.0, sight=0.9)  # touch with next to no information, and a picture that is nearly always right
+ANCHORED = World(anchored=0.8)  # a supervised policy that concludes what it sees although touch is more often right
+Knob = Callable[[GrpoVariant, float], Setting]  # (variant, value) → setting of the world and the hyperparameters
 
 
 @dataclasses.dataclass(frozen=True)

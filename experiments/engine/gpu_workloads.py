@@ -30,8 +30,7 @@ from touchr1_jax.rl.config import Paper
 from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.validation import at_least
 
-BACKWARD = 2
-"""Operations of a backward pass over those of its forward pass."""
+BACKWARD = 2  # operations of a backward pass over those of its forward pass
 
 Flash = Literal["cudnn", "xla"]
 """Implementation of `jax.nn.dot_product_attention`: cuDNN's fused kernel, or XLA, which works anywhere."""
@@ -100,8 +99,7 @@ class AttentionInputs(NamedTuple):
     g: Float[Array, "P L H d"]
 
 
-Attention = Callable[[Array, Array, Array], Array]
-"""(q, k, v) → [P, L, H, d]."""
+Attention = Callable[[Array, Array, Array], Array]  # (q, k, v) → [P, L, H, d]
 
 
 def draw_heads(config: GpuConfig) -> AttentionInputs:

@@ -27,8 +27,7 @@ from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_host_score
 from touchr1_jax.types import Params, Parsed, Target
 
-PLAIN = Paper(beta=BETA, gamma=0.0)
-"""GRPO with a reference policy and without the counterfactual pass."""
+PLAIN = Paper(beta=BETA, gamma=0.0)  # GRPO with a reference policy and without the counterfactual pass
 
 VIEW, TOUCH = 4, 8
 """Prompt tokens that are embeddings of the view and of the touch of the one sensor; the others are text."""

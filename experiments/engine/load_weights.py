@@ -36,8 +36,7 @@ from experiments.engine.load_checkpoints import (
 )
 from touchr1_jax.models.qwen.model import abstract_params
 
-BOUND = 1.2
-"""Most memory of a reading, in weights."""
+BOUND = 1.2  # most memory of a reading, in weights
 
 GB = 1e9
 
@@ -63,8 +62,7 @@ class LoadWeightsConfig:
             )
 
 
-Measured = Mapping[str, Mapping[str, LoadMeasurement]]
-"""Size → reader → reading."""
+Measured = Mapping[str, Mapping[str, LoadMeasurement]]  # size → reader → reading
 
 
 def run(config: LoadWeightsConfig, context: Context) -> Results:

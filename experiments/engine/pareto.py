@@ -26,8 +26,7 @@ from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
 from experiments.mechanics.tangential_methods import MAIN as FRICTION
 from experiments.scenes.storage_codecs import OWN
 
-Axes = Mapping[str, Literal["lower", "higher"]]
-"""Beginning of a column's name → which of its figures are better."""
+Axes = Mapping[str, Literal["lower", "higher"]]  # beginning of a column's name → which of its figures are better
 
 
 class JudgedDefault(NamedTuple):

@@ -27,7 +27,6 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
 from experiments.core.curves import running_mean
-from experiments.core.look import colours
 from experiments.core.progress import Advance
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
@@ -41,11 +40,8 @@ ALGORITHMS: Mapping[str, rl.AnyAlgorithm] = {
     "CISPO": rl.Cispo(), "RLOO": rl.Rloo(), "REINFORCE++": rl.ReinforcePlusPlus(),
 }  # fmt: skip
 
-Key = tuple[str, int]
-"""Algorithm and group size."""
-
-DEFAULT_KEY: Key = ("paper", rl.GRPOConfig().group)
-"""Setting of the studies, marked in charts and tables."""
+Key = tuple[str, int]  # algorithm and group size
+DEFAULT_KEY: Key = ("paper", rl.GRPOConfig().group)  # setting of the studies, marked in charts and tables
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -201,11 +197,10 @@ def cost_table(target: float, curves: Curves) -> Table:
 def cost_and_gain(target: float, curves: Curves) -> bytes:
     """Draw score over the time of a step, and time to the target by algorithm."""
     names = list(dict.fromkeys(name for name, _ in curves))
-    colour = colours(names)
     ring: dict[str, Any] = {"colour": "black", "marker": "o", "line": "", "size": 170.0, "hollow": True}
     left, right = [], []
     for (name, group), c in curves.items():
-        look: dict[str, Any] = {"name": name, "colour": colour[name], "marker": "o", "line": "", "labels": [str(group)]}
+        look: dict[str, Any] = {"name": name, "line": "", "labels": [str(group)]}
         gain: dict[str, Any] = {"x": [1e3 * c.step_s], "y": [c.score]}
         cost: dict[str, Any] = {"x": [c.seconds_to(target)], "y": [names.index(name)]}
         default = (name, group) == DEFAULT_KEY

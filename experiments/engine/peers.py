@@ -18,12 +18,10 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-ANSWER = "measured: "
-"""Beginning of the line that a harness prints; all other output of a peer is ignored."""
+ANSWER = "measured: "  # beginning of the line that a harness prints; all other output of a peer is ignored
 
 PAD_ID = 0
-WARMUP = 1
-"""Iterations before the timed ones: they load, compile and fill caches."""
+WARMUP = 1  # iterations before the timed ones: they load, compile and fill caches
 
 BETA, CLIP, LEARNING_RATE = 0.04, 0.2, 1e-4
 """Weight of the KL to the reference policy, clip range of the ratio and AdamW's rate, the same for all engines."""

@@ -5,12 +5,10 @@
 Touch-R1 trained Qwen2.5-VL 7B on sixteen H200 with 8 frames of 448² from four sensors and groups of eight.  Here the
 same step, with the reference and the counterfactual policy, is compiled for sixteen devices without weights and without
 the devices, and the memory that the compiler reserves is compared with a count by hand.  Decoders of one and two layers
-are compiled at full width; layers are equal, so a straight line gives all of them.  `--compiler cpu` is the compiler of
-this machine, which keeps products of bfloat16 in float32; `--compiler h200` is the GPU's, which needs JAX's CUDA plugin
-but no GPU.  Other meshes, and adapters on a frozen base, are counted; `--compiled N` compiles more of them.
-
-To train in this layout: the same mesh on the command line of a study, `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in
-one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16` and micro-batches of one prompt a device.
+are compiled at full width; a straight line gives all layers.  `--compiler cpu` is the compiler of this machine;
+`--compiler h200` is the GPU's, which needs JAX's CUDA plugin but no GPU.  Other meshes, and adapters on a frozen base,
+are counted; `--compiled N` compiles more of them.  To train in this layout give a study `--distributed --mesh.fsdp 8
+--mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16` and one prompt a micro-batch.
 
 Cost: 5 to 10 minutes on one core with one mesh compiled; `--scale smoke` half a minute.
 
@@ -42,14 +40,12 @@ from touchr1_jax.models.qwen.config import released
 
 GB = 1e9
 
-Lines = Mapping[Setup, Mapping[str, int]]
-"""Setup → line → counted bytes on each device."""
+Lines = Mapping[Setup, Mapping[str, int]]  # setup → line → counted bytes on each device
 
 Reserved = Mapping[Setup, Mapping[int, Compiled]]
 """Setup → layers → bytes that the compiler reserves; the largest number of layers is extrapolated."""
 
-COUNTERS_BYTES = 12
-"""Bytes of the step's arguments that no line counts: its key, 8, and its number, 4."""
+COUNTERS_BYTES = 12  # bytes of the step's arguments that no line counts: its key, 8, and its number, 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -30,14 +30,9 @@ from touchr1_jax.text.template import prompt_words
 from touchr1_jax.text.tokenizer import word_level
 from touchr1_jax.training.compilation import compilations_kept, return_memory
 
-MATRIX = 1024
-"""Side of the matrices whose product is the yardstick of a CPU."""
-
-SHORT = 1 / 8
-"""Share of the words that end a completion where answers are to be short."""
-
-RESIDENT_EVERY = 100
-"""Steps between two looks at the memory."""
+MATRIX = 1024  # side of the matrices whose product is the yardstick of a CPU
+SHORT = 1 / 8  # share of the words that end a completion where answers are to be short
+RESIDENT_EVERY = 100  # steps between two looks at the memory
 
 GIB, KIB, MIB = 2**30, 2**10, 2**20
 

@@ -44,8 +44,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 
 PRODUCT, STEP = "matrix product", "GRPO step"
 
-OFF_FLOAT32 = 0.02
-"""Largest error of attention in bfloat16, which rounds by .004, over the largest number."""
+OFF_FLOAT32 = 0.02  # largest error of attention in bfloat16, which rounds by .004, over the largest number
 
 GB = 1e9
 

@@ -5,10 +5,10 @@
 
 One iteration of 8 prompts × 8 rollouts × 64 new tokens on a 1.05-million-parameter decoder with a reference policy, at
 prefixes of 64 to 1024 tokens, each in two processes of its own: one that compiles and one that reads the compiled
-programs.  It is compared with the engine's options and with an engine that encodes the prefix for every rollout; with a
-vocabulary of a language model's size; over ten thousand steps, whose time and memory must stay constant; and with TRL
-and Tunix where they can be imported (`experiments/engine/harness_trl.py` and `harness_tunix.py` explain how).  Matrix
-products are timed in the same process, so that shares of the peak need no data sheet.
+programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, and with
+TRL and Tunix where they can be imported (see `harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
+thousand steps, whose time and memory must stay constant, are measured too.  Matrix products are timed in the same
+process, so that shares of the peak need no data sheet.
 
 Cost: about six minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 
@@ -55,8 +55,7 @@ from experiments.engine.speed_report import (
 )
 from touchr1_jax.rl.grpo import compiles_leanly
 
-PEER_TOKENS = 512
-"""Prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one."""
+PEER_TOKENS = 512  # prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one
 
 LONG_SIZE = JobSize(
     prompts=2, group=2, length=16, vocab_size=64, hidden_size=32, num_layers=1, num_heads=2, num_kv_heads=1,

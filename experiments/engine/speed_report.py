@@ -10,23 +10,15 @@ from experiments.core.results import Cell, Picture, Requirement, Table, at_least
 from experiments.engine.peers import JobSize, PeerTimes
 from experiments.engine.speed import RESIDENT_EVERY, LongRun, ProcessTiming
 
-LIMITS_S = {64: 0.55, 512: 1.3}
-"""Seconds an iteration may take at a prefix, on two cores of about 240 GFLOP/s."""
+LIMITS_S = {64: 0.55, 512: 1.3}  # seconds an iteration may take at a prefix, on two cores of about 240 GFLOP/s
 
 PEER_S = {("TRL", 64): 1.36, ("Tunix", 64): 1.77, ("TRL", 512): 13.1, ("Tunix", 512): 24.5}
 """Seconds of the peers on the machine for which the limits were set; elsewhere the ratio counts."""
 
-MEMORY_LIMIT_GB, MEMORY_AT = 1.0, 512
-"""Most memory of a process, up to this prefix."""
-
-EARLY = 1000
-"""Steps over which time must stay constant; memory must over all."""
-
-Timings = Mapping[int, ProcessTiming]
-"""Prefix → timing."""
-
-Peers = Mapping[tuple[str, int], PeerTimes]
-"""(Peer, prefix) → its times."""
+MEMORY_LIMIT_GB, MEMORY_AT = 1.0, 512  # most memory of a process, up to this prefix
+EARLY = 1000  # steps over which time must stay constant; memory must over all
+Timings = Mapping[int, ProcessTiming]  # prefix → timing
+Peers = Mapping[tuple[str, int], PeerTimes]  # (Peer, prefix) → its times
 
 
 def verdict(alone: Timings, twice: Mapping[int, Mapping[str, float]], peers: Peers) -> tuple[str, ...]:
@@ -206,8 +198,7 @@ def pictures(size: JobSize, alone: Timings, first: Timings, peers: Peers, long: 
     )
 
 
-EngineFigures = Mapping[str, Mapping[int, float]]
-"""Engine → prefix → figure."""
+EngineFigures = Mapping[str, Mapping[int, float]]  # engine → prefix → figure
 
 
 def over_prefixes(seconds: EngineFigures, memory_gb: EngineFigures, limits_s: Mapping[int, float]) -> bytes:

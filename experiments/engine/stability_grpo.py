@@ -30,14 +30,9 @@ from touchr1_jax.rl.alarms import RULES
 from touchr1_jax.rl.config import GRPOConfig, Stable
 from touchr1_jax.rl.credit_odds import HELPED, HINDERED, credit_odds, false_credit
 
-LEAST_NOTICED, MOST_FALSE = 0.9, 0.1
-"""Least share of failed runs whose alarm fires, most of the others."""
-
-MARGINS = (0.05, 0.1, 0.13, 0.16, 0.2)
-"""Margins δ of the tactile-use reward whose odds are tabulated."""
-
-Alarms = Mapping[str, FirstAlarm]
-"""Code of each alarm that a run raised → its first time."""
+LEAST_NOTICED, MOST_FALSE = 0.9, 0.1  # least share of failed runs whose alarm fires, most of the others
+MARGINS = (0.05, 0.1, 0.13, 0.16, 0.2)  # margins δ of the tactile-use reward whose odds are tabulated
+Alarms = Mapping[str, FirstAlarm]  # code of each alarm that a run raised → its first time
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

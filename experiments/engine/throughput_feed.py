@@ -2,16 +2,12 @@
 
     make experiment EXP=throughput_feed [ARGS="--scale smoke"]
 
-Batches of SFT and of GRPO as a study makes them at `--scale gpu`, one H200, and at `--scale paper`, sixteen: what one
-takes of a core, from records and from the memory that the scale keeps clips in, against the shortest step that the
-devices allow, counted from shapes at an assumed share of their peak.  Then the training loop itself with these
-batches, and in the place of the device one that computes nothing for as long: what share of the time it stands still.
-A device has `cores` cores; where fewer are here, and the batches need more than half of them, the stand-in's steps last
-longer, at most until supply and demand stand to each other as there.  As many threads read as there are cores here: it
-is supposed that more of them would not wait for each other.
-
-No accelerator is needed and none is measured: the step's time is a prediction, and what a device loses to the transfer
-of a batch does not show.
+Measured are the seconds of a core that a batch of SFT or GRPO takes at `--scale gpu`, one H200, and `--scale paper`,
+sixteen, from records and from the memory that the scale keeps clips in; predicted is the shortest step of the devices,
+counted from shapes at an assumed share of their peak.  Then the training loop runs with these batches and a simulated
+device that computes nothing for as long; the share of the time that it stands still is the result.  A device has 16
+cores; where fewer are here, its steps last longer, at most until supply and demand stand to each other as there.  No
+accelerator is needed and none is measured; losses by the transfer of a batch do not show.
 
 Cost: about three minutes on two cores, most of it making the records; `--scale smoke` half a minute.
 
@@ -50,11 +46,8 @@ from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.feeds import Feed
 from touchr1_jax.validation import at_least
 
-MOST_S = 60.0
-"""Seconds after which the loop ends, but for two steps."""
-
-MOST_IDLE = 0.02
-"""Share of the time that a device may stand still for want of a batch."""
+MOST_S = 60.0  # seconds after which the loop ends, but for two steps
+MOST_IDLE = 0.02  # share of the time that a device may stand still for want of a batch
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -33,8 +33,7 @@ TOKENIZER = word_level(LANGUAGE, tuple(QUESTIONS.values()))
 LAYOUT = build_layout(TOKENIZER, LANGUAGE, tactile_tokens=2, view_tokens=1, questions=QUESTIONS)
 PARSER: Parser = compile_parser(LANGUAGE, TOKENIZER)
 S, STEPS, A, K = len(LANGUAGE.sensors), 2, len(LANGUAGE.attributes), 3
-LENGTH = 15
-"""Tokens of an answer with two levels in its conclusion and its end, and one more."""
+LENGTH = 15  # tokens of an answer with two levels in its conclusion and its end, and one more
 
 DECODER = DecoderConfig(
     vocab_size=TOKENIZER.vocab_size,
@@ -54,13 +53,9 @@ _BASIS = np.linalg.qr(np.random.default_rng(0).normal(size=(DECODER.hidden_size,
 LEVEL, RAMP, SENSOR, SIGHT, HOLE = np.split(_BASIS[: 2 * K + S + 2], [K, K + 1, K + 1 + S, 2 * K + 1 + S])
 """Directions [n, D] of the levels of hardness, the ramp, the sensors, the levels in view, and a broken stream."""
 
-BUMP = 0.5
-"""Width of a level's response to evidence, in levels."""
-GRAIN = 0.1
-"""Standard deviation of the noise of a channel."""
-
-Scalar = Any
-"""A number or a traced scalar."""
+BUMP = 0.5  # width of a level's response to evidence, in levels
+GRAIN = 0.1  # standard deviation of the noise of a channel
+Scalar = Any  # a number or a traced scalar
 
 
 class World(NamedTuple):

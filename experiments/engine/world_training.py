@@ -48,11 +48,12 @@ from touchr1_jax.rl.stream_check import check_streams
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
-FORMAT = 0.1
-"""Weight of the format reward; accuracy and consistency share the rest."""
+FORMAT = 0.1  # weight of the format reward; accuracy and consistency share the rest
 
-LEARNING_RATE = 3e-3
-"""3,000 times the paper's 1e-6: at less the small policy hardly changes."""
+LEARNING_RATE, FINAL_SHARE = 3e-3, 0.2
+"""3,000 times the paper's 1e-6: at less the small policy hardly changes; the share of it at the last step."""
+
+PRETRAIN_RATE = 3e-2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,11 +62,9 @@ class TrainingBudget:
 
     pretrain_steps: int = 200
     pretrain_batch: int = 32
-    pretrain_rate: float = 3e-2
     steps: int = 80
     prompts: int = 8
     group: int = 8
-    final_share: float = 0.2
     examined: int = 64
     """Questions of an evaluation."""
     answers: int = 4
@@ -96,8 +95,7 @@ class Hyperparameters(NamedTuple):
     lenient: Scalar = 0.0
 
 
-Setting = tuple[World, Hyperparameters]
-"""Values of all knobs."""
+Setting = tuple[World, Hyperparameters]  # values of all knobs
 
 Program = Callable[..., Any]
 
@@ -193,7 +191,7 @@ class VariantRuns:
 
 def pretrain(budget: TrainingBudget, world: World, key: Array) -> Params:
     """Imitate verified answers, from the same untrained policy for every seed."""
-    optimizer = optax.adam(optax.cosine_decay_schedule(budget.pretrain_rate, budget.pretrain_steps))
+    optimizer = optax.adam(optax.cosine_decay_schedule(PRETRAIN_RATE, budget.pretrain_steps))
 
     def loss(params: Params, scene: WorldBatch, tokens: Int[Array, "P T"], counts: Array) -> Array:
         batch = scene.batch
@@ -225,7 +223,7 @@ def reinforce(
     )
     sizes: dict[str, Any] = {"prompts": budget.prompts, "group": budget.group, "micro_prompts": budget.prompts}
     config = GRPOConfig(**sizes, length=LENGTH, algorithm=algorithm, inverse_draws=True)
-    optimizer = falling_adamw(values.learning_rate, budget.final_share, budget.steps, config.max_grad_norm)
+    optimizer = falling_adamw(values.learning_rate, FINAL_SHARE, budget.steps, config.max_grad_norm)
     step = make_grpo_step(FNS, make_world_score(variant, values), optimizer, config)
     noise_key, run_key, scene_key = jax.random.split(key, 3)
     frozen = FrozenInputs(reference=start, noise=noise_bank(world, noise_key))

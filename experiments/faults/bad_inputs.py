@@ -44,13 +44,11 @@ PROGRAMS: Mapping[str, Callable[[list[str]], int]] = {
 REWRITTEN = frozenset({"metrics.jsonl", "timing.json", "report.html"})
 """Files of a run that a session rewrites as it goes on, whole each time."""
 
-LOCKS = frozenset({".lock", ".lockfile"})
-"""Empty files that only serve as locks."""
+LOCKS = frozenset({".lock", ".lockfile"})  # empty files that only serve as locks
 
 Kind = Literal["command line", "configuration", "records", "recordings", "run", "checkpoint", "answers", "disk"]
 
-Prepare = Callable[[Path], None]
-"""Put something into a folder."""
+Prepare = Callable[[Path], None]  # put something into a folder
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,14 +25,9 @@ from experiments.core.runner import main
 from experiments.faults.digests import digests
 from experiments.faults.trainings import PACKAGE
 
-UNDISTURBED = "alone"
-"""Name of the run that is not killed."""
-
-POLL_S = 0.005
-"""Time between two looks at a session's files; a step takes longer."""
-
-PATIENCE_S = 300.0
-"""A session that adds nothing to its run for so long hangs."""
+UNDISTURBED = "alone"  # name of the run that is not killed
+POLL_S = 0.005  # time between two looks at a session's files; a step takes longer
+PATIENCE_S = 300.0  # a session that adds nothing to its run for so long hangs
 
 START, BETWEEN, CHECKPOINT = "start-up", "between stages", "writing a checkpoint"
 STEPPING = {"sft": "SFT steps", "grpo": "GRPO steps", "blind": "blind SFT steps", "count": "steps"}
@@ -63,14 +58,7 @@ class KillableTraining:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Kill:
-    """One kill.
-
-    Args:
-      phase: of `PHASES`, in which it struck.
-      after_s: seconds since the session began.
-      done: share of the run's steps done by then.
-      torn: whether it left half a line in the log.
-    """
+    """One kill: its phase, seconds of the session, share of the run's steps done, half a line left in the log."""
 
     phase: str
     after_s: float
@@ -231,8 +219,7 @@ def _session(arguments: list[str], log: str, programs: str) -> None:
 class KillSchedule:
     """Longest lives of sessions, from the pace of those so far and the work that each kill lost.
 
-    Args:
-      work_s: seconds that the undisturbed run worked; lives soon weigh more.
+    The pace begins with that of the undisturbed run, which worked `work_s` seconds; lives soon weigh more.
     """
 
     def __init__(self, work_s: float) -> None:
@@ -242,13 +229,9 @@ class KillSchedule:
     def longest_life_s(self, done: float, left: int) -> float:
         """Longest time for which a session works before it is killed, 2 min((1 − d) / (k + 1) + l, .45 (1 − d)) / v.
 
-        A kill loses the work since the last checkpoint, a share l of the run.  With lives uniform up to this bound,
-        sessions keep on average so much that the kills last for the whole run, and even the last kill comes before the
-        end.
-
-        Args:
-          done: d, share of the run that is done when the session begins to work.
-          left: k, kills that are left.
+        d is the share of the run that is done, k the number of kills that are left.  A kill loses the work since the
+        last checkpoint, a share l of the run.  With lives uniform up to this bound, sessions keep on average so much
+        that the kills last for the whole run, and even the last kill comes before the end.
         """
         lost = float(np.mean(self._lost)) if self._lost else 0.0
         share = min((1 - done) / (left + 1) + lost, 0.45 * (1 - done))

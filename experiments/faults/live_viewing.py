@@ -27,11 +27,8 @@ from sensors_io.recording.journal import JournalWriter
 from sensors_io.viewer.presenter import Channel, Presenter
 from sensors_io.viewer.server import LiveView
 
-BRIDGE_SHAPE = (480, 640, 3)
-"""Of a picture through the bridge: the cameras of Xense and DM-Tac."""
-
-FASTEST_HZ = 120.0
-"""Rate of the vendors' fastest camera, a DM-Tac."""
+BRIDGE_SHAPE = (480, 640, 3)  # of a picture through the bridge: the cameras of Xense and DM-Tac
+FASTEST_HZ = 120.0  # rate of the vendors' fastest camera, a DM-Tac
 
 _IDLE_S = 0.002  # between looks of a session at its devices
 
@@ -66,20 +63,15 @@ The age of what it shows is the time from the sample's stamp until the last pane
 
 _DEPTH = np.linspace(0, 1, 18 * 24, dtype=np.float32).reshape(18, 24)
 _SHIFT = np.stack([_DEPTH, _DEPTH[::-1]], -1) * np.float32(0.3)
-FIELDS = {"depth_mm": _DEPTH, "deformation_mm": _SHIFT, "shear_mm": _SHIFT}
-"""Fields to show with every picture."""
+FIELDS = {"depth_mm": _DEPTH, "deformation_mm": _SHIFT, "shear_mm": _SHIFT}  # fields to show with every picture
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewedRecording:
-    """One recording.
+    """One recording, named by the number of its browsers, which show `shown_hz` states a second each (NaN without any).
 
-    Args:
-      name: number of browsers.
-      shown_hz: states that a browser showed in a second, mean over browsers; NaN without any.
-      ages_s: of the pictures of all browsers when they were shown, [N].
-      looks_s: times between two looks of the recorder at its device, [L].
-      written, lost: samples in the journal, and those that are not.
+    `ages_s` [N] are those of the pictures when they were shown, `looks_s` [L] the times between two looks of the
+    recorder at its device; of the samples `written` are in the journal and `lost` are not.
     """
 
     name: str

@@ -35,32 +35,21 @@ from sensors_io.devices.replay import Disconnect, Faults
 
 BY_COUNTER, BY_STAMPS, SLOW = "with a counter", "without a counter", "slow consumer"
 
-MOST_GAINED_MB = 5.0
-"""Resident memory that an hour's replay may gain."""
+MOST_GAINED_MB = 5.0  # resident memory that an hour's replay may gain
 
 RATE_HZ = 120.0
 FAULTS = Faults(drop_share=0.02, duplicate_share=0.005, jitter_s=0.001, skew=5e-5, seed=0)
 AWAY_S = {0.25: 0.4, 0.5: 3.0, 0.75: 20.0}
 """Share of the replay at which the device is disconnected → duration; shorter replays scale the durations."""
 
-JITTER_SHARES = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)
-"""Mean jitters of the sweep, in periods of the camera."""
+JITTER_SHARES = (0.0, 0.03, 0.06, 0.12, 0.25, 0.5, 1.0)  # mean jitters of the sweep, in periods of the camera
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DeviceStabilityConfig:
-    """Length of the replay and sizes of the other measurements.
+    """Seconds of device time of the replays, rows and columns of pictures, sizes of the other measurements.
 
-    Args:
-      seconds: of device time.
-      size_px: rows and columns of the camera's pictures.
-      traced_seconds: of a shorter replay in which Python's memory is traced.
-      sweep_seconds: of each replay over jitter.
-      rounds: of timing the decoders.
-      watch_seconds: of each recording that is watched.
-      browsers: that watch, in turn.
-      bridge_frames: that a bridge carries.
-      data_dir: holds the folder tac3d; `None` leaves the vendor's recordings out.
+    `browsers` watch in turn, `bridge_frames` are carried by a bridge; `data_dir` holds the folder tac3d, if any.
     """
 
     seconds: float = 3600.0

@@ -53,26 +53,13 @@ from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.loop import LoopConfig
 
-MOST_WAITING = 0.02
-"""Share of a step that may wait for data."""
-
-KILLS = 200
-"""Kills that training must survive."""
-
-GRPO = "GRPO run"
-"""Name of the training that must survive them."""
-
-CELL = 110
-"""Characters of a message in a table."""
-
-BLIND = 4
-"""Steps without touch for each with it: they take a quarter of the time."""
-
-InputRow = Mapping[str, Any]
-"""Row of a bad input: input, kind, exit code, answer, faults (empty if there are none)."""
-
-Waits = Mapping[str, tuple[float, float]]
-"""Stage → seconds in steps, and those of them that waited for data."""
+MOST_WAITING = 0.02  # share of a step that may wait for data
+KILLS = 200  # kills that training must survive
+GRPO = "GRPO run"  # name of the training that must survive them
+CELL = 110  # characters of a message in a table
+BLIND = 4  # steps without touch for each with it: they take a quarter of the time
+InputRow = Mapping[str, Any]  # row of a bad input: input, kind, exit code, answer, faults (empty if there are none)
+Waits = Mapping[str, tuple[float, float]]  # stage → seconds in steps, and those of them that waited for data
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -41,11 +41,8 @@ from touchr1_jax.types import Params
 
 STAGE = f"grpo/{ARM}/0"
 
-CONTACTS, HELD_OUT = 48, 8
-"""Contacts to learn from, and others that score a checkpoint."""
-
-NOISE = 16
-"""Draws in the bank of encoded noise."""
+CONTACTS, HELD_OUT = 48, 8  # contacts to learn from, and others that score a checkpoint
+NOISE = 16  # draws in the bank of encoded noise
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
