@@ -26,17 +26,7 @@ from experiments.core.charts import bars
 from experiments.core.context import Context
 from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.engine.gpu_workloads import (
-    AttentionInputs,
-    GpuConfig,
-    PolicyWorkloads,
-    attention_errors,
-    attention_variants,
-    attention_workload,
-    draw_heads,
-    tactile_encoder,
-    vision_tower,
-)
+from experiments.engine import gpu_workloads as gpu
 from experiments.engine.peers import JobSize
 from experiments.engine.speed import TimedWorkload, Workload, matrix_product, measure
 from touchr1_jax.models.qwen.config import QwenVisionConfig
@@ -90,15 +80,15 @@ def accelerator(*, anywhere: bool) -> jax.Device:
     return device
 
 
-def run(config: GpuConfig, context: Context) -> Results:
+def run(config: gpu.GpuConfig, context: Context) -> Results:
     """Time every workload, then compare attention with float32 and memory with the count."""
     device = accelerator(anywhere=config.anywhere)
-    heads = draw_heads(config)
+    heads = gpu.draw_heads(config)
     timed = measure("pieces", without_policy(config, heads), config.rounds, context)
-    off = attention_errors(heads, attention_variants(config))
+    off = gpu.attention_errors(heads, gpu.attention_variants(config))
     del heads
     with context.progress("making the policy", 2) as advance:
-        policy = PolicyWorkloads(config)
+        policy = gpu.PolicyWorkloads(config)
         advance()
         reserved, counted = policy.memory()
         advance()
@@ -126,16 +116,16 @@ def run(config: GpuConfig, context: Context) -> Results:
     )
 
 
-def without_policy(config: GpuConfig, heads: AttentionInputs) -> dict[str, Callable[[], Workload]]:
+def without_policy(config: gpu.GpuConfig, heads: gpu.AttentionInputs) -> dict[str, Callable[[], Workload]]:
     """Makers of the product, attention and the encoders by name."""
     pieces: dict[str, Callable[[], Workload]] = {PRODUCT: functools.partial(matrix_product, config.side, jnp.bfloat16)}
-    for name, attend in attention_variants(config).items():
+    for name, attend in gpu.attention_variants(config).items():
         for gradient in (False, True):
             title = f"attention, {name}{', with gradient' if gradient else ''}"
-            pieces[title] = functools.partial(attention_workload, config, heads, attend, gradient=gradient)
+            pieces[title] = functools.partial(gpu.attention_workload, config, heads, attend, gradient=gradient)
     return pieces | {
-        "tactile encoder, float32": functools.partial(tactile_encoder, config),
-        "vision tower": functools.partial(vision_tower, config),
+        "tactile encoder, float32": functools.partial(gpu.tactile_encoder, config),
+        "vision tower": functools.partial(gpu.vision_tower, config),
     }
 
 
@@ -203,8 +193,8 @@ def memory_table(reserved: int, counted: int, device: jax.Device) -> Table:
     )
 
 
-DEFAULT = GpuConfig()
-SMOKE = GpuConfig(
+DEFAULT = gpu.GpuConfig()
+SMOKE = gpu.GpuConfig(
     anywhere=True, rounds=2, side=64, prompts=1, tokens=24, heads=4, kv_heads=2, head_dim=8, flash="xla", streams=2,
     frames=4, contacts=1, tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
     tactile_px=28,

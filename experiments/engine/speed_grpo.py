@@ -29,30 +29,11 @@ import jax
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
+from experiments.engine import speed
+from experiments.engine import speed_report as report
 from experiments.engine.job import config_of
 from experiments.engine.peers import BETA, JobSize, Peer, PeerFailed, PeerJob, PeerTimes, installed_peers
 from experiments.engine.processes import in_own_process
-from experiments.engine.speed import (
-    Option,
-    ProcessTiming,
-    many_steps,
-    options,
-    parser_seconds,
-    repeated,
-    side_by_side,
-    time_alone,
-)
-from experiments.engine.speed_report import (
-    Peers,
-    Timings,
-    alone_table,
-    compare_table,
-    memory_table,
-    peer_table,
-    pictures,
-    requirements,
-    verdict,
-)
 from touchr1_jax.rl.grpo import compiles_leanly
 
 PEER_TOKENS = 512  # prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one
@@ -70,7 +51,7 @@ class SpeedConfig:
 
     prefixes: tuple[int, ...] = (64, 128, 512, 1024)
     rounds: int = 8
-    options: tuple[Option, ...] = get_args(Option)
+    options: tuple[speed.Option, ...] = get_args(speed.Option)
     """Changes of the engine, one at a time."""
     options_at: int = 64
     """Prefix at which the options are timed."""
@@ -101,62 +82,60 @@ def run(config: SpeedConfig, context: Context) -> Results:
         first, alone = every_prefix(config, Path(folder), context)
         step = dataclasses.replace(config_of(size), lean_compilation=True)
         lean = {
-            prefix: in_own_process(time_alone, size, prefix, step, 1, Path(folder))
+            prefix: in_own_process(speed.time_alone, size, prefix, step, 1, Path(folder))
             for prefix in context.each("lean compilation", (lean_at,) if compiles_leanly() else (), still=True)
         }
         words = many_words(config, Path(folder), context) if config.words else {}
-    makers = options(size, config.options_at, config.buckets, config.options)
-    found = side_by_side(makers, config.rounds, "options", context)
-    twice = {
-        prefix: side_by_side(repeated(size, prefix), max(2, config.rounds // 2), f"prefix {prefix}", context)
-        for prefix in config.repeated_at
-    }
+    makers = speed.options(size, config.options_at, config.buckets, config.options)
+    found = speed.side_by_side(makers, config.rounds, "options", context)
+    few = max(2, config.rounds // 2)
+    twice = {p: speed.side_by_side(speed.repeated(size, p), few, f"prefix {p}", context) for p in config.repeated_at}
     with context.progress_callback("steps", still=True) as progress:
         progress(0, config.steps)
-        long = in_own_process(many_steps, LONG_SIZE, short, (4, 8, 12), config.steps, progress=progress)
+        long = in_own_process(speed.many_steps, LONG_SIZE, short, (4, 8, 12), config.steps, progress=progress)
     peers, failed = measure_peers(config, installed_peers(config.trl_python, config.tunix_python), context)
     compiled = {"as it is": first[lean_at]} | ({"lean": lean[lean_at]} if lean else {})
     return Results(
-        verdict=(*verdict(alone, twice, peers), *failed),
-        requirements=requirements(alone, first, lean, peers, long, parser_seconds(size)),
-        pictures=pictures(size, alone, first, peers, long),
+        verdict=(*report.verdict(alone, twice, peers), *failed),
+        requirements=report.requirements(alone, first, lean, peers, long, speed.parser_seconds(size)),
+        pictures=report.pictures(size, alone, first, peers, long),
         tables=(
-            alone_table(size, alone, first),
-            *((peer_table(size, alone, first, peers),) if peers else ()),
-            compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
-            compare_table("Repeating the prefix: time over that of the engine as it is", twice),
-            memory_table(f"Compiling at prefix {lean_at}", compiled),
-            *((memory_table(f"A vocabulary of {config.words:,} words", words),) if words else ()),
+            report.alone_table(size, alone, first),
+            *((report.peer_table(size, alone, first, peers),) if peers else ()),
+            report.compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
+            report.compare_table("Repeating the prefix: time over that of the engine as it is", twice),
+            report.memory_table(f"Compiling at prefix {lean_at}", compiled),
+            *((report.memory_table(f"A vocabulary of {config.words:,} words", words),) if words else ()),
         ),
         settings={"beta": BETA, "micro_prompts": 1, "devices": str(jax.devices())},
     )
 
 
-def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[Timings, Timings]:
+def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[report.Timings, report.Timings]:
     """Each prefix in a process that compiles, and in one that reads what the first compiled."""
     first, alone = {}, {}
     step = config_of(config.size)
     for prefix in context.each("prefixes", config.prefixes, still=True):
-        first[prefix] = in_own_process(time_alone, config.size, prefix, step, 1, cache)
-        alone[prefix] = in_own_process(time_alone, config.size, prefix, step, config.rounds, cache)
+        first[prefix] = in_own_process(speed.time_alone, config.size, prefix, step, 1, cache)
+        alone[prefix] = in_own_process(speed.time_alone, config.size, prefix, step, config.rounds, cache)
         a, b = alone[prefix], first[prefix]
         context.print(f"prefix {prefix}: {a.median_s:.3f} s, {a.peak_gb:.2f} GB, compiling {b.peak_gb:.2f} GB")
     return first, alone
 
 
-def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, ProcessTiming]:
+def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, speed.ProcessTiming]:
     """A large vocabulary, all logits at once and in blocks, each in a process of its own."""
     size = dataclasses.replace(config.size, prompts=2, vocab_size=config.words)
     blocks = config_of(size)
     whole = dataclasses.replace(blocks, max_logits=size.group * size.length * size.vocab_size)
     variants = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
     return {
-        name: in_own_process(time_alone, size, min(config.prefixes), step, 2, cache)
+        name: in_own_process(speed.time_alone, size, min(config.prefixes), step, 2, cache)
         for name, step in context.each("many words", variants.items(), still=True)
     }
 
 
-def measure_peers(config: SpeedConfig, peers: Sequence[Peer], context: Context) -> tuple[Peers, tuple[str, ...]]:
+def measure_peers(config: SpeedConfig, peers: Sequence[Peer], context: Context) -> tuple[report.Peers, tuple[str, ...]]:
     """Every engine that is installed at every prefix, one after the other, and sentences on failures at a longer one.
 
     Raises:

@@ -25,21 +25,9 @@ from experiments.core.charts import bars
 from experiments.core.context import Context
 from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.engine.feeding import (
-    BatchCost,
-    FeedScale,
-    answers,
-    clip_bytes,
-    grpo_seconds,
-    idle_share,
-    make_seconds,
-    memory_share,
-    questions,
-    sft_seconds,
-)
+from experiments.engine import feeding
 from experiments.paper import presets
-from experiments.study.study import SMOKE as TINY_STUDY
-from experiments.study.study import open_study_data
+from experiments.study import study as studies
 from sensors_io.pipeline import ClipMemory
 from touchr1_jax.distributed.work import Machine
 from touchr1_jax.models.touch_policy import build_policy
@@ -54,10 +42,10 @@ MOST_IDLE = 0.02  # share of the time that a device may stand still for want of 
 class FeedingConfig:
     """Scales, and how long each feed is watched."""
 
-    scales: Mapping[str, FeedScale] = dataclasses.field(
+    scales: Mapping[str, feeding.FeedScale] = dataclasses.field(
         default_factory=lambda: {
-            "gpu": FeedScale(study=presets.GPU, devices=1, contacts=48),
-            "paper": FeedScale(study=presets.PAPER, devices=16, contacts=16),
+            "gpu": feeding.FeedScale(study=presets.GPU, devices=1, contacts=48),
+            "paper": feeding.FeedScale(study=presets.PAPER, devices=16, contacts=16),
         }
     )
     cores: int = 16
@@ -81,7 +69,7 @@ class FeedMeasurement:
     """
 
     name: str
-    made: BatchCost
+    made: feeding.BatchCost
     step_s: float
     idle: float
     configured: bool
@@ -120,7 +108,7 @@ def cores_here() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Context) -> Iterator[FeedMeasurement]:
+def feeds_of(config: FeedingConfig, name: str, scale: feeding.FeedScale, context: Context) -> Iterator[FeedMeasurement]:
     """The feeds of one scale: SFT from records, SFT with the scale's memory where it has one, and GRPO."""
     study = dataclasses.replace(
         scale.study,
@@ -128,22 +116,22 @@ def feeds_of(config: FeedingConfig, name: str, scale: FeedScale, context: Contex
         clip_memory_gib=0.0,
         read_threads=min(scale.study.read_threads, cores_here()),
     )
-    data = open_study_data(study, context)
+    data = studies.open_study_data(study, context)
     data = dataclasses.replace(data, parts={**data.parts, "sft": np.arange(len(data.store))})
     policy = build_policy(study.model, data.clip.sensors)
-    sft = answers(policy, data, scale)
-    batch = next(answers(policy, data, scale))
+    sft = feeding.answers(policy, data, scale)
+    batch = next(feeding.answers(policy, data, scale))
     whole = jax.tree.map(lambda x: jax.ShapeDtypeStruct((study.sft.batch_size, *x.shape[1:]), x.dtype), batch)
-    step_s = sft_seconds(policy, study.sft, whole, scale.devices, config.machine)
-    kept = memory_share(scale.study, data, batch.touch)
+    step_s = feeding.sft_seconds(policy, study.sft, whole, scale.devices, config.machine)
+    kept = feeding.memory_share(scale.study, data, batch.touch)
     yield watch(config, f"{name}/sft/records", sft, step_s, context, configured=not kept)
     if kept:
-        memory = ClipMemory(data.clip, round(kept * len(data.store)) * clip_bytes(batch.touch))
+        memory = ClipMemory(data.clip, round(kept * len(data.store)) * feeding.clip_bytes(batch.touch))
         remembering = dataclasses.replace(data, memory=memory)
-        feed = answers(policy, remembering, scale)
+        feed = feeding.answers(policy, remembering, scale)
         yield watch(config, f"{name}/sft/memory", feed, step_s, context, configured=True, warm=len(data.store))
-    grpo_s = grpo_seconds(policy, study.grpo, scale.devices, config.machine)
-    asked = questions(policy, batch.touch, data, scale)
+    grpo_s = feeding.grpo_seconds(policy, study.grpo, scale.devices, config.machine)
+    asked = feeding.questions(policy, batch.touch, data, scale)
     yield watch(config, f"{name}/grpo/memory", asked, grpo_s, context, configured=True)
 
 
@@ -156,13 +144,13 @@ def watch(
     """
     if not context.done(stage):
         ahead = context.each(f"{stage}, ahead", range(warm))
-        made = make_seconds(feed, context.rounds(f"{stage}, timing batches", config.batches), ahead)
+        made = feeding.make_seconds(feed, context.rounds(f"{stage}, timing batches", config.batches), ahead)
         lasts_s = step_s * stretch(made.cpu_s / step_s, here=cores_here(), there=config.cores)
-        idle = idle_share(feed, lasts_s, min(config.steps, max(2, round(MOST_S / lasts_s))), context, stage)
+        idle = feeding.idle_share(feed, lasts_s, min(config.steps, max(2, round(MOST_S / lasts_s))), context, stage)
         context.save_stage(stage, {"made": made._asdict(), "idle": idle})
     saved = context.load_stage(stage)
     name = stage.replace("/", ", ")
-    return FeedMeasurement(name, BatchCost(**saved["made"]), step_s, saved["idle"], configured)
+    return FeedMeasurement(name, feeding.BatchCost(**saved["made"]), step_s, saved["idle"], configured)
 
 
 def stretch(needed: float, *, here: int, there: int) -> float:
@@ -215,8 +203,9 @@ def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str,
 
 
 DEFAULT = FeedingConfig()
+TINY_STUDY = dataclasses.replace(studies.SMOKE, clip_memory_gib=0.002)
 SMOKE = FeedingConfig(
-    scales={"smoke": FeedScale(study=dataclasses.replace(TINY_STUDY, clip_memory_gib=0.002), devices=2, contacts=24)},
+    scales={"smoke": feeding.FeedScale(study=TINY_STUDY, devices=2, contacts=24)},
     machine=Machine(flops=2e10),
     batches=1,
     steps=3,
