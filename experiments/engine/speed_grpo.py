@@ -18,11 +18,12 @@ engines, which repeat it.  On two cores of about 240 GFLOP/s: at most .55 s at p
 """
 
 import dataclasses
+import functools
 import itertools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import get_args
+from typing import TypeVar, get_args
 
 import jax
 
@@ -34,7 +35,11 @@ from experiments.engine import speed_report as report
 from experiments.engine.job import config_of
 from experiments.engine.peers import BETA, JobSize, Peer, PeerFailed, PeerJob, PeerTimes, installed_peers
 from experiments.engine.processes import in_own_process
+from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
+
+K = TypeVar("K")
+TimedJob = tuple[JobSize, int, GRPOConfig, int]  # size, prefix, step, rounds
 
 PEER_TOKENS = 512  # prompt tokens of the timed iterations of a peer: fewer iterations at longer prefixes, at least one
 
@@ -77,22 +82,24 @@ class SpeedConfig:
 
 def run(config: SpeedConfig, context: Context) -> Results:
     """Every prefix alone, the variants side by side, many words, many steps, the peers."""
-    size, lean_at, short = config.size, config.repeated_at[-1], min(config.prefixes)
+    size, step = config.size, config_of(config.size)
+    lean_at, lean_step = config.repeated_at[-1], dataclasses.replace(step, lean_compilation=True)
     with tempfile.TemporaryDirectory() as folder:
-        first, alone = every_prefix(config, Path(folder), context)
-        step = dataclasses.replace(config_of(size), lean_compilation=True)
-        lean = {
-            prefix: in_own_process(speed.time_alone, size, prefix, step, 1, Path(folder))
-            for prefix in context.each("lean compilation", (lean_at,) if compiles_leanly() else (), still=True)
-        }
-        words = many_words(config, Path(folder), context) if config.words else {}
+        alone_in_processes = functools.partial(time_in_processes, Path(folder), context)
+        first = alone_in_processes("prefixes, compiling", {p: (size, p, step, 1) for p in config.prefixes})
+        alone = alone_in_processes("prefixes", {p: (size, p, step, config.rounds) for p in config.prefixes})
+        leanly = {lean_at: (size, lean_at, lean_step, 1)} if compiles_leanly() else {}
+        lean = alone_in_processes("lean compilation", leanly)
+        worded = alone_in_processes("many words", many_words(config) if config.words else {})
     makers = speed.options(size, config.options_at, config.buckets, config.options)
     found = speed.side_by_side(makers, config.rounds, "options", context)
     few = max(2, config.rounds // 2)
     twice = {p: speed.side_by_side(speed.repeated(size, p), few, f"prefix {p}", context) for p in config.repeated_at}
     with context.progress_callback("steps", still=True) as progress:
         progress(0, config.steps)
-        long = in_own_process(speed.many_steps, LONG_SIZE, short, (4, 8, 12), config.steps, progress=progress)
+        long = in_own_process(
+            speed.many_steps, LONG_SIZE, min(config.prefixes), (4, 8, 12), config.steps, progress=progress
+        )
     peers, failed = measure_peers(config, installed_peers(config.trl_python, config.tunix_python), context)
     compiled = {"as it is": first[lean_at]} | ({"lean": lean[lean_at]} if lean else {})
     return Results(
@@ -105,34 +112,30 @@ def run(config: SpeedConfig, context: Context) -> Results:
             report.compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
             report.compare_table("Repeating the prefix: time over that of the engine as it is", twice),
             report.memory_table(f"Compiling at prefix {lean_at}", compiled),
-            *((report.memory_table(f"A vocabulary of {config.words:,} words", words),) if words else ()),
+            *((report.memory_table(f"A vocabulary of {config.words:,} words", worded),) if worded else ()),
         ),
         settings={"beta": BETA, "micro_prompts": 1, "devices": str(jax.devices())},
     )
 
 
-def every_prefix(config: SpeedConfig, cache: Path, context: Context) -> tuple[report.Timings, report.Timings]:
-    """Each prefix in a process that compiles, and in one that reads what the first compiled."""
-    first, alone = {}, {}
-    step = config_of(config.size)
-    for prefix in context.each("prefixes", config.prefixes, still=True):
-        first[prefix] = in_own_process(speed.time_alone, config.size, prefix, step, 1, cache)
-        alone[prefix] = in_own_process(speed.time_alone, config.size, prefix, step, config.rounds, cache)
-        a, b = alone[prefix], first[prefix]
-        context.print(f"prefix {prefix}: {a.median_s:.3f} s, {a.peak_gb:.2f} GB, compiling {b.peak_gb:.2f} GB")
-    return first, alone
+def time_in_processes(
+    cache: Path, context: Context, title: str, jobs: Mapping[K, TimedJob]
+) -> dict[K, speed.ProcessTiming]:
+    """Time jobs, each in a process of its own that keeps its programs in the cache."""
+    found = {}
+    for name, job in context.each(title, jobs.items(), still=True):
+        found[name] = t = in_own_process(speed.time_alone, *job, cache)
+        context.print(f"{title} {name}: {t.median_s:.3f} s, {t.peak_gb:.2f} GB")
+    return found
 
 
-def many_words(config: SpeedConfig, cache: Path, context: Context) -> dict[str, speed.ProcessTiming]:
-    """A large vocabulary, all logits at once and in blocks, each in a process of its own."""
+def many_words(config: SpeedConfig) -> dict[str, TimedJob]:
+    """Jobs with a large vocabulary, all logits at once and in blocks."""
     size = dataclasses.replace(config.size, prompts=2, vocab_size=config.words)
     blocks = config_of(size)
     whole = dataclasses.replace(blocks, max_logits=size.group * size.length * size.vocab_size)
-    variants = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
-    return {
-        name: in_own_process(speed.time_alone, size, min(config.prefixes), step, 2, cache)
-        for name, step in context.each("many words", variants.items(), still=True)
-    }
+    steps = {"all at once": whole, f"{blocks.max_logits:,} at a time": blocks}
+    return {name: (size, min(config.prefixes), step, 2) for name, step in steps.items()}
 
 
 def measure_peers(config: SpeedConfig, peers: Sequence[Peer], context: Context) -> tuple[report.Peers, tuple[str, ...]]:
