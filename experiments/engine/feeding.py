@@ -143,7 +143,7 @@ class BatchCost(NamedTuple):
 
 
 class SimulatedDevice:
-    """A device that computes nothing for as long as a step would take, and knows how long it had nothing to do.
+    """A device that computes nothing for as long as a step would take, and measures its idle time.
 
     Like a real one it accepts the next step during a step, and reading the metrics of a step waits for its end.
     """
@@ -169,7 +169,7 @@ class SimulatedDevice:
 
 
 class _PendingMetric:
-    """A number that is there when a step ends, with what is asked of arrays on a device."""
+    """A number that is available when a step ends, with the interface of an array on a device."""
 
     def __init__(self, at: float, value: float) -> None:
         self._at, self._value = at, value
@@ -183,7 +183,7 @@ class _PendingMetric:
 
 
 def make_seconds(batches: Iterator[Any], rounds: Iterable[object], ahead: Iterable[object]) -> BatchCost:
-    """Mean over some batches, of the processor's clock: all threads together, without the load of other processes.
+    """Mean processor time of some batches: all threads together, without the load of other processes.
 
     Args:
       batches: endless.

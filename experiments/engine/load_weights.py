@@ -137,7 +137,7 @@ def physical_memory() -> int:
 
 
 def verdict(readings: Measured) -> tuple[str, ...]:
-    """The answer in sentences."""
+    """Memory and time to read the largest shape, and memory with all tensors first."""
     largest, by = max(readings.items(), key=lambda item: item[1][OURS].held)
     ours = by[OURS]
     return (

@@ -76,7 +76,7 @@ class FeedMeasurement:
 
     @property
     def cores(self) -> float:
-        """That a device needs for its batches."""
+        """Cores that a device needs for its batches."""
         return self.made.cpu_s / self.step_s
 
 
@@ -154,7 +154,7 @@ def watch(
 
 
 def stretch(needed: float, *, here: int, there: int) -> float:
-    """Factor that slows the stand-in's steps until half of the cores here suffice, if so many are there.
+    """Factor by which simulated steps are longer, so that half of the cores here suffice; at most `there` / `here`.
 
     Args:
       needed: cores that the batches of a device need.

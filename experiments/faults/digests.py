@@ -30,7 +30,7 @@ def digests(directory: Path) -> dict[str, str]:
 
 
 def differences(a: Mapping[str, str], b: Mapping[str, str]) -> tuple[str, ...]:
-    """Names of what differs between two runs."""
+    """Names of the digests that differ between two runs."""
     return tuple(sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name)))
 
 

@@ -57,7 +57,7 @@ class ReinforcingConfig:
         self.loop()  # refuses its own values
 
     def loop(self) -> LoopConfig:
-        """The loop's part."""
+        """Settings of the loop."""
         return LoopConfig(steps=self.steps, save_every=self.save_every)
 
 

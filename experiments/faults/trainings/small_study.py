@@ -62,11 +62,11 @@ SHORT = dataclasses.replace(
 
 
 def run(config: StudyConfig, context: Context) -> Results:
-    """Train and ask every policy; what matters lies in the run's directory."""
+    """Train and query every policy; its results are the files of the run."""
     study = run_study(config, {ARM: PUBLISHED}, context)
     return Results(
         verdict=("It came to its end.",),
-        data={"questions": {name: len(said[0].contact) for name, said in study.answers.items()}},
+        data={"questions": {name: len(answers[0].contact) for name, answers in study.answers.items()}},
     )
 
 
