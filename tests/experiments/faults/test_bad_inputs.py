@@ -1,5 +1,6 @@
 """Bad input through the public command lines: error, place and way out are named, nothing is lost or half-written."""
 
+import contextlib
 from pathlib import Path
 
 import pytest
@@ -47,20 +48,18 @@ def test_good_input_is_a_fault_of_its_case(tmp_path):
 
 
 def test_lost_and_half_written_files_are_noticed(tmp_path):
-    class Losing:
-        def __enter__(self):
-            (tmp_path / "lost").unlink()
-            (tmp_path / ".half.tmp").write_text("x")
-
-        def __exit__(self, *error):
-            pass
+    @contextlib.contextmanager
+    def losing(folder):
+        (folder / "lost").unlink()
+        (folder / ".half.tmp").write_text("x")
+        yield
 
     def prepare(folder):
         (folder / "kept").write_text("one")
         (folder / "lost").write_text("two")
 
     expected = ("There is no experiment", "'nothing'", "Did you mean")
-    case = BadInput("run", "a loss", "trainings nothing", *expected, prepare, lambda folder: Losing())
+    case = BadInput("run", "a loss", "trainings nothing", *expected, prepare, losing)
     assert provoke(case, tmp_path).faults == ("lost lost", "half-written .half.tmp")
 
 
