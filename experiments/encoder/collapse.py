@@ -1,7 +1,5 @@
 """Small encoders driven into collapse, many seeds at once, with the measurements that raise the alarms."""
 
-import dataclasses
-import functools
 from collections.abc import Callable
 
 import jax
@@ -33,7 +31,7 @@ COPY_FLOOR = 1e-6
 
 @struct.dataclass
 class LatentMeasures:
-    """Measurements of an encoder on held-out contacts: `probes.told_apart`, effective rank over width, skill."""
+    """Measurements of an encoder on held-out contacts: `told_apart`, effective rank over width, skill."""
 
     told_apart: Float[Array, ""]
     rank_share: Float[Array, ""]
@@ -95,7 +93,8 @@ def make_runner(
             return state, measure_latents(config, state, watched)
 
         end, measured = jax.lax.scan(block, start, draws)
-        features = functools.partial(_features, config, contacts)
+        exists = steps_of(contacts, config.encoder.frames_per_step).exists
+        features = lambda state: contact_features(encode_batch(config.encoder, state.target, contacts), exists)
         return CollapseRun(
             untrained=measure_latents(config, start, watched),
             blocks=measured,
@@ -123,17 +122,6 @@ def measure_latents(config: DynamicsConfig, state: DynamicsState, batch: TouchBa
     )
 
 
-def _features(config: DynamicsConfig, contacts: TouchBatch, state: DynamicsState) -> Float[Array, "n D"]:
-    exists = steps_of(contacts, config.encoder.frames_per_step).exists
-    return contact_features(encode_batch(config.encoder, state.target, contacts), exists)
-
-
 def _take(contacts: TouchBatch, rows: Array | np.ndarray) -> TouchBatch:
     taken: TouchBatch = jax.tree.map(lambda x: x[rows], contacts)
     return taken
-
-
-def in_memory(parts: list[TouchBatch]) -> TouchBatch:
-    """Several batches as one, without the pictures of the objects."""
-    joined: TouchBatch = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-    return dataclasses.replace(joined, view=joined.view[:, :1, :1])

@@ -106,16 +106,11 @@ def run(config: ParetoEncoderConfig, context: Context) -> Results:
     product = matrix_product()
     seconds = medians({**programs, "product": product}, context.rounds("timing variants", config.rounds))
     between = len(data.parts["val"])
-    measured = {
-        v.name: MeasuredVariant(
-            variant=v,
-            choosing=right[v.name][:between],
-            right=right[v.name][between:],
-            seconds=seconds[v.name],
-            gflop=programs[v.name].gflop,
-        )
-        for v in listed
-    }
+    measured = {}
+    for v in listed:
+        choosing, tested = np.split(right[v.name], [between])
+        cost: dict[str, float] = {"seconds": seconds[v.name], "gflop": programs[v.name].gflop}
+        measured[v.name] = MeasuredVariant(variant=v, choosing=choosing, right=tested, **cost)
     best = choose(measured)
     makers = parts(best.variant.config.dynamics(sensors), encoders[best.variant.name], prompts(best.variant, data))
     pieces = {name: make() for name, make in context.each("compiling parts", makers.items())}
@@ -176,8 +171,9 @@ def report(
 ) -> Results:
     """The chart, the choice and where its time goes; `peak` is that of the matrix product, Gflop/s."""
     losses = {name: loss(m, measured, objects) for name, m in measured.items()}
-    lost, reference = losses[best.variant.name], measured[REFERENCE]
-    share = best.gflop / best.seconds / peak
+    lost, reference, share = losses[best.variant.name], measured[REFERENCE], best.gflop / best.seconds / peak
+    sizes = f"8 frames × 4 sensors at 112², batches of {TIMED}; matrix products at {peak:.0f} Gflop/s"
+    span = f"paired interval over objects {bounds(lost.low, lost.high, '.1f')}"
     return Results(
         verdict=(
             f"'{best.variant.name}' reads {best.rate:.0f} prompts a second and its probes are right in "
@@ -186,20 +182,8 @@ def report(
             f"Its arithmetic runs at {share:.0%} of the {peak:.0f} Gflop/s of a matrix product on the same cores.",
         ),
         requirements=(
-            at_least(
-                f"forward, '{best.variant.name}'",
-                best.rate,
-                LEAST_RATE,
-                "prompts/s",
-                f"8 frames × 4 sensors at 112², batches of {TIMED}; matrix products at {peak:.0f} Gflop/s",
-            ),
-            at_most(
-                "probes below 256 tokens a stream",
-                lost.mean,
-                MOST_LOSS,
-                "points",
-                f"paired interval over objects {bounds(lost.low, lost.high, '.1f')}",
-            ),
+            at_least(f"forward, '{best.variant.name}'", best.rate, LEAST_RATE, "prompts/s", sizes),
+            at_most("probes below 256 tokens a stream", lost.mean, MOST_LOSS, "points", span),
         ),
         tables=(variant_table(measured, losses, peak), where),
         pictures=(
@@ -222,23 +206,22 @@ def report(
 
 def variant_table(measured: Mapping[str, MeasuredVariant], losses: Mapping[str, Interval], peak: float) -> Table:
     """All variants."""
-    rows: list[dict[str, Cell]] = [
-        {
-            "variant": name,
-            "tokens": m.variant.tokens,
-            "a prompt": 1e3 / m.rate,
-            "prompts/s": m.rate,
-            "share of peak": m.gflop / m.seconds / peak,
-            "mean": m.accuracy,
-            "gain": 0.0 - losses[name].mean,  # 0 − 0 has no minus sign
-            "95 %": bounds(0.0 - losses[name].high, 0.0 - losses[name].low, ".1f"),
-            **{attribute: float(100 * x) for attribute, x in zip(ORDINAL, m.right.mean(0), strict=True)},
-        }
-        for name, m in measured.items()
-    ]
     return named_table(
         "Variants",
-        rows,
+        [
+            {
+                "variant": name,
+                "tokens": m.variant.tokens,
+                "a prompt": 1e3 / m.rate,
+                "prompts/s": m.rate,
+                "share of peak": m.gflop / m.seconds / peak,
+                "mean": m.accuracy,
+                "gain": 0.0 - losses[name].mean,  # 0 − 0 has no minus sign
+                "95 %": bounds(0.0 - losses[name].high, 0.0 - losses[name].low, ".1f"),
+                **{attribute: float(100 * x) for attribute, x in zip(ORDINAL, m.right.mean(0), strict=True)},
+            }
+            for name, m in measured.items()
+        ],
         formats={"tokens": "d", "a prompt": ".2f", "prompts/s": ".0f", "share of peak": ".2f", "mean": ".1f"}
         | {"gain": "+.1f"}
         | dict.fromkeys(ORDINAL, ".1f"),
@@ -302,11 +285,10 @@ def accuracy_chart(measured: Mapping[str, MeasuredVariant], losses: Mapping[str,
     return draw([panel], size=(8.4, 5.0))
 
 
-DEFAULT = ParetoEncoderConfig()
 SMOKE = ParetoEncoderConfig(
     touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
     pretrain=PretrainConfig(frames=FRAMES, image_px=IMAGE_PX, steps=2, batch_size=4, probe_every=2),
     rounds=2,
 )
 
-EXPERIMENT = Experiment(name="pareto_encoder", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_encoder", config=ParetoEncoderConfig(), scales={"smoke": SMOKE}, run=run)

@@ -164,11 +164,10 @@ def learning_chart(lines: Sequence[Mapping[str, Any]]) -> bytes:
     return draw([dataclasses.replace(panel, x_label="step") for panel in panels], size=(10.2, 3.4))
 
 
-DEFAULT = PretrainEncoderConfig()
 SMOKE = PretrainEncoderConfig(
     touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1)),
     pretrain=PretrainConfig(steps=6, batch_size=8, probe_every=3),
     watch_fit=24,
 )
 
-EXPERIMENT = Experiment(name="pretrain_encoder", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pretrain_encoder", config=PretrainEncoderConfig(), scales={"smoke": SMOKE}, run=run)

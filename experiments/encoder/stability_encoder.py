@@ -31,7 +31,7 @@ from experiments.core.errors import DataError
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.collapse import CollapseRun, CollapseRunner, in_memory, make_runner
+from experiments.encoder.collapse import CollapseRun, CollapseRunner, make_runner
 from experiments.encoder.held_out import StageOneDataConfig, open_touch, training_rows
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import clip_batches
@@ -46,13 +46,15 @@ from touchr1_jax.training.latent_probes import BOUNDS, collapse_alarms, probe_ri
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import TouchBatch
 
+SENSORS, FRAMES = 2, 4  # the first sensors of the records
 RATE = 1e-3
+PREDICTOR = PredictorConfig(width=32, num_layers=1, num_heads=2)
 NONE = Guards(variance=0.0, covariance=0.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CollapseArm:
-    """One way to train: guards, learning rate, and the arm whose failure it is meant to cure, if any."""
+    """Guards, learning rate, and the arm whose failure these are meant to cure, if any."""
 
     name: str
     guards: Guards
@@ -84,9 +86,6 @@ class StabilityEncoderConfig:
     """Data in memory, networks, length."""
 
     touch: StageOneDataConfig = StageOneDataConfig(scenes=SceneConfig(objects=600, sites=1, image_px=28, seed=1))
-    sensors: int = 2
-    """The first ones of the records."""
-    frames: int = 4
     seeds: int = 10
     batch_size: int = 16
     blocks: int = 6
@@ -94,7 +93,6 @@ class StabilityEncoderConfig:
     encoder: TactileViTConfig = TactileViTConfig(
         sensors=0, width=32, num_layers=1, num_heads=2, stem_px=2, stem_width=8, tokens_per_step=1, causal=True
     )
-    predictor: PredictorConfig = PredictorConfig(width=32, num_layers=1, num_heads=2)
     probe: ProbeConfig = ProbeConfig(iterations=30)
 
 
@@ -139,19 +137,18 @@ def run(config: StabilityEncoderConfig, context: Context) -> Results:
     Raises:
       DataError: fewer than two contacts to watch.
     """
-    data = open_touch(config.touch, config.frames, config.touch.scenes.image_px, context)
+    data = open_touch(config.touch, FRAMES, config.touch.scenes.image_px, context)
     if len(data.parts["val"]) < 2:
         raise DataError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
     fit, test = training_rows(data), data.parts["test"]
     rows = np.concatenate([fit, test])
     label = data.label[rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
     train = np.arange(len(rows)) < len(fit)
-    encoder = dataclasses.replace(config.encoder, sensors=config.sensors)
     runner = make_runner(
-        DynamicsConfig(encoder=encoder, predictor=config.predictor),
-        batch_of(data, config, rows, context),
+        DynamicsConfig(encoder=dataclasses.replace(config.encoder, sensors=SENSORS), predictor=PREDICTOR),
+        batch_of(data, rows, context),
         train,
-        batch_of(data, config, data.parts["val"], context),
+        batch_of(data, data.parts["val"], context),
         batch_size=config.batch_size,
         blocks=config.blocks,
         block_steps=config.block_steps,
@@ -161,16 +158,17 @@ def run(config: StabilityEncoderConfig, context: Context) -> Results:
     return report(config, outcomes)
 
 
-def batch_of(data: Dataset, config: StabilityEncoderConfig, rows: np.ndarray, context: Context) -> TouchBatch:
-    """Some contacts as one batch."""
-    clip = dataclasses.replace(data.clip, sensors=data.clip.sensors[: config.sensors], view_px=1)
+def batch_of(data: Dataset, rows: np.ndarray, context: Context) -> TouchBatch:
+    """Some contacts as one batch, without the pictures of the objects."""
+    clip = dataclasses.replace(data.clip, sensors=data.clip.sensors[:SENSORS], view_px=1)
     clips = clip_batches(data.store, rows, clip, batch_size=64, seed=0, shuffle=False, repeat=False)
     found = []
     with context.progress("reading clips", len(rows)) as advance:
         for one in clips:
             found.append(touch_batch(one))
             advance(len(one["contact"]))
-    return in_memory(found)
+    joined: TouchBatch = jax.tree.map(lambda *x: jnp.concatenate(x), *found)
+    return dataclasses.replace(joined, view=joined.view[:, :1, :1])
 
 
 def run_arm(

@@ -15,8 +15,10 @@ little.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,35 +32,39 @@ from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
 from experiments.encoder.held_out import StageOneDataConfig, open_touch, skill, training_rows
 from experiments.encoder.pretrain import ClipFeed
-from experiments.encoder.video_scoring import (
-    COPY,
-    MEAN,
-    TARGET,
-    FrameMetrics,
-    FrameScores,
-    TrainedPredictor,
-    batches,
-    mean_frames,
-    predict_all,
-    score_frames,
-)
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from sensors_io.scenes.config import SceneConfig
-from touchr1_jax.bench.image_similarity import check_weights
+from touchr1_jax.bench.image_similarity import check_weights, lpips, ssim
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig
+from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.models.pretrained import PretrainedEncoder, load_encoder
-from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.training import video
 from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
-from touchr1_jax.training.video import VideoConfig, VideoState, every_question, make_video_step, start_video
+from touchr1_jax.types import Params, TouchBatch
 
 TOUCH, VISION = "touch", "touch + vision"
+COPY, MEAN = "copy last", "mean frame"
+"""The baselines: the last visible frame, and the mean training frame of that sensor at that position."""
+
+TARGET, EXISTS = "true frame", "exists"
+
 SEED = 0
 SHOWN = 3  # contacts in the picture
+SCORE_BATCH = 8  # contacts that are scored at once; a clip of 8 frames by four sensors is 1.2 MB
+OPTIMIZER = OptimizerConfig(learning_rate=1e-5, lr_scale=200.0)
+
+METRICS = {
+    "l1": "mean absolute difference of pixels in [0, 1]",
+    "ssim": "structural similarity, 11 × 11 Gaussian window, higher is better",
+    "encoder_distance": "mean absolute difference of a tactile encoder's patch tokens; no published metric",
+    "lpips": "AlexNet, with the given weights",
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,8 +73,6 @@ class VideoTrainingConfig:
 
     steps: int = 300
     batch_size: int = 8
-    save_every: int = 100
-    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=200.0)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,11 +99,30 @@ def run(config: VideoPredictionConfig, context: Context) -> Results:
     rows, test = training_rows(data), data.parts["test"][: config.scored]
     start = None if config.encoder is None else load_encoder(config.encoder)
     predictors = {name: train(config, name, data, rows, context, start) for name in (TOUCH, VISION)}
-    metrics = frame_metrics(config, start, predictors[TOUCH])
+    metrics = FrameMetrics(
+        encoder=predictors[TOUCH].config.encoder,
+        params=jax.device_get(predictors[TOUCH].params["encoder"] if start is None else start.params),
+        lpips_weights=None if config.lpips_weights is None else read_lpips(config.lpips_weights),
+    )
     with context.timed("score"):
         mean = mean_frames(data, rows[: config.mean_of], context)
-        scores = score_frames(predictors, mean, data, test, metrics, context)
-    return report(config, data, scores, data.object_ids[test], frame_grid(predictors, mean, data, test, config))
+        methods = FrameMethods(predictors=predictors, mean=mean, skips=config.skips)
+        scores = score_frames(methods, data, test, metrics, context)
+    return report(config, data, scores, data.object_ids[test], frame_grid(methods, data, test))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TrainedPredictor:
+    """A trained video predictor."""
+
+    config: video.VideoConfig
+    params: Params
+
+    @functools.cached_property
+    def predict(self) -> Callable[[TouchBatch, video.Asked], Any]:
+        """Predicted frames, clipped to [0, 1]; compiled once."""
+        apply = jax.jit(lambda p, b, a: jnp.clip(video.predict_frames(self.config, p, b, a), 0.0, 1.0))
+        return functools.partial(apply, self.params)
 
 
 def train(
@@ -112,55 +135,158 @@ def train(
 ) -> TrainedPredictor:
     """Train one predictor, its encoder of the shape of `start` if given; a stopped stage resumes."""
     tactile = config.tactile if start is None else start.config
-    video = VideoConfig(
+    networks = video.VideoConfig(
         encoder=dataclasses.replace(tactile, sensors=len(data.clip.sensors)),
         decoder=config.decoder,
         vision=VisionConfig(image_px=data.clip.view_px) if name == VISION else None,
         skips=config.skips,
     )
-    training = config.film
-    feed = ClipFeed(data.store, rows, data.clip, batch_size=training.batch_size, seed=SEED)
-    optimizer = make_optimizer(training.optimizer, training.steps)
-    one = next(iter(data.batches(rows[:1], batch_size=1, seed=0, repeat=False)))
-    state: VideoState = jax.jit(lambda key, batch: start_video(video, optimizer, key, batch))(
-        jax.random.key(SEED), touch_batch(one)
-    )
+    feed = ClipFeed(data.store, rows, data.clip, batch_size=config.film.batch_size, seed=SEED)
+    optimizer = make_optimizer(OPTIMIZER, config.film.steps)
+    one = touch_batch(next(iter(data.batches(rows[:1], batch_size=1, seed=0, repeat=False))))
+    begin = jax.jit(lambda key, batch: video.start_video(networks, optimizer, key, batch))
+    state = begin(jax.random.key(SEED), one)
     if start is not None:
         params = {**state.params, "encoder": jax.tree.map(jnp.array, start.for_sensors(data.clip.sensors).params)}
         state = dataclasses.replace(state, params=params)
-    step, loop = make_video_step(video, optimizer), LoopConfig(steps=training.steps, save_every=training.save_every)
+    step, loop = video.make_video_step(networks, optimizer), LoopConfig(steps=config.film.steps, save_every=100)
     trained = run_loop(step, state, feed, loop, context, f"film/{name.replace(' + ', '-')}/{SEED}")
-    return TrainedPredictor(config=video, params=trained.params)
+    return TrainedPredictor(config=networks, params=trained.params)
 
 
-def frame_metrics(
-    config: VideoPredictionConfig, start: PretrainedEncoder | None, predictor: TrainedPredictor
-) -> FrameMetrics:
-    """The metrics; features are those of the encoder to start from, otherwise of the predictor by touch alone.
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class FrameMetrics:
+    """The metrics: L1, SSIM, LPIPS if its weights are given, and the distance of an encoder's features: of the encoder
+    to start from, if one is given, otherwise of that of the predictor by touch alone."""
 
-    Raises:
-      ValueError: the LPIPS weights do not have the published shapes.
+    encoder: TactileViTConfig
+    params: Params
+    lpips_weights: Mapping[str, np.ndarray] | None
+
+    def score(self, predicted: np.ndarray, target: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
+        """Metric → [P, S], of frames [P, S, H, W, 3] in [0, 1]."""
+        found = {
+            "l1": np.abs(predicted - target).mean((-3, -2, -1)),
+            "ssim": ssim(predicted, target),
+            "encoder_distance": np.asarray(self._distance(self.params, predicted, target, batch)),
+        }
+        if self.lpips_weights is not None:
+            flat = lambda x: jnp.asarray(x).reshape(-1, *x.shape[-3:])
+            found["lpips"] = np.asarray(self._lpips(flat(predicted), flat(target))).reshape(predicted.shape[:2])
+        return found
+
+    @functools.cached_property
+    def _lpips(self) -> Callable[..., Any]:
+        return jax.jit(lambda a, b: lpips(a, b, self.lpips_weights or {}))
+
+    @functools.cached_property
+    def _distance(self) -> Callable[..., Any]:
+        """Mean |LN f(x̂) − LN f(x)| over the patch tokens of the second frame of the pair (first frame, frame)."""
+        network = TactileViT(self.encoder)
+
+        def tokens(params: Params, frame: Any, batch: TouchBatch) -> Any:
+            pair = 255.0 * jnp.stack([video.unit_pixels(batch.frames[:, :, 0]), frame], 2)
+            index = jnp.broadcast_to(jnp.arange(2), pair.shape[:3])
+            sensors = jnp.broadcast_to(jnp.arange(pair.shape[1]), pair.shape[:2])
+            streams = (pair, jnp.zeros((*index.shape, 3)), index, jnp.ones(index.shape, bool), sensors)
+            encoded: Any = network.apply({"params": params}, *streams, method=TactileViT.encode)
+            return layer_norm(encoded.patches[:, :, 1])
+
+        return jax.jit(lambda p, a, b, batch: jnp.abs(tokens(p, a, batch) - tokens(p, b, batch)).mean((-2, -1)))
+
+
+def read_lpips(path: Path) -> dict[str, np.ndarray]:
+    """The weights of LPIPS, whose shapes must be the published ones."""
+    with np.load(path) as file:
+        weights = dict(file)
+    check_weights(weights)
+    return weights
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FrameScores:
+    """Scores of one method: metric → [contact, S, question], NaN where a stream or frame is missing.
+
+    Question q asks for the frame `skips[q]` frames ahead.
     """
-    weights = None
-    if config.lpips_weights is not None:
-        with np.load(config.lpips_weights) as file:
-            weights = dict(file)
-        check_weights(weights)
-    params = predictor.params["encoder"] if start is None else start.params
-    return FrameMetrics(encoder=predictor.config.encoder, params=jax.device_get(params), lpips_weights=weights)
+
+    values: Mapping[str, np.ndarray]
+    skips: np.ndarray
+
+    def mean(self, metric: str, skip: int, axis: int) -> np.ndarray:
+        """Mean over the questions of one skip and over the contacts, axis 0, or the sensors, axis 1."""
+        return np.asarray(np.nanmean(self.values[metric][:, :, self.skips == skip], (axis, 2)))
 
 
-def frame_grid(
-    predictors: Mapping[str, TrainedPredictor],
-    mean: np.ndarray,
-    data: Dataset,
-    rows: np.ndarray,
-    config: VideoPredictionConfig,
-) -> bytes:
+def mean_frames(data: Dataset, rows: np.ndarray, context: Context) -> np.ndarray:
+    """Mean frame of every sensor at every position of its clip, float32 [S, F, H, W, 3] in [0, 1]; 0 without frames."""
+    total: Any = 0.0
+    count: Any = 0.0
+    with context.progress("mean frames", len(rows)) as advance:
+        for clip in data.batches(rows, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False):
+            exists = (clip["frame_mask"] & clip["stream_mask"][..., None])[..., None, None, None]
+            total = total + np.where(exists, clip["frames"], 0).sum(0, dtype=np.float64)
+            count = count + exists.sum(0)
+            advance(len(exists))
+    return (total / np.maximum(count, 1) / 255.0).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FrameMethods:
+    """The predictors, all of the same skips, and the baselines; `mean` is that of `mean_frames`."""
+
+    predictors: Mapping[str, TrainedPredictor]
+    mean: np.ndarray
+    skips: tuple[int, ...]
+
+    def frames(self, batch: TouchBatch, t: int, k: int) -> dict[str, np.ndarray]:
+        """Every method's frames `skips[k]` ahead of frame t, the true frames (`TARGET`) and whether they exist."""
+        shape = batch.stream_mask.shape
+        asked = video.Asked(last=jnp.full(shape, t, jnp.int32), skip=jnp.full(shape, k, jnp.int32))
+        target, exists = video.target_of(batch, asked, self.skips)
+        return {
+            **{name: np.asarray(predictor.predict(batch, asked)) for name, predictor in self.predictors.items()},
+            COPY: np.asarray(video.frame_at(batch, asked.last)),
+            MEAN: np.broadcast_to(self.mean[:, t + self.skips[k]], target.shape),
+            TARGET: np.asarray(target),
+            EXISTS: np.asarray(exists),
+        }
+
+
+def score_frames(
+    methods: FrameMethods, data: Dataset, rows: np.ndarray, metrics: FrameMetrics, context: Context
+) -> dict[str, FrameScores]:
+    """Scores of every method on some contacts, for every question."""
+    questions = video.every_question(data.clip.frames, methods.skips)
+    blocks: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in (*methods.predictors, COPY, MEAN)}
+    with context.progress("scoring", len(rows)) as advance:
+        for batch, count in batches(data, rows):
+            frames = [methods.frames(batch, t, k) for t, k in questions]
+            for name, parts in blocks.items():
+                found = [(metrics.score(one[name], one[TARGET], batch), one[EXISTS]) for one in frames]
+                known = {m: [np.where(exists, s[m], np.nan) for s, exists in found] for m in found[0][0]}
+                parts.append({m: np.stack(values, -1)[:count] for m, values in known.items()})
+            advance(count)
+    skip_of = np.array([methods.skips[k] for _, k in questions])
+    return {
+        name: FrameScores(values={m: np.concatenate([b[m] for b in parts]) for m in parts[0]}, skips=skip_of)
+        for name, parts in blocks.items()
+    }
+
+
+def batches(data: Dataset, rows: np.ndarray) -> Iterator[tuple[TouchBatch, int]]:
+    """Batches of one size, the last one padded, and the number of their contacts that count."""
+    padded = rows[np.minimum(np.arange(-(-len(rows) // SCORE_BATCH) * SCORE_BATCH), len(rows) - 1)]
+    clips = data.batches(padded, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
+    for start, clip in zip(range(0, len(padded), SCORE_BATCH), clips, strict=True):
+        yield touch_batch(clip), min(SCORE_BATCH, len(rows) - start)
+
+
+def frame_grid(methods: FrameMethods, data: Dataset, rows: np.ndarray) -> bytes:
     """Frames of the first test contacts by the first sensor, predicted from the first frame over the longest skip."""
     batch, _ = next(batches(data, rows))
-    found = predict_all(predictors, mean, batch, 0, int(np.argmax(config.skips)), config.skips)
-    first, names = np.asarray(batch.frames[:, 0, 0]) / 255.0, (*predictors, MEAN, TARGET)
+    found = methods.frames(batch, 0, int(np.argmax(methods.skips)))
+    first, names = np.asarray(batch.frames[:, 0, 0]) / 255.0, (*methods.predictors, MEAN, TARGET)
     shown = {
         f"object {i + 1}": [np.clip(frame, 0, 1) for frame in (first[i], *(found[name][i, 0] for name in names))]
         for i in range(min(SHOWN, len(rows)))
@@ -172,16 +298,17 @@ def report(
     config: VideoPredictionConfig, data: Dataset, scores: Mapping[str, FrameScores], objects: np.ndarray, grid: bytes
 ) -> Results:
     """Skill of each predictor and skip, tables of all metrics, a grid of frames."""
-    l1 = lambda name, skip: scores[name].by_contact("l1", skip)
+    l1 = lambda name, skip: scores[name].mean("l1", skip, 1)
     skills = {
         (name, s): skill(l1(name, s), l1(COPY, s), objects) for name in (TOUCH, VISION, MEAN) for s in config.skips
     }
     longest = max(config.skips)
     vision = skill(l1(VISION, longest), l1(TOUCH, longest), objects)
-    over_mean = skill(l1(TOUCH, longest), l1(MEAN, longest), objects)
     note = "lower end of the 95 % interval over objects"
+    questions = len(video.every_question(config.frames, config.skips))
     required = {f"skill of touch, {s} frames ahead": skills[TOUCH, s] for s in config.skips}
-    required[f"touch over the mean frame, {longest} frames ahead"] = over_mean
+    over_mean = f"touch over the mean frame, {longest} frames ahead"
+    required[over_mean] = skill(l1(TOUCH, longest), l1(MEAN, longest), objects)
     return Results(
         verdict=(
             *(
@@ -204,8 +331,7 @@ def report(
                 kind="png",
             ),
         ),
-        data=data.summary()
-        | {"scored contacts": len(objects), "questions": len(every_question(config.frames, config.skips))},
+        data={**data.summary(), "scored contacts": len(objects), "questions": questions},
     )
 
 
@@ -213,23 +339,20 @@ def score_table(
     config: VideoPredictionConfig, scores: Mapping[str, FrameScores], skills: Mapping[tuple[str, int], Interval]
 ) -> Table:
     """Every metric of every method and skip."""
-    metrics = tuple(next(iter(scores.values())).values)
-    rows: list[dict[str, Cell]] = []
-    for s in config.skips:
-        for name, found in scores.items():
-            means = {metric: float(found.by_contact(metric, s).mean()) for metric in metrics}
-            rows.append({"method": f"{name}, {s} ahead", **means, "skill": interval(skills.get((name, s)), ".3f")})
-    meanings = {
-        "l1": "mean absolute difference of pixels in [0, 1]",
-        "ssim": "structural similarity, 11 × 11 Gaussian window, higher is better",
-        "encoder_distance": "mean absolute difference of a tactile encoder's patch tokens; no published metric",
-        "lpips": "AlexNet, with the given weights",
-    }
+    metrics = [metric for metric in METRICS if metric in next(iter(scores.values())).values]
     return named_table(
         "Scores on unseen objects",
-        rows,
+        [
+            {
+                "method": f"{name}, {s} ahead",
+                **{metric: float(found.mean(metric, s, 1).mean()) for metric in metrics},
+                "skill": interval(skills.get((name, s)), ".3f"),
+            }
+            for s in config.skips
+            for name, found in scores.items()
+        ],
         formats=dict.fromkeys(metrics, ".4f"),
-        meanings={metric: meanings[metric] for metric in metrics}
+        meanings={metric: METRICS[metric] for metric in metrics}
         | {"skill": "1 − L1 / L1 of copying the last frame, 95 % interval over objects"},
     )
 
@@ -237,11 +360,10 @@ def score_table(
 def paper_table(config: VideoPredictionConfig, scores: Mapping[str, FrameScores]) -> Table:
     """The predictors and baselines, and the paper's rows for its own recordings."""
     columns = {"l1": "L1", "ssim": "SSIM", "lpips": "LPIPS"}
-    rows: list[dict[str, Cell]] = []
-    for s in config.skips:
-        for name, found in scores.items():
-            means = {columns[m]: float(found.by_contact(m, s).mean()) for m in columns if m in found.values}
-            rows.append({"method": f"{name}, {s} ahead", **means})
+    means = lambda found, s: {c: float(found.mean(m, s, 1).mean()) for m, c in columns.items() if m in found.values}
+    rows: list[dict[str, Cell]] = [
+        {"method": f"{name}, {s} ahead", **means(found, s)} for s in config.skips for name, found in scores.items()
+    ]
     for (name, s, inputs), values in paper.VIDEO.items():
         cells = dict(zip(columns.values(), values, strict=True))
         rows.append({"method": f"{name}: {inputs}, {s} ahead (paper)", **cells})
@@ -250,24 +372,23 @@ def paper_table(config: VideoPredictionConfig, scores: Mapping[str, FrameScores]
         rows,
         formats=dict.fromkeys(columns.values(), ".3f"),
         meanings={"LPIPS": "only with weights given by the user"},
-        note="Differences: generated presses of 8 frames here, recorded press-and-slide videos there; no pretrained "
-        "weights here. The paper does not give the scale of its L1. A grey picture differs by at most .5 from pixels "
-        "in [0, 1], so its figures, .608 to .861, cannot be means of absolute differences on that scale. It has no row "
-        "for copying the last frame or for a mean frame.",
+        note="Generated presses of 8 frames here, recorded press-and-slide videos there; no pretrained weights here. "
+        "The paper does not give the scale of its L1: a grey picture differs by at most .5 from pixels in [0, 1], so "
+        ".608 to .861 cannot be means of absolute differences on that scale. It has no row for copying the last frame "
+        "or for a mean frame.",
     )
 
 
 def sensor_table(config: VideoPredictionConfig, data: Dataset, scores: Mapping[str, FrameScores]) -> Table:
     """L1 by sensor."""
-    columns = {f"{name}, {s}": scores[name].by_sensor("l1", s) for s in config.skips for name in (TOUCH, COPY, MEAN)}
-    rows: list[dict[str, Cell]] = [
-        {"sensor": sensor} | {name: float(values[i]) for name, values in columns.items()}
+    columns = {f"{name}, {s}": scores[name].mean("l1", s, 0) for s in config.skips for name in (TOUCH, COPY, MEAN)}
+    rows = [
+        {"sensor": sensor, **{name: float(values[i]) for name, values in columns.items()}}
         for i, sensor in enumerate(data.clip.sensors)
     ]
     return named_table("L1 by sensor", rows, formats=dict.fromkeys(columns, ".4f"))
 
 
-DEFAULT = VideoPredictionConfig()
 SMOKE = VideoPredictionConfig(
     touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, seed=1)),
     film=VideoTrainingConfig(steps=4, batch_size=2),
@@ -275,4 +396,4 @@ SMOKE = VideoPredictionConfig(
     mean_of=16,
 )
 
-EXPERIMENT = Experiment(name="video_prediction", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="video_prediction", config=VideoPredictionConfig(), scales={"smoke": SMOKE}, run=run)

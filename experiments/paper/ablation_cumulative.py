@@ -28,14 +28,12 @@ from experiments.paper.component_effects import (
     LADDER_METRICS,
     ComponentComparison,
     ComponentStep,
-    compare_components,
-    effects_picture,
-    effects_table,
     estimate_cell,
+    run_components,
 )
 from experiments.paper.components import BASE, BASE_ROW, COMPONENTS, published_steps, reinforced
 from experiments.study import paper_numbers as paper
-from experiments.study.ablation import Ablation, run_ablation
+from experiments.study.ablation import Ablation
 from experiments.study.stages import encode_rows, untrained
 from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy
 from touchr1_jax.training.evaluation import Evaluation
@@ -87,9 +85,8 @@ PER_ATTRIBUTE = {"h_acc": "H-Acc", "r_acc": "R-Acc", "p_acc": "P-Acc", "mat_acc"
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train the arms, compare each with the one below it, diagnose the signs that do not come out."""
-    study, scored, results = run_ablation(ABLATION, config, context)
-    with context.timed("compare"):
-        found = compare_components(study, scored, STEPS, context)
+    found, results = run_components(ABLATION, STEPS, TITLE, NOTE, config, context)
+    effects, *further = results.tables
     return dataclasses.replace(
         results,
         baselines={**results.baselines, UNTRAINED: found.reported(UNTRAINED)},
@@ -97,13 +94,12 @@ def run(config: StudyConfig, context: Context) -> Results:
         requirements=requirements(found),
         tables=(
             ladder_table(found.estimates),
-            effects_table(found, TITLE, NOTE),
+            effects,
             attribute_table(found.estimates),
             *pooled_table(results.arms, SFT),
-            *results.tables,
+            *further,
             paper.differences_table(presets.DIFFERENCES),
         ),
-        pictures=(*effects_picture(found.effects, TITLE), *results.pictures),
     )
 
 

@@ -22,14 +22,7 @@ from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.paper import presets
 from experiments.paper.bench_scores import pooled_table
-from experiments.paper.component_effects import (
-    FOUR,
-    ComponentComparison,
-    ComponentStep,
-    compare_components,
-    effects_picture,
-    effects_table,
-)
+from experiments.paper.component_effects import FOUR, ComponentComparison, ComponentStep, run_components
 from experiments.paper.components import (
     COMPONENTS,
     FULL,
@@ -39,7 +32,7 @@ from experiments.paper.components import (
     published_steps,
     reinforced,
 )
-from experiments.study.ablation import Ablation, run_ablation
+from experiments.study.ablation import Ablation
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import encode_rows, noise_bank, run_grpo, untrained
@@ -89,20 +82,13 @@ NOTE = (
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train the full objective and every omission, compare."""
-    study, scored, results = run_ablation(ABLATION, config, context)
-    with context.timed("compare"):
-        found = compare_components(study, scored, STEPS, context)
+    found, results = run_components(ABLATION, STEPS, TITLE, NOTE, config, context)
+    effects, *further = results.tables
     return dataclasses.replace(
         results,
         arms={**results.arms, NO_SFT: found.reported(NO_SFT)},
         verdict=verdict(found),
-        tables=(
-            effects_table(found, TITLE, NOTE),
-            *pooled_table(results.arms, FULL),
-            *results.tables,
-            differences_table(presets.DIFFERENCES),
-        ),
-        pictures=(*effects_picture(found.effects, TITLE), *results.pictures),
+        tables=(effects, *pooled_table(results.arms, FULL), *further, differences_table(presets.DIFFERENCES)),
     )
 
 

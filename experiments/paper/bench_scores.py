@@ -26,12 +26,7 @@ from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM, Scores
 from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
-from touchr1_jax.bench.statistics import (
-    draw_clusters,
-    drawn_means,
-    improvement_interval,
-    stratified_bootstrap_iqm,
-)
+from touchr1_jax.bench.statistics import draw_clusters, drawn_means, improvement_interval, stratified_bootstrap_iqm
 from touchr1_jax.training.evaluation import Evaluation
 
 ORDINAL_LEVELS = 3
@@ -52,10 +47,7 @@ class SingleTouchAnswers:
 
     @staticmethod
     def of(answers: Evaluation, contacts: int) -> "SingleTouchAnswers":
-        """From the answers to every question about `contacts` contacts, which `answers.contact` counts.
-
-        A policy without touch gives the same answer whichever sensor is shown.
-        """
+        """From all answers about some contacts; a policy without touch answers the same whichever sensor is shown."""
         attributes, streams = answers.label.shape[1], answers.streams.shape[1]
         level = np.full((contacts, attributes), BOTTOM)
         alone = np.full((contacts, streams, attributes), BOTTOM)

@@ -9,13 +9,14 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context, read_metrics
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Estimate, Picture, Table, named_table
+from experiments.core.results import Estimate, Picture, Results, Table, named_table
 from experiments.core.text import bounds, interval, number
 from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
+from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.baselines import baselines
 from experiments.study.estimates import RESAMPLES, estimate, pooled
 from experiments.study.scores import Scored, score
-from experiments.study.study import Study
+from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
 from touchr1_jax.bench.statistics import (
     Interval,
@@ -182,6 +183,18 @@ class ComponentComparison:
     def effect(self, arm: str, metric: str) -> ComponentEffect | None:
         """The effect of a step's arm on a metric."""
         return next((e for e in self.effects if e.step.arm == arm and e.metric.metric == metric), None)
+
+
+def run_components(
+    ablation: Ablation, steps: Sequence[ComponentStep], title: str, note: str, config: StudyConfig, context: Context
+) -> tuple[ComponentComparison, Results]:
+    """Train the arms and compare the steps; the results begin with the table and the chart of the effects."""
+    study, scored, results = run_ablation(ablation, config, context)
+    with context.timed("compare"):
+        found = compare_components(study, scored, steps, context)
+    tables = (effects_table(found, title, note), *results.tables)
+    pictures = (*effects_picture(found.effects, title), *results.pictures)
+    return found, dataclasses.replace(results, tables=tables, pictures=pictures)
 
 
 def compare_components(

@@ -6,10 +6,11 @@ Every arm of GRPO starts from the SFT checkpoint of its seed and sees the same q
 import dataclasses
 from collections.abc import Iterable, Mapping
 
+from experiments.core.context import Context
 from experiments.study import paper_numbers as paper
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import Weights
-from experiments.study.study import SFT
+from experiments.study.study import SFT, EvalVariant, Study, StudyConfig, run_study
 from touchr1_jax.rl.config import AnyAlgorithm, Paper, TactileUse
 
 BASE, FULL, NO_SFT = "constant", "full", "no_sft"
@@ -123,3 +124,8 @@ def reinforced(arms: Iterable[ComponentArm]) -> tuple[dict[str, Weights], Mappin
     """Reward weights and algorithms of the arms that GRPO trains, by name."""
     trained = [(arm, arm.weights) for arm in arms if arm.weights is not None]
     return {arm.name: weights for arm, weights in trained}, {arm.name: arm.algorithm for arm, _ in trained}
+
+
+def run_full_model(config: StudyConfig, context: Context, variants: Mapping[str, EvalVariant] = {}) -> Study:
+    """A study of one arm, the full model of the paper's equations: published rewards and grounding."""
+    return run_study(config, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)

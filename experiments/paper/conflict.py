@@ -30,7 +30,7 @@ from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, named_table
 from experiments.core.text import bounds, interval
 from experiments.paper import presets
-from experiments.paper.components import FULL
+from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
     TouchGain,
     TouchQuestions,
@@ -45,12 +45,11 @@ from experiments.study.estimates import RESAMPLES
 from experiments.study.examples import rollout_examples
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_results
-from experiments.study.study import BLIND, SFT, StudyConfig, run_study
+from experiments.study.study import BLIND, SFT, StudyConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.grounding import SHUFFLE, revision_rate
 from touchr1_jax.bench.metrics import BOTTOM, accuracy
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, student_interval
-from touchr1_jax.rl.config import Paper
 
 POLICIES = (FULL, SFT)
 
@@ -88,7 +87,7 @@ Contrasts = Mapping[str, AccuracyContrast]
 def run(config: StudyConfig, context: Context) -> Results:
     """Train, evaluate with and without touch, contrast."""
     variants = {**control_variants(FULL), **control_variants(SFT)}
-    study = run_study(config, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)
+    study = run_full_model(config, context, variants)
     questions = touch_questions(study, study.answers[SFT][0])
     levels = {name: [concluded(answers) for answers in study.answers[name]] for name in (*POLICIES, BLIND)}
     priors = picture_prior(levels[BLIND])
@@ -126,9 +125,6 @@ def run(config: StudyConfig, context: Context) -> Results:
 def picture_prior(blind: Sequence[np.ndarray]) -> list[Int[np.ndarray, "N"]]:
     """For every seed the majority answer of the other seeds' policies without touch, the lower level on a tie.
 
-    Args:
-      blind: int [N] of every seed.
-
     Raises:
       ValueError: fewer than two seeds.
     """
@@ -154,10 +150,7 @@ def revision_share(questions: TouchQuestions, levels: Sequence[np.ndarray], prio
 
 
 def contrasts_of(
-    questions: TouchQuestions,
-    misled: Sequence[np.ndarray],
-    ours: Sequence[np.ndarray],
-    theirs: Sequence[np.ndarray],
+    questions: TouchQuestions, misled: Sequence[np.ndarray], ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray]
 ) -> Contrasts:
     """`contrast` on groups of questions, those that have two objects for every seed; `misled` are each seed's."""
     each = lambda mask: [mask] * len(misled)
@@ -179,12 +172,7 @@ def contrasts_of(
 def contrast(
     questions: TouchQuestions, ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], masks: Sequence[np.ndarray]
 ) -> AccuracyContrast:
-    """Compare two policies, paired by question and seed, on the questions of each seed's mask.
-
-    Args:
-      questions: the questions.
-      ours, theirs: levels int [N] of every seed.
-      masks: bool [N] of every seed.
+    """Compare two policies' levels [N], paired by question and seed, on the questions of each seed's mask [N].
 
     Raises:
       ValueError: a mask without a question, or fewer than two seeds or objects.

@@ -29,16 +29,15 @@ from experiments.core.text import bounds
 from experiments.paper import bench_scores as bench
 from experiments.paper import feature_baselines as features
 from experiments.paper import presets
-from experiments.paper.components import FULL
+from experiments.paper.components import FULL, run_full_model
 from experiments.study import paper_numbers as paper
 from experiments.study.baselines import baselines, level_answers
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, study_settings
-from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
+from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig
 from touchr1_jax.bench.averages import AVERAGED
-from touchr1_jax.rl.config import Paper
 from touchr1_jax.training.evaluation import Evaluation
 
 ENCODER_PROBE, SWAPPED = "encoder_probe", "shuffled_touch"
@@ -71,7 +70,7 @@ def run(config: MainConfig, context: Context) -> Results:
         ENCODER_PROBE: EvalVariant(of=SFT, evaluate=features.encoder_probe),
         SWAPPED: EvalVariant(of=SFT, evaluate=functools.partial(features.encoder_probe, swapped=True)),
     }
-    study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, variants)
+    study = run_full_model(config.study, context, variants)
     with context.timed("baselines"):
         untrained = {name: [answers] for name, answers in without_policy(study, context).items()}
     with context.timed("score"):

@@ -16,17 +16,15 @@ from experiments.core.look import PALETTE, SHARED
 from experiments.core.loops import STEPPING
 from experiments.core.results import Estimate, Table, named_table
 from experiments.core.text import bounds, number
-from experiments.paper.components import FULL
-from experiments.study.scores import PUBLISHED
+from experiments.paper.components import run_full_model
 from experiments.study.stages import ENCODE_BATCH, answer_feed
-from experiments.study.study import Study, StudyConfig, run_study
+from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.bench.statistics import Interval, student_interval
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.config import Paper
 from touchr1_jax.training.encoding import encode_program
 from touchr1_jax.training.evaluation import answer_program
 from touchr1_jax.training.feeds import touch_batch
@@ -80,7 +78,7 @@ def study_of_size(config: StudyConfig, name: str, context: Context) -> tuple[Stu
         directory, context.cache_dir, context.console, (), context.stopping, context.processes, context.devices
     )
     with contextlib.closing(inner), context.timed(f"study/{name}"):
-        study = run_study(config, {FULL: PUBLISHED}, inner, {FULL: Paper()})
+        study = run_full_model(config, inner)
         for line in read_metrics(directory):
             phase, seed = line["stage"].split("/")[0], line["stage"].split("/")[-1]
             scalars = {key: value for key, value in line.items() if key not in ("stage", "step")}

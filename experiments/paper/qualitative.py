@@ -26,7 +26,7 @@ from experiments.core.context import Context
 from experiments.core.results import Results, RolloutExample, Table, named_table
 from experiments.paper import presets
 from experiments.paper.bench_scores import bench_answers, bench_questions, touch_rows
-from experiments.paper.components import FULL
+from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
     TouchQuestions,
     concluded,
@@ -38,26 +38,25 @@ from experiments.paper.touch_gain import (
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_results
-from experiments.study.study import BLIND, SFT, Study, StudyConfig, run_study
+from experiments.study.study import BLIND, SFT, Study, StudyConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM
-from touchr1_jax.rl.config import Paper
 from touchr1_jax.training.evaluation import Evaluation
-
-SWAPPED = "swapped"
-"""The control with another object's touch."""
 
 REPLACEMENTS = {
     "drop": "nothing",
     "noise": "noise of each sensor",
-    SWAPPED: "another object's touch",
+    "swapped": "another object's touch",
     "shuffle": "its frames in another order",
 }
 """Control → the replacement of the touch, as the browser names it."""
 
 OTHER_POLICIES = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
 """In the same table."""
+
+SHOWN = 2
+"""Answers of each case that are shown, at most."""
 
 SHOWN_KINDS = ("compose", "compare", "order")
 """Kinds of the bench's items whose answer consists of several answers."""
@@ -71,11 +70,10 @@ DIFFERENCES = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class QualitativeConfig:
-    """The study, the bench's items that are drawn, and how many answers of each case are shown."""
+    """The study, and the bench's items that are drawn."""
 
     study: StudyConfig = dataclasses.replace(presets.BENCH, seeds=1)
     quota: Quota = Quota()
-    shown: int = 2
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -117,7 +115,7 @@ class AnswerCase:
 
 def run(config: QualitativeConfig, context: Context) -> Results:
     """Train one seed, evaluate every variant, choose, show."""
-    study = run_study(config.study, {FULL: PUBLISHED}, context, {FULL: Paper()}, control_variants(FULL))
+    study = run_full_model(config.study, context, control_variants(FULL))
     first = {name: seeds[0] for name, seeds in {**study.answers, **study.variants}.items()}
     full, questions = first[FULL], touch_questions(study, first[SFT])
     slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
@@ -127,12 +125,12 @@ def run(config: QualitativeConfig, context: Context) -> Results:
             full=concluded(full),
             sft=concluded(first[SFT]),
             blind=concluded(first[BLIND]),
-            swapped=concluded(first[control_name(FULL, SWAPPED)]),
+            swapped=concluded(first[control_name(FULL, "swapped")]),
             perceived=np.where(full.streams, slots, BOTTOM),
         ),
     )
     asks = bench_questions(study.data, config.quota, context)
-    chosen = [(case.title, first_of(case.rows, questions.objects, config.shown)) for case in cases]
+    chosen = [(case.title, first_of(case.rows, questions.objects, SHOWN)) for case in cases]
     chosen += item_examples(asks, bench_answers(study.data, asks, [full])[0], touch_rows(study.data), full)
     return study_results(
         study,

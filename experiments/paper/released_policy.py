@@ -259,11 +259,7 @@ def write_policy(
 ) -> None:
     """Publish a policy in one move, so that `directory` is never half written; one that exists is replaced.
 
-    Args:
-      directory: to write.
-      source: the released folder that the policy started from.
-      params: of the policy, adapters merged.
-      progress: called as the released weights are written.
+    `source` is the released folder that the policy started from; adapters are merged in `params`.
     """
     unfinished = directory.with_name(f"{directory.name}.unfinished")
     for folder in (unfinished, directory):

@@ -59,12 +59,7 @@ SMALLEST = DecoderConfig(
 """0.1 million parameters with a vision tower."""
 
 
-VISION_MARKS = {
-    "vision_start": "vision_start",
-    "vision_end": "vision_end",
-    "image": "image_pad",
-    "video": "video_pad",
-}
+VISION_MARKS = {"vision_start": "vision_start", "vision_end": "vision_end", "image": "image_pad", "video": "video_pad"}
 """Token of `QwenConfig` → its name in the vocabulary."""
 
 DECODER_FIELDS = {

@@ -62,7 +62,7 @@ from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, score, score_study, study_results, study_settings
 from experiments.study.stages import StudySFT
-from experiments.study.study import BLIND, SFT, EvalVariant, check_arms, check_variants, train_study
+from experiments.study.study import BLIND, SFT, EvalVariant, check_arms, train_study
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
@@ -155,14 +155,13 @@ class TouchR1Config(TrainingConfig):
 def run(config: TouchR1Config, context: Context) -> Results:
     """Load, train, score, write."""
     arms = {ARM: PUBLISHED}
-    check_arms(arms)
     source = released_folder(config, context)
     variants = {
         ZERO: EvalVariant(of=SFT, evaluate=released.zero_shot),
         WRITTEN: EvalVariant(of=ARM, evaluate=functools.partial(released.written, source)),
         **control_variants(ARM),
     }
-    check_variants(variants, arms)
+    check_arms(arms, variants)
     policy, data, tactile = begin(config, source, context)
     memory = released.memory_bytes(config, policy, data, context.devices.shape)
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))

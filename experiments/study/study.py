@@ -71,29 +71,36 @@ SMOKE = StudyConfig(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainedPolicy:
+class StudySeed:
+    """One seed of a study."""
+
+    config: TrainingConfig
+    data: Dataset
+    policy: TouchPolicy
+    context: Context
+    seed: int
+
+    def ask(self, params: Params, features: Features, *, alone: bool = True) -> Evaluation:
+        """Answers about encoded test contacts, asked under a progress bar; arguments of `evaluate_policy`."""
+        label = self.data.labels("test")
+        with self.context.progress_callback("asking") as progress:
+            return evaluate_policy(self.policy, params, features, label, alone=alone, progress=progress)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainedPolicy(StudySeed):
     """A trained policy of one seed, and everything that another evaluation of it needs.
 
     Attributes:
-      policy, data, config, context, seed: those of the study.
       params: its parameters.
       test: encoded test contacts; `noise` is the noise bank of its encoder.
       evaluation: its answers about them.
     """
 
-    policy: TouchPolicy
-    data: Dataset
-    config: TrainingConfig
-    context: Context
-    seed: int
     params: Params
     test: Features
     noise: Array
     evaluation: Evaluation
-
-    def ask(self, params: Params, features: Features, *, alone: bool = True) -> Evaluation:
-        """Answers with other parameters or other encoded test contacts; arguments of `evaluate_policy`."""
-        return ask_policy(self.policy, params, features, self.data.labels("test"), self.context, alone=alone)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,25 +145,28 @@ def run_study(
       variants: further evaluations of SFT and the arms, by the names of their answers.
 
     Raises:
-      ValueError, RewardError, SizeError, EncoderError: as `check_variants`, `check_arms`, `check_model` and
-        `load_encoder`.
+      ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `load_encoder`.
     """
-    check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()})
+    check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()}, variants)
     check_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
-    check_variants(variants, arms)
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
     policy = build_policy(model, data.clip.sensors)
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
-def check_arms(arms: Mapping[str, Weights], rewards: Mapping[str, AnyReward] | None = None) -> None:
+def check_arms(
+    arms: Mapping[str, Weights],
+    variants: Mapping[str, EvalVariant] = {},
+    rewards: Mapping[str, AnyReward] | None = None,
+) -> None:
     """Try every weighted reward of every arm, so that a misfit is reported before anything is made.
 
     Raises:
       RewardError: as `check_rewards`; it names the arm.
+      ValueError: a variant of a policy that is not there, or with the name of one.
     """
     known = rewards or make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
     for arm, weights in arms.items():
@@ -164,22 +174,12 @@ def check_arms(arms: Mapping[str, Weights], rewards: Mapping[str, AnyReward] | N
             check_rewards(known, weights, TOUCH_LANGUAGE)
         except RewardError as error:
             raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
-
-
-def check_variants(variants: Mapping[str, EvalVariant], arms: Mapping[str, Weights]) -> None:
-    """Check the names of evaluation variants against the policies of a study.
-
-    Raises:
-      ValueError: a variant of a policy that is not there, or with the name of one.
-    """
     policies = (SFT, *arms)
     for name, variant in variants.items():
         if variant.of not in policies:
             raise ValueError(f"variant {name!r} is of {variant.of!r}: must be one of {', '.join(policies)}; correct it")
         if name in (BLIND, *policies):
-            raise ValueError(
-                f"variant {name!r} has the name of a policy: its answers would take their place; rename it"
-            )
+            raise ValueError(f"variant {name!r} has the name of a policy, whose answers it would replace; rename it")
 
 
 def open_study_data(config: StudyConfig, context: Context) -> Dataset:
@@ -214,9 +214,10 @@ def train_study(
         for arm, weights in arms.items()
     }
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, *arms, BLIND, *variants)}
+    study: dict[str, Any] = {"config": config, "data": data, "policy": policy, "context": context, "share": share}
+    study |= {"tactile": tactile, "evidence": evidence, "arms": made, "variants": variants}
     for seed in context.each("seeds", range(config.seeds)):
-        of_seed = _Seed(config, data, policy, tactile, share, evidence, made, variants, context, seed)
-        for name, evaluation in of_seed.answers().items():
+        for name, evaluation in _Seed(**study, seed=seed).answers().items():
             answers[name].append(evaluation)
     further = {name: answers.pop(name) for name in variants}
     return Study(
@@ -247,20 +248,15 @@ def grpo_contacts(data: Dataset, features: Features, noise: Array) -> EncodedCon
     return EncodedContacts(features=features, label=label, truth=truth, noise=noise)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Seed:
-    """One seed: its SFT checkpoint, the arms that start from it, and its blind baseline."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Seed(StudySeed):
+    """Its SFT checkpoint, the arms that start from it, and its blind baseline."""
 
-    config: TrainingConfig
-    data: Dataset
-    policy: TouchPolicy
     tactile: Params | None
     share: bool
     evidence: np.ndarray
     arms: Mapping[str, GRPOArm]
     variants: Mapping[str, EvalVariant]
-    context: Context
-    seed: int
 
     def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
@@ -286,7 +282,7 @@ class _Seed:
     def _blind(self) -> Evaluation:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
         features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return ask_policy(self.policy, params, features, self.data.labels("test"), self.context)
+        return self.ask(params, features)
 
     def _sft(self, config: StudySFT, stage: str, **options: Any) -> Params:
         order: dict[str, Any] = {"seed": self.seed, "stage": stage, "share": self.share}
@@ -294,21 +290,12 @@ class _Seed:
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Evaluate a policy, then all variants of it."""
-        policy, context = self.policy, self.context
-        self._evaluate(name, lambda: ask_policy(policy, params, test, self.data.labels("test"), context))
+        self._evaluate(name, lambda: self.ask(params, test))
+        of_study = {field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}
         for title, variant in self.variants.items():
             if variant.of == name:
-                trained = TrainedPolicy(
-                    policy=policy,
-                    data=self.data,
-                    config=self.config,
-                    context=context,
-                    seed=self.seed,
-                    params=params,
-                    test=test,
-                    noise=noise,
-                    evaluation=load_answers(self._path(name)),
-                )
+                evaluation = load_answers(self._path(name))
+                trained = TrainedPolicy(**of_study, params=params, test=test, noise=noise, evaluation=evaluation)
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
     def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:
@@ -319,14 +306,6 @@ class _Seed:
 
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
-
-
-def ask_policy(
-    policy: TouchPolicy, params: Params, features: Features, label: np.ndarray, context: Context, *, alone: bool = True
-) -> Evaluation:
-    """`evaluate_policy` under a progress bar of the run."""
-    with context.progress_callback("asking") as progress:
-        return evaluate_policy(policy, params, features, label, alone=alone, progress=progress)
 
 
 def save_answers(path: Path, evaluation: Evaluation) -> None:

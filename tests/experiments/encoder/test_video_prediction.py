@@ -8,8 +8,15 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.encoder import video_prediction
 from experiments.encoder.held_out import StageOneDataConfig
-from experiments.encoder.video_prediction import TOUCH, VISION, VideoTrainingConfig
-from experiments.encoder.video_scoring import COPY, MEAN, FrameScores, mean_frames
+from experiments.encoder.video_prediction import (
+    COPY,
+    MEAN,
+    TOUCH,
+    VISION,
+    FrameScores,
+    VideoTrainingConfig,
+    mean_frames,
+)
 from sensors_io.pipeline import clip_batches
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
@@ -52,5 +59,5 @@ def test_mean_frames_are_means_of_what_was_recorded(data, context):
 def test_scores_leave_out_what_is_missing():
     values = np.array([[[1.0, np.nan, 7.0]], [[3.0, 5.0, 9.0]]])
     scores = FrameScores(values={"l1": values}, skips=np.array([3, 3, 5]))
-    np.testing.assert_array_equal(scores.by_contact("l1", 3), [1, 4])
-    np.testing.assert_array_equal(scores.by_sensor("l1", 3), [3])
+    np.testing.assert_array_equal(scores.mean("l1", 3, 1), [1, 4])
+    np.testing.assert_array_equal(scores.mean("l1", 3, 0), [3])

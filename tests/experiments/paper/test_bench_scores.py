@@ -1,5 +1,7 @@
 """The bench's questions answered from single touches, their average, rows pooled over columns: hand values."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -60,10 +62,8 @@ def everything() -> tuple[Ask, ...]:
     """Questions of every kind about objects whose hardness is their number modulo three."""
     singles = [ask("identify", (t % 3,), touches=(t,), attributes=(a,)) for a in ATTRIBUTES for t in range(6)]
     pairs = [
-        ask("compare", (int(b % 3 > a % 3),), touches=(a, b), group=f"{min(a, b)}{max(a, b)}", position=int(a > b))
-        for a in range(3)
-        for b in range(3)
-        if a != b
+        ask("compare", (int(b > a),), touches=(a, b), group=f"{min(a, b)}{max(a, b)}", position=int(a > b))
+        for a, b in itertools.permutations(range(3), 2)
     ]
     orders = [
         ask("order", (k,), touches=tuple(3 * half + order.index(place) for place in range(3)))
@@ -131,9 +131,6 @@ def test_pooled_columns_are_shares_and_errors_count_the_other_way():
     assert got["sft"][0] == "50.0"  # 50, 60 and 50, 50: the middle two of four
     assert got["full"][0] == "65.0"  # 60, 70 and 75, 50: of 50, 60, 70, 75 the middle two
     assert got["full"][2] == "0.81"  # h: 60 against 50 and 60, 70 against both: 3.5 of 4; omae: 2 and 2 halves, 3 of 4
-    for mean, ends, *_ in got.values():
-        low, high = map(float, ends.strip("[]").split(","))
-        assert low <= float(mean) <= high
     assert pooled_table({"sft": rows["constant"]}, "sft") == ()
 
 

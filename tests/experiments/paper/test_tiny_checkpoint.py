@@ -7,14 +7,7 @@ import pytest
 
 from experiments.core.context import read_metrics
 from experiments.paper.released_policy import build_released_policy, instruction
-from experiments.paper.tiny_checkpoint import (
-    STAGE,
-    UNUSED_TOUCH,
-    drawn_batch,
-    empty_touch,
-    teach,
-    write_tiny,
-)
+from experiments.paper.tiny_checkpoint import STAGE, UNUSED_TOUCH, drawn_batch, empty_touch, teach, write_tiny
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.policy import Features, prompt_mask

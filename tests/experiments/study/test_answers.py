@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from tests.experiments import tiny
+from tests.experiments.study.test_study import answers_about
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rl.rollout import GreedyAnswers
-from touchr1_jax.training.evaluation import Evaluation, evaluate_policy, reward_terms, rewards_of
+from touchr1_jax.training.evaluation import evaluate_policy, reward_terms, rewards_of
 from touchr1_jax.types import Parsed
 
 WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
@@ -19,26 +20,7 @@ WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
 @pytest.fixture(scope="module")
 def said(data):
     """Made-up answers to all questions about the test contacts, right and wrong, parsed and not."""
-    rng = np.random.default_rng(0)
-    contact, attribute = np.nonzero(data.label[data.parts["test"]] >= 0)
-    n, asked = len(contact), np.arange(4) == attribute[:, None]
-    level = lambda *shape: np.where(asked if len(shape) < 3 else asked[:, None], rng.integers(-1, 3, shape), -1)
-    return Evaluation(
-        contact=contact,
-        attribute=attribute,
-        streams=rng.random((n, 4)) < 0.7,
-        tokens=np.zeros((n, 0), np.int32),
-        parsed=Parsed(
-            perceive=level(n, 4, 4).astype(np.int32),
-            compare=level(n, 4).astype(np.int32),
-            conclude=level(n, 4).astype(np.int32),
-            formatted=rng.random(n) < 0.7,
-            truncated=np.zeros(n, bool),
-            length=np.zeros(n, np.int32),
-        ),
-        label=np.where(asked, data.label[data.parts["test"]][contact], -1),
-        alone=None,
-    )
+    return answers_about(data.labels("test"))
 
 
 def test_the_terms_of_a_reward_sum_to_the_total(policy, data, said):

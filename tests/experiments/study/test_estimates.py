@@ -8,7 +8,7 @@ import pytest
 
 from experiments.core.errors import ResultsError
 from experiments.core.results import Estimate
-from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate, pooled
 from touchr1_jax.bench.metrics import accuracy, ordinal_mae
 
 GOOD = Estimate(mean=50.0, ci95=(40.0, 60.0), per_seed=(45.0, 55.0))
@@ -22,6 +22,12 @@ def test_estimate_averages_seeds_and_resamples_objects():
     assert made.per_seed == (100.0, pytest.approx(200 / 3))
     assert made.mean == pytest.approx(250 / 3)
     assert made.ci95 == (50.0, 100.0)  # two objects, so the ends are theirs
+
+
+def test_pooling_means_over_seeds_question_by_question():
+    one = ordinal_mae(np.array([[0], [1], [0]]), LABEL[:, None], np.array([3]))
+    two = dataclasses.replace(one, values=one.values + 2.0)
+    assert np.array_equal(pooled([one, two]).values, one.values + 1.0)
 
 
 def test_comparison_over_seeds_by_hand():

@@ -14,7 +14,7 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
-from touchr1_jax.training.feeds import AnswerFeed, Feed, falling_share, random_streams
+from touchr1_jax.training.feeds import AnswerFeed, falling_share, random_streams
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch, take
 
@@ -102,12 +102,6 @@ def test_answers_say_what_the_evidence_and_the_labels_say(policy, answers, clips
     assert seen, "evidence that always agrees with the label tests nothing"
 
 
-def test_the_questions_of_a_contact_are_about_different_attributes(policy, answers, clips):
-    batch = answers(questions=4).make(clips, np.random.default_rng(0))
-    for i in range(3):
-        assert sorted(attribute_of(policy, ids) for ids in batch.ids[i]) == [0, 1, 2, 3]
-
-
 def test_absent_streams_are_never_asked_about(answers, clips):
     for draw in range(10):
         streams = np.asarray(answers().make(clips, np.random.default_rng(draw)).streams)
@@ -116,13 +110,14 @@ def test_absent_streams_are_never_asked_about(answers, clips):
 
 
 def test_an_attribute_that_nobody_annotated_has_no_answer_and_no_loss(policy, answers, clips):
+    """The questions of a contact are about different attributes."""
     hidden = clips | {"label": np.where(np.arange(4) == 1, -1, clips["label"])}
     batch = answers(questions=4).make(hidden, np.random.default_rng(0))
     for i in range(3):
-        for j in range(4):
-            asked = attribute_of(policy, batch.ids[i, j])
-            assert bool(batch.token_mask[i, j].any()) == (asked != 1)
-            assert (asked != 1) or (batch.tokens[i, j] == policy.tokenizer.pad_id).all()
+        asked = np.array([attribute_of(policy, ids) for ids in batch.ids[i]])
+        assert sorted(asked) == [0, 1, 2, 3]
+        assert np.array_equal(batch.token_mask[i].any(-1), asked != 1)
+        assert (batch.tokens[i, asked == 1] == policy.tokenizer.pad_id).all()
 
 
 def test_a_blind_policy_perceives_nothing_and_is_told_the_label(policy, answers, clips):
@@ -131,9 +126,6 @@ def test_a_blind_policy_perceives_nothing_and_is_told_the_label(policy, answers,
     for i, a, _, said in readings(policy, batch):
         assert said.perceive == [[-1] * 4] * 4
         assert said.compare[a] == said.conclude[a] == clips["label"][i, a]
-
-
-def test_a_blind_policy_is_shown_no_touch(answers):
     batch = next(answers(blind=True))
     assert not np.asarray(batch.touch.stream_mask).any()
     assert np.asarray(batch.touch.frames).size < np.asarray(batch.touch.view).size
@@ -213,21 +205,20 @@ def equal(a, b) -> bool:
     return all(np.array_equal(x, y) for m, n in zip(a, b, strict=True) for x, y in zip(m, n, strict=True))
 
 
-def test_a_feed_must_make_batches(questions):
-    with pytest.raises(TypeError, match=r"Feed\.make is not defined"):
-        Feed.make(questions(), None, np.random.default_rng(0))
+def contacts_of(features, batch) -> list[int]:
+    """The contacts that the questions of a batch are about, by their touch."""
+    return [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
 
 
 def test_targets_hold_every_label_with_the_one_that_is_asked(policy, features, data):
     """Only hardness is asked about; a reward sees the material and all else that is true of the contact."""
-    truth = data.label[data.parts["grpo"]]
+    truth = data.labels("grpo")
     label = np.where(np.arange(4) == 0, truth, -1)
     questions = QuestionFeed(policy, features, label, batch_size=4, seed=1, truth=truth)
     for _, batch in zip(range(5), questions, strict=False):
         target = jax.tree.map(np.asarray, batch.target)
-        contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
         assert (target.asked == [True, False, False, False]).all()
-        np.testing.assert_array_equal(target.label, truth[contact])
+        np.testing.assert_array_equal(target.label, truth[contacts_of(features, batch)])
 
 
 def test_targets_describe_the_question(policy, questions, data):
@@ -249,8 +240,7 @@ def test_every_question_comes_once_an_epoch_and_none_without_a_label(policy, fea
     label = np.where(np.arange(4) == 3, -1, data.label[data.parts["grpo"]])
     total = int((label >= 0).sum())
     batch = next(QuestionFeed(policy, features, label, batch_size=total, seed=0))
-    asked = np.asarray(batch.target.asked).argmax(1)
-    contact = [int(np.flatnonzero((features.touch == touch).all((1, 2, 3)))[0]) for touch in batch.features.touch]
+    asked, contact = np.asarray(batch.target.asked).argmax(1), contacts_of(features, batch)
     assert sorted(zip(contact, asked, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
     np.testing.assert_array_equal(batch.target.label, label[contact])
 

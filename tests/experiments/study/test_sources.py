@@ -1,6 +1,7 @@
 """Where data comes from: refused combinations, caches named after what made them."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -29,15 +30,17 @@ def imported(monkeypatch):
     return calls
 
 
-def test_generated_scenes_take_no_directory(tmp_path):
-    with pytest.raises(ValueError, match=f"data_dir is {tmp_path}: data 'generated' takes no data_dir: drop it"):
-        dataclasses.replace(GENERATED, data_dir=tmp_path)
-
-
-@pytest.mark.parametrize("kind", ["physiclear", "records"])
-def test_recordings_need_a_directory(kind):
-    with pytest.raises(ValueError, match=f"data_dir is None: data '{kind}' needs data_dir"):
-        dataclasses.replace(GENERATED, data=kind)
+@pytest.mark.parametrize(
+    ("data", "folder", "message"),
+    [
+        ("generated", Path("x"), "data_dir is x: data 'generated' takes no data_dir: drop it"),
+        ("physiclear", None, "data_dir is None: data 'physiclear' needs data_dir"),
+        ("records", None, "data_dir is None: data 'records' needs data_dir"),
+    ],
+)
+def test_recordings_need_a_folder_and_scenes_have_none(data, folder, message):
+    with pytest.raises(ValueError, match=message):
+        SourceConfig(data=data, data_dir=folder)
 
 
 def test_records_are_taken_as_they_are(records, context):

@@ -208,7 +208,7 @@ def test_sizes_that_the_data_determine_are_not_set(model, message):
 def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
     check_arms({"published": PUBLISHED})
     with pytest.raises(RewardError, match=rf"{message}.* \(in the weights of arm 'good', {{'mine': 0.5}}\)"):
-        check_arms({"good": {"mine": 0.5}}, {"mine": reward})
+        check_arms({"good": {"mine": 0.5}}, rewards={"mine": reward})
     with pytest.raises(RewardError, match=r"no reward is called 'brevty'; choose from accuracy.* of arm 'mine'"):
         check_arms({"published": PUBLISHED, "mine": {"brevty": 1.0}})
 
