@@ -72,9 +72,6 @@ def test_fields_take_the_place_of_pictures(data):
 )
 def test_variants_have_their_tokens(tokens, names):
     assert {name for name, variant in VARIANTS.items() if variant.tokens == tokens} == names
-
-
-def test_one_variant_is_the_encoder_of_the_studies():
     studied, default = VARIANTS[STUDIED].config, PretrainConfig()
     assert (studied.encoder, studied.frames_kept) == (default.encoder, default.frames)
 

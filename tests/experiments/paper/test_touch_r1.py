@@ -44,30 +44,18 @@ def test_settings_that_cannot_be_trained_are_named(change, message):
         dataclasses.replace(DEFAULT, **change)
 
 
-def refused(tmp_path, *arguments: str) -> int:
-    return main(["touch_r1", "--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data"), *arguments])
-
-
-def test_without_weights_there_is_nothing_to_train(tmp_path, capsys):
-    assert refused(tmp_path) == 1
-    said = " ".join(capsys.readouterr().err.split())
-    assert "WeightsError: weights is None: must be the folder of a released Qwen2.5-VL" in said
-    assert "pass --weights DIR, or --scale smoke" in said
-    assert not (tmp_path / "data" / "scenes").exists()
-
-
-def test_a_folder_that_is_none_is_named_before_data_are_made(tmp_path, capsys):
-    assert refused(tmp_path, "--weights", str(tmp_path / "nowhere")) == 1
-    said = "".join(capsys.readouterr().err.split())
-    assert "nowhere/config.jsonisnofile:mustbetheconfig.jsonofacheckpoint;correctthedirectory" in said
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (None, "weights is None: must be the folder of a released Qwen2.5-VL"),
+        ("nowhere", "nowhere/config.json is no file: must be the config.json of a checkpoint; correct the directory"),
+    ],
+)
+def test_a_folder_without_weights_is_named_before_data_are_made(tmp_path, capsys, weights, message):
+    places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
+    assert main(["touch_r1", *places, *([] if weights is None else ["--weights", str(tmp_path / weights)])]) == 1
+    assert "".join(message.split()) in "".join(capsys.readouterr().err.split())
     assert not list((tmp_path / "data").glob("scenes-*"))
-
-
-def test_only_a_trial_makes_weights_of_its_own():
-    assert not DEFAULT.tiny
-    assert SMOKE.tiny
-    assert SMALL.tiny
-    assert SMOKE.weights is SMALL.weights is DEFAULT.weights is None
 
 
 @pytest.mark.parametrize(("config", "first"), [(SMOKE, DRAWN), (SMALL, TAUGHT)])

@@ -21,15 +21,12 @@ def test_no_object_is_in_two_parts_and_no_contact_is_lost(data):
     assert sorted(np.concatenate(list(data.parts.values()))) == list(range(len(data.store)))
 
 
-def test_a_share_of_the_training_objects_is_kept_for_grpo(data):
+def test_a_share_of_the_training_objects_is_kept_for_grpo_with_all_their_contacts(data, tmp_path):
     train = data.store.contacts_of_split("train")
     assert len(data.parts["grpo"]) == round(0.35 * len(train))
     assert set(data.parts["sft"]) | set(data.parts["grpo"]) == set(train)
     again = split_parts(data.store, 0.35)
     assert all(np.array_equal(again[part], data.parts[part]) for part in PARTS)
-
-
-def test_all_contacts_of_an_object_stay_together(tmp_path):
     store = RecordStore(fakes.write(tmp_path, contacts=16))  # two trials of each object
     parts = split_parts(store, 0.5)
     ids = {part: {store.contacts[i].object_id for i in rows} for part, rows in parts.items()}
@@ -60,21 +57,18 @@ def test_the_prior_is_that_of_training_labels_alone(data):
 
 
 def test_records_are_opened_with_their_own_sensors_labels_and_forces(tmp_path):
-    path = fakes.write(tmp_path, contacts=8, sensors=SENSORS[:2])
+    path = fakes.write(tmp_path / "forces", contacts=8, sensors=SENSORS[:2])
     data = open_dataset(path, ClipConfig(sensors=SENSORS[:1]), 0.5)
     assert data.clip.sensors == data.store.meta.sensors
     assert data.label.tolist()[4:6] == [[2, 0, 1, 2]] * 2
     assert data.object_ids.tolist()[:3] == ["object_0", "object_0", "object_1"]
     assert data.has_force
     assert not data.visual_lies.any()  # unknown of recordings
-
-
-def test_recordings_without_forces_say_so(tmp_path):
-    with fakes.RecordWriter(tmp_path, meta=fakes.META) as writer:
+    with fakes.RecordWriter(tmp_path / "bare", meta=fakes.META) as writer:
         for n in range(4):
             writer.write_object(fakes.card(n))
             writer.write_contact([fakes.sequence(n, force_n=None)])
-    assert not open_dataset(tmp_path, ClipConfig(), 0.5).has_force
+    assert not open_dataset(tmp_path / "bare", ClipConfig(), 0.5).has_force
 
 
 def test_the_summary_counts_contacts_and_objects(data):

@@ -38,9 +38,6 @@ def test_accuracy_by_agreement_by_hand():
     assert counts == [1, 4]  # two objects each; unread and not asked are left out
     assert [r.mean for r in right] == [50.0, 100.0]
     np.testing.assert_allclose(weight, [0.5, 0.5])
-
-
-def test_agreement_needs_single_sensors():
     with pytest.raises(ValueError, match="ask with each sensor alone"):
         accuracy_by_agreement(LevelAnswers(answer=ANSWERS.answer, label=ANSWERS.label, objects=ANSWERS.objects))
 

@@ -102,10 +102,8 @@ def test_the_joint_mode_is_that_of_whole_rows():
     assert joint_mode(np.array(rows)).tolist() == [0, 0, 0, 5]  # not 1 1 1 2, the mode of each column
     rows = [[2, 1, 0, 7], [2, 1, 0, 3], [2, 1, 0, 3], [0, 0, 0, 7], [0, 0, 0, 7]]
     assert joint_mode(np.array(rows)).tolist() == [2, 1, 0, 3]  # its own most frequent material
-
-
-def test_the_joint_mode_counts_annotated_rows_alone():
-    assert joint_mode(np.array([[1, 1, 1, 4], [0, 0, -1, 2], [0, 0, -1, 2]])).tolist() == [1, 1, 1, 4]
+    rows = [[1, 1, 1, 4], [0, 0, -1, 2], [0, 0, -1, 2]]
+    assert joint_mode(np.array(rows)).tolist() == [1, 1, 1, 4]  # annotated rows alone
 
 
 def test_a_constant_scores_what_its_label_share_is(study):
@@ -128,12 +126,6 @@ def test_a_constant_agrees_with_itself_and_is_right_where_its_pairs_are(study):
     assert (np.asarray(said.parsed.perceive)[said.contact == 4, 2:] == -1).all()
 
 
-def test_levels_are_given_contact_by_contact(study):
-    scores = table(study, constant_answers(study, TEST))
-    assert (scores["acc"], scores["mat_acc"], scores["omae"], scores["csc"]) == (100, 100, 0, 100)
-    assert scores["reward"] == pytest.approx(1)  # the whole published reward
-
-
 def test_every_baseline_answers_the_questions_of_the_policies(study):
     rows = baselines(study)
     assert list(rows) == ["constant", "constant_joint", "constant_middle", "force_only"]
@@ -147,11 +139,8 @@ def test_every_baseline_answers_the_questions_of_the_policies(study):
     assert table(study, rows["constant_middle"])["middle_rate"] == 100
 
 
-def test_force_that_gives_hardness_away_is_found_out(study):
+def test_force_that_gives_hardness_away_is_found_out_where_it_is_measured(study):
     assert table(study, baselines(study)["force_only"])["h_acc"] == 100
-
-
-def test_data_without_forces_has_no_force_baseline(study):
     silent = dataclasses.replace(study, data=dataclasses.replace(study.data, has_force=False))
     assert "force_only" not in baselines(silent)
 
@@ -175,7 +164,10 @@ def test_a_variant_evaluates_a_policy_that_is_there_under_a_name_of_its_own(cont
         run_study(tiny.STUDY, {}, context, variants={name: variant})
 
 
-def test_answers_by_single_sensors_are_their_own(study):
+def test_levels_are_given_contact_by_contact_and_by_single_sensors(study):
+    scores = table(study, constant_answers(study, TEST))
+    assert (scores["acc"], scores["mat_acc"], scores["omae"], scores["csc"]) == (100, 100, 0, 100)
+    assert scores["reward"] == pytest.approx(1)  # the whole published reward
     alone = np.tile([0, 1, 2, 0], (5, 4, 1))
     alone[:, 0] = TEST
     said = level_answers(study.policy, study.answers[SFT][0], TEST, alone)
