@@ -22,7 +22,7 @@ _POISSON = 0.48  # of silicone, nearly incompressible
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Learn a sensor's colours from pictures of a ball pressed into it, with no labelling; says its held-out error.
+    """Fit the map from colour to slope from pictures of a ball pressed into the gel; print its error on unseen presses.
 
     Press one rigid ball a dozen times or more, all over the window, and take one picture of the gel at rest.
     """
@@ -32,18 +32,18 @@ class Calibrate:
     background: pathlib.Path
     """Picture of the gel at rest."""
     ball_diameter_mm: float
-    """Of the ball."""
+    """Diameter of the ball."""
     out: pathlib.Path
-    """File of the calibration."""
+    """Calibration file to write."""
     mm_per_px: float | None = None
-    """Pitch of the pixels; the geometry's where there is one, and measured where the press depths are known."""
+    """Millimetres per pixel; not needed if a geometry or the press depths are given."""
     press_depths_mm: tuple[float, ...] = ()
-    """Indentation of each picture's ball since first contact, in the order of the pictures, or one depth for
-    all: the pitch is then measured from the size of the contacts."""
+    """Depth of the ball below first contact in each picture, in their order, or one depth for all; millimetres per
+    pixel are then measured from the size of the contacts."""
     gel_thickness_mm: float = 4.5
-    """Of the soft layer on its window, which decides how large a contact is at a depth."""
+    """Thickness of the soft layer, which determines the size of a contact at a given depth."""
     geometry: pathlib.Path | None = None
-    """File that `geometry` wrote: the pictures are straightened first, and `extract` must then be given it too."""
+    """File written by `geometry`: pictures are rectified first. Give the same file to `extract`."""
     sensor: str = "gelsight_mini"
     """Name of the sensor."""
     config: Annotated[CalibrateConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=CalibrateConfig)
@@ -72,8 +72,8 @@ class Calibrate:
         """The pitch by which the contacts are as large as the ball makes them at the known depths."""
         if self.mm_per_px is not None or self.geometry is not None:
             raise CalibrationError(
-                "press_depths_mm is given beside mm_per_px or geometry: must be alone, since it measures the pitch; "
-                "leave one of them out"
+                "press_depths_mm is given together with mm_per_px or geometry: must be alone, since it measures the "
+                "pitch; leave one of them out"
             )
         depths = self.press_depths_mm * (len(pictures) if len(self.press_depths_mm) == 1 else 1)
         if len(depths) != len(pictures):

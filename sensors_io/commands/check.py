@@ -30,11 +30,11 @@ class Check:
     records: tyro.conf.Positional[pathlib.Path]
     """Directory of the records."""
     pictures: bool = False
-    """Look at the pictures, against the gel at rest that was recorded with them or else `--background`."""
+    """Judge the pictures too, against the gel at rest that was recorded with them, or else `--background`."""
     background: pathlib.Path | None = None
-    """Picture of the gel at rest, where none was recorded."""
+    """Picture of the gel at rest, if none was recorded."""
     calibration: pathlib.Path | None = None
-    """Of the colours, from `calibrate`: contact is then told by depth, and the pitch by it where none was recorded."""
+    """Calibration from `calibrate`: contact is then judged by depth, and mm per pixel are known."""
 
     def run(self) -> int:
         store = RecordStore(self.records, allow_incomplete=True)

@@ -17,11 +17,11 @@ class Devices:
     """List the cameras of this machine, whether a Tac3D is sending, and whether a Net F/T answers at its address."""
 
     tac3d_port: int = PORT
-    """On which the vendor's program of a Tac3D sends."""
+    """UDP port that the vendor's Tac3D program sends to."""
     netft_host: str | None = None
-    """Address of a Net F/T; without one none is asked for."""
+    """Address of a Net F/T force sensor; without one, none is queried."""
     wait_s: float = 1.0
-    """For each of them."""
+    """Time to wait for each device."""
 
     def run(self) -> int:
         table = Table("device", "product", "serial", "at")

@@ -23,7 +23,7 @@ _REFUSED = (("depth_mm", (1, 1)), ("deformation_mm", (1, 1, 2)), ("shear_mm", (1
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Extract:
-    """Depth, contact, deformation, shear and force of pictures, as arrays over frames in one npz.
+    """Extract depth, contact, deformation, shear and force from pictures, as arrays over frames in one npz file.
 
     A field that the input cannot carry is flagged in every frame, said so, and written as NaN on a grid of one point.
     """
@@ -33,15 +33,15 @@ class Extract:
     background: pathlib.Path
     """Picture of the gel at rest."""
     out: pathlib.Path
-    """The npz."""
+    """File to write (.npz)."""
     sensor: str = "gelsight_mini"
-    """Name of the sensor; whose frames are taken out of records."""
+    """Name of the sensor; of records, its frames are read."""
     calibration: pathlib.Path | None = None
-    """File that `calibrate` wrote; without it there is neither depth nor shear."""
+    """Calibration from `calibrate`; without it, neither depth nor shear is computed."""
     mm_per_px: float | None = None
-    """Pitch of the pixels; the calibration's or the geometry's where there is one."""
+    """Millimetres per pixel; by default those of the calibration or the geometry."""
     geometry: pathlib.Path | None = None
-    """File that `geometry` wrote, by which pictures are made straight first; the one that `calibrate` was given."""
+    """File written by `geometry`: pictures are rectified first. Must be the file that `calibrate` was given."""
     config: Annotated[ExtractConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ExtractConfig)
 
     def run(self) -> int:

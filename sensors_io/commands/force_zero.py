@@ -28,9 +28,9 @@ class ForceZeroing(Bench):
     out: pathlib.Path
     """JSON for `record --gravity`."""
     poses: int = 8
-    """To be held; six in all directions are the least that make sense."""
+    """Number of poses to hold; use six or more, in all directions."""
     wait_s: float = 300.0
-    """For all of them."""
+    """Time limit for all poses together."""
     still: PoseConfig = dataclasses.field(default_factory=PoseConfig)
     """Criterion for a hand at rest."""
 

@@ -23,9 +23,9 @@ class MeasureGeometry:
     columns: int
     """Pins from left to right."""
     pitch_mm: float
-    """Between neighbouring pins."""
+    """Distance between neighbouring pins."""
     out: pathlib.Path
-    """JSON of the geometry."""
+    """Geometry file to write (JSON)."""
 
     def run(self) -> int:
         picture, rest = read_picture(self.board), read_picture(self.background)

@@ -42,9 +42,9 @@ class Label(Shares):
     records: tyro.conf.Positional[pathlib.Path]
     """Directory of the records."""
     labels: pathlib.Path
-    """The table."""
+    """CSV table of labels."""
     annotator: str
-    """Whose labels they are."""
+    """Name of the annotator."""
 
     def run(self) -> int:
         store = RecordStore(self.records, allow_incomplete=True)
@@ -89,7 +89,7 @@ def read_labels(path: pathlib.Path) -> dict[str, Row]:
             raise LabelsError(f"{path}, line {number}: must have {len(columns)} cells; complete it")
         row = {column: cell.strip() for column, cell in line.items()}
         if row[ID] in rows:
-            raise LabelsError(f"{path}, line {number}: object_id {row[ID]!r} stands there twice; keep one line")
+            raise LabelsError(f"{path}, line {number}: object_id {row[ID]!r} appears twice; keep one line")
         rows[row[ID]] = row
     return rows
 

@@ -69,31 +69,31 @@ class Record(Bench):
     out: pathlib.Path
     """Directory of the records."""
     object_id: str
-    """Of the object; `label` gives it labels afterwards."""
+    """Identifier of the object; `label` adds its labels later."""
     site: int = 0
     """Number of the place on the object."""
     free_s: float = 0.0
-    """> 0 records free motion for so many seconds instead of the protocol."""
+    """If > 0, record free motion for this many seconds instead of the protocol."""
     gravity: pathlib.Path | None = None
-    """JSON of bias and dead weight, made by `force-zero`; none leaves readings alone."""
+    """Bias and dead weight from `force-zero` (JSON); without it, force readings are stored uncorrected."""
     sync: pathlib.Path | None = None
-    """JSON of how late each sensor is stamped, made by `sync`; none takes their stamps as they are."""
+    """Delays of the sensors from `sync` (JSON); without it, timestamps are stored uncorrected."""
     mount: MountConfig = dataclasses.field(default_factory=MountConfig)
     """Mounting of the gel on the force sensor."""
     contact_mm: tuple[float, float, float] | None = None
-    """Centre of the contact in the frame of an RGB-D camera, X right, Y down, Z ahead: stores where it shows."""
+    """Centre of the contact in the frame of the RGB-D camera (X right, Y down, Z forward); stores its image region."""
     window_mm: float = 20.0
-    """Side of the sensing window, for that."""
+    """Side of the sensing window; used with `--contact-mm`."""
     licence: str = "all rights reserved"
-    """Of the recordings."""
+    """Licence of the recordings."""
     coach: CoachConfig = dataclasses.field(default_factory=CoachConfig)
     """Thresholds of force and time."""
     port: int | None = None
-    """Of a live view in the browser beside the recording; none shows the terminal alone."""
+    """Port of a live view in the browser; without one, only the terminal shows the recording."""
     background: pathlib.Path | None = None
-    """Picture of the gel at rest, for fields in that view."""
+    """Picture of the gel at rest; enables fields in the live view."""
     calibration: pathlib.Path | None = None
-    """Of the colours, for depth in that view."""
+    """Calibration from `calibrate`; enables depth in the live view."""
 
     def run(self) -> int:
         parts = self.parts()

@@ -18,7 +18,7 @@ _LOOK_S = 0.02  # between two looks at the devices
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Sync(Bench):
-    """Measure how late each sensor is stamped against the force sensor, or against the first one, by touching them.
+    """Measure by touch how late each sensor's timestamps are against the force sensor, or else the first one.
 
     Devices are joined by a + of its own: sync --out S.json uvc --serial S + tac3d + netft --host H.  Keep still for a
     second, then tap everything at once, sharply and irregularly, five times or more (`--by taps`), or press and release
@@ -26,13 +26,13 @@ class Sync(Bench):
     """
 
     out: pathlib.Path | None = None
-    """JSON for `record --sync`; none only prints."""
+    """File for `record --sync` (JSON); without it, the delays are only printed."""
     check: pathlib.Path | None = None
-    """JSON of an earlier `sync`: what is left over with it is printed, exit status 1 where it is too much."""
+    """File of an earlier `sync`: print the remaining delays; exit status 1 if one is too large."""
     most_s: float = 0.01
-    """Left over, for `--check`."""
+    """Largest remaining delay that `--check` accepts."""
     seconds: float = 15.0
-    """Of touching."""
+    """Duration of the measurement."""
     by: By = "taps"
     """Events that are compared: the rise of taps, or the course of presses."""
 
@@ -73,7 +73,7 @@ class Sync(Bench):
             raise OffsetsError(f"{self.check} knows nothing of {', '.join(unknown)}; measure again with --out")
         zero_s = before[found.reference]
         left_s = {name: offset.late_s - (before[name] - zero_s) for name, offset in found.sensors.items()}
-        table = Table("sensor", "left over", f"against {found.reference}, at most {1e3 * self.most_s:g} ms")
+        table = Table("sensor", "remaining delay", f"against {found.reference}, at most {1e3 * self.most_s:g} ms")
         for name, left in left_s.items():
             table.add_row(name, f"{1e3 * left:+.1f} ms", "good" if abs(left) <= self.most_s else "measure again")
         OUT.print(table)

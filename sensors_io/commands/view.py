@@ -21,17 +21,17 @@ class View(Bench):
     """
 
     port: int = 8765
-    """Of the page."""
+    """Port of the page."""
     host: str = "127.0.0.1"
     """0.0.0.0 shows it to the whole network, to those who know the token in the printed address."""
     background: pathlib.Path | None = None
     """Picture of the gel at rest: fields are then extracted from the first camera's frames."""
     calibration: pathlib.Path | None = None
-    """Of the colours, from `calibrate`; without one there is no depth."""
+    """Calibration from `calibrate`; without one, no depth is shown."""
     mm_per_px: float = 0.0634
-    """Pitch of the frames where neither calibration nor device tells it; that of a GelSight Mini at 320 × 240."""
+    """Millimetres per pixel if neither calibration nor device states them; default: a GelSight Mini at 320 × 240."""
     seconds: float = 0.0
-    """> 0 ends after so long."""
+    """If > 0, stop after this time."""
 
     def run(self) -> int:
         parts = self.parts()

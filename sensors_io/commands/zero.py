@@ -27,14 +27,14 @@ class Zeroable(Device, Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Zero(Bench):
-    """Let sensors take their present state as zero; nothing may touch them.  Tac3D and Net F/T can.
+    """Set the zero of sensors to their present state; nothing may touch them.  Tac3D and Net F/T can.
 
     Devices are joined by a + of its own: zero tac3d + netft --host H.  The sensor keeps no trace of what it took off,
     so for a force sensor `force-zero` is the better way: its bias goes with the records.
     """
 
     seconds: float = 0.5
-    """Of readings before and after."""
+    """Duration of the readings before and after."""
 
     def run(self) -> int:
         table = Table("sensor", "force before, N", "force after, N")
@@ -42,7 +42,7 @@ class Zero(Bench):
             with opened(config) as device:
                 name = device.identity.sensor
                 if not isinstance(device, Zeroable):
-                    raise DeviceNotFoundError(f"{name} has no zero to take: give tac3d or netft")
+                    raise DeviceNotFoundError(f"{name} has no zero to take: must be tac3d or netft; leave it out")
                 before = _mean_force(device, self.seconds)
                 device.take_zero()
                 _mean_force(device, _SETTLE_S)

@@ -53,7 +53,9 @@ class GelBackground:
         if self._mean is None:
             self._mean = frame.astype(np.float32)
         elif frame.shape != self._mean.shape:
-            raise ValueError(f"frame is {list(frame.shape)}: must be {list(self._mean.shape)}; start a new background")
+            raise ValueError(
+                f"frame is {list(frame.shape)}: must be {list(self._mean.shape)} as before; start a new background"
+            )
         self._count += 1
         self._mean += (frame - self._mean) / np.float32(min(self._count, self._memory))
         if self._count == self._memory:

@@ -92,7 +92,9 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
     except (ValueError, KeyError, TypeError) as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
-        raise DeviceDataError(f"bridge frame has {len(payload)} bytes of arrays where its header tells {start}")
+        raise DeviceDataError(
+            f"bridge frame has {len(payload)} bytes of arrays: must be {start}; use the server of this version"
+        )
     return described, arrays
 
 
@@ -108,7 +110,9 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     for name, resultant in resultants.items():
         six = resultant.astype(np.float32).ravel()
         if six.size not in (3, 6):
-            raise DeviceDataError(f"bridge resultant {name} has {six.size} numbers: must have 3 or 6")
+            raise DeviceDataError(
+                f"bridge resultant {name} has {six.size} numbers: must have 3 or 6; correct the adapter"
+            )
         fields["force_n"] = six[:3]
         if six.size >= 6:
             fields["moment_nmm"] = six[3:6] * np.float32(_MOMENT_UNIT_NMM[name])
@@ -116,7 +120,7 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
         return None, fields
     if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[2:] not in ((), (1,), (3,)):
         raise DeviceDataError(
-            f"bridge picture is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W] or [H, W, 3]"
+            f"bridge picture is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W] or [H, W, 3]; correct it"
         )
     picture = picture.reshape(picture.shape[:2]) if picture.shape[2:] == (1,) else picture
     code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
@@ -202,7 +206,9 @@ class Bridge:
             return None
         magic, header_size, payload_size = prefix.unpack_from(self._buffer)
         if magic != bridge_server.MAGIC or header_size > _LARGEST_HEADER or payload_size > _LARGEST_PAYLOAD:
-            raise DeviceLostError(f"{self._config.sensor}: the bridge is out of step ({bytes(self._buffer[:12])!r})")
+            raise DeviceLostError(
+                f"{self._config.sensor}: the bridge is out of step ({bytes(self._buffer[:12])!r}); open it again"
+            )
         middle, end = prefix.size + header_size, prefix.size + header_size + payload_size
         if len(self._buffer) < end:
             return None

@@ -111,7 +111,9 @@ def parse_calibration(answer: bytes) -> NetFtScale:
       DeviceDataError: an answer that is cut off, another header, an unknown unit or no counts.
     """
     if len(answer) != CALIBRATION.size:
-        raise DeviceDataError(f"NetFT calibration of {len(answer)} bytes: must have {CALIBRATION.size}")
+        raise DeviceDataError(
+            f"NetFT calibration of {len(answer)} bytes: must have {CALIBRATION.size}; check host and tcp_port"
+        )
     header, force_unit, torque_unit, per_force, per_torque = CALIBRATION.unpack(answer)[:5]
     if header != HEADER or force_unit not in _FORCE_UNIT_N or torque_unit not in _TORQUE_UNIT_NMM:
         raise DeviceDataError(f"NetFT calibration {answer.hex()}: header or unit is unknown; set N and N m on its page")
@@ -252,13 +254,19 @@ class NetFt:
             self._socket.settimeout(timeout_s)
             datagram = self._socket.recv(65_535)
         except TimeoutError as silence:
-            raise DeviceTimeoutError(f"NetFT at {self._config.host} sent nothing in {timeout_s} s") from silence
+            raise DeviceTimeoutError(
+                f"NetFT at {self._config.host} sent nothing in {timeout_s} s; check its cable and its page"
+            ) from silence
         except OSError as error:
-            raise DeviceLostError(f"NetFT at {self._config.host} is gone ({error})") from error
+            raise DeviceLostError(
+                f"NetFT at {self._config.host} is gone ({error}); check its power and cable"
+            ) from error
         stamp_ns = time.monotonic_ns()
         count, rest = divmod(len(datagram), RECORD.size)
         if rest or not count:
-            raise DeviceDataError(f"NetFT datagram of {len(datagram)} bytes: must be records of {RECORD.size}")
+            raise DeviceDataError(
+                f"NetFT datagram of {len(datagram)} bytes: must be records of {RECORD.size}; check host and rdt_port"
+            )
         period_ns = round(NS_PER_S / self._config.rate_hz)
         for k in range(count):  # those of one datagram were taken one period after the other
             record = datagram[k * RECORD.size : (k + 1) * RECORD.size]

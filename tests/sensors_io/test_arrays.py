@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sensors_io.arrays import ArraysError, load_arrays
+from tests.sensors_io.checks import refused
 
 
 def test_arrays_come_back_from_both_formats(tmp_path):
@@ -33,8 +34,7 @@ def npy(header):
 )
 def test_what_is_no_array_is_refused(tmp_path, data, message):
     (tmp_path / "a.npy").write_bytes(data)
-    with pytest.raises(ArraysError, match=message):
-        load_arrays(tmp_path / "a.npy")
+    refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
 
 
 def test_no_flip_of_a_byte_raises_anything_else(tmp_path):

@@ -40,10 +40,8 @@ def pushed(rows=5, columns=6):
 
 def where(image):
     """Row and column of the pressed pixel."""
-    return tuple(
-        int(i)
-        for i in np.unravel_index(np.abs(image[0]).reshape(*image.shape[1:3], -1).sum(-1).argmax(), image.shape[1:3])
-    )
+    size = np.abs(image[0]).reshape(*image.shape[1:3], -1).sum(-1)
+    return tuple(map(int, np.unravel_index(size.argmax(), size.shape)))
 
 
 @pytest.mark.parametrize(

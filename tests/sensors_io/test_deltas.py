@@ -60,6 +60,5 @@ def test_the_filter_with_the_smallest_residual_is_chosen(frames, name):
     assert choose_filter((frames % 256).astype(np.uint8)) == name
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_short_sequences_have_a_filter_too(count):
-    assert choose_filter(np.repeat(SCENE[None], count, 0)) in FILTERS
+def test_short_sequences_have_a_filter_too():
+    assert all(choose_filter(np.repeat(SCENE[None], count, 0)) in FILTERS for count in range(4))

@@ -54,15 +54,11 @@ def test_two_threads_give_the_same_order(scenes):
 
 
 def test_a_feed_resumes_from_its_state(scenes):
-    feed = iter(_batches(scenes, threads=2))
-    for _ in range(4):
-        next(feed)
-    state = feed.get_state()
-    rest = [next(feed) for _ in range(3)]
-    again = iter(_batches(scenes, threads=2))
-    again.set_state(state)
-    for batch in rest:
-        np.testing.assert_array_equal(next(again)["contact"], batch["contact"])
+    feed, again = (iter(_batches(scenes, threads=2)) for _ in range(2))
+    list(itertools.islice(feed, 4))
+    again.set_state(feed.get_state())
+    for _ in range(3):
+        np.testing.assert_array_equal(next(again)["contact"], next(feed)["contact"])
 
 
 def test_splits_are_those_of_the_cards(scenes):

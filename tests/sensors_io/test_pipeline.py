@@ -1,6 +1,7 @@
 """Clips and their batches: shapes and masks by hand, order by seed, resumed = uninterrupted."""
 
 import copy
+import itertools
 
 import cv2
 import numpy as np
@@ -218,10 +219,7 @@ class TestClipBatches:
             same(clip.arrays(), {name: batch[name][row] for name in CLIP_ARRAYS})
 
     def test_the_order_is_a_function_of_the_seed(self, store):
-        def order(seed):
-            iterator = iter(self.batches(store, seed=seed))
-            return np.concatenate([next(iterator)["contact"] for _ in range(7)])
-
+        order = lambda seed: np.concatenate([b["contact"] for b in itertools.islice(self.batches(store, seed=seed), 7)])
         np.testing.assert_array_equal(order(1), order(1))
         assert (order(1) != order(2)).any()
         epochs = order(1).reshape(3, 7)
@@ -229,18 +227,14 @@ class TestClipBatches:
         assert (epochs[0] != epochs[1]).any()
 
     def test_changes_are_a_function_of_the_seed_and_of_the_place(self, store):
-        def frames(**options):
-            iterator = iter(self.batches(store, **options))
-            return [next(iterator) for _ in range(5)]
-
+        frames = lambda **options: list(itertools.islice(self.batches(store, **options), 5))
         plain, changed, again = frames(), frames(augment=LIVELY), frames(augment=LIVELY)
         for a, b, c in zip(plain, changed, again, strict=True):
             np.testing.assert_array_equal(a["contact"], b["contact"])
             same(b, c)
         first, later = (np.concatenate([b["frames"] for b in part]) for part in (changed[:2], changed[2:4]))
         assert not any((clip == other).all() for clip in first for other in later)  # another change each time
-        quiet = frames(augment=AugmentConfig())
-        same(plain[0], quiet[0])
+        same(plain[0], frames(augment=AugmentConfig())[0])
 
     @pytest.mark.parametrize("stop", [0, 1, 2, 3, 6, 7])
     @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
@@ -258,34 +252,22 @@ class TestClipBatches:
             same(next(second), batch)
 
     def test_one_epoch_ends_with_a_smaller_batch_or_without_it(self, store):
-        kept = [b["contact"].tolist() for b in self.batches(store, shuffle=False, repeat=False)]
-        assert kept == [[0, 1, 2], [3, 4, 5], [6]]
-        dropped = list(self.batches(store, shuffle=False, repeat=False, drop_remainder=True))
-        assert [len(b["contact"]) for b in dropped] == [3, 3]
+        once = {"shuffle": False, "repeat": False}
+        assert [b["contact"].tolist() for b in self.batches(store, **once)] == [[0, 1, 2], [3, 4, 5], [6]]
+        assert [len(b["contact"]) for b in self.batches(store, **once, drop_remainder=True)] == [3, 3]
+        some = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, **once)
+        assert [b["contact"].tolist() for b in some] == [[5, 1]]
 
-    def test_only_the_given_contacts_are_read(self, store):
-        batches = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, shuffle=False, repeat=False)
-        assert [b["contact"].tolist() for b in batches] == [[5, 1]]
-
-    def test_worker_processes_change_nothing_but_speed(self, store):
-        iterator = iter(self.batches(store, workers=2, augment=LIVELY))
+    def test_worker_processes_change_nothing_but_speed_and_resume_exactly(self, store):
         alone = iter(self.batches(store, augment=LIVELY))
+        first, second = (iter(self.batches(store, workers=2, augment=LIVELY)) for _ in range(2))
         try:
+            same(next(first), next(alone))
+            second.set_state(first.get_state())
             for _ in range(3):
-                same(next(iterator), next(alone))
-        finally:
-            iterator.close()
-
-    def test_worker_processes_resume_exactly(self, store):
-        first = iter(self.batches(store, workers=2, augment=LIVELY))
-        second = iter(self.batches(store, workers=2, augment=LIVELY))
-        try:
-            next(first)
-            state = first.get_state()
-            want = [next(first) for _ in range(3)]
-            second.set_state(state)
-            for batch in want:
-                same(next(second), batch)
+                want = next(alone)
+                same(next(first), want)
+                same(next(second), want)
         finally:
             first.close()
             second.close()

@@ -75,16 +75,12 @@ def test_a_store_can_be_sent_to_a_worker(tmp_path):
     np.testing.assert_array_equal(copy.contact(1)["xense"].frames, store.contact(1)["xense"].frames)
 
 
-def test_a_contact_may_lack_sensors(tmp_path):
+def test_a_contact_may_lack_sensors_and_notes_reach_the_meta(tmp_path):
     store = RecordStore(fakes.write(tmp_path / "r", 2, sensors=("tac3d", "xense")))
-    assert store.sensors_of(0) == ("tac3d", "xense")
-    assert tuple(store.contact(0)) == ("tac3d", "xense")
-
-
-def test_notes_reach_the_meta(tmp_path):
-    with RecordWriter(tmp_path / "r", meta=fakes.META) as writer:
+    assert store.sensors_of(0) == tuple(store.contact(0)) == ("tac3d", "xense")
+    with RecordWriter(tmp_path / "s", meta=fakes.META) as writer:
         writer.note(report={"skipped": 3})
-    assert RecordStore(tmp_path / "r").meta.notes == {"report": {"skipped": 3}}
+    assert RecordStore(tmp_path / "s").meta.notes == {"report": {"skipped": 3}}
 
 
 class TestBadInput:

@@ -96,7 +96,7 @@ def test_a_card_of_no_object_is_refused(root):
         ("object_id,hardnes\nobject_0,1\n", "columns are ('object_id', 'hardnes'): must be object_id and any of"),
         ("name\ncup\n", "columns are ('name',): must be object_id"),
         ("object_id,hardness\nobject_0\n", "line 2: must have 2 cells"),
-        ("object_id\nobject_0\nobject_0\n", "line 3: object_id 'object_0' stands there twice"),
+        ("object_id\nobject_0\nobject_0\n", "line 3: object_id 'object_0' appears twice"),
         ("", "columns are (): must be object_id"),
     ],
 )

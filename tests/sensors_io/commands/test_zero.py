@@ -40,4 +40,4 @@ def test_a_drifted_sensor_reads_zero_afterwards(monkeypatch, capsys):
 
 def test_a_device_without_a_zero_is_named(tmp_path, capsys):
     assert cli.main(["zero", "replay", "--path", str(tmp_path)]) == 1
-    assert "gelsight_mini has no zero to take: give tac3d or netft" in capsys.readouterr().err
+    assert "gelsight_mini has no zero to take: must be tac3d or netft" in capsys.readouterr().err

@@ -12,6 +12,7 @@ from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
+from tests.sensors_io.checks import refused
 from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
 from tests.sensors_io.recording.test_session import CONFIG, SHORT
 
@@ -118,5 +119,4 @@ def test_a_journal_of_another_layout_is_named(tmp_path):
         with JournalWriter(tmp_path / f"{k}.journal") as journal:
             journal.append("start", plain)
             journal.append("frame", {"stream": 0, "time_ns": 1, "index": 0})
-        with pytest.raises(JournalError, match="entries of another layout"):
-            assemble(tmp_path / f"{k}.journal")
+        refused(JournalError, "entries of another layout", assemble, tmp_path / f"{k}.journal")

@@ -137,12 +137,6 @@ def test_force_balance_and_complementarity(name: str) -> None:
     assert np.all(w[p == 0] - solved.approach_mm > -1.1e-2 * solved.approach_mm)
 
 
-def test_an_offset_of_the_gap_changes_nothing() -> None:
-    gap, *rest = _scene("rough sphere")
-    plain, lifted = (_solve(g, *rest).displacement_mm for g in (gap, gap + 7.0))
-    np.testing.assert_allclose(lifted, plain, atol=2e-3 * plain.max())
-
-
 def test_the_reference_refuses_to_return_unconverged() -> None:
     with pytest.raises(RuntimeError, match="raise the cap"):
         solve_reference(R2 / 16, 1.0, _spectrum(GEL), SPACING, max_iterations=2)
