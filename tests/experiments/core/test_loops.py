@@ -1,4 +1,4 @@
-"""A training loop as a stage: its files, its end on a signal, its way on."""
+"""A training loop as a stage: its files, its end on a signal, its continuation."""
 
 import json
 import signal
@@ -14,10 +14,6 @@ from experiments.faults.trainings import counting
 from touchr1_jax.rl.scoring import NONFINITE_IN
 
 
-def run(folder, *options: str) -> int:
-    return run_counting(folder, *options)
-
-
 def lines(folder) -> list[dict]:
     return [json.loads(line) for line in (run_directory(folder) / "metrics.jsonl").read_text().splitlines()]
 
@@ -25,19 +21,14 @@ def lines(folder) -> list[dict]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    assert run(folder) == 0
+    assert run_counting(folder) == 0
     return folder
-
-
-def test_waiting_is_kept_with_the_wall_times(whole):
-    times = read_json(run_directory(whole) / "timing.json")
-    assert 0 <= times["waiting for data/count/0"] <= times["in steps/count/0"] <= times["count/0"]
 
 
 @pytest.mark.parametrize(
     ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
 )
-def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_path, capsys, monkeypatch, number, code):
+def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, monkeypatch, number, code):
     """Step 5 of 12, while the batch of step 6 is made; every fourth is saved: nothing computed is computed again."""
     made = counting.targets
 
@@ -54,29 +45,26 @@ def test_a_signal_saves_the_step_it_strikes_and_says_how_to_go_on(whole, tmp_pat
         def __iter__(self):
             return self
 
-        def get_state(self):
-            return self._targets.get_state()
-
-        def set_state(self, state):
-            self._targets.set_state(state)
+        def __getattr__(self, name):
+            return getattr(self._targets, name)
 
     with monkeypatch.context() as patch:
         patch.setattr(counting, "targets", Struck)
-        assert run(tmp_path) == code
-    said = capsys.readouterr().out
-    assert f"Stopped by {number.name}" in said
-    assert "To continue: python -m experiments counting" in said
+        assert run_counting(tmp_path) == code
+    output = capsys.readouterr().out
+    assert f"Stopped by {number.name}" in output
+    assert "To continue: python -m experiments counting" in output
     assert [line["step"] for line in lines(tmp_path)] == list(range(6))
     assert (run_directory(tmp_path) / "checkpoints" / "count" / "0" / "6").is_dir()
-    assert run(tmp_path) == 0
+    assert run_counting(tmp_path) == 0
     assert not differences(digests(run_directory(whole)), digests(run_directory(tmp_path)))
 
 
 def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_path, capsys):
-    assert run(tmp_path, "--poison-from", "3", "--poison-to", "5") == 0
-    printed = capsys.readouterr().out
-    assert "of it waiting for data" in printed
-    assert "count/0: 2 updates were left out" in printed
+    assert run_counting(tmp_path, "--poison-from", "3", "--poison-to", "5") == 0
+    assert "count/0: 2 updates were left out" in capsys.readouterr().out
+    times = read_json(run_directory(tmp_path) / "timing.json")
+    assert 0 <= times["waiting for data/count/0"] <= times["in steps/count/0"] <= times["count/0"]
     (table,) = read_json(run_directory(tmp_path) / "results.json")["tables"]
     assert table["rows"] == [["count/0", 12, 2, ""]]
     assert table["title"] in (run_directory(tmp_path) / "report.html").read_text()
@@ -96,7 +84,7 @@ def test_groups_that_a_reward_left_out_are_counted_for_each_stage():
     assert left_out_tables(lines[1:]) == ()
 
 
-def test_the_best_checkpoint_is_kept_beside_the_newest(context):
+def test_the_best_checkpoint_is_kept_with_the_newest(context):
     """Held-out scores fall from step 4 on, so that its checkpoint outlives two newer ones."""
     config = counting.CountingConfig()
     seen = []
@@ -115,26 +103,26 @@ def test_the_best_checkpoint_is_kept_beside_the_newest(context):
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_damage_is_told_to_the_reader_and_costs_the_steps_since(whole, tmp_path, capsys):
-    assert run(tmp_path) == 0
+def test_damage_is_reported_and_costs_the_steps_since(whole, tmp_path, capsys):
+    assert run_counting(tmp_path) == 0
     directory = run_directory(tmp_path)
     (directory / "results.json").unlink()
     (directory / "checkpoints" / "count" / "0" / "12" / "state" / "manifest.ocdbt").write_bytes(b"")
     capsys.readouterr()
-    assert run(tmp_path) == 0
+    assert run_counting(tmp_path) == 0
     assert "is kept as damaged-12" in capsys.readouterr().out
     assert not differences(digests(run_directory(whole)), digests(directory))
 
 
 @pytest.mark.parametrize("kept", [0, 5], ids=["emptied", "cut"])
 def test_no_run_ends_with_a_part_of_its_log(tmp_path, capsys, kept):
-    assert run(tmp_path) == 0
+    assert run_counting(tmp_path) == 0
     directory = run_directory(tmp_path)
     (directory / "results.json").unlink()
     log = directory / "metrics.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:kept]))
-    assert run(tmp_path) != 0
-    said = capsys.readouterr().err
-    assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in said
-    assert "put a copy back, or start a new run with --fresh" in said
+    assert run_counting(tmp_path) != 0
+    error = capsys.readouterr().err
+    assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in error
+    assert "put a copy back, or start a new run with --fresh" in error
     assert not (directory / "results.json").exists()

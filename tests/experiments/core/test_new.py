@@ -47,7 +47,7 @@ def test_the_dictionary_gains_two_lines_in_order(name):
         (SOURCE.replace("return {", "return dict() or {"), "must return one dictionary"),
     ],
 )
-def test_a_dictionary_that_cannot_be_changed_is_said(source, message):
+def test_a_dictionary_of_another_form_is_refused(source, message):
     with pytest.raises(NewError, match=message):
         with_entry(source, "accuracy")
 
@@ -69,27 +69,15 @@ def test_an_experiment_alone(checkout, capsys):
         ("compare", "it is taken"),
         ("grpo", "it is taken"),
         ("accuracy", "has a reward of that name"),
+        ("mine", r"mine.py exists: nothing is overwritten"),
     ],
 )
 def test_a_name_that_cannot_be_is_refused_and_nothing_written(checkout, capsys, name, message):
+    (checkout / "touchr1_jax/rewards/mine.py").write_text("mine")
     before = contents(checkout)
     assert main(["new", name, "--reward", "--root", str(checkout)]) == 1
     assert message in capsys.readouterr().err
     assert contents(checkout) == before
-
-
-def test_a_file_in_the_way_is_kept(checkout, capsys):
-    (checkout / "touchr1_jax/rewards/brevity.py").write_text("mine")
-    before = contents(checkout)
-    assert main(["new", "brevity", "--reward", "--root", str(checkout)]) == 1
-    assert "brevity.py exists: nothing is overwritten" in capsys.readouterr().err
-    assert contents(checkout) == before
-
-
-def test_outside_a_checkout_nothing_is_written(tmp_path, capsys):
-    assert main(["new", "brevity", "--reward", "--root", str(tmp_path)]) == 1
-    assert "must be a checkout of the project" in capsys.readouterr().err
-    assert not contents(tmp_path)
 
 
 def test_what_was_written_is_taken_back_when_a_file_cannot_be(checkout):
@@ -99,3 +87,9 @@ def test_what_was_written_is_taken_back_when_a_file_cannot_be(checkout):
     with pytest.raises(OSError, match=DICTIONARY.name):
         write_new(checkout, "brevity", reward=True, taken=())
     assert contents(checkout) == before
+
+
+def test_outside_a_checkout_nothing_is_written(tmp_path, capsys):
+    assert main(["new", "brevity", "--reward", "--root", str(tmp_path)]) == 1
+    assert "must be a checkout of the project" in capsys.readouterr().err
+    assert not contents(tmp_path)

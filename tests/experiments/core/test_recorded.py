@@ -10,6 +10,7 @@ from experiments.core.runs import ROOT
 
 RESULTS = {
     "experiment": "coin",
+    "config": {"data_dir": "/home/someone/touch data/x", "paths": ["/a/b.npz", "1/2", "/"]},
     "arms": {"paid": {"acc": {"mean": 62.96, "ci95": [60.0, 65.0]}}},
     "requirements": [{"name": "least gain", "measured": -0.25}],
     "tables": [{"title": "Tosses", "columns": [{"name": "coin"}, {"name": "heads"}], "rows": [["gold", 7]]}],
@@ -20,7 +21,6 @@ RESULTS = {
 def root(tmp_path):
     """A checkout with one recorded run."""
     run = tmp_path / "runs" / "coin"
-    run.mkdir(parents=True)
     write_json(run / "results.json", RESULTS)
     record(run, tmp_path)
     return tmp_path
@@ -59,18 +59,11 @@ def test_a_document_without_the_block_is_refused(root):
         filled("text", root)
 
 
-def test_a_run_is_recorded_whole_and_only_when_finished(root, tmp_path, capsys):
-    assert read_json(root / "experiments" / "recorded" / "coin.json") == RESULTS
+def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp_path, capsys):
+    recorded = read_json(root / RECORDED / "coin.json")
+    assert recorded == RESULTS | {"config": {"data_dir": "x", "paths": ["b.npz", "1/2", "/"]}}
     assert main(["record", str(tmp_path)]) == 1
     assert "finish it first" in capsys.readouterr().err
-
-
-def test_paths_of_the_machine_are_not_recorded(tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    config = {"data_dir": "/home/someone/touch data/x", "paths": ["/a/b.npz", "1/2", "/"]}
-    write_json(run / "results.json", {"experiment": "coin", "config": config})
-    assert read_json(record(run, tmp_path))["config"] == {"data_dir": "x", "paths": ["b.npz", "1/2", "/"]}
 
 
 def test_the_readme_shows_what_was_recorded():

@@ -53,11 +53,12 @@ def test_bad_results_are_named(changes, message):
         results(**changes)
 
 
-def test_a_bound_is_kept_on_its_own_side():
-    assert FAST.met
-    assert not SLOW.met
-    assert dataclasses.replace(SLOW, measured=400.0).met
-    assert not dataclasses.replace(FAST, measured=2.51).met
+@pytest.mark.parametrize(
+    ("requirement", "measured", "met"),
+    [(FAST, 2.5, True), (FAST, 2.51, False), (SLOW, 399.9, False), (SLOW, 400.0, True)],
+)
+def test_a_bound_is_kept_on_its_own_side(bound, measured, met):
+    assert dataclasses.replace(bound, measured=measured).met is met
 
 
 def test_results_json_has_the_agreed_shape():

@@ -11,12 +11,11 @@ from experiments.core.stopping import AGAIN_S, SIGNALS, Stopped, Stopping
 
 
 @pytest.fixture(autouse=True)
-def restored():
-    """The handlers that the test began with, whatever happens."""
-    before = {n: signal.getsignal(n) for n in SIGNALS}
-    yield
-    for n, handler in before.items():
-        signal.signal(n, handler)
+def handlers():
+    """The handlers that the test began with, which are there again after each block."""
+    before = [signal.getsignal(n) for n in SIGNALS]
+    yield before
+    assert [signal.getsignal(n) for n in SIGNALS] == before
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -36,11 +35,15 @@ def patiently(inside) -> None:
         inside()
 
 
-def test_a_patient_block_is_told_and_ends_before_it_raises():
+def test_a_patient_block_ends_before_the_stop_which_is_announced(capfd):
+    """A second signal would end the process: no handler is left."""
     done = []
     with pytest.raises(Stopped, match="SIGTERM"):
-        patiently(lambda: done.append("the step"))
-    assert done == ["the step"]
+        patiently(lambda: done.extend(signal.getsignal(n) for n in SIGNALS))
+    assert done == [signal.SIG_DFL] * 2
+    assert "stopping once this step is done and saved" in capfd.readouterr().err
+    with pytest.raises(ZeroDivisionError):
+        patiently(lambda: 1 / 0)
 
 
 def test_all_processes_leave_where_one_was_asked():
@@ -51,46 +54,23 @@ def test_all_processes_leave_where_one_was_asked():
         seen.append(here)
         return next(others)
 
-    def train(stopping: Stopping) -> None:
-        with stopping.patient(agreed) as asked:
+    def train() -> None:
+        with Stopping().patient(agreed) as asked:
             assert not asked()
             assert asked()
             assert asked()  # known by now: nobody is asked again
 
     with pytest.raises(Stopped, match="SIGTERM"):
-        train(Stopping())
+        train()
     assert seen == [False, False]
 
 
 def test_a_signal_after_the_last_step_is_agreed_on_as_well():
-    seen = []
-
-    def train(stopping: Stopping) -> None:
-        with stopping.listening(), stopping.patient(lambda here: bool(seen.append(here)) or here):
-            signal.raise_signal(signal.SIGTERM)
-
-    with pytest.raises(Stopped, match="SIGTERM"):
-        train(Stopping())
+    seen, stopping = [], Stopping()
+    agreed = lambda here: bool(seen.append(here)) or here
+    with pytest.raises(Stopped, match="SIGTERM"), stopping.listening(), stopping.patient(agreed):
+        signal.raise_signal(signal.SIGTERM)
     assert seen == [True]
-
-
-def test_a_second_signal_acts_as_if_nobody_listened():
-    handlers = []
-    with pytest.raises(Stopped):
-        patiently(lambda: handlers.extend(signal.getsignal(n) for n in SIGNALS))
-    assert handlers == [signal.SIG_DFL] * 2
-
-
-def test_an_error_inside_is_what_comes_out():
-    with pytest.raises(ZeroDivisionError):
-        patiently(lambda: 1 / 0)
-
-
-def test_handlers_come_back():
-    before = [signal.getsignal(n) for n in SIGNALS]
-    with Stopping().listening():
-        assert [signal.getsignal(n) for n in SIGNALS] != before
-    assert [signal.getsignal(n) for n in SIGNALS] == before
 
 
 @pytest.mark.parametrize("twice", [False, True])
@@ -120,7 +100,7 @@ def test_a_stop_that_the_garbage_collector_swallows_is_raised_again(twice):
     assert struck
 
 
-def test_what_is_put_away_on_the_way_up_is_not_disturbed():
+def test_cleaning_up_after_a_stop_is_not_disturbed():
     closed = []
 
     def train() -> None:
@@ -136,9 +116,9 @@ def test_what_is_put_away_on_the_way_up_is_not_disturbed():
     assert closed == [True]
 
 
-def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
-    said = []
-    monkeypatch.setattr("sys.unraisablehook", lambda lost: said.append(lost.exc_value))
+def test_other_errors_that_cannot_be_raised_are_reported_as_before(monkeypatch):
+    reported = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: reported.append(lost.exc_value))
 
     class Broken:
         def __del__(self):
@@ -147,10 +127,4 @@ def test_what_else_cannot_be_raised_is_reported_as_before(monkeypatch):
     with Stopping().listening():
         broken = Broken()
         del broken
-    assert [str(x) for x in said] == ["the disk is gone"]
-
-
-def test_a_stop_that_has_to_wait_says_so(capfd):
-    with pytest.raises(Stopped):
-        patiently(lambda: None)
-    assert "stopping once this step is done and saved" in capfd.readouterr().err
+    assert [str(x) for x in reported] == ["the disk is gone"]
