@@ -54,8 +54,7 @@ def test_bad_results_are_named(changes, message):
 
 
 @pytest.mark.parametrize(
-    ("requirement", "measured", "met"),
-    [(FAST, 2.5, True), (FAST, 2.51, False), (SLOW, 399.9, False), (SLOW, 400.0, True)],
+    ("bound", "measured", "met"), [(FAST, 2.5, True), (FAST, 2.51, False), (SLOW, 399.9, False), (SLOW, 400.0, True)]
 )
 def test_a_bound_is_kept_on_its_own_side(bound, measured, met):
     assert dataclasses.replace(bound, measured=measured).met is met
