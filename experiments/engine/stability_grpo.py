@@ -24,6 +24,7 @@ from experiments.core.context import Context
 from experiments.core.look import PALETTE
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.engine.answers_without_touch import adversary_picture, adversary_requirement, adversary_table
 from experiments.engine.failures import PAPER, PLAIN, SCENARIOS, STABLE, FailureScenario
 from experiments.engine.world_training import FirstAlarm, TrainingBudget, VariantRuns, hyperparameters_of
 from touchr1_jax.rl.alarms import RULES
@@ -115,8 +116,14 @@ def run(config: StabilityGrpoConfig, context: Context) -> Results:
     return Results(
         verdict=verdict(outcomes, undriven),
         requirements=requirements(outcomes),
-        tables=(summary_table(outcomes), criterion_table(outcomes), alarm_table(outcomes), odds_table()),
-        pictures=(failure_picture(outcomes),),
+        tables=(
+            summary_table(outcomes),
+            criterion_table(outcomes),
+            alarm_table(outcomes),
+            odds_table(),
+            adversary_table(),
+        ),
+        pictures=(failure_picture(outcomes), adversary_picture()),
         settings={
             "seeds": config.seeds,
             "updates": config.effort.steps,
@@ -216,6 +223,7 @@ def requirements(outcomes: Sequence[ScenarioOutcome]) -> tuple[Requirement, ...]
         *([at_most("other runs whose alarm fired", others.mean(), MOST_FALSE)] if len(others) else []),
         at_most("tactile-use reward: false credit", chance, 0.12),
         at_least("tactile-use reward: power", power, 0.5),
+        adversary_requirement(),
     )
 
 

@@ -19,9 +19,11 @@ from touchr1_jax.rewards.base import (
 from touchr1_jax.rewards.consistency import consistency, consistency_applies
 from touchr1_jax.rewards.consistency_gated import consistency_gated
 from touchr1_jax.rewards.consistency_strict import consistency_strict
+from touchr1_jax.rewards.diversity import diversity
 from touchr1_jax.rewards.exact import exact
 from touchr1_jax.rewards.format_strict import format_strict
 from touchr1_jax.rewards.formatted import formatted
+from touchr1_jax.rewards.overlong import overlong
 
 __all__ = [
     "AnyReward",
@@ -53,6 +55,8 @@ def make_rewards(prior: np.ndarray) -> dict[str, AnyReward]:
         "consistency_strict": consistency_strict(prior),
         "format": Reward(formatted),
         "format_strict": Reward(format_strict),
+        "overlong": GroupReward(overlong),
+        "diversity": GroupReward(diversity),
     }
 
 

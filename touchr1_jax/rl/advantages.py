@@ -1,9 +1,11 @@
 """Advantages, and which groups give a gradient."""
 
+import math
 from collections.abc import Mapping
 from typing import assert_never
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
@@ -24,11 +26,35 @@ def no_signal(
     """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
     match algorithm.advantage:
         case Advantage.GLOBAL:
-            return jnp.broadcast_to(zero_variance(reward.reshape(-1)), reward.shape[:1])
+            every = best_of(reward, algorithm.best_of).reshape(-1)
+            return jnp.broadcast_to(zero_variance(every), reward.shape[:1])
         case Advantage.PER_REWARD:
             return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
         case _:
-            return zero_variance(reward)
+            return zero_variance(best_of(reward, algorithm.best_of))
+
+
+def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
+    """Mean largest reward of the sets of k rollouts that a rollout is in, max@k; of rewards 0 and 1 it is pass@k.
+
+    R̃_i = Σ_{S ∋ i, |S| = k} max_{j∈S} R_j / C(G − 1, k − 1).  The mean over i is the unbiased estimate of max@k (of
+    pass@k: 1 − C(wrong, k)/C(G, k)), and R̃_i less it is the advantage of pass@k training up to its σ (arXiv 2508.10751;
+    for rewards of any size arXiv 2503.19595, 2505.15201).
+
+    Args:
+      reward: rewards of groups of G ≥ k rollouts.
+      k: size of a set; 1 changes nothing.
+    """
+    if k == 1:
+        return reward
+    group = reward.shape[-1]
+    below = np.arange(group)
+    largest = [math.comb(m - 1, k - 2) for m in range(1, group)]  # sets with i whose largest is the m-th above it
+    share = np.triu(np.tile([0, *largest], (group, 1)), 1) + np.diag([math.comb(m, k - 1) for m in below])
+    order = jnp.argsort(reward, -1)
+    rising = jnp.take_along_axis(reward, order, -1)
+    found = rising @ jnp.asarray(share.T / math.comb(group - 1, k - 1), reward.dtype)
+    return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 
 def advantages(
@@ -43,10 +69,10 @@ def advantages(
 
     Args:
       algorithm: which comparison, and ε.
-      reward: total rewards.
+      reward: total rewards, which count by the best of `algorithm.best_of`.
       terms: weighted rewards that it is made of.
     """
-    epsilon = algorithm.epsilon
+    epsilon, reward = algorithm.epsilon, best_of(reward, algorithm.best_of)
     match algorithm.advantage:
         case Advantage.GROUP:
             return group_advantage(reward, epsilon=epsilon)

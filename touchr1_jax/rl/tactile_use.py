@@ -4,6 +4,10 @@ With s = max(R_acc, 0) and, for each control c of the touch, the mean s̄^c of i
   Literal:      m_i = 1[s̄ > b + δ] · 1[d_i = 0], added to the reward (Touch-R1, arXiv 2605.27154, abstract).
   Recommended:  m_i = 1[s̄ > b + δ] · 1[formatted_i] · max(0, s_i − b), added to the advantage.
 Both are 0 where nothing is right, and the recommended one does not cancel when all right rollouts earn it.
+
+b is the largest of the controls that apply, so that fewer controls let more chance through: at δ = .13, in groups of 8
+with 4 rollouts a control, a group without any lead is paid in up to 9 % of cases with three controls, in 15 % with two,
+in 32 % with one (`credit_odds.false_credit`).  `control_missing_share` logs how many do not apply.
 """
 
 from collections.abc import Callable, Mapping
@@ -114,8 +118,8 @@ def score(parsed: Parsed, target: Target) -> Float[Array, ""]:
 
 
 def right(parsed: Parsed, target: Target) -> Bool[Array, ""]:
-    """d = 0: every asked attribute is answered right."""
-    return jnp.all((parsed.conclude == target.label) | ~target.asked)
+    """d = 0: every asked attribute is answered right; an unknown label (−1) is matched by no answer."""
+    return jnp.all(((parsed.conclude == target.label) & (target.label >= 0)) | ~target.asked)
 
 
 def bar(control: Float[Array, "C J"], counts: Bool[Array, "C"]) -> Float[Array, ""]:

@@ -7,6 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import stability_grpo
+from experiments.engine.answers_without_touch import PRIORS, adversary_requirement, adversary_table
 from experiments.engine.failures import PAPER, SCENARIOS, STABLE
 from experiments.engine.stability_grpo import (
     SMOKE,
@@ -34,6 +35,16 @@ def test_both_variants_are_reported_at_every_value(tmp_path):
     assert names[0] == "F3 grounding without bound: failed runs of stable"
     assert "other runs whose alarm fired" in names
     assert (directory / "plots" / "stability_grpo.svg").exists()
+
+
+def test_the_adversary_finds_answers_under_the_published_rewards_and_none_under_stable():
+    table, better = adversary_table(), dict[str, list[int]]()
+    for presets, *_, count in table.rows:
+        better.setdefault(presets, []).append(count)
+    assert better.pop("Stable") == [0] * len(PRIORS)
+    (published,) = better.values()
+    assert min(published) > 0
+    assert adversary_requirement().measured == 0
 
 
 def test_the_odds_of_the_tactile_reward():

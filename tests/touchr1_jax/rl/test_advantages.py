@@ -1,5 +1,8 @@
 """Advantages by hand; rounding must not make signal out of equal rewards."""
 
+import itertools
+import math
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from hypothesis import strategies as st
 from touchr1_jax.rl.advantages import (
     advantages,
     batch_advantage,
+    best_of,
     group_advantage,
     no_signal,
     prompt_weights,
@@ -134,6 +138,36 @@ def test_groups_without_signal_are_those_whose_advantages_are_zero(kind):
         Advantage.GLOBAL: [False, False, False],
         Advantage.PER_REWARD: [True, False, False],
     }.get(kind, [True, False, True])
+
+
+@pytest.mark.parametrize("k", [1, 2, 3, 6])
+def test_the_best_of_k_is_the_mean_over_all_sets_with_a_rollout(k):
+    reward = np.random.default_rng(k).choice([1.0, 0.4, 0.0, -0.1], (5, 6)).astype(np.float32)
+    sets = list(itertools.combinations(range(6), k))
+    expected = [[np.mean([row[list(s)].max() for s in sets if i in s]) for i in range(6)] for row in reward]
+    found = best_of(jnp.asarray(reward), k)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(
+        found.mean(-1), [np.mean([row[list(s)].max() for s in sets]) for row in reward], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(("right", "k"), [(0, 3), (1, 2), (3, 4), (5, 4), (8, 2)])
+def test_pass_at_k_by_its_formula(right, k):
+    """Advantages (1 − p)/σ of a right and (1 − p − C(w − 1, k − 1)/C(G − 1, k − 1))/σ of a wrong answer, up to σ."""
+    wrong = 8 - right
+    reward = jnp.array([1.0] * right + [0.0] * wrong)
+    p = 1 - math.comb(wrong, k) / math.comb(8, k)
+    of_wrong = 1 - p - (math.comb(wrong - 1, k - 1) / math.comb(7, k - 1) if wrong else 0)
+    found = best_of(reward, k)
+    np.testing.assert_allclose(found - found.mean(), [1 - p] * right + [of_wrong] * wrong, atol=1e-6)
+
+
+def test_the_best_of_a_group_is_all_that_counts_where_k_is_its_size():
+    """Every rollout then shares the one best answer, and nothing is left to compare."""
+    algorithm, reward = Paper(best_of=4), jnp.array([[1.0, 0.0, 0.4, 0.0]])
+    assert no_signal(algorithm, reward, {}).all()
+    assert not advantages(algorithm, reward, {}).any()
 
 
 def test_weights_of_prompts_that_count():

@@ -62,6 +62,8 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
     """Its advantage would be 0 in every step; the mean of the batch needs no group."""
     with pytest.raises(ValueError, match="group is 1: must be at least 2"):
         GRPOConfig(group=1)
+    with pytest.raises(ValueError, match="best_of is 9: must be at most group 8"):
+        GRPOConfig(algorithm=Paper(best_of=9))
     assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
 
 

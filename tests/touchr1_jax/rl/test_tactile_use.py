@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax.rewards.examples import make_parsed, make_target
 from touchr1_jax.rl.config import Stable
 from touchr1_jax.rl.credit_odds import CREDIT, HELPED, HINDERED, credit_odds, false_credit
-from touchr1_jax.rl.tactile_use import bar, literal, recommended
+from touchr1_jax.rl.tactile_use import bar, literal, recommended, right
 
 SIZES = {"group": 8, "rollouts": Stable().controls, "controls": 3}
 
@@ -20,6 +21,18 @@ def test_false_credit_and_power_of_the_stable_preset():
     assert worst == pytest.approx(0.086, abs=0.002)
     assert power >= 0.5
     assert power == pytest.approx(0.5115, abs=0.002)
+
+
+@pytest.mark.parametrize(("controls", "worst"), [(2, 0.149), (1, 0.320)])
+def test_fewer_controls_let_more_chance_through(controls, worst):
+    found = false_credit(group=8, rollouts=Stable().controls, controls=controls, margin=Stable().tactile_margin)
+    assert found == pytest.approx(worst, abs=0.002)
+
+
+def test_an_unknown_label_is_matched_by_no_answer():
+    target = make_target(label=(-1, 0, 0))
+    assert not right(make_parsed((-1, 0, 0)), target)
+    assert right(make_parsed((0, 0, 0)), make_target(label=(0, -1, -1)))
 
 
 def test_the_literal_margin_is_too_small():
@@ -51,8 +64,8 @@ def test_recommended_by_hand():
 
 
 def test_literal_by_hand():
-    own, right = jnp.array([1.0, 0.4, 0.0, 1.0]), jnp.array([True, False, False, True])
-    np.testing.assert_array_equal(literal(own, jnp.array(0.3), right, 0.1), [1, 0, 0, 1])
+    own, is_right = jnp.array([1.0, 0.4, 0.0, 1.0]), jnp.array([True, False, False, True])
+    np.testing.assert_array_equal(literal(own, jnp.array(0.3), is_right, 0.1), [1, 0, 0, 1])
 
 
 def test_nothing_right_earns_nothing():
