@@ -45,6 +45,7 @@ Lines = Mapping[Setup, Mapping[str, int]]  # setup → line → counted bytes on
 Reserved = Mapping[Setup, Mapping[int, Compiled]]
 """Setup → layers → bytes that the compiler reserves; the largest number of layers is extrapolated."""
 
+LAYERS = (1, 2)  # depths that are compiled
 COUNTERS_BYTES = 12  # bytes of the step's arguments that no line counts: its key, 8, and its number, 4
 
 
@@ -53,7 +54,7 @@ class ScaleConfig:
     """The training, its layouts over devices, and how many of these are compiled.
 
     Raises:
-      ValueError: no mesh, more compiled than there are, depths that do not ascend.
+      ValueError: no mesh, more compiled than there are.
     """
 
     size: str = "7B"
@@ -63,8 +64,6 @@ class ScaleConfig:
     compiled: int = 1
     """Setups that are compiled, from the first on."""
     compiler: Compiler = "cpu"
-    layers: tuple[int, int] = (1, 2)
-    """Depths that are compiled."""
     prompts: int = 16
     group: int = 8
     length: int = 512
@@ -75,8 +74,6 @@ class ScaleConfig:
             raise ValueError(
                 f"compiled is {self.compiled}: must be 0 … {len(self.meshes) + 1}, the meshes and the adapters; correct"
             )
-        if not 0 < self.layers[0] < self.layers[1]:
-            raise ValueError(f"layers is {self.layers}: must be two ascending depths; give such as 1 2")
 
     @property
     def setups(self) -> tuple[Setup, ...]:
@@ -132,7 +129,7 @@ def run(config: ScaleConfig, context: Context) -> Results:
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:
     """Bytes that the compiler reserves at both depths, saved as stages, and by extrapolation at the model's depth."""
     found: dict[int, Compiled] = {}
-    for layers in context.each(setup.name, config.layers):
+    for layers in context.each(setup.name, LAYERS):
         stage = f"compile/{config.setups.index(setup)}/{layers}"
         if not context.done(stage):
             with context.timed(stage):
