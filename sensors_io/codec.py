@@ -15,12 +15,13 @@ a data set never drift.
 Entries of the first version, TCH1, stored their frames as they are and are read as well.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,11 @@ def decode_sequence(data: bytes, *, fields: bool = True) -> Sequence:
     Raises:
       CorruptRecordsError: the checksum or the layout does not hold.
     """
+    with _checked():
+        return _sequence(data, fields)
+
+
+def _sequence(data: bytes, fields: bool) -> Sequence:
     header, payload = _open(data, "sequence")
     seen = {array["name"] for array in header["arrays"]}
     skip = FIELDS if not fields and "frames" in seen else ()
@@ -109,8 +115,21 @@ def decode_card(data: bytes) -> ObjectCard:
     Raises:
       CorruptRecordsError: the checksum or the layout does not hold.
     """
-    header, payload = _open(data, "object")
-    return ObjectCard(**header["plain"], **_unpack(header, payload, ()))
+    with _checked():
+        header, payload = _open(data, "object")
+        return ObjectCard(**header["plain"], **_unpack(header, payload, ()))
+
+
+@contextlib.contextmanager
+def _checked() -> Iterator[None]:
+    """Name an entry whose checksum holds and whose content this code did not write."""
+    try:
+        yield
+    except CorruptRecordsError:
+        raise
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        reason = error if isinstance(error, UserError) else repr(error)
+        raise CorruptRecordsError(f"the entry is not laid out as this version writes it ({reason})") from error
 
 
 def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float]:
@@ -190,6 +209,10 @@ def _unpack(header: Mapping[str, Any], payload: memoryview, skip: tuple[str, ...
             if "bits" in entry:
                 array = np.unpackbits(array, count=count).view(np.bool_)
             elif "scale" in entry:
+                if not 0 < entry["scale"] < math.inf:
+                    raise CorruptRecordsError(
+                        f"{entry['name']} has scale {entry['scale']}: must be positive and finite"
+                    )
                 array = array * np.float32(entry["scale"])
             arrays[entry["name"]] = _undo(array.reshape(shape), entry)
         start += -(-stored * dtype.itemsize // 8) * 8

@@ -11,11 +11,8 @@ from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
-from sensors_io.errors import UserError
 
 _OPTIONS = "group_size:1,zstd:1"
-_FOREIGN = (RuntimeError, ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError)
-"""Errors that bytes raise which are damaged, or whose checksum holds though this code did not write them."""
 _T = TypeVar("_T")
 
 
@@ -85,11 +82,10 @@ class Entries:
         """Entry i, decoded; errors get the path of its file."""
         try:
             return decode(self._source[i])
-        except _FOREIGN as error:
+        except (RuntimeError, CorruptRecordsError) as error:
             file, position = self._locate(i)
-            reason = error if isinstance(error, UserError) else repr(error)
             raise CorruptRecordsError(
-                f"{file}, entry {position}: {reason}; copy the file again from its source, or write the records again"
+                f"{file}, entry {position}: {error}; copy the file again from its source, or write the records again"
             ) from error
 
     def _locate(self, i: int) -> tuple[pathlib.Path, int]:

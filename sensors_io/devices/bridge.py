@@ -89,7 +89,7 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
             arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
             start += count * dtype.itemsize
         int(described["number"] or 0), int(described["stamp_ns"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
         raise DeviceDataError(
@@ -106,9 +106,9 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     rest = dict(arrays)
     picture = rest.pop("frame_bgr", None)
     resultants = {name: rest.pop(name) for name in _MOMENT_UNIT_NMM if name in rest}
-    fields = {name: a.astype(np.float32) for name, a in rest.items()}
+    fields = {name: _float32(a) for name, a in rest.items()}
     for name, resultant in resultants.items():
-        six = resultant.astype(np.float32).ravel()
+        six = _float32(resultant).ravel()
         if six.size not in (3, 6):
             raise DeviceDataError(
                 f"bridge resultant {name} has {six.size} numbers: must have 3 or 6; correct the adapter"
@@ -125,6 +125,12 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     picture = picture.reshape(picture.shape[:2]) if picture.shape[2:] == (1,) else picture
     code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(picture, code), fields
+
+
+def _float32(array: np.ndarray) -> np.ndarray:
+    """What float32 cannot hold is not finite afterwards, and the records flag it."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return array.astype(np.float32)
 
 
 class Bridge:

@@ -221,14 +221,16 @@ def to_schema(matrices: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     for name, size in sizes.items():
         if name in matrices and matrices[name].size != size:
             raise DeviceDataError(f"Tac3D array {name} has {matrices[name].size} numbers: must have {size}")
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is not finite, and flagged as such
+        theirs = {name: matrices[name].astype(np.float32) for name in sizes if name in matrices}
     fields: dict[str, np.ndarray] = {}
-    if "3D_Displacements" in matrices:
-        grid = matrices["3D_Displacements"].reshape(GRID, GRID, 3)[::-1, ::-1].astype(np.float32)
+    if "3D_Displacements" in theirs:
+        grid = theirs["3D_Displacements"].reshape(GRID, GRID, 3)[::-1, ::-1]
         fields["deformation_mm"] = np.ascontiguousarray(grid[..., :2])
         fields["depth_mm"] = -grid[..., 2]
-    for theirs, ours in (("3D_ResultantForce", "force_n"), ("3D_ResultantMoment", "moment_nmm")):
-        if theirs in matrices:
-            fields[ours] = matrices[theirs].reshape(3).astype(np.float32)
+    for name, ours in (("3D_ResultantForce", "force_n"), ("3D_ResultantMoment", "moment_nmm")):
+        if name in theirs:
+            fields[ours] = theirs[name].reshape(3)
     return fields
 
 
