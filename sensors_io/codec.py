@@ -211,7 +211,7 @@ def _unpack(header: Mapping[str, Any], payload: memoryview, skip: tuple[str, ...
             elif "scale" in entry:
                 if not 0 < entry["scale"] < math.inf:
                     raise CorruptRecordsError(
-                        f"{entry['name']} has scale {entry['scale']}: must be positive and finite"
+                        f"{entry['name']} has scale {entry['scale']}: must be finite and > 0"
                     )
                 array = array * np.float32(entry["scale"])
             arrays[entry["name"]] = _undo(array.reshape(shape), entry)

@@ -60,7 +60,8 @@ PUBLISHED = {
     "rms_norm_eps": 1e-6, "rope_theta": 1e6, "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
     "tie_word_embeddings": True, "vision_start_token_id": 1, "vision_end_token_id": 2, "image_token_id": 3,
     "video_token_id": 4, "vision_config": {"out_hidden_size": 64, "depth": 2, "hidden_size": 64, "num_heads": 4,
-    "intermediate_size": 96, "hidden_act": "silu", "patch_size": 14, "in_chans": 3, "temporal_patch_size": 2, "spatial_merge_size": 2,
+    "intermediate_size": 96, "hidden_act": "silu", "patch_size": 14, "in_chans": 3, "temporal_patch_size": 2,
+    "spatial_merge_size": 2,
     "window_size": 112, "fullatt_block_indexes": [1]},
 }  # fmt: skip
 
