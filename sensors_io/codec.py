@@ -47,6 +47,11 @@ WIDEST: Mapping[str, float] = {
 }
 """Largest value of each quantised array that int16 carries within its tolerance: 32 mm, 64 N, 512 N mm."""
 
+_FOREIGN = (
+    ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError,
+)  # fmt: skip
+"""Errors of a header that this code did not write; NumPy raises the last for the name of a type."""
+
 _MAGIC, _OLD_MAGIC = b"TCH2", b"TCH1"
 _PREFIX = struct.Struct("<4sII")
 _TOP = 32767
@@ -127,7 +132,7 @@ def _checked() -> Iterator[None]:
         yield
     except CorruptRecordsError:
         raise
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+    except _FOREIGN as error:
         reason = error if isinstance(error, UserError) else repr(error)
         raise CorruptRecordsError(f"the entry is not laid out as this version writes it ({reason})") from error
 
@@ -210,9 +215,7 @@ def _unpack(header: Mapping[str, Any], payload: memoryview, skip: tuple[str, ...
                 array = np.unpackbits(array, count=count).view(np.bool_)
             elif "scale" in entry:
                 if not 0 < entry["scale"] < math.inf:
-                    raise CorruptRecordsError(
-                        f"{entry['name']} has scale {entry['scale']}: must be finite and > 0"
-                    )
+                    raise CorruptRecordsError(f"{entry['name']} has scale {entry['scale']}: must be finite and > 0")
                 array = array * np.float32(entry["scale"])
             arrays[entry["name"]] = _undo(array.reshape(shape), entry)
         start += -(-stored * dtype.itemsize // 8) * 8

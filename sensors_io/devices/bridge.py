@@ -89,7 +89,7 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
             arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
             start += count * dtype.itemsize
         int(described["number"] or 0), int(described["stamp_ns"])
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, SyntaxError) as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
         raise DeviceDataError(

@@ -118,7 +118,16 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
             return
         try:
             entry = _decode(body)
-        except (ValueError, KeyError, TypeError, IndexError, OverflowError, MemoryError, struct.error) as error:
+        except (
+            ValueError,
+            KeyError,
+            TypeError,
+            IndexError,
+            OverflowError,
+            MemoryError,
+            SyntaxError,
+            struct.error,
+        ) as error:
             raise JournalError(
                 f"{path} holds an entry of another layout at byte {start} ({error!r}): move it away, or bring it in "
                 "with the version that wrote it"

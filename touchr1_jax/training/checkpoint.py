@@ -1,7 +1,8 @@
 """Checkpoints by Orbax: state, data iterator and step together, published atomically; the newest N and the best kept.
 
-Every array is saved with a digest and held to it when it comes back, for a flipped bit on a disk raises no error of its
-own.  A damaged checkpoint is set aside, and an older one takes its place.
+Every file of a checkpoint is compared with its checksum before it is read, and every array with its digest afterwards,
+for a flipped bit on a disk raises no error of its own.  A damaged checkpoint is set aside, and an older one takes its
+place.
 """
 
 import itertools
@@ -20,13 +21,19 @@ from jax.experimental import multihost_utils
 from jaxtyping import Array, UInt32
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
+CHECKSUMS = "checksums.json"
+"""In a checkpoint's folder: CRC-32 of every file, written once all others are in place."""
+
+_STAMPED = "_CHECKPOINT_METADATA"
+"""Orbax's file of times, which it writes once more after the checksums; nothing of the state depends on it."""
+
 MOST_SAID = 240
 """Characters of a library's error that a message quotes."""
 
 _MIX = 0x9E3779B1
 """2³² over the golden ratio, odd: multiples of it spread over all 32 bits (Knuth, TAOCP 3, §6.4)."""
 
-_FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError)
+_FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError, AssertionError, AttributeError, IndexError)
 """What Orbax and TensorStore raise where bytes cannot be read or written: they name no class of their own."""
 
 
@@ -76,6 +83,7 @@ class Checkpoints:
         if keep < 1:
             raise ValueError(f"keep is {keep}: must be at least 1; raise it")
         self._directory, self._scored, self._say = directory.absolute(), better is not None, say
+        self._saving: int | None = None
         policy = LatestN(keep)
         if better is not None:
             best = BestN(get_metric_fn=_score, reverse=better == "lower", n=1, keep_checkpoints_without_metrics=False)
@@ -86,6 +94,7 @@ class Checkpoints:
             best_mode="min" if better == "lower" else "max",
             create=True,
             cleanup_tmp_directories=True,
+            async_options=ocp.AsyncOptions(post_finalization_callback=self._sign),
         )
         try:
             self._manager = ocp.CheckpointManager(self._directory, options=options)
@@ -129,6 +138,8 @@ class Checkpoints:
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
         )
         try:
+            self._manager.wait_until_finished()
+            self._saving = step
             self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
         except _FAILURES as error:
             raise self._unsaved(error) from error
@@ -171,6 +182,9 @@ class Checkpoints:
 
     def _read(self, step: int, like: Any) -> Restored:
         where = self._directory / str(step)
+        changed = _changed_files(where)
+        if changed:
+            raise DamagedCheckpointError(f"{where}: the checksum of {', '.join(changed)} does not hold")
         try:
             found = self._restored(step, like)
             held = {name: found.data[name] for name in ("data", "digests")}
@@ -200,6 +214,12 @@ class Checkpoints:
         except _FAILURES:
             return False
         return True
+
+    def _sign(self) -> None:
+        """Write the checksums into the temporary folder of the checkpoint, whose files are whole, before its renaming."""
+        if jax.process_index() == 0:
+            (where,) = self._directory.glob(f"{self._saving}.orbax-checkpoint-tmp*")
+            (where / CHECKSUMS).write_text(json.dumps(_file_checksums(where)))
 
     def _set_aside(self, step: int) -> Path:
         names = itertools.chain([f"damaged-{step}"], (f"damaged-{step}-{i}" for i in itertools.count(2)))
@@ -252,6 +272,24 @@ def _digests(state: Any) -> dict[str, int]:
     paths = (path for path, _ in jax.tree.leaves_with_path(state))
     names = (jax.tree_util.keystr(path, simple=True, separator="/") for path in paths)
     return dict(zip(names, numbers.tolist(), strict=True))
+
+
+def _file_checksums(where: Path) -> dict[str, int]:
+    """CRC-32 of every file below a folder, by its path in it."""
+    files = sorted(path for path in where.rglob("*") if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
+    return {path.relative_to(where).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
+
+
+def _changed_files(where: Path) -> list[str]:
+    """Files that are not what was saved; of a checkpoint of earlier versions, which has no checksums, none."""
+    path = where / CHECKSUMS
+    if not path.is_file():
+        return []
+    try:
+        saved, found = json.loads(path.read_text()), _file_checksums(where)
+        return sorted(name for name, checksum in saved.items() if found.get(name) != checksum)
+    except (OSError, ValueError, AttributeError):
+        return [CHECKSUMS]
 
 
 def _crc32(value: Any) -> int:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, start, step
-from touchr1_jax.training.checkpoint import CheckpointError, Checkpoints, DamagedCheckpointError, digest
+from touchr1_jax.training.checkpoint import CHECKSUMS, CheckpointError, Checkpoints, DamagedCheckpointError, digest
+
+UNREAD = ("_CHECKPOINT_METADATA", "commit_success.txt")
+"""Files that Orbax writes after the checksums; no state depends on them."""
 
 
 def test_an_empty_directory_holds_none(tmp_path):
@@ -136,7 +139,19 @@ class TestDamage:
         path.write_text(path.read_text().replace('"at": 2', '"at": 7'))
         found, told = self.restored(stage)
         assert found.data == {"at": 1}
-        assert "the checksum of its data does not hold" in told[0]
+        assert "the checksum of data/metadata does not hold" in told[0]
+
+    def test_a_flipped_bit_of_any_file_does_not_pass(self, stage):
+        """Of a few places of each, its checksums among them, before Orbax reads anything."""
+        files = [p for p in sorted((stage / "2").rglob("*")) if p.is_file() and p.name not in UNREAD]
+        assert {"_METADATA", "metadata", CHECKSUMS} <= {path.name for path in files}
+        for path in files:
+            content = path.read_bytes()
+            for at in (0.1, 0.6) if content else ():
+                self.spoil(path, at)
+                with Checkpoints(stage) as checkpoints, pytest.raises(DamagedCheckpointError, match="checksum"):
+                    checkpoints._read(2, self.numbers(0))
+                path.write_bytes(content)
 
     def test_none_intact_is_an_error_that_says_so(self, stage):
         for n in (1, 2):
