@@ -24,6 +24,11 @@ from sensors_io.errors import UserError
 
 _MAGIC = b"TJR1"
 _PREFIX = struct.Struct("<4sII")
+_FOREIGN = (
+    ValueError, KeyError, TypeError, IndexError, OverflowError, MemoryError, SyntaxError, struct.error,
+)  # fmt: skip
+"""Errors of a body that this code did not write; NumPy raises `SyntaxError` for the name of a type."""
+
 _HEADER_SIZE = struct.Struct("<I")
 _SYNC_EVERY_S = 1.0
 
@@ -118,16 +123,7 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
             return
         try:
             entry = _decode(body)
-        except (
-            ValueError,
-            KeyError,
-            TypeError,
-            IndexError,
-            OverflowError,
-            MemoryError,
-            SyntaxError,
-            struct.error,
-        ) as error:
+        except _FOREIGN as error:
             raise JournalError(
                 f"{path} holds an entry of another layout at byte {start} ({error!r}): move it away, or bring it in "
                 "with the version that wrote it"

@@ -216,7 +216,7 @@ class Checkpoints:
         return True
 
     def _sign(self) -> None:
-        """Write the checksums into the temporary folder of the checkpoint, whose files are whole, before its renaming."""
+        """Write the checksums of a checkpoint into its temporary folder, before Orbax renames it."""
         if jax.process_index() == 0:
             (where,) = self._directory.glob(f"{self._saving}.orbax-checkpoint-tmp*")
             (where / CHECKSUMS).write_text(json.dumps(_file_checksums(where)))
