@@ -128,7 +128,7 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
 
 
 def _float32(array: np.ndarray) -> np.ndarray:
-    """What float32 cannot hold is not finite afterwards, and the records flag it."""
+    """The array in float32; a number past its range becomes infinite, which the records flag."""
     with np.errstate(over="ignore", invalid="ignore"):
         return array.astype(np.float32)
 
