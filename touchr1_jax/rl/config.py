@@ -71,6 +71,8 @@ class Algorithm:
     """Clip range of the ratio above 1."""
     importance_cap: float | None = None
     """Largest weight of a token for π_learner/π_sampler (truncated importance sampling); `None` trusts the sampler."""
+    importance_sequence: bool = False
+    """Weight whole rollouts by the product of their ratios, at most `importance_cap`, instead of each token."""
     average: Average = Average.ROLLOUT
     advantage: Advantage = Advantage.GROUP
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
@@ -84,13 +86,19 @@ class Algorithm:
     """Leave groups of equal rewards out of the policy-gradient mean; KL and G_tg keep all."""
     candidates: int = 1
     """Prompts sampled for each prompt that is learned from; groups of equal rewards are passed over."""
+    mask_truncated: bool = False
+    """Leave rollouts without an end token out of the loss; their rewards still count in the group."""
     constrained: bool = False
     """Sample only tokens from which a formatted answer can still follow; the learner scores them without constraint."""
     beta: float = 1e-3
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
+    kl_in_reward: bool = False
+    """Subtract β Σ_t log(π/π_ref) from the reward of a rollout, instead of β KL from the objective."""
     reference_every: int | None = None
     """Steps after which the policy becomes its own reference; `None` keeps the first one."""
+    reference_share: float = 1.0
+    """Share of the policy in the reference that it then becomes; below 1 this is a moving average."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus, per nat."""
     entropy_floor_nat: float | None = None
@@ -112,14 +120,22 @@ class Algorithm:
     """Rollouts of each control."""
     updates: int = 1
     """Updates μ from the same rollouts."""
+    minibatches: int = 1
+    """Equal parts of the prompts, from each of which an update takes an optimizer step."""
+    stale: int = 0
+    """Steps by which the sampler's parameters lag behind the learner's."""
     trust_nat: float | None = None
     """Largest KL between the policies before and after an update, nat a token; longer updates are shortened."""
 
     def __post_init__(self) -> None:
-        for field in ("best_of", "candidates", "controls", "updates", "reference_every"):
+        for field in ("best_of", "candidates", "controls", "updates", "minibatches", "reference_every"):
             count = getattr(self, field)
             if count is not None and count < 1:
                 raise ValueError(f"{field} is {count}: must be at least 1; raise it")
+        if self.stale < 0:
+            raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
+        if not 0 < self.reference_share <= 1:
+            raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
         for field in ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "tactile_weight"):
             if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
                 raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0; it is a size, not a sign")
@@ -127,6 +143,19 @@ class Algorithm:
             bound = getattr(self, field)
             if bound is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
+
+
+def ratio_to_learner(algorithm: Algorithm) -> bool:
+    """True where ratios are to the learner before its first update, false where to a sampler that lags behind it.
+
+    Under an importance cap the weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
+    """
+    return algorithm.stale == 0 or algorithm.importance_cap is not None
+
+
+def loss_beta(algorithm: Algorithm) -> float:
+    """β of the KL in the loss; none where the KL is in the reward."""
+    return 0.0 if algorithm.kl_in_reward else algorithm.beta
 
 
 def left_out(weight: float | jax.Array) -> bool:
@@ -259,6 +288,12 @@ class GRPOConfig:
     final_share: float = 0.05
     max_grad_norm: float = 1.0
     algorithm: AnyAlgorithm = dataclasses.field(default_factory=Paper)
+    temperature: float = 1.0
+    """Logits are divided by it, of the sampler, the learner and the reference alike."""
+    top_p: float = 1.0
+    """Sample among the most likely tokens that reach this probability together; the learner renormalises alike."""
+    min_p: float = 0.0
+    """Sample among tokens of at least this share of the largest probability; the learner renormalises alike."""
     buckets: tuple[int, ...] = ()
     """Lengths below `length`, ascending: an update computes the shortest that holds its rollouts; each is compiled."""
     inverse_draws: bool = False
@@ -276,10 +311,13 @@ class GRPOConfig:
         at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
         at_least(self, 0, "learning_rate", "lr_scale")
         within(self, 0, 1, "final_share")
-        above(self, 0, "max_grad_norm")
-        if self.prompts % self.micro_prompts:
+        above(self, 0, "max_grad_norm", "temperature", "top_p")
+        within(self, 0, 1, "top_p", "min_p")
+        if self.prompts % (self.micro_prompts * self.algorithm.minibatches):
+            parts = f"{self.algorithm.minibatches} minibatches" if self.algorithm.minibatches > 1 else ""
             raise ValueError(
-                f"micro_prompts {self.micro_prompts} must divide prompts {self.prompts}; choose a divisor of it"
+                f"micro_prompts {self.micro_prompts}{parts and ' of each of '}{parts} must divide prompts "
+                f"{self.prompts}; choose a divisor of it"
             )
         if self.group < 2 and self.algorithm.advantage is not Advantage.GLOBAL:
             raise ValueError(

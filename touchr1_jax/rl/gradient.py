@@ -19,9 +19,9 @@ from touchr1_jax.models.chunked_logits import Rows, by_blocks
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out
+from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out, loss_beta, ratio_to_learner
 from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_terms
-from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
 
@@ -57,7 +57,8 @@ def grpo_gradient(
       reference: the policy that the KL is taken to.
       experience: rollouts with their advantages.
       first: true before the first update from this experience: the learner's own log-probabilities are then the old
-        ones, so that every ratio is 1 whatever precision the sampler computed in.
+        ones, so that every ratio is 1 whatever precision the sampler computed in.  Where a
+        sampler lags behind and no weights correct for it, `old` are the sampler's at every update.
 
     Returns:
       The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest); and the
@@ -68,7 +69,9 @@ def grpo_gradient(
 
     def loss(params: Params, micro: Experience) -> tuple[Array, tuple[dict[str, Array], Array]]:
         terms = experience_terms(fns, config, params, reference, micro)
-        old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), micro.old)
+        old = micro.old
+        if ratio_to_learner(algorithm):
+            old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
         rollout, a, w = micro.rollout, micro.advantage, micro.weight
         value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest)
         return value, (parts | {"loss": value}, old)
@@ -78,19 +81,18 @@ def grpo_gradient(
         return jax.tree.map(jnp.add, grads, more), found
 
     zero = jax.tree.map(jnp.zeros_like, params)
-    grads, (by_prompt, old) = jax.lax.scan(add_micro_batch, zero, micro_batches(config, experience))
+    grads, (by_prompt, old) = jax.lax.scan(add_micro_batch, zero, batches_of(config.micro_prompts, experience))
     over_prompts = lambda name: {"loss": jnp.sum}.get(name, jnp.max if name.endswith("_peak") else jnp.mean)
     parts = {name: over_prompts(name)(value) for name, value in by_prompt.items()}
-    parts["kl_cost_peak"] = algorithm.beta * parts["kl_peak"]
+    parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
     return grads, parts | _grounding_by_stream(in_order(by_prompt["grounding"]), experience), in_order(old)
 
 
-def micro_batches(config: GRPOConfig, tree: Any) -> Any:
-    """Arrays [P, …] cut into [P / `micro_prompts`, `micro_prompts`, …], neighbours into different micro-batches.
+def batches_of(size: int, tree: Any) -> Any:
+    """Arrays [P, …] cut into [P / size, size, …], neighbours into different batches.
 
-    Where devices share the prompts, neighbours lie on one device, so that each has its part of every micro-batch.
+    Where devices share the prompts, neighbours lie on one device, so that each has its part of every batch.
     """
-    size = config.micro_prompts
     cut = lambda x: x.reshape(size, x.shape[0] // size, *x.shape[1:])  # not −1: a prompt without a view has 0 tokens
     return jax.tree.map(lambda x: cut(x).swapaxes(0, 1), tree)
 
@@ -98,6 +100,19 @@ def micro_batches(config: GRPOConfig, tree: Any) -> Any:
 def in_order(x: Array) -> Array:
     """An array [P, …] again from its micro-batches."""
     return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
+
+
+def log_probs(
+    fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
+) -> Float[Array, "P G T"]:
+    """Log-probabilities of the sampled tokens under some parameters."""
+    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
+    plain = dataclasses.replace(config, algorithm=algorithm)
+    each = jnp.ones(rollout.mask.shape[:2])
+    stream = jnp.zeros(len(each), jnp.int32)
+    learn = Experience(batch, batch.features.touch, stream, rollout, rollout.log_prob, each, each[:, 0])
+    of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob
+    return in_order(jax.lax.map(of_micro_batch, batches_of(config.micro_prompts, learn)))
 
 
 def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
@@ -132,7 +147,7 @@ def prompt_terms(
     states = group_states(fns, config, experience)
     own, prefix = states(params, batch.features)
     rows: Rows = {"own": own, "token": tokens}
-    if not left_out(algorithm.beta):
+    if not left_out(loss_beta(algorithm)):
         rows["reference"] = jax.lax.stop_gradient(states(reference, batch.features)[0])
     if not left_out(algorithm.gamma):
         rows["perturbed"] = perturbed_states(fns, config, params, experience, prefix)
@@ -140,8 +155,14 @@ def prompt_terms(
     heads = {name: at_precision(config, p) for name, p in heads.items()}
 
     def of_rows(rows: Rows) -> TokenTerms:
-        log = {name: jax.nn.log_softmax(fns.logits(p, rows[name])) for name, p in heads.items() if name in rows}
-        return token_terms(algorithm, rows["token"], log["own"], log.get("reference"), log.get("perturbed"))
+        logits = {
+            name: tempered(fns.logits(p, rows[name]), config.temperature) for name, p in heads.items() if name in rows
+        }
+        log = {name: jax.nn.log_softmax(x) for name, x in logits.items()}
+        terms = token_terms(algorithm, rows["token"], log["own"], log.get("reference"), log.get("perturbed"))
+        if not truncates(config.top_p, config.min_p):
+            return terms
+        return terms._replace(log_prob=drawn_log_probs(log["own"], rows["token"], config.top_p, config.min_p))
 
     if config.remat:
         of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)

@@ -19,6 +19,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rewards.base import GROUP
@@ -31,9 +32,10 @@ from touchr1_jax.rl.advantages import (
     prompt_weights,
     zero_variance,
 )
-from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
+from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.gradient import Experience
+from touchr1_jax.rl.gradient import Experience, log_probs
+from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.metrics import advantage_metrics, answer_metrics, reward_metrics, rollout_metrics, touch_metrics
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import ScoreFn, left_out_groups
@@ -52,7 +54,8 @@ LEAN_BEFORE = (0, 11)
 class GRPOState:
     """Everything that a step changes; `key` is the run's root key and the step is folded into it.
 
-    `reference` is there only where the algorithm refreshes it; otherwise that of `FrozenInputs` counts.
+    `reference` is there only where the algorithm refreshes it; otherwise that of `FrozenInputs` counts.  `behind` are
+    the parameters before the last `stale` updates, the oldest first, with which the next rollouts are sampled.
     """
 
     params: Params
@@ -60,6 +63,7 @@ class GRPOState:
     step: Int[Array, ""]
     key: Array
     reference: Params | None = None
+    behind: tuple[Params, ...] = ()
 
 
 class FrozenInputs(NamedTuple):
@@ -90,10 +94,16 @@ class Group(NamedTuple):
 
 def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
     """State before the first step, on buffers of its own, since steps take them over."""
-    own = jax.tree.map(jnp.copy, params)
-    reference = jax.tree.map(jnp.copy, params) if config.algorithm.reference_every is not None else None
-    step = jnp.zeros((), jnp.int32)
-    return GRPOState(params=own, opt_state=optimizer.init(own), step=step, key=key, reference=reference)
+    copy = lambda: jax.tree.map(jnp.copy, params)
+    own = copy()
+    return GRPOState(
+        params=own,
+        opt_state=optimizer.init(own),
+        step=jnp.zeros((), jnp.int32),
+        key=key,
+        reference=copy() if config.algorithm.reference_every is not None else None,
+        behind=tuple(copy() for _ in range(config.algorithm.stale)),
+    )
 
 
 def compiles_leanly() -> bool:
@@ -153,18 +163,24 @@ class _Engine:
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
         control_key = jax.random.fold_in(key, 2)
-        group, metrics = self.rollouts(state.params, batch, frozen.noise, sample_key, control_key)
+        if len(state.behind) != self.config.algorithm.stale:
+            lag = f"stale is {self.config.algorithm.stale}, but the state holds {len(state.behind)} older parameters"
+            raise ValueError(f"{lag}; make it with `start_state`")
+        sampler = state.behind[0] if state.behind else state.params
+        group, metrics = self.rollouts(sampler, batch, frozen.noise, sample_key, control_key)
         if self.config.algorithm.candidates > 1:
             metrics |= {f"drawn_{name}": value for name, value in self.group_metrics(group).items()}
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
-        learn = self.experience(group, frozen.noise, mask_key)
         reference = frozen.reference if state.reference is None else state.reference
+        group = self.penalised(group, reference) if self.config.algorithm.kl_in_reward else group
+        learn = self.experience(group, frozen.noise, mask_key)
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
         metrics |= parts | self.group_metrics(group) | self.metrics(group, learn)
-        after = dataclasses.replace(state, params=params, opt_state=opt_state, step=state.step + 1)
+        step, behind = state.step + 1, (*state.behind, state.params)[1:]
+        after = dataclasses.replace(state, params=params, opt_state=opt_state, step=step, behind=behind)
         return self.refreshed(after), metrics
 
     def rollouts(
@@ -200,6 +216,9 @@ class _Engine:
             length=self.config.length,
             end_ids=self.fns.end_ids,
             pad_id=self.fns.pad_id,
+            temperature=self.config.temperature,
+            top_p=self.config.top_p,
+            min_p=self.config.min_p,
             inverse=self.config.inverse_draws,
             constraint=self.constraint,
         )
@@ -211,6 +230,13 @@ class _Engine:
             equal &= zero_variance(group.bonus)
         return equal | ~group.finite
 
+    def penalised(self, group: Group, reference: Params) -> Group:
+        """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL."""
+        rollout = group.rollout
+        log_ref = log_probs(self.fns, self.config, reference, group.batch, rollout)
+        term = -self.config.algorithm.beta * masked.total(rollout.log_prob - log_ref, rollout.mask, -1)
+        return group._replace(reward=group.reward + term, terms={**group.terms, "kl": term})
+
     def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
@@ -219,26 +245,37 @@ class _Engine:
             advantage += added_after(group.bonus, algorithm.tactile_weight)
         advantage = jnp.where(group.finite[:, None], advantage, 0.0)
         no_signal = self.no_signal(group)
-        even = jnp.full(no_signal.shape, 1 / self.config.prompts)
+        rollout, weight = group.rollout, jnp.full(no_signal.shape, 1 / self.config.prompts)
+        if algorithm.mask_truncated:
+            rollout = dataclasses.replace(rollout, mask=rollout.mask & ~group.parsed.truncated[..., None])
+        if algorithm.drop_degenerate:
+            weight = prompt_weights(~no_signal)
+        if algorithm.average is Average.BATCH:
+            weight = over_tokens(weight, rollout.mask)
         masked_touch, stream = mask_one_stream(batch.features, noise, key)
         return Experience(
             batch=batch,
             masked_touch=masked_touch,
             masked_stream=stream,
-            rollout=group.rollout,
-            old=group.rollout.log_prob,
+            rollout=rollout,
+            old=rollout.log_prob,
             advantage=advantage,
-            weight=prompt_weights(~no_signal) if algorithm.drop_degenerate else even,
+            weight=weight,
         )
 
     def refreshed(self, state: GRPOState) -> GRPOState:
-        """The state with the policy as its own reference where the algorithm's period is over."""
+        """The state with a reference that moved to the policy, or by a share of the way, every `reference_every` steps.
+
+        The moving average of TR-DPO (arXiv 2404.09656), TRL's `ref_model_mixup_alpha`.
+        """
         every = self.config.algorithm.reference_every
         if every is None:
             return state
         if state.reference is None:
             raise ValueError(f"reference_every is {every}, but the state has no reference; make it with `start_state`")
-        pick = lambda new, old: jnp.where(state.step % every == 0, new, old)
+        share = self.config.algorithm.reference_share
+        mix = lambda new, old: new if share == 1.0 else share * new + (1 - share) * old
+        pick = lambda new, old: jnp.where(state.step % every == 0, mix(new, old), old)
         return dataclasses.replace(state, reference=jax.tree.map(pick, state.params, state.reference))
 
     def group_metrics(self, group: Group) -> dict[str, Array]:

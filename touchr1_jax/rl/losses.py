@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, KLEstimator, Surrogate, left_out
+from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, KLEstimator, Surrogate, left_out, loss_beta
 
 LOG_RATIO_CLAMP = 20.0
 """Bound of a log-ratio before `exp`: e^20 is far past any meaning and far from float32 overflow."""
@@ -44,7 +44,7 @@ def grpo_loss(
 
         J   = Σ_p w_p ⟨c_t S_t⟩ + 1/N Σ_p [ min(γ ⟨G_t⟩, budget) − β ⟨KL_t⟩ + η min(⟨H_t⟩, floor) ]
         S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
-        c_t = min(π_old(o_t) / π_sampler(o_t), cap)
+        c_t = min(π_old(o_t) / π_sampler(o_t), cap)                       (`importance` has another)
 
     ⟨·⟩ is the mean over the tokens of a prompt's group: `algorithm.average` for S and KL, per rollout for G and H.
     Source: Touch-R1 (arXiv 2605.27154, eq. 5), where N = P, w = 1/N, c = 1, η = 0 and nothing bounds G.
@@ -67,14 +67,14 @@ def grpo_loss(
     longest = divisor(config, mask) if longest is None else longest
     objective, clipped = surrogate(algorithm, terms.log_prob, old, mask, advantage)
     if algorithm.importance_cap is not None:
-        objective *= jnp.minimum(_ratio(old - sampler), algorithm.importance_cap)
+        objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
 
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
-    gain = jnp.sum(weight * policy) + jnp.sum(grounded - algorithm.beta * kl + explored) / config.prompts
+    gain = jnp.sum(weight * policy) + jnp.sum(grounded - loss_beta(algorithm) * kl + explored) / config.prompts
 
     gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
@@ -89,6 +89,19 @@ def grpo_loss(
         "sampler_gap": per_rollout(gap),
         "sampler_gap_peak": peak(gap),
     }
+
+
+def importance(
+    algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Array, "*n T"]
+) -> Float[Array, "*n T"]:
+    """π_old/π_sampler of every token, or, for a whole rollout, their product; the loss cuts them at a cap.
+
+    Truncated importance sampling (Yao et al. 2025, "Your efficient RL framework secretly brings you off-policy RL
+    training"); TRL's `token_truncate` and `sequence_truncate`.
+    """
+    if algorithm.importance_sequence:
+        log_ratio = jnp.broadcast_to(masked.total(log_ratio, mask, -1, keepdims=True), log_ratio.shape)
+    return _ratio(log_ratio)
 
 
 def surrogate(
@@ -128,6 +141,13 @@ def surrogate(
 def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:
     """N of `group_mean`: the mean length of the rollouts where tokens are averaged over the batch, otherwise T."""
     return jnp.mean(jnp.sum(mask, -1)) if config.algorithm.average is Average.BATCH else config.length
+
+
+def over_tokens(weight: Float[Array, "P"], mask: Bool[Array, "P G T"]) -> Float[Array, "P"]:
+    """Weights of prompts for the mean over the batch's tokens, which then is that over the prompts that count."""
+    length = jnp.mean(jnp.sum(mask, -1), -1)
+    kept = jnp.sum(weight * length)
+    return jnp.where(kept > 0, weight * jnp.sum(weight) * jnp.mean(length) / jnp.where(kept > 0, kept, 1.0), 0.0)
 
 
 def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G T"], longest: int | Array) -> Array:

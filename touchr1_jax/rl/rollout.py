@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax.models.lm import LayerCache, PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
@@ -57,10 +58,11 @@ DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[A
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SampleConfig:
-    """Settings of the sampler: `group` completions per prompt of at most `length` tokens, greedy or at temperature 1.
+    """Settings of the sampler: `group` completions per prompt of at most `length` tokens, greedy or at a temperature.
 
-    `inverse` draws by the inverse distribution function, with one random number per rollout instead of V;
-    `constraint` allows only tokens from which a formatted answer can still be finished in time.
+    `top_p` and `min_p` choose the tokens that may be drawn (see `nucleus`); `inverse` draws by the inverse distribution
+    function, with one random number per rollout instead of V; `constraint` allows only tokens from which a formatted
+    answer can still be finished in time.
     """
 
     group: int
@@ -68,6 +70,9 @@ class SampleConfig:
     end_ids: tuple[int, ...]
     pad_id: int
     greedy: bool = False
+    temperature: float = 1.0
+    top_p: float = 1.0
+    min_p: float = 0.0
     inverse: bool = False
     constraint: Constraint | None = None
 
@@ -143,8 +148,9 @@ def sample(
     ends = jnp.asarray(config.end_ids)
 
     def body(loop: _Loop) -> _Loop:
-        token = _draw(_allowed(loop, config), jax.random.fold_in(key, loop.t), config)
-        log_prob = jnp.take_along_axis(jax.nn.log_softmax(loop.logits), token[..., None], -1)[..., 0]
+        logits = tempered(loop.logits, config.temperature)
+        token = _draw(_allowed(logits, loop, config), jax.random.fold_in(key, loop.t), config)
+        log_prob = drawn_log_probs(jax.nn.log_softmax(logits), token, config.top_p, config.min_p)
         token = jnp.where(loop.alive, token, config.pad_id)
         logits, caches = step(token, loop.t, prefix, loop.caches)
         return _Loop(
@@ -189,11 +195,51 @@ def _any_alive_anywhere(size: int, batched: list[bool], alive: Array) -> tuple[A
     return _any_alive(alive), False
 
 
-def _allowed(loop: _Loop, config: SampleConfig) -> Float[Array, "P G V"]:
-    """The logits, those of tokens that the constraint forbids at −∞."""
-    if config.constraint is None:
-        return loop.logits
-    return jnp.where(config.constraint.allowed(loop.state, config.length - loop.t), loop.logits, -jnp.inf)
+def _allowed(logits: Float[Array, "P G V"], loop: _Loop, config: SampleConfig) -> Float[Array, "P G V"]:
+    """The logits, those of tokens that the constraint forbids or the nucleus does not hold at −∞."""
+    if config.constraint is not None:
+        logits = jnp.where(config.constraint.allowed(loop.state, config.length - loop.t), logits, -jnp.inf)
+    if not truncates(config.top_p, config.min_p):
+        return logits
+    return jnp.where(nucleus(jax.nn.log_softmax(logits), config.top_p, config.min_p), logits, -jnp.inf)
+
+
+def tempered(logits: Float[Array, "*n V"], temperature: float) -> Float[Array, "*n V"]:
+    """Logits at a temperature; at 1 as they are."""
+    return logits if temperature == 1.0 else logits / temperature
+
+
+def truncates(top_p: float, min_p: float) -> bool:
+    """True where some tokens are never drawn."""
+    return top_p < 1.0 or min_p > 0.0
+
+
+def nucleus(log_p: Float[Array, "*n V"], top_p: float, min_p: float) -> Bool[Array, "*n V"]:
+    """Tokens that may be drawn: of the most likely ones as few as have probability `top_p` together (Holtzman et al.,
+    arXiv 1904.09751), and of those all of at least `min_p` times the largest probability (arXiv 2407.01082).
+    """
+    p = jnp.exp(log_p)
+    kept = p >= min_p * jnp.max(p, -1, keepdims=True)
+    if top_p == 1.0:
+        return kept
+    falling = -jnp.sort(-p, axis=-1)
+    before = jnp.cumsum(falling, -1) - falling
+    least = jnp.min(jnp.where(before < top_p, falling, jnp.inf), -1, keepdims=True)
+    return kept & (p >= least)
+
+
+def drawn_log_probs(
+    log_p: Float[Array, "*n V"], tokens: Int[Array, "*n"], top_p: float, min_p: float
+) -> Float[Array, "*n"]:
+    """Log-probability of each drawn token among those that may be drawn, for the sampler and for the learner.
+
+    The learner's nucleus is its own, without gradient, and holds the drawn token; on policy it is the sampler's.
+    """
+    drawn = token_log_probs(log_p, tokens)
+    if not truncates(top_p, min_p):
+        return drawn
+    kept = nucleus(jax.lax.stop_gradient(log_p), top_p, min_p) | (jnp.arange(log_p.shape[-1]) == tokens[..., None])
+    return drawn - jax.nn.logsumexp(jnp.where(kept, log_p, -jnp.inf), -1)
 
 
 def _draw(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) -> Int[Array, "P G"]:

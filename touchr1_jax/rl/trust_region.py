@@ -1,7 +1,5 @@
 """Updates of bounded size: the KL of each update is measured, and an update that is too long is shortened."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -9,7 +7,7 @@ from jaxtyping import Array, Float
 from touchr1_jax import masked
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.gradient import Experience, experience_terms, in_order, micro_batches
+from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import estimated_kl
 from touchr1_jax.types import Params
 
@@ -45,7 +43,7 @@ def within_trust(
     between = lambda scale: jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
 
     def moved_by(scale: Float[Array, ""]) -> Float[Array, ""]:
-        moved = log_probs(fns, config, between(scale), learn)
+        moved = log_probs(fns, config, between(scale), learn.batch, learn.rollout)
         return jnp.mean(masked.mean(estimated_kl(learn.old, moved, "k3"), learn.rollout.mask, axis=-1))
 
     def too_long(carry: tuple[Array, Array, Array]) -> Array:
@@ -61,11 +59,3 @@ def within_trust(
     proposed = moved_by(whole)
     scale, _, _ = jax.lax.while_loop(too_long, shortened, (whole, proposed, jnp.ones((), jnp.int32)))
     return between(scale), {"update_kl": proposed, "update_scale": scale}
-
-
-def log_probs(fns: PolicyFns, config: GRPOConfig, params: Params, learn: Experience) -> Float[Array, "P G T"]:
-    """Log-probabilities of the sampled tokens under some parameters."""
-    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
-    plain = dataclasses.replace(config, algorithm=algorithm)
-    of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob
-    return in_order(jax.lax.map(of_micro_batch, micro_batches(config, learn)))

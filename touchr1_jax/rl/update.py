@@ -1,5 +1,6 @@
 """The update of a step: one or several optimizer steps from the same rollouts."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +10,8 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.rl.gradient import Experience, grpo_gradient
+from touchr1_jax.rl.config import GRPOConfig, ratio_to_learner
+from touchr1_jax.rl.gradient import Experience, batches_of, grpo_gradient, log_probs
 from touchr1_jax.rl.trust_region import within_trust
 from touchr1_jax.skipping import Skipping
 from touchr1_jax.types import Params
@@ -28,30 +29,45 @@ def update_policy(
     reference: Params,
     learn: Experience,
 ) -> tuple[Params, optax.OptState, dict[str, Array]]:
-    """μ optimizer steps on the same rollouts.
+    """μ passes over the same rollouts, each of one optimizer step for every minibatch.
+
+    Ratios are to the learner before the first step.  With minibatches that takes a forward pass of its own; their
+    gradients at the same parameters have that of the whole batch as their mean.
 
     Returns:
-      Parameters, state of the optimizer, and parts of the first gradient, but `clip_share` of the last one.
+      Parameters, state of the optimizer, and parts of the first pass, but `clip_share` of the last one.
     """
+    algorithm = config.algorithm
+    number, count = algorithm.minibatches, algorithm.updates
+    if number > 1:
+        alone = dataclasses.replace(algorithm, minibatches=1)
+        config = dataclasses.replace(config, algorithm=alone, prompts=config.prompts // number)
+        old = log_probs(fns, config, params, learn.batch, learn.rollout) if ratio_to_learner(algorithm) else learn.old
+        learn = learn._replace(old=old, weight=number * learn.weight)
+    minibatches = learn if number == 1 else batches_of(config.prompts, learn)
 
-    def once(carry: tuple[Params, optax.OptState, Array], first: Any):
+    def once(carry: tuple[Params, optax.OptState, Array], place: Any):
         params, opt_state, old = carry
-        grads, parts, old = bucketed_gradient(fns, config, params, reference, learn._replace(old=old), first)
+        first, which = place
+        part = learn._replace(old=old) if number == 1 else jax.tree.map(lambda x: x[which], minibatches)
+        grads, parts, old = bucketed_gradient(fns, config, params, reference, part, first)
         norm = optax.tree.norm(grads)
         moved, opt_state = finite_update(optimizer, grads, norm, opt_state, params)
         parts = parts | {"grad_norm": norm}
-        if (trust := config.algorithm.trust_nat) is not None:
-            moved, size = within_trust(fns, config, params, moved, learn._replace(old=old), trust)
+        if (trust := algorithm.trust_nat) is not None:
+            moved, size = within_trust(fns, config, params, moved, part._replace(old=old), trust)
             parts |= size
-        return (moved, opt_state, old), parts
+        return (moved, opt_state, old if number == 1 else learn.old), parts
 
-    start, count = (params, opt_state, learn.old), config.algorithm.updates
-    if count == 1:
-        (params, opt_state, _), parts = once(start, True)
+    start = (params, opt_state, learn.old)
+    if number == count == 1:
+        (params, opt_state, _), parts = once(start, (True, 0))
         return params, opt_state, parts
-    (params, opt_state, _), all_parts = jax.lax.scan(once, start, jnp.arange(count) == 0)
-    parts = jax.tree.map(lambda x: x[0], all_parts)
-    return params, opt_state, parts | {"clip_share": all_parts["clip_share"][-1]}
+    steps = jnp.arange(number * count)
+    places = ((steps == 0) & (number == 1), steps % number)
+    (params, opt_state, _), all_parts = jax.lax.scan(once, start, places)
+    parts = {name: (jnp.max if name.endswith("_peak") else jnp.mean)(x[:number]) for name, x in all_parts.items()}
+    return params, opt_state, parts | {"clip_share": jnp.mean(all_parts["clip_share"][-number:])}
 
 
 def finite_update(

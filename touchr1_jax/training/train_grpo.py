@@ -111,7 +111,7 @@ def grpo_program(
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds; with adapters the frozen decoder is the last argument."""
     learning_rate = config.learning_rate * config.lr_scale
-    updates = steps * config.algorithm.updates
+    updates = steps * config.algorithm.updates * config.algorithm.minibatches
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
     plain = make_grpo_step(fns, score, optimizer, config, constraint, gather=gather)
     if lora is None:

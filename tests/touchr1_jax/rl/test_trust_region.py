@@ -8,9 +8,9 @@ import pytest
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, P
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.gradient import Experience
+from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
-from touchr1_jax.rl.trust_region import NEAR, log_probs, within_trust
+from touchr1_jax.rl.trust_region import NEAR, within_trust
 
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
@@ -38,7 +38,7 @@ def shorten(learn):
 
 
 def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
-    ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn))()
+    ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn.batch, learn.rollout))()
     mask = np.asarray(learn.rollout.mask)
     np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
 
