@@ -7,7 +7,7 @@ where the vocabulary is large.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -155,20 +155,23 @@ def prompt_terms(
     heads = {name: at_precision(config, p) for name, p in heads.items()}
 
     def of_rows(rows: Rows) -> TokenTerms:
-        logits = {
-            name: tempered(fns.logits(p, rows[name]), config.temperature) for name, p in heads.items() if name in rows
-        }
-        log = {name: jax.nn.log_softmax(x) for name, x in logits.items()}
-        terms = token_terms(algorithm, rows["token"], log["own"], log.get("reference"), log.get("perturbed"))
-        if not truncates(config.top_p, config.min_p):
-            return terms
-        return terms._replace(log_prob=drawn_log_probs(log["own"], rows["token"], config.top_p, config.min_p))
+        logits = {name: fns.logits(p, rows[name]) for name, p in heads.items() if name in rows}
+        return logit_terms(config, rows["token"], logits)
 
     if config.remat:
         of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
     rows = {name: x.reshape(-1, *x.shape[2:]) for name, x in rows.items()}
     found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
     return jax.tree.map(lambda x: x.reshape(tokens.shape), found)
+
+
+def logit_terms(config: GRPOConfig, tokens: Int[Array, "*n"], logits: Mapping[str, Float[Array, "*n V"]]) -> TokenTerms:
+    """`token_terms` from logits of the policies `own` and, where they are run, `reference` and `perturbed`."""
+    log = {name: jax.nn.log_softmax(tempered(x, config.temperature)) for name, x in logits.items()}
+    terms = token_terms(config.algorithm, tokens, log["own"], log.get("reference"), log.get("perturbed"))
+    if not truncates(config.top_p, config.min_p):
+        return terms
+    return terms._replace(log_prob=drawn_log_probs(log["own"], tokens, config.top_p, config.min_p))
 
 
 def group_states(

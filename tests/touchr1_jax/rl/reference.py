@@ -100,3 +100,68 @@ def loss(algorithm, *, prompts: int, longest: int, **x: np.ndarray) -> tuple[flo
         for name, value in zip(found, (surrogate, kl, grounding, entropy), strict=True):
             found[name].append(value)
     return -total, {name: np.array(values) for name, values in found.items()}
+
+
+def nucleus(p: Float, top_p: float, min_p: float) -> NDArray[np.bool_]:
+    """Tokens of one distribution that may be drawn, one after the other from the most likely on."""
+    kept, together = np.zeros(len(p), bool), 0.0
+    for v in np.argsort(-p, kind="stable"):
+        if together < top_p and p[v] >= min_p * p.max():
+            kept[v] = True
+        together += p[v]
+    return kept
+
+
+def objective(config, own, perturbed, fixed, *, first: bool) -> float:
+    """The loss from logits [P, G, T, V] in float64, term by term as published.
+
+    `fixed` are the numbers of `test_reference_gradients.problem`; its `own` and `perturbed` take the place of the
+    arguments wherever no gradient may flow.
+    """
+    a, mask, tokens = config.algorithm, fixed["mask"], fixed["tokens"]
+    log_p, log_q, log_ref, still, still_q = (
+        log_softmax(x / config.temperature)
+        for x in (own, perturbed, fixed["reference"], fixed["own"], fixed["perturbed"])
+    )
+
+    def drawn(log):
+        value = of_tokens(log, tokens)
+        if config.top_p == 1 and config.min_p == 0:
+            return value
+        for at in np.ndindex(tokens.shape):
+            kept = nucleus(np.exp(still[at]), config.top_p, config.min_p)
+            kept[tokens[at]] = True
+            value[at] -= np.log(np.exp(log[at][kept]).sum())
+        return value
+
+    here, then = drawn(log_p), drawn(still)
+    old = then if first else fixed["old"]
+    log_c = old - fixed["sampler"]
+    if a.importance_sequence:
+        log_c = np.broadcast_to((log_c * mask).sum(-1, keepdims=True), log_c.shape)
+    c = 1.0 if a.importance_cap is None else np.minimum(np.exp(log_c), a.importance_cap)
+    advantage, length = fixed["advantage"][..., None], mask.sum(-1)
+    ratio, low, high = np.exp(here - old), 1 - a.clip_low, 1 + a.clip_high
+    if a.surrogate.value == "sequence":
+        ratio = np.exp(((here - old) * mask).sum(-1, keepdims=True) / length[..., None]) * np.ones_like(here)
+    policy = np.minimum(ratio * advantage, np.clip(ratio, low, high) * advantage)
+    if a.surrogate.value == "cispo":
+        policy = np.clip(np.exp(then - old), low, high) * advantage * here
+    log_r = of_tokens(log_ref, tokens) - of_tokens(log_p, tokens)
+    p = np.exp(log_p)
+    kl = {"k1": -log_r, "k2": log_r**2 / 2, "k3": np.exp(log_r) - 1 - log_r, "exact": (p * (log_p - log_ref)).sum(-1)}
+    grounding = (p * (log_p - (still_q if a.grounding_stop_masked else log_q))).sum(-1)
+    grounding = np.minimum(grounding, a.grounding_cap_nat or np.inf)
+    sums = lambda x: (x * mask).sum(-1)
+    per_rollout = lambda x: (sums(x) / length).mean(-1)
+    average = {
+        "rollout": per_rollout,
+        "token": lambda x: sums(x).sum(-1) / length.sum(-1),
+        "batch": lambda x: sums(x).mean(-1) / length.mean(),
+        "length": lambda x: sums(x).mean(-1) / config.length,
+    }[a.average.value]
+    gain = (fixed["weight"] * average(c * policy)).sum()
+    beta = 0.0 if a.kl_in_reward else a.beta
+    grounded = np.minimum(a.gamma * per_rollout(grounding), a.grounding_budget or np.inf)
+    entropy = np.minimum(per_rollout(-(p * log_p).sum(-1)), a.entropy_floor_nat or np.inf)
+    return -(gain + (grounded - beta * average(kl[a.kl]) + a.entropy_weight * entropy).sum() / config.prompts)
