@@ -1,0 +1,246 @@
+"""Options of a step: minibatches, a lagging sampler, a moving reference, KL in the reward, truncated rollouts."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.gradient import Experience, log_probs
+from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.losses import over_tokens
+from touchr1_jax.rl.rollout import SampleConfig, drawn_log_probs, nucleus, sample_group
+from touchr1_jax.rl.update import update_policy
+
+G, T, RATE = 3, 4, 1e-3
+CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=Paper(beta=0.0, gamma=0.0))
+OPTIMIZER = optax.sgd(RATE)
+START = tiny.shallow_params(0)
+
+
+def of(score=score, **options):
+    """Step and first state under an algorithm with some options."""
+    config = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, **options))
+    step = make_grpo_step(FNS, score, OPTIMIZER, config)
+    return step, start_state(START, OPTIMIZER, jax.random.key(1), config)
+
+
+def copy(tree):
+    return jax.tree.map(jnp.copy, tree)
+
+
+def close(a, b, **tolerance) -> None:
+    for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True):
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+BATCH = tiny.question_batch(1, P)
+
+
+@pytest.fixture(scope="module")
+def on_policy():
+    """The step without options; a state after its first step, and its metrics."""
+    step, state = of()
+    after, metrics = step(state, BATCH, FROZEN)
+    return step, copy(after), jax.device_get(metrics)
+
+
+@pytest.fixture(scope="module")
+def lagging():
+    """Two steps: the sampler is one step behind, the reference moves a quarter, the KL is in the reward."""
+    step, state = of(stale=1, reference_every=1, reference_share=0.25, kl_in_reward=True, beta=0.1)
+    state = state.replace(reference=copy(FROZEN.reference))
+    states, found = [copy(state)], []
+    for _ in range(2):
+        state, metrics = step(state, BATCH, FROZEN)
+        states.append(copy(state))
+        found.append(jax.device_get(metrics))
+    return states, found
+
+
+def test_a_lagging_sampler_draws_with_the_parameters_before_the_last_update(on_policy, lagging):
+    """At step 1 it says what the first parameters say there; the learner by then says something else."""
+    step, after, _ = on_policy
+    states, metrics = lagging
+    close(states[1].behind, (states[0].params,), rtol=0)
+    close(states[2].behind, (states[1].params,), rtol=0)
+    early = start_state(START, OPTIMIZER, jax.random.key(1), CONFIG).replace(step=jnp.int32(1))
+    _, expected = step(early, BATCH, FROZEN)
+    assert metrics[1]["reward_right"] == expected["reward_right"]
+    assert metrics[0]["sampler_gap_peak"] < 1e-4 < metrics[1]["sampler_gap_peak"]
+    assert early.behind == after.behind == ()
+
+
+def test_without_a_lag_the_step_is_on_policy(on_policy):
+    """`stale=0` compiles the same program; at the first step a lagging sampler has not fallen behind yet."""
+    _, after, metrics = on_policy
+    for stale in (0, 2):
+        step, state = of(stale=stale)
+        state, found = step(state, BATCH, FROZEN)
+        assert len(state.behind) == stale
+        assert found["reward"] == metrics["reward"]
+        tolerance = {"rtol": 0} if stale == 0 else {"rtol": 1e-4, "atol": 1e-7}
+        close(state.params, after.params, **tolerance)
+
+
+def test_a_state_without_older_parameters_cannot_lag():
+    step, _ = of(stale=1)
+    _, state = of()
+    with pytest.raises(ValueError, match="stale is 1, but the state holds 0 older parameters; make"):
+        step(state, BATCH, FROZEN)
+
+
+def test_the_reference_moves_by_its_share(lagging):
+    states, _ = lagging
+    for before, after in itertools.pairwise(states):
+        mixed = jax.tree.map(lambda new, old: 0.25 * new + 0.75 * old, after.params, before.reference)
+        close(after.reference, mixed, rtol=1e-6)
+
+
+def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
+    """−β Σ_t log(π/π_ref) of the rollouts, from log-probabilities of their own; the loss has no KL then."""
+    state, metrics = lagging[0][0], lagging[1][0]
+    draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
+    sample_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
+    rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, sample_key, draw))()
+    log_p, log_ref = (
+        jax.jit(lambda p: log_probs(FNS, CONFIG, p, BATCH, rollout))(p) for p in (START, FROZEN.reference)
+    )
+    kl = np.where(rollout.mask, log_p - log_ref, 0).sum(-1)
+    np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl.mean(), rtol=1e-4)
+    paid = jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, BATCH.target)
+    np.testing.assert_allclose(metrics["reward"], metrics["reward_kl"] + np.mean(paid), rtol=1e-4)
+    assert metrics["kl"] == metrics["kl_cost_peak"] == 0
+
+
+def test_truncated_rollouts_are_out_of_the_loss():
+    """Where every rollout is cut off nothing is learned, where only one prompt's are, it alone."""
+
+    def cut_off(which):
+        def pay(tokens, target):
+            reward, terms, parsed = score(tokens, target)
+            return reward, terms, parsed.replace(truncated=which(target))
+
+        return pay
+
+    def equal(tokens, target):
+        reward, *rest = score(tokens, target)
+        return jnp.where(target.asked[0], 0.5, reward), *rest
+
+    step, state = of(cut_off(lambda target: target.asked[0]), mask_truncated=True)
+    part, metrics = step(state, BATCH, FROZEN)
+    step, state = of(equal)
+    close(part.params, step(state, BATCH, FROZEN)[0].params, rtol=1e-5, atol=1e-8)
+    assert metrics["grad_norm"] > 0
+    assert metrics["truncated_share"] == 0.25
+    step, state = of(cut_off(lambda target: jnp.array(True)), mask_truncated=True)
+    assert step(state, BATCH, FROZEN)[1]["grad_norm"] == 0
+
+
+@pytest.fixture(scope="module")
+def learn() -> Experience:
+    """Rollouts with advantages of their own, from a sampler whose log-probabilities are off."""
+    rng = np.random.default_rng(0)
+    draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
+    rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, jax.random.key(0), draw))()
+    off = rollout.replace(log_prob=rollout.log_prob + jnp.asarray(rng.uniform(-0.5, 0.5, (P, G, T)), jnp.float32))
+    advantage = jnp.asarray(rng.normal(size=(P, G)), jnp.float32)
+    stream = jnp.zeros(P, jnp.int32)
+    return Experience(BATCH, BATCH.features.touch, stream, off, off.log_prob, advantage, jnp.full(P, 1 / P))
+
+
+def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
+    """At a small rate two halves move twice as far as the whole; at a large one the second is off policy."""
+    halves = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, minibatches=2))
+
+    def move(config):
+        def run(rate):
+            optimizer = optax.sgd(rate)
+            params, _, parts = update_policy(FNS, optimizer, config, START, optimizer.init(START), START, learn)
+            return jax.tree.map(lambda a, b: (a - b) / rate, params, START), parts
+
+        return jax.jit(run)
+
+    (whole, _), (both, parts), (_, far) = move(CONFIG)(1e-3), move(halves)(1e-3), move(halves)(30.0)
+    scale = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(whole))
+    close(jax.tree.map(lambda x: x / 2, both), whole, atol=0.01 * scale)
+    assert parts["clip_share"] == 0
+    assert far["clip_share"] > 0
+
+
+def test_a_mean_over_the_tokens_of_the_batch_weighs_prompts_by_them():
+    """Of three prompts with 1, 3 and 2 tokens a rollout the last does not count: Σ x / 4 over the other two."""
+    mask = jnp.arange(3) < jnp.array([1, 3, 2])[:, None, None]
+    weight = over_tokens(jnp.array([0.5, 0.5, 0.0]), mask)
+    np.testing.assert_allclose(weight / 2.0, [0.25, 0.25, 0.0])  # of sums over tokens, in units of the mean length, 2
+    np.testing.assert_array_equal(over_tokens(jnp.zeros(3), mask), np.zeros(3))
+
+
+P_BY_HAND = np.array([0.5, 0.3, 0.15, 0.05])
+
+
+@pytest.mark.parametrize(
+    ("top_p", "min_p", "kept"),
+    [
+        (1.0, 0.0, [True, True, True, True]),
+        (0.5, 0.0, [True, False, False, False]),
+        (0.6, 0.0, [True, True, False, False]),
+        (0.81, 0.0, [True, True, True, False]),
+        (1.0, 0.4, [True, True, False, False]),
+        (0.81, 0.4, [True, True, False, False]),
+    ],
+)
+def test_nucleus_by_hand(top_p, min_p, kept):
+    order = np.array([2, 0, 3, 1])
+    log_p = jnp.log(jnp.asarray(P_BY_HAND[order], jnp.float32))
+    np.testing.assert_array_equal(nucleus(log_p, top_p, min_p), np.array(kept)[order])
+    share = P_BY_HAND[np.array(kept)].sum()
+    drawn = drawn_log_probs(log_p, jnp.array(1), top_p, min_p)  # the most likely one
+    np.testing.assert_allclose(drawn, np.log(0.5 / share), rtol=1e-5)
+
+
+def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
+    """At a temperature and from a nucleus; without these settings it would be off by tenths of a nat."""
+    config = dataclasses.replace(CONFIG, group=8, temperature=0.7, top_p=0.8, min_p=0.05)
+    draw = SampleConfig(
+        group=8, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id, temperature=0.7, top_p=0.8, min_p=0.05
+    )
+    rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, jax.random.key(0), draw))()
+    gap = lambda config: np.abs(
+        np.where(rollout.mask, jax.jit(lambda: log_probs(FNS, config, START, BATCH, rollout))() - rollout.log_prob, 0)
+    ).max()
+    assert gap(config) < 1e-4
+    assert gap(CONFIG) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"minibatches": 0}, "minibatches is 0: must be at least 1"),
+        ({"stale": -1}, "stale is -1: must be ≥ 0"),
+        ({"reference_share": 0.0}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
+    ],
+)
+def test_bad_options_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        Paper(**change)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"top_p": 0.0}, "top_p is 0.0"),
+        ({"min_p": 1.5}, "min_p is 1.5"),
+        ({"algorithm": Paper(minibatches=3)}, "micro_prompts 4 of each of 3 minibatches must divide prompts 8"),
+    ],
+)
+def test_bad_settings_of_a_step_are_named(change, message):
+    with pytest.raises(ValueError, match=message):
+        GRPOConfig(**change)
