@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import collections
 import functools
 import graphlib
 import importlib
@@ -207,6 +208,14 @@ def test_dataclasses_are_frozen():
     made = {name: [ast.unparse(d) for d in node.decorator_list] for name, node in classes()}
     plain = {name for name, by in made.items() if any("dataclasses.dataclass" in d for d in by)}
     assert {name for name in plain if not any("frozen=True" in d for d in made[name])} == MUTABLE.keys()
+
+
+def test_class_names_are_unique():
+    """One name, one thing: a reader who searches for a class finds it alone."""
+    where = collections.defaultdict(list)
+    for name, _ in classes():
+        where[name.rpartition(".")[2]].append(name)
+    assert not {name: found for name, found in where.items() if len(found) > 1}
 
 
 def test_docstrings_open_with_a_noun_or_a_verb():

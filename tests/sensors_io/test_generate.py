@@ -89,7 +89,7 @@ generate.generate_records(SceneConfig(), out, records_per_shard=64)
 
 def _generate(out, place="nowhere", count=1):
     command = [sys.executable, "-c", _CHILD, str(out), place, str(count)]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120).returncode
+    return subprocess.run(command, check=False, timeout=120).returncode
 
 
 def test_kill_9_at_five_places_changes_no_byte(tmp_path):

@@ -24,15 +24,15 @@ def test_offsets_come_back(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
+    "tree",
     [
-        "{",
-        "[]",
-        json.dumps({"reference": "netft"}),
-        json.dumps({"reference": "a", "sensors": {"b": {"late_s": 1}}}),
-        json.dumps({"reference": "a", "sensors": {"b": {"late_s": 31, "spread_s": 0, "events": 1, "by": "taps"}}}),
+        [],
+        {"reference": "netft"},
+        {"reference": "a", "sensors": {"b": {"late_s": 1}}},
+        {"reference": "a", "sensors": {"b": {"late_s": 31, "spread_s": 0, "events": 1, "by": "taps"}}},
     ],
 )
-def test_anything_else_is_refused(tmp_path, text):
-    (tmp_path / "s.json").write_text(text)
+@pytest.mark.parametrize("end", [None, -1])
+def test_anything_else_is_refused(tmp_path, tree, end):
+    (tmp_path / "s.json").write_text(json.dumps(tree)[:end])
     refused(OffsetsError, "make them with `sync`", Offsets.load, tmp_path / "s.json")

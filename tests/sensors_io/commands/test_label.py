@@ -9,6 +9,7 @@ from sensors_io.cards import replace_cards
 from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.schema import SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 
 def label(root, table, *more):
@@ -76,11 +77,8 @@ def test_a_kill_before_the_index_leaves_the_old_cards(root, monkeypatch):
     assert RecordStore(root).objects["object_0"].split == "unlabelled"
     assert label(root, "object_id,hardness\nobject_0,1\n") == 0
     assert RecordStore(root).objects["object_0"].labels == {"hardness": 1}
-
-
-def test_a_card_of_no_object_is_refused(root):
-    with pytest.raises(SchemaError, match=r"object_id is 'object_7': .* holds object_0, object_1"):
-        replace_cards(root, [fakes.card(7)])
+    said = r"object_id is 'object_7': .* holds object_0, object_1"
+    refused(SchemaError, said, replace_cards, root, [fakes.card(7)])
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,33 @@
-"""Float64 references that tests of friction share."""
+"""References in float64 and made gels that tests of scenes share."""
 
 import jax.numpy as jnp
 import numpy as np
 
 from sensors_io.layer import Layer, depth_response, wave_numbers
-from sensors_io.scenes import traction
+from sensors_io.scenes import optics, traction
 from sensors_io.scenes.hertz import half_space_spectrum
+
+
+def deformed(
+    window_mm: float,
+    depth: np.ndarray,
+    x: np.ndarray | float = 0,
+    y: np.ndarray | float = 0,
+    marker_depth: np.ndarray | float = 0,
+) -> optics.DeformedGel:
+    """A gel with these fields [N, N] in mm, 0 where one is not given."""
+    f = [jnp.asarray(a + 0 * depth, jnp.float32) for a in (depth, x, y, marker_depth)]
+    return optics.DeformedGel(
+        depth_mm=f[0], marker_x_mm=f[1], marker_y_mm=f[2], marker_depth_mm=f[3], window_mm=window_mm
+    )
+
+
+def light(
+    texture: np.ndarray, gain: tuple[float, float, float] = (1, 1, 1), shift: tuple[float, float] = (0.0, 0.0)
+) -> optics.Light:
+    return optics.Light(
+        exposure=jnp.ones(()), led_gain=jnp.array(gain), pattern_shift_mm=jnp.array(shift), texture=jnp.asarray(texture)
+    )
 
 
 def off(found: np.ndarray, true: np.ndarray) -> float:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import optics, photometric
+from tests.sensors_io.scenes.references import deformed, light
 
 PX, WINDOW_MM = 80, 16.0
 X = (np.arange(PX) + 0.5) * WINDOW_MM / PX - WINDOW_MM / 2
@@ -13,17 +14,11 @@ RENDERERS = {"photometric": photometric.gelsight_mini, "dots": optics.dots, "spe
 
 
 def _gel(depth=ZERO, x=ZERO, y=ZERO, marker_depth=ZERO) -> optics.DeformedGel:
-    f = [jnp.asarray(a, jnp.float32) for a in (depth, x, y, marker_depth)]
-    return optics.DeformedGel(
-        depth_mm=f[0], marker_x_mm=f[1], marker_y_mm=f[2], marker_depth_mm=f[3], window_mm=WINDOW_MM
-    )
+    return deformed(WINDOW_MM, depth, x, y, marker_depth)
 
 
 def _light(shift: tuple[float, float] = (0.0, 0.0)) -> optics.Light:
-    texture = optics.speckle_texture(np.random.default_rng(0), 192, 5.0)
-    return optics.Light(
-        exposure=jnp.array(1.0), led_gain=jnp.ones(3), pattern_shift_mm=jnp.array(shift), texture=jnp.asarray(texture)
-    )
+    return light(optics.speckle_texture(np.random.default_rng(0), 192, 5.0), shift=shift)
 
 
 @pytest.mark.parametrize("name", RENDERERS)
@@ -51,11 +46,9 @@ def test_dots_follow_a_stretched_gel() -> None:
 
 
 def test_indentation_magnifies_the_pattern() -> None:
-    depth = 1.0
-    magnified = optics.speckle(_gel(marker_depth=ZERO + depth), _light())
-    factor = depth / optics.CAMERA_DISTANCE_MM
+    factor = 1.0 / optics.CAMERA_DISTANCE_MM
     stretched = optics.speckle(_gel(x=factor * X[None] + ZERO, y=factor * X[:, None] + ZERO), _light())
-    np.testing.assert_allclose(magnified, stretched, atol=1e-4)
+    np.testing.assert_allclose(optics.speckle(_gel(marker_depth=ZERO + 1.0), _light()), stretched, atol=1e-4)
 
 
 def test_noise_grows_from_read_to_shot_noise_channel_by_channel() -> None:

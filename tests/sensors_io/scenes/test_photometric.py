@@ -8,6 +8,8 @@ import pytest
 
 from sensors_io.scenes import optics, photometric
 from sensors_io.scenes.photometric import MINI, PhotometricOptics
+from tests.sensors_io.checks import refused
+from tests.sensors_io.scenes.references import deformed, light
 
 PX, WINDOW_MM = 56, 15.2
 X = (np.arange(PX) + 0.5) * WINDOW_MM / PX - WINDOW_MM / 2
@@ -15,21 +17,11 @@ ZERO = np.zeros((PX, PX))
 
 
 def _gel(depth: np.ndarray) -> optics.DeformedGel:
-    still = jnp.zeros((PX, PX))
-    return optics.DeformedGel(
-        depth_mm=jnp.asarray(depth, jnp.float32),
-        marker_x_mm=still,
-        marker_y_mm=still,
-        marker_depth_mm=still,
-        window_mm=WINDOW_MM,
-    )
+    return deformed(WINDOW_MM, depth)
 
 
 def _light(texture: np.ndarray | None = None, gain: tuple[float, float, float] = (1, 1, 1)) -> optics.Light:
-    texture = np.zeros((2, 2), np.float32) if texture is None else texture
-    return optics.Light(
-        exposure=jnp.ones(()), led_gain=jnp.array(gain), pattern_shift_mm=jnp.zeros(2), texture=jnp.asarray(texture)
-    )
+    return light(np.zeros((2, 2), np.float32) if texture is None else texture, gain=gain)
 
 
 def _random(seed: int) -> PhotometricOptics:
@@ -58,18 +50,13 @@ def test_terms_are_legendre_products_in_a_stable_order() -> None:
     assert photometric.terms(1) == [(0, 0), (0, 1), (1, 0)]
     grid = photometric.basis(np.array([0.3]), np.array([-0.5]), 2)[:, 0, 0]
     np.testing.assert_allclose(grid, [1, -0.5, -0.125, 0.3, -0.15, -0.365], atol=1e-12)
+    said = r"slope has shape \(29, 3\): must be \(30, 3\)"
+    refused(ValueError, said, dataclasses.replace, MINI, slope=MINI.slope[1:])
 
 
-def test_gel_steeper_than_the_fit_is_shown_as_steep_as_the_fit() -> None:
-    steep, steepest = (np.asarray(photometric.tilt(jnp.array(s), jnp.array(0.0), 0.5)) for s in (0.5, 40.0))
-    np.testing.assert_allclose(steep, [0.5 / np.sqrt(1.25), 0])
-    np.testing.assert_allclose(steepest, [0.5, 0], atol=1e-6)
-    np.testing.assert_allclose(photometric.tilt(jnp.zeros(()), jnp.zeros(()), 0.5), 0)
-
-
-def test_constants_of_the_wrong_number_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"slope has shape \(29, 3\): must be \(30, 3\)"):
-        dataclasses.replace(MINI, slope=MINI.slope[1:])
+@pytest.mark.parametrize(("slope", "tilt"), [(0.0, 0.0), (0.5, 0.5 / np.sqrt(1.25)), (40.0, 0.5)])
+def test_gel_steeper_than_the_fit_is_shown_as_steep_as_the_fit(slope: float, tilt: float) -> None:
+    np.testing.assert_allclose(photometric.tilt(jnp.array(slope), jnp.array(0.0), 0.5), [tilt, 0], atol=1e-6)
 
 
 def test_grain_has_its_deviation_and_its_correlations() -> None:

@@ -76,8 +76,11 @@ def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
     assert drawn[0] != threading.get_ident()
 
 
-def test_streams_end_with_the_view():
+def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
     with LiveView(port=0) as view:
+        port = int(urllib.parse.urlsplit(view.address).port)
+        with pytest.raises(OSError, match="in use"), LiveView(port=port):
+            pass
         view.publish({}, NUMBERS)
         events = ask(view, "numbers")
         events.readline()
@@ -85,33 +88,17 @@ def test_streams_end_with_the_view():
     events.close()
 
 
-def test_a_taken_port_is_an_error():
-    with LiveView(port=0) as view:
-        port = int(view.address.rsplit(":", 1)[1].strip("/"))
-        with pytest.raises(OSError, match="in use"), LiveView(port=port):
-            pass
-
-
 def test_panels_of_a_sample():
-    arrays = {
-        "depth_mm": np.zeros((20, 20), np.float32),
-        "deformation_mm": np.ones((20, 20, 2), np.float32),
-        "force_n": np.zeros(3),
-    }
-    shown = panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays=arrays))
-    assert list(shown) == ["camera", "depth", "deformation"]
-    assert all(p().dtype == np.uint8 and p().ndim == 3 for p in shown.values())
+    grey = np.zeros((4, 4, 3), np.uint8)
+    shown = lambda frame, **arrays: panels(Sample(host_time_ns=0, frame=frame, arrays=arrays))
+    fields = shown(grey, depth_mm=np.zeros((20, 20)), deformation_mm=np.ones((20, 20, 2)), force_n=np.zeros(3))
+    assert list(fields) == ["camera", "depth", "deformation"]
+    assert all(p().dtype == np.uint8 and p().ndim == 3 for p in fields.values())
     touched = np.zeros((4, 4), bool)
     touched[1:3, 1:3] = True
-    seen = panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays={"contact": touched}))
-    assert np.array_equal(seen["camera"]()[..., 0] == 255, touched)
-    depth = panels(Sample(host_time_ns=0, frame=np.full((4, 4), 700, np.uint16)))["camera"]()
-    assert depth.shape == (320, 320, 3)
-    view = {"view_depth_mm": np.full((4, 4), 300.0, np.float32)}
-    assert list(panels(Sample(host_time_ns=0, frame=np.zeros((4, 4, 3), np.uint8), arrays=view))) == [
-        "camera",
-        "distance",
-    ]
+    assert np.array_equal(shown(grey, contact=touched)["camera"]()[..., 0] == 255, touched)
+    assert shown(np.full((4, 4), 700, np.uint16))["camera"]().shape == (320, 320, 3)
+    assert list(shown(grey, view_depth_mm=np.full((4, 4), 300.0, np.float32))) == ["camera", "distance"]
 
 
 def test_fields_are_coloured_and_holes_are_black():
