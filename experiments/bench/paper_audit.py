@@ -1,6 +1,6 @@
 """Do the published numbers of Touch-R1 agree with one another?
 
-    make experiment EXP=paper_audit
+    make experiment EXP=paper_audit [ARGS="--vtv-items N"]
 
 Every number of the paper on which a conclusion rests is typed in `study/paper_numbers.py` under the table or section
 where it is printed; every inconsistency is a check that recomputes what follows from these numbers, with rounding

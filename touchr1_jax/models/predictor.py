@@ -24,17 +24,12 @@ LN_FLOOR = 1e-6
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PredictorConfig:
-    """Shape of the predictor.
-
-    `told_force` gives it the force of the next step, as a planner knows what it will do; without, it must also guess
-    the hand.
-    """
+    """Shape of the predictor, which knows the force of the next step, as a planner knows what it will do."""
 
     width: int = 96
     num_layers: int = 2
     num_heads: int = 3
     mlp_ratio: int = 2
-    told_force: bool = True
 
 
 class LatentPredictor(nn.Module):
@@ -69,9 +64,8 @@ class LatentPredictor(nn.Module):
         x = jnp.where(shown[..., None], x, hidden)
         x = x + nn.Embed(self.sensors, c.width, name="sensor")(jnp.arange(s))[:, None]
         x = x + nn.Dense(c.width, name="time")(sinusoid(next_index, TIME_WAVES))
-        if c.told_force:
-            force = nn.gelu(nn.Dense(c.width, name="force_in")(force_features(next_force_n)))
-            x = x + nn.Dense(c.width, name="force_out")(force)
+        force = nn.gelu(nn.Dense(c.width, name="force_in")(force_features(next_force_n)))
+        x = x + nn.Dense(c.width, name="force_out")(force)
         x = x.swapaxes(1, 2).reshape(p, t * s, c.width)  # step by step, as `earlier_steps` counts
         keys = shown.swapaxes(1, 2).reshape(p, t * s)
         for i in range(c.num_layers):

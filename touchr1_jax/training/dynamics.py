@@ -48,23 +48,24 @@ class Guards:
     leak: Float[Array, ""] | float = 0.0
 
 
+FULL_SHARE = 0.5
+"""Probability that all streams are shown; else a random non-empty subset is."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DynamicsConfig:
-    """Encoder and predictor; with probability `full_share` all streams are shown, else a random non-empty subset.
+    """Encoder and predictor.
 
     With `frames_kept` only the most telling frames of each stream are read, see `salience.fewer_frames`.
     """
 
     encoder: TactileViTConfig
     predictor: PredictorConfig = PredictorConfig()
-    full_share: float = 0.5
     frames_kept: int | None = None
 
     def __post_init__(self) -> None:
         if not self.encoder.causal:
             raise ValueError("encoder.causal is False: a step that sees the next one predicts it by copying; set it")
-        if not 0 <= self.full_share <= 1:
-            raise ValueError(f"full_share is {self.full_share}: must lie in [0, 1], a probability; change it")
 
 
 @struct.dataclass
@@ -250,7 +251,7 @@ def dynamics_update(
     batch: TouchBatch,
 ) -> tuple[DynamicsState, dict[str, Array]]:
     """One step of gradient descent, then f̄ ← ema · f̄ + (1 − ema) · f; pure, for `jit` and `vmap`."""
-    shown = random_shown(jax.random.fold_in(state.key, state.step), batch.stream_mask, config.full_share)
+    shown = random_shown(jax.random.fold_in(state.key, state.step), batch.stream_mask, FULL_SHARE)
     loss = lambda p: dynamics_loss(config, p, state.target, batch, shown, guards)
     (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)

@@ -1,7 +1,5 @@
 """The predictor sees the past of the streams that are shown, and nothing else."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -61,11 +59,10 @@ def test_it_is_told_when_and_how_hard(predict, inputs):
     assert changed(before, predict(latent, shown, index, force.at[:, :, 2].add(4)))[:, 2].all()
 
 
-def test_a_fresh_predictor_copies_what_is_shown_and_force_can_be_kept_from_it(inputs):
+def test_a_fresh_predictor_copies_what_is_shown(inputs):
     latent, shown, *rest = inputs
-    module = LatentPredictor(dataclasses.replace(CONFIG, told_force=False), S)
+    module = LatentPredictor(CONFIG, S)
     params = module.init(jax.random.key(0), *inputs)
-    assert not [name for name in params["params"] if name.startswith("force")]
     out = module.apply(params, latent, shown.at[:, 1].set(False), *rest)
     np.testing.assert_array_equal(out[:, 0], layer_norm(latent[:, 0]))
     np.testing.assert_array_equal(out[:, 1], 0)

@@ -28,8 +28,8 @@ class QwenViewConfig:
     """The vision tower and the size of the pictures that it is shown, pixels; they are resized within `budget`."""
 
     tower_config: QwenVisionConfig
-    height_px: int = 64
-    width_px: int = 64
+    height_px: int
+    width_px: int
     budget: PixelBudget = PICTURE_BUDGET
 
     @property
