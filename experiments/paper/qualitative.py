@@ -220,10 +220,10 @@ def case_table(cases: Sequence[AnswerCase]) -> Table:
         units={"share": "%"},
         meanings={
             "of": "questions that could have been of this case",
-            "paper's examples": "what its figure of examples is said to show",
+            "paper's examples": "described in the caption of its figure",
         },
         note="Greedy answers of the full model's first seed to all questions about the test objects. The paper shows "
-        "chosen examples and says of none how common it is.",
+        "chosen examples without their frequency.",
     )
 
 

@@ -240,7 +240,7 @@ def require_same(source: Path, context: Context) -> None:
     changed = sorted(name for name in {*began, *marks} if began.get(name) != marks.get(name))
     if changed:
         raise WeightsError(
-            f"{source} is not what this run began with: {', '.join(changed)} changed; put it back, or say --fresh"
+            f"{source} is not what this run began with: {', '.join(changed)} changed; put it back, or pass --fresh"
         )
 
 

@@ -27,8 +27,8 @@ which GRPO holds 28 or 52 GB by the count that every run makes ahead.  `--scale 
 small` 24 of one core, of which scenes and teaching take 4 each.
 
 Expected: the released model without touch near the constant, and much above it after SFT; from GRPO what the paper's
-ladder has (`ablation_cumulative`), of which small policies show only a part.  At `small` the loss of SFT stands still
-for 500 steps before it falls; of ordinal questions about unseen objects 60 % are then answered right, 61 % after GRPO,
+ladder has (`ablation_cumulative`), of which small policies show only a part.  At `small` the loss of SFT does not fall
+for 500 steps; of ordinal questions about unseen objects 60 % are then answered right, 61 % after GRPO,
 26 % by the checkpoint that writes and never had touch, 36 % after the same training without touch, 34 % by a constant.
 """
 
@@ -83,7 +83,7 @@ DRAWN = "These are drawn weights of a tiny model: this run tries the code, and i
 
 TAUGHT = (
     "These are weights of a tiny model that was taught to write answers, without touch or pictures, before anything "
-    "else: the figures say that this training learns to feel, and nothing about a released model."
+    "else: the figures show that this training learns from touch, and nothing about a released model."
 )
 
 COMPARED = ("acc", "omae", "csc", "mat_acc")

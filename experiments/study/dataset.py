@@ -77,8 +77,7 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     train = store.contacts_of_split("train")
     ids = np.array([store.contacts[i].object_id for i in train])
     names = np.unique(ids)
-    held = np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))]
-    kept = np.isin(ids, held)
+    kept = np.isin(ids, np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))])
     val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
     parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
     for name, rows in parts.items():

@@ -106,7 +106,7 @@ OBJECTS, SENSORS, MOTIONS = 1_000, 4, 7
 SEQUENCES, RECORDS = 14_700, 1_323_000
 """Section 3.1, "Acquisition": what is left after filtering."""
 
-HELD_OUT_OBJECTS, BENCH_ITEMS = 200, 4_800
+HELD_OUT_OBJECTS = 200
 """Section 4.1, "Benchmarks"."""
 
 PRETRAIN_FRAMES, SFT_QA, RL_QA = 1_000_000, 240_000, 120_000

@@ -191,13 +191,9 @@ def noise_bank(
 class GRPOArm:
     """One arm of a study: its reward, its algorithm, its length.
 
-    Attributes:
-      weights: of each reward.
-      prior: share of each level among the training labels.
-      score: total reward made of both; the same object for all seeds, so that it is compiled once.
-      config: of GRPO.
-      loop: its steps and when it saves.
-      lora: adapters that are trained instead of the decoder's weights; `None` trains those.
+    `score` is the total reward, made of the weights and of the prior, the share of each level among the training
+    labels; it is one object for all seeds, so that it is compiled once.  Without `lora` the decoder's weights are
+    trained, not adapters.
     """
 
     weights: Weights

@@ -1,5 +1,6 @@
 """What the stages are fed: right answers, random questions, exact resumption."""
 
+import dataclasses
 import json
 import threading
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.study.stages import StudySFT, answer_feed
 from sensors_io.augment import AugmentConfig
 from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
@@ -39,9 +41,9 @@ def clips(data):
 
 @pytest.fixture
 def answers(policy, data, evidence):
-    def feed(augment=None, **changes):
-        order = {"batch_size": 3, "seed": 1} | {k: v for k, v in changes.items() if k in ("batch_size", "seed", "own")}
-        clips = data.batches(data.parts["sft"], felt=not changes.get("blind"), augment=augment, **order)
+    def feed(**changes):
+        order = {"batch_size": 3, "seed": 1} | {k: v for k, v in changes.items() if k in ("seed", "own")}
+        clips = data.batches(data.parts["sft"], felt=not changes.get("blind"), **order)
         return AnswerFeed(policy, clips, evidence, **{"questions": 3, **order, **changes})
 
     return feed
@@ -131,14 +133,12 @@ def test_a_blind_policy_perceives_nothing_and_is_told_the_label(policy, answers,
     assert np.asarray(batch.touch.frames).size < np.asarray(batch.touch.view).size
 
 
-def test_answers_are_given_for_sft_contacts_alone(answers, data):
+def test_the_feed_of_a_study_reads_sft_contacts_alone_and_changes_their_touch_at_random(policy, data, evidence):
     views = {data.store.objects[data.object_ids[i]].view.tobytes() for i in data.parts["sft"]}
-    feed = answers(batch_size=5)
-    assert {view.tobytes() for _ in range(2) for view in np.asarray(next(feed).touch.view)} <= views
-
-
-def test_what_is_felt_can_be_changed_at_random(answers):
-    plain, changed = (next(answers(augment=augment)) for augment in (None, AugmentConfig(mirror=1)))
+    config = StudySFT(batch_size=5, micro_contacts=5)
+    mirrored = dataclasses.replace(config, augment=AugmentConfig(mirror=1))
+    plain, changed = (next(answer_feed(policy, data, evidence, c, seed=1)) for c in (config, mirrored))
+    assert {view.tobytes() for view in np.asarray(plain.touch.view)} <= views
     assert (np.asarray(plain.touch.frames) != np.asarray(changed.touch.frames)).any()
     np.testing.assert_array_equal(changed.touch.force_n[..., 0], -plain.touch.force_n[..., 0])
     for name in ("ids", "streams", "tokens", "token_mask"):
