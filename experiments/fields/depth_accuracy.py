@@ -16,7 +16,7 @@ from experiments.core.timing import median_ms
 from experiments.fields.depth_methods import MAPS, SlopeMap, calibrated, depth_by
 from experiments.fields.generated_presses import fitted_optics, generated_presses, near_lamps
 from experiments.fields.published import gelslam
-from experiments.fields.sections import FieldSection
+from experiments.fields.sections import ReportPart
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.presses import BallPresses, Touches
 from sensors_io.calibration.validate import BallErrors, score_ball, score_presses
@@ -47,9 +47,7 @@ ERRORS = {
 """Column → figure of `BallErrors`, unit, format."""
 
 
-def generated_sections(
-    presses: int, strange_lamps: bool, rounds: int, seed: int, context: Context
-) -> list[FieldSection]:
+def generated_sections(presses: int, strange_lamps: bool, rounds: int, seed: int, context: Context) -> list[ReportPart]:
     """Balls of other diameters than the calibration's under the supposed and under near lamps, and the speed.
 
     Args:
@@ -61,31 +59,28 @@ def generated_sections(
     """
     lamps = {"generated, supposed optics": fitted_optics}
     lamps |= {"generated, near lamps": near_lamps} if strange_lamps else {}
-    calibrations, sections = [], []
+    calibrations, parts = [], list[ReportPart]()
     for source, optics in lamps.items():
         calibrations.append(calibrated(generated_presses(BALL_MM, presses, seed, optics), seed))
         others = {
             f"{diameter:g} mm": generated_presses(diameter, max(2, presses // 2), seed + 1, optics)
             for diameter in OTHER_BALLS_MM
         }
-        sections.append(other_ball_section(calibrations[-1], others, source, context))
-    return [*sections, speed_section(calibrations[0], rounds, "generated balls")]
+        parts += other_ball_section(calibrations[-1], others, source, context)
+    return [*parts, *speed_section(calibrations[0], rounds, "generated balls")]
 
 
-def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, context: Context) -> list[FieldSection]:
+def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, context: Context) -> list[ReportPart]:
     """Recorded presses of the calibration's ball; the speed; a ball of 9.5 mm where it was recorded."""
     presses = gelslam(root)
     made = calibrated(presses, seed)
-    sections = [
-        held_out_section(presses, "gelslam", folds, rounds, seed, context),
-        speed_section(made, rounds, "gelslam"),
-    ]
+    parts = held_out_section(presses, "gelslam", folds, rounds, seed, context) + speed_section(made, rounds, "gelslam")
     other = root / "gelslam" / "9.500mm"
     if other.is_dir():
         pictures = read_pictures([other], "gelsight_mini").frames
         bigger = dataclasses.replace(presses, pictures=pictures, radius_mm=9.5 / 2)
-        sections.append(other_ball_section(made, {"9.5 mm": bigger}, "gelslam", context))
-    return sections
+        parts += other_ball_section(made, {"9.5 mm": bigger}, "gelslam", context)
+    return parts
 
 
 class CalibrationFold(NamedTuple):
@@ -125,7 +120,7 @@ def held_out_errors(
 
 def held_out_section(
     presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context
-) -> FieldSection:
+) -> list[ReportPart]:
     """All maps on the presses of one real sensor."""
     parts = folds_of(presses, folds, seed, context)
     errors = {kind: held_out_errors(parts, make, seed) for kind, make in context.each("maps", MAPS.items())}
@@ -156,22 +151,20 @@ def held_out_section(
         f"{SAME_BALL[0]:g} µm.",
         content=speed_against_error(points, "depth rmse, µm", (1e3 / LEAST_HZ, SAME_BALL[0]), legend=False),
     )
-    return FieldSection(
-        verdict=(
-            f"On {int(own['presses'])} real presses ({name}), with circles found without labels and {folds} folds "
-            f"by press, the median depth rmse is {own['depth rmse median, um']:.1f} µm and the median error of the "
-            f"radius {own['radius error median, %']:.1f} % (bias of the median radius "
-            f"{own['radius error of the median, %']:+.1f} %).",
-        ),
-        requirements=ball_requirements(own, f"{name}, held out by press", SAME_BALL),
-        tables=(table,),
-        pictures=(picture,),
-    )
+    return [
+        f"On {int(own['presses'])} real presses ({name}), with circles found without labels and {folds} folds "
+        f"by press, the median depth rmse is {own['depth rmse median, um']:.1f} µm and the median error of the "
+        f"radius {own['radius error median, %']:.1f} % (bias of the median radius "
+        f"{own['radius error of the median, %']:+.1f} %).",
+        *ball_requirements(own, f"{name}, held out by press", SAME_BALL),
+        table,
+        picture,
+    ]
 
 
 def other_ball_section(
     made: Calibration, others: Mapping[str, BallPresses], source: str, context: Context
-) -> FieldSection:
+) -> list[ReportPart]:
     """A calibration made with one ball, scored on balls of other diameters."""
     rows, requirements = [], list[Requirement]()
     for name, presses in context.each("balls", others.items()):
@@ -179,10 +172,10 @@ def other_ball_section(
         requirements += ball_requirements(figures, f"{name}, {source}", OTHER_BALL)
         rows.append({"ball": name, "presses": figures["presses"], **_error_cells(figures, list(ERRORS)[:4])})
     table = _error_table(f"Balls of other diameters than the calibration's ({source})", rows)
-    return FieldSection(requirements=tuple(requirements), tables=(table,))
+    return [*requirements, table]
 
 
-def speed_section(made: Calibration, rounds: int, source: str) -> FieldSection:
+def speed_section(made: Calibration, rounds: int, source: str) -> list[ReportPart]:
     """Speed from a picture to depth, zero level and contact mask on one core, by a calibration from some source."""
     height, width = SPEED_PX
     background = cv2.resize(made.background, (width, height), interpolation=cv2.INTER_AREA)
@@ -197,7 +190,7 @@ def speed_section(made: Calibration, rounds: int, source: str) -> FieldSection:
         note=f"{ms:.2f} ms, degree {made.colours.degree} in colour, {made.colours.position_degree} in place",
     )
     sentence = f"Depth and contact come at {speed.measured:.0f} Hz from pictures of {width} × {height} on one core"
-    return FieldSection(verdict=(f"{sentence}, by the map of {source}.",), requirements=(speed,))
+    return [f"{sentence}, by the map of {source}.", speed]
 
 
 def ball_requirements(

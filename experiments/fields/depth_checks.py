@@ -19,7 +19,7 @@ from experiments.fields.published import (
     known_truth,
     read_folder,
 )
-from experiments.fields.sections import FieldSection
+from experiments.fields.sections import ReportPart
 from sensors_io import quality
 from sensors_io.fields.contact import ContactConfig, changed_contacts, steepest_change
 from sensors_io.fields.depth import DepthReader
@@ -62,7 +62,7 @@ def scale_error(
     return 100 * (scale - 1), 1e3 * float(np.sqrt(np.mean((depth - truth)[deep] ** 2)))
 
 
-def integrator_section(rounds: Iterable[object]) -> FieldSection:
+def integrator_section(rounds: Iterable[object]) -> list[ReportPart]:
     """Every integrator on every analytic surface, and its time."""
     surfaces = analytic_surfaces()
     errors = {name: [scale_error(f, *surface) for surface in surfaces.values()] for name, f in INTEGRATORS.items()}
@@ -79,14 +79,14 @@ def integrator_section(rounds: Iterable[object]) -> FieldSection:
         note="Other projects' integrators are reimplemented with the faults that they ship with.",
     )
     scale = at_most("scale of depth from analytic slopes, worst of centre and border", worst, MOST_SCALE, "%")
-    return FieldSection(
-        verdict=(f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.",),
-        requirements=(scale,),
-        tables=(table,),
-    )
+    return [
+        f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.",
+        scale,
+        table,
+    ]
 
 
-def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> FieldSection:
+def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list[ReportPart]:
     """Presses at known depth, by a calibration made with the ball presses of the same sensor."""
     presses = ball_presses("gelsight sim2real", root)
     read = SlopeReader(calibrated(presses, seed).colours, presses.background)
@@ -120,17 +120,13 @@ def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> Fiel
         note="Calibrated with the 22 ball presses of the folder, circles found automatically; the press depth is "
         "known to about 50 µm.",
     )
-    return FieldSection(
-        verdict=(
-            f"At known press depth the mean rmse is {rmse:.0f} µm, {shape_only:.1f} µm with the offset removed "
-            f"({fixed[0]:.0f} and {fixed[1]:.0f} µm with a fixed border).",
-        ),
-        requirements=(
-            at_most("known press depth, mean rmse", rmse, MOST_UM, "µm"),
-            at_most("known press depth, offset removed", shape_only, MOST_SHAPE_UM, "µm"),
-        ),
-        tables=(table,),
-    )
+    return [
+        f"At known press depth the mean rmse is {rmse:.0f} µm, {shape_only:.1f} µm with the offset removed "
+        f"({fixed[0]:.0f} and {fixed[1]:.0f} µm with a fixed border).",
+        at_most("known press depth, mean rmse", rmse, MOST_UM, "µm"),
+        at_most("known press depth, offset removed", shape_only, MOST_SHAPE_UM, "µm"),
+        table,
+    ]
 
 
 def rejections(
@@ -154,7 +150,7 @@ def rejections(
     return cells, int((by_colour | by_depth).sum())
 
 
-def contact_section(root: pathlib.Path, seed: int) -> FieldSection:
+def contact_section(root: pathlib.Path, seed: int) -> list[ReportPart]:
     """Pictures and table rows that the filters reject, with one setting for all recordings."""
     folder, config = FOLDERS["FeelAnyForce, untouched"], ContactConfig()
     frames, _, background = read_folder(folder, root)
@@ -176,16 +172,12 @@ def contact_section(root: pathlib.Path, seed: int) -> FieldSection:
         note=f"A contact changes some channel by {config.steepness:g} grey levels/mm somewhere; its depth reaches "
         f"{1e3 * config.high_mm:g} µm and a slope of {config.rim:g}.",
     )
-    return FieldSection(
-        verdict=(
-            f"{rejected} of {len(frames)} pictures without contact are rejected, {real} of "
-            f"{sum(map(len, presses.values()))} real contacts; {int((flagged & empty).sum())} of {int(empty.sum())} "
-            "empty rows are flagged.",
-        ),
-        requirements=(
-            at_most("pictures without contact that pass", len(frames) - rejected, 0.0),
-            at_most("real contacts that are rejected, by colour or by depth", real, 0.0),
-            at_most("rows flagged wrongly or not", int(np.count_nonzero(flagged != empty)), 0.0),
-        ),
-        tables=(table,),
-    )
+    return [
+        f"{rejected} of {len(frames)} pictures without contact are rejected, {real} of "
+        f"{sum(map(len, presses.values()))} real contacts; {int((flagged & empty).sum())} of {int(empty.sum())} "
+        "empty rows are flagged.",
+        at_most("pictures without contact that pass", len(frames) - rejected, 0.0),
+        at_most("real contacts that are rejected, by colour or by depth", real, 0.0),
+        at_most("rows flagged wrongly or not", int(np.count_nonzero(flagged != empty)), 0.0),
+        table,
+    ]

@@ -11,7 +11,7 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import at_most, named_table
 from experiments.fields.published import load, reduced
-from experiments.fields.sections import FieldSection
+from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern, examine
 from sensors_io.importers.keep import Keep
@@ -70,7 +70,7 @@ CROPS = {"wedge": (0.24, 0.24, 0.78, 0.72)}
 """Left, top, right and bottom of the gel, as shares of width and height, where it does not fill the picture."""
 
 
-def flag_section(data_dir: pathlib.Path, context: Context) -> FieldSection:
+def flag_section(data_dir: pathlib.Path, context: Context) -> list[ReportPart]:
     """Number of pictures of loaded gels with each flag, by recording.
 
     Raises:
@@ -86,11 +86,10 @@ def flag_section(data_dir: pathlib.Path, context: Context) -> FieldSection:
         formats=dict.fromkeys(("pictures", *map(str.lower, flags)), "d"),
         note="Which of them truly lost markers is unknown, so this is an upper bound on the false alarms.",
     )
-    sentence = f"Of {total} real pictures of loaded marker gels {flagged} carry a flag of tracking."
-    return FieldSection(verdict=(sentence,), tables=(table,))
+    return [f"Of {total} real pictures of loaded marker gels {flagged} carry a flag of tracking.", table]
 
 
-def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> FieldSection:
+def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> list[ReportPart]:
     """Recognition of bare and marker gels on at most `most` pictures of every folder, evenly chosen.
 
     Raises:
@@ -99,14 +98,14 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> Fiel
     patterns = MARKER_GELS | BARE_GELS
     every = {name: _pattern_counts(data_dir, name, patterns[name], most) for name in context.each("patterns", patterns)}
     counts = _present(every, data_dir, list(patterns.values()))
-    verdict, requirements = [], []
+    parts: list[ReportPart] = []
     for folders, what in ((BARE_GELS, "bare gels taken for patterned ones"), (MARKER_GELS, "marker gels refused")):
         of = [by for name, by in counts.items() if name in folders]
         total, bare = sum(by.total() for by in of), sum(by[Pattern.BARE] for by in of)
         wrong = total - bare if folders is BARE_GELS else bare
-        verdict.append(f"{what}: {wrong} of {total}.")
+        parts.append(f"{what}: {wrong} of {total}.")
         if total:
-            requirements.append(at_most(what, wrong / total, 0.01, note=f"{wrong} of {total}"))
+            parts.append(at_most(what, wrong / total, 0.01, note=f"{wrong} of {total}"))
     truth = dict.fromkeys(MARKER_GELS, Pattern.MARKERS) | dict.fromkeys(BARE_GELS, Pattern.BARE)
     table = named_table(
         "What each gel is taken for",
@@ -114,7 +113,7 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> Fiel
         formats={p.value: "d" for p in Pattern},
         note="Every picture is classified as if it were the one at rest; most are under load, which is harder.",
     )
-    return FieldSection(verdict=tuple(verdict), requirements=tuple(requirements), tables=(table,))
+    return [*parts, table]
 
 
 def _present(

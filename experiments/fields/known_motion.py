@@ -8,7 +8,6 @@ cubic `remap` rounds coordinates to 1/32 pixel, which is as large as the errors 
 import dataclasses
 import pathlib
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import jax.numpy as jnp
@@ -49,44 +48,6 @@ REAL_GELS = {
 The tracker's settings, the windows and the number of rest pictures were chosen on others: `marker_calib/data/3.png`,
 the two `ref.jpg`, frame 0 of the video and the first picture of `letac_mpc/gel`.
 """
-
-
-class GelAtRest(NamedTuple):
-    """A gel at rest: its name, RGB uint8 [H, W, 3], whether a camera took it."""
-
-    name: str
-    picture: np.ndarray
-    real: bool
-
-
-def gels(data_dir: pathlib.Path | None) -> list[GelAtRest]:
-    """The real gels in the data directory, and the generated ones.
-
-    Raises:
-      FileNotFoundError: a data directory that holds none of the pictures.
-    """
-    generated = [
-        GelAtRest("Xense, generated", _generated(XENSE, 240, 1), False),
-        GelAtRest("DM-Tac, generated", _generated(DMTAC_X, 240, 3), False),
-    ]
-    if data_dir is None:
-        return generated
-    found = {name: (sorted(data_dir.glob(pattern)), frame) for name, (pattern, frame) in REAL_GELS.items()}
-    real = [GelAtRest(name, load(paths[0], frame), True) for name, (paths, frame) in found.items() if paths]
-    if not real:
-        wanted = ", ".join(pattern for pattern, _ in REAL_GELS.values())
-        raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
-    return [*real, *generated]
-
-
-def _generated(sensor: SensorModel, side_px: int, order: int) -> np.ndarray:
-    """The gel of a generated sensor at rest, without noise."""
-    if sensor.render is None:
-        raise ValueError(f"{sensor.name} exposes no camera: it has no picture; choose another sensor")
-    still = dict.fromkeys(("depth_mm", "marker_x_mm", "marker_y_mm", "marker_depth_mm"), jnp.zeros((side_px, side_px)))
-    gel = optics.DeformedGel(**still, window_mm=sensor.window_mm)
-    picture = np.asarray(sensor.render(gel, unit_of(0, order, 0).light))
-    return np.round(255 * np.clip(picture, 0, 1)).astype(np.uint8)
 
 
 def grey(picture: np.ndarray) -> np.ndarray:
@@ -200,17 +161,21 @@ class GelCamera:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class TrackedGel:
-    """A gel as the package tracks it.
+class MarkerGel:
+    """A gel at rest as the package tracks it.
 
     Args:
-      rest: the gel.
-      points_px: that are tracked [P, 2].
+      name: of the gel.
+      picture: RGB uint8 [H, W, 3], at rest.
+      real: a camera took it.
+      points_px: tracked points [P, 2].
       half_px: half side of their windows.
       dot_radius_px: radius of a dot; on a dense pattern, half the side of a window.
     """
 
-    rest: GelAtRest
+    name: str
+    picture: np.ndarray
+    real: bool
     points_px: np.ndarray
     half_px: int
     dot_radius_px: float
@@ -218,26 +183,54 @@ class TrackedGel:
     @property
     def unit(self) -> float:
         """Pixels per pixel of a picture 320 wide."""
-        return self.rest.picture.shape[1] / 320
+        return self.picture.shape[1] / 320
 
     def motion(self, peak_px: float, seed: int | None) -> GelMotion:
         """A motion of a peak on a picture 320 wide; without a seed the one of published figures."""
         rng = None if seed is None else np.random.default_rng(seed)
-        return pressed(self.rest.picture.shape, peak_px * self.unit, rng)
+        return pressed(self.picture.shape, peak_px * self.unit, rng)
 
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Bool [P], points whose window lies in the picture."""
-        height, width = self.rest.picture.shape[:2]
+        height, width = self.picture.shape[:2]
         margin = self.half_px + 1
         return np.all((points >= margin) & (points <= np.array([width, height]) - 1 - margin), -1)
 
 
-def tracked(rest: GelAtRest) -> TrackedGel:
-    """The points, windows and dots that the package finds on a gel."""
-    reader = DeformationReader(rest.picture, mm_per_px=1.0)
-    dots, half = reader.evidence.markers, reader.tracker.half_px
+def gels(data_dir: pathlib.Path | None, most: int | None = None) -> list[MarkerGel]:
+    """The real gels in the data directory, and the generated ones; the first `most` of them.
+
+    Raises:
+      FileNotFoundError: a data directory that holds none of the pictures.
+    """
+    found = [(n, sorted(data_dir.glob(pattern)), i) for n, (pattern, i) in REAL_GELS.items()] if data_dir else []
+    real = [(name, load(paths[0], frame)) for name, paths, frame in found if paths]
+    if data_dir is not None and not real:
+        wanted = ", ".join(pattern for pattern, _ in REAL_GELS.values())
+        raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
+    generated = [
+        ("Xense, generated", _generated(XENSE, 240, 1)),
+        ("DM-Tac, generated", _generated(DMTAC_X, 240, 3)),
+    ]
+    return [_tracked(*gel, i < len(real)) for i, gel in enumerate([*real, *generated][:most])]
+
+
+def _generated(sensor: SensorModel, side_px: int, order: int) -> np.ndarray:
+    """The gel of a generated sensor at rest, without noise."""
+    if sensor.render is None:
+        raise ValueError(f"{sensor.name} exposes no camera: it has no picture; choose another sensor")
+    still = dict.fromkeys(("depth_mm", "marker_x_mm", "marker_y_mm", "marker_depth_mm"), jnp.zeros((side_px, side_px)))
+    gel = optics.DeformedGel(**still, window_mm=sensor.window_mm)
+    picture = np.asarray(sensor.render(gel, unit_of(0, order, 0).light))
+    return np.round(255 * np.clip(picture, 0, 1)).astype(np.uint8)
+
+
+def _tracked(name: str, picture: np.ndarray, real: bool) -> MarkerGel:
+    """A gel with the points, windows and dots that the package finds on it."""
+    reader = DeformationReader(picture, mm_per_px=1.0)
+    dots, half, points = reader.evidence.markers, reader.tracker.half_px, reader.tracker.points_px
     radius = float(half) if dots is None else dots.radius_px
-    return TrackedGel(rest=rest, points_px=reader.tracker.points_px, half_px=half, dot_radius_px=radius)
+    return MarkerGel(name=name, picture=picture, real=real, points_px=points, half_px=half, dot_radius_px=radius)
 
 
 def _pixels(shape: tuple[int, ...]) -> np.ndarray:

@@ -14,8 +14,8 @@ import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.results import Picture, Table, at_most, named_table
-from experiments.fields.known_motion import NOISE_GREY, PEAK_PX, REST_PICTURES, GelCamera, TrackedGel, grey
-from experiments.fields.sections import FieldSection
+from experiments.fields.known_motion import NOISE_GREY, PEAK_PX, REST_PICTURES, GelCamera, MarkerGel, grey
+from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FOLLOWERS
 
 METHODS = ("this", "this, affine alone", "this, LK alone", "LK frame to frame")
@@ -38,9 +38,9 @@ DriftErrors = Mapping[str, Mapping[int, np.ndarray]]
 """Method → cycles → distance of every point from the truth [P], px of a picture 320 wide."""
 
 
-def drift_errors(gel: TrackedGel, cycles: Sequence[int], methods: Sequence[str], period: int = PERIOD) -> DriftErrors:
+def drift_errors(gel: MarkerGel, cycles: Sequence[int], methods: Sequence[str], period: int = PERIOD) -> DriftErrors:
     """Errors of the methods after each of the given numbers of cycles, in one sequence of pictures."""
-    camera, motion = GelCamera(gel.rest.picture, NOISE_GREY, _FIRST_SEED), gel.motion(PEAK_PX, None)
+    camera, motion = GelCamera(gel.picture, NOISE_GREY, _FIRST_SEED), gel.motion(PEAK_PX, None)
     rest = grey(camera.at_rest(1))
     followers = {name: FOLLOWERS[name](rest, gel.points_px, gel.half_px) for name in methods}
     shares = np.sin(2 * np.pi * np.arange(period) / period)
@@ -55,9 +55,9 @@ def drift_errors(gel: TrackedGel, cycles: Sequence[int], methods: Sequence[str],
     return errors
 
 
-def still_errors(gel: TrackedGel, pairs: int) -> dict[str, float]:
+def still_errors(gel: MarkerGel, pairs: int) -> dict[str, float]:
     """Median errors of the package on pictures of a gel that does not move, and their lower bounds, px."""
-    camera = GelCamera(gel.rest.picture, NOISE_GREY, _FIRST_SEED + 1)
+    camera = GelCamera(gel.picture, NOISE_GREY, _FIRST_SEED + 1)
     (one, alone_one), (mean, alone_mean) = (_pair_errors(gel, camera, n, pairs) for n in (1, REST_PICTURES))
     return {
         "still": one,
@@ -69,7 +69,7 @@ def still_errors(gel: TrackedGel, pairs: int) -> dict[str, float]:
     }
 
 
-def _pair_errors(gel: TrackedGel, camera: GelCamera, at_rest: int, pairs: int) -> list[float]:
+def _pair_errors(gel: MarkerGel, camera: GelCamera, at_rest: int, pairs: int) -> list[float]:
     """Median errors with and without smoothing, with the mean of so many pictures at rest."""
     errors: dict[str, list[np.ndarray]] = {MAIN: [], UNSMOOTHED: []}
     for _ in range(pairs):
@@ -80,7 +80,7 @@ def _pair_errors(gel: TrackedGel, camera: GelCamera, at_rest: int, pairs: int) -
     return [float(np.nanmedian(found)) for found in errors.values()]
 
 
-def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
+def bound_px(gel: MarkerGel, light_and_strain: bool) -> float:
     """Cramér–Rao bound on a window's displacement between two noisy pictures, median over the windows, px.
 
         Cov d ≥ 2σ² [(Σ_r J_r J_rᵀ)⁻¹]_dd,   J = (∇I, and with unknown light and strain: ∇I ⊗ r, 1, r, I)
@@ -91,7 +91,7 @@ def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
 
     Source: Kay, Fundamentals of Statistical Signal Processing I, 1993, ch. 3.
     """
-    picture = (gel.rest.picture.astype(np.float64) @ np.array(_LUMA)).round()
+    picture = (gel.picture.astype(np.float64) @ np.array(_LUMA)).round()
     side = np.arange(-gel.half_px, gel.half_px + 1)
     y, x = (a.ravel() for a in np.meshgrid(side, side, indexing="ij"))
     columns, rows = np.round(gel.points_px).astype(int).T
@@ -109,44 +109,41 @@ def bound_px(gel: TrackedGel, light_and_strain: bool) -> float:
 
 
 def drift_section(
-    gels: Sequence[TrackedGel], cycles: Sequence[int] = CYCLES, pairs: int = PAIRS, period: int = PERIOD
-) -> FieldSection:
+    gels: Sequence[MarkerGel], cycles: Sequence[int] = CYCLES, pairs: int = PAIRS, period: int = PERIOD
+) -> list[ReportPart]:
     """Drift on every gel, long on the first; the noise of still pictures and its bounds."""
-    first = gels[0].rest.name
+    first = gels[0].name
     drift = {first: drift_errors(gels[0], cycles, METHODS, period)}
-    drift |= {g.rest.name: drift_errors(g, OTHERS_CYCLES, (MAIN,), period) for g in gels[1:]}
-    still = {g.rest.name: still_errors(g, pairs) for g in gels}
+    drift |= {g.name: drift_errors(g, OTHERS_CYCLES, (MAIN,), period) for g in gels[1:]}
+    still = {g.name: still_errors(g, pairs) for g in gels}
     bound = still[first]["bound of each alone"]
     medians = {m: [_median(drift[first], m, c) for c in (1, PUBLISHED, max(cycles))] for m in METHODS}
     own, alone, peer = (medians[name] for name in (MAIN, UNSMOOTHED, FRAME_TO_FRAME))
     pooled = lambda cycles: float(np.nanmedian(np.concatenate([errors[MAIN][cycles] for errors in drift.values()])))
-    return FieldSection(
-        verdict=(
-            f"After 1, {PUBLISHED} and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f}, {own[1]:.4f} "
-            f"and {own[2]:.4f} px, without smoothing by {alone[0]:.4f}, {alone[1]:.4f} and {alone[2]:.4f} px. This is "
-            f"not drift but the noise of a pair of pictures, whose lower bound for a single marker is {bound:.4f} px. "
-            f"Tracked from frame to frame they are off by {peer[0]:.3f}, {peer[1]:.3f} and {peer[2]:.3f} px.",
+    return [
+        f"After 1, {PUBLISHED} and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f}, {own[1]:.4f} "
+        f"and {own[2]:.4f} px, without smoothing by {alone[0]:.4f}, {alone[1]:.4f} and {alone[2]:.4f} px. This is "
+        f"not drift but the noise of a pair of pictures, whose lower bound for a single marker is {bound:.4f} px. "
+        f"Tracked from frame to frame they are off by {peer[0]:.3f}, {peer[1]:.3f} and {peer[2]:.3f} px.",
+        at_most(
+            f"off after 900 pictures, as published ({first}, one picture at rest)",
+            own[1],
+            BOUND_PX,
+            "px",
+            note=f"each marker alone {alone[1]:.4f}, with the mean of {REST_PICTURES} pictures at rest "
+            f"{still[first]['each alone, mean at rest']:.4f}",
         ),
-        requirements=(
-            at_most(
-                f"off after 900 pictures, as published ({first}, one picture at rest)",
-                own[1],
-                BOUND_PX,
-                "px",
-                note=f"each marker alone {alone[1]:.4f}, with the mean of {REST_PICTURES} pictures at rest "
-                f"{still[first]['each alone, mean at rest']:.4f}",
-            ),
-            at_most(
-                "growth from the first cycle to the tenth, all gels' markers",
-                pooled(PUBLISHED) - pooled(1),
-                BOUND_PX,
-                "px",
-                note=f"after ten {pooled(PUBLISHED):.4f}",
-            ),
+        at_most(
+            "growth from the first cycle to the tenth, all gels' markers",
+            pooled(PUBLISHED) - pooled(1),
+            BOUND_PX,
+            "px",
+            note=f"after ten {pooled(PUBLISHED):.4f}",
         ),
-        tables=(_cycle_table(drift[first], first), _noise_table(drift, still)),
-        pictures=(_picture(drift[first], bound, first),),
-    )
+        _cycle_table(drift[first], first),
+        _noise_table(drift, still),
+        _picture(drift[first], bound, first),
+    ]
 
 
 def _median(errors: DriftErrors, method: str, cycles: int) -> float:

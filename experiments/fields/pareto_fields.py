@@ -26,9 +26,9 @@ from experiments.core.runner import Experiment
 from experiments.fields.depth_accuracy import generated_sections, recorded_sections
 from experiments.fields.depth_checks import contact_section, integrator_section, known_depth_section
 from experiments.fields.false_alarms import pattern_section
-from experiments.fields.known_motion import gels, tracked
+from experiments.fields.known_motion import gels
 from experiments.fields.marker_drift import drift_section
-from experiments.fields.sections import FieldSection, joined
+from experiments.fields.sections import ReportPart, assemble
 from experiments.fields.shear_accuracy import layer_section, shear_section
 from experiments.fields.tracking_accuracy import dense_section, marker_section
 
@@ -63,30 +63,30 @@ def run(config: FieldsConfig, context: Context) -> Results:
     """Measure section by section."""
     root, rounds, seed = config.data_dir, config.rounds, config.seed
     balls = config.generated_presses, config.strange_lamps, rounds, seed
-    measured: dict[str, Callable[[], list[FieldSection]]] = {
-        "integrators": lambda: [integrator_section(context.rounds("timing integrators", rounds))],
+    measured: dict[str, Callable[[], list[ReportPart]]] = {
+        "integrators": lambda: integrator_section(context.rounds("timing integrators", rounds)),
         "generated balls": lambda: generated_sections(*balls, context),
     }
     if root is not None:
         measured["real balls"] = lambda: recorded_sections(root, config.folds, rounds, seed, context)
-        measured["known depth"] = lambda: [known_depth_section(root, seed, context)]
-        measured["failed contact"] = lambda: [contact_section(root, seed)]
+        measured["known depth"] = lambda: known_depth_section(root, seed, context)
+        measured["failed contact"] = lambda: contact_section(root, seed)
     if config.motion:
-        subjects = [tracked(rest) for rest in gels(root)]
-        real = [gel for gel in subjects if gel.rest.real] or subjects[:1]
-        measured["markers"] = lambda: [marker_section(subjects, context)]
-        measured["drift"] = lambda: [drift_section(real)]
-        measured["dense fields"] = lambda: [dense_section(rounds, subjects, context)]
-        measured["shear"] = lambda: [shear_section(root, context)]
-        measured["wrong layers"] = lambda: [layer_section()]
+        subjects = gels(root)
+        real = [gel for gel in subjects if gel.real] or subjects[:1]
+        measured["markers"] = lambda: marker_section(subjects, context)
+        measured["drift"] = lambda: drift_section(real)
+        measured["dense fields"] = lambda: dense_section(rounds, subjects, context)
+        measured["shear"] = lambda: shear_section(root, context)
+        measured["wrong layers"] = layer_section
     if config.motion and root is not None:
-        measured["patterns"] = lambda: [pattern_section(root, PICTURES, context)]
-    sections: list[FieldSection] = []
+        measured["patterns"] = lambda: pattern_section(root, PICTURES, context)
+    parts: list[ReportPart] = []
     for name, measure in context.each("sections", measured.items()):
         context.print(name)
         with context.timed(name.replace(", ", "_").replace(" ", "_")):
-            sections += measure()
-    return joined(sections, {"recordings": "none" if root is None else "read", "cores": 1})
+            parts += measure()
+    return assemble(parts, {"recordings": "none" if root is None else "read", "cores": 1})
 
 
 EXPERIMENT = Experiment(

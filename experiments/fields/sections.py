@@ -1,29 +1,21 @@
-"""Sections of a report on fields: the figures, tables and pictures that answer one question."""
+"""Sections of a report on fields, each a list of parts: sentences of the verdict, requirements, tables, pictures."""
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from experiments.core.results import Picture, Requirement, Results, Table
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FieldSection:
-    """Sentences, requirements, tables and pictures of one question."""
-
-    verdict: tuple[str, ...] = ()
-    requirements: tuple[Requirement, ...] = ()
-    tables: tuple[Table, ...] = ()
-    pictures: tuple[Picture, ...] = ()
+ReportPart = str | Requirement | Table | Picture
 
 
-def joined(sections: Sequence[FieldSection], settings: Mapping[str, Any], data: Mapping[str, Any] = {}) -> Results:
-    """Results of all sections in their order."""
+def assemble(parts: Iterable[ReportPart], settings: Mapping[str, Any], data: Mapping[str, Any] = {}) -> Results:
+    """Results of parts; those of one kind keep their order."""
+    every = tuple(parts)
     return Results(
-        verdict=tuple(sentence for section in sections for sentence in section.verdict),
-        requirements=tuple(r for section in sections for r in section.requirements),
-        tables=tuple(table for section in sections for table in section.tables),
-        pictures=tuple(picture for section in sections for picture in section.pictures),
+        verdict=tuple(part for part in every if isinstance(part, str)),
+        requirements=tuple(part for part in every if isinstance(part, Requirement)),
+        tables=tuple(part for part in every if isinstance(part, Table)),
+        pictures=tuple(part for part in every if isinstance(part, Picture)),
         settings=settings,
         data=data,
     )

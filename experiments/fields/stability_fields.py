@@ -24,8 +24,8 @@ from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.fields.false_alarms import flag_section, pattern_section
 from experiments.fields.known_motion import gels
-from experiments.fields.sections import FieldSection, joined
-from experiments.fields.stress import OURS, StressOutcomes, gathered, silent_frames, stress_section
+from experiments.fields.sections import assemble
+from experiments.fields.stress import OURS, gathered, silent_frames, stress_section
 from experiments.fields.stressed_readings import DEPTH, SHEAR, TRACKING, attempt_depth, attempt_shear, attempt_tracking
 from touchr1_jax.validation import at_least
 
@@ -63,34 +63,33 @@ class FieldStabilityConfig:
 
 def run(config: FieldStabilityConfig, context: Context) -> Results:
     """Stress tracking, shear and depth; count false alarms on real pictures."""
-    chosen = gels(config.data_dir)[: config.gels]
+    chosen = gels(config.data_dir, config.gels)
     motions = itertools.product(chosen, range(config.seed, config.seed + config.seeds))
     tracking = gathered(
         attempt
-        for rest, seed in context.each("motions", motions)
-        for attempt in attempt_tracking(rest, config.methods, seed)
+        for gel, seed in context.each("motions", motions)
+        for attempt in attempt_tracking(gel, config.methods, seed)
     )
     shear = gathered(attempt_shear(config.slide_frames, config.seed, context))
     depth = gathered(attempt_depth(config.ball_presses, config.seeds, config.seed, context))
-    sections = [tracking_section(tracking), stress_section(SHEAR, shear), stress_section(DEPTH, depth)]
+    mild = [tracking[OURS][stress, levels[0]] for stress, levels in TRACKING.stresses.items()]
+    whole = [o for frames in mild for o in frames if not o.broken]
+    flagged = sum(bool(o.flags) for o in whole)
+    parts = [
+        *stress_section(TRACKING, tracking),
+        f"{OURS}: {flagged} of {len(whole)} frames under the mildest level of each stress are flagged.",
+        *stress_section(SHEAR, shear),
+        *stress_section(DEPTH, depth),
+    ]
     if config.data_dir is not None:
-        sections.append(flag_section(config.data_dir, context))
-        sections.append(pattern_section(config.data_dir, config.pictures, context))
+        parts += flag_section(config.data_dir, context)
+        parts += pattern_section(config.data_dir, config.pictures, context)
     settings = {
-        "gels": [rest.name for rest in chosen],
+        "gels": [gel.name for gel in chosen],
         "motions a gel": config.seeds,
         "a point is wrong from": f"{TRACKING.tolerance} px",
     }
-    return joined(sections, settings, {f"silent, {name}": silent_frames(by) for name, by in tracking.items()})
-
-
-def tracking_section(outcomes: StressOutcomes) -> FieldSection:
-    """Curves and first breaks of tracking, silent failures, flags under the mildest stress."""
-    section = stress_section(TRACKING, outcomes)
-    mild = [o for s, levels in TRACKING.stresses.items() for o in outcomes[OURS][s, levels[0]] if not o.broken]
-    flagged = sum(bool(o.flags) for o in mild)
-    sentence = f"{OURS}: {flagged} of {len(mild)} frames under the mildest level of each stress are flagged."
-    return dataclasses.replace(section, verdict=(*section.verdict, sentence))
+    return assemble(parts, settings, {f"silent, {name}": silent_frames(by) for name, by in tracking.items()})
 
 
 DEFAULT = FieldStabilityConfig()

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Picture, Table, at_most, named_table
-from experiments.fields.sections import FieldSection
+from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
 
@@ -84,23 +84,18 @@ class StressedField(NamedTuple):
         return [(stress, level) for stress, levels in self.stresses.items() for level in levels]
 
 
-def stress_section(field: StressedField, outcomes: StressOutcomes) -> FieldSection:
+def stress_section(field: StressedField, outcomes: StressOutcomes) -> list[ReportPart]:
     """Table of first breaks and curves of the error of all methods; silent failures."""
-    verdict, requirements = [], []
+    title, chart = f"Where {field.name} breaks", _curves(field, outcomes)
+    picture = Picture(name=f"stability_{field.name}", title=title, caption=field.caption, content=chart)
+    parts: list[ReportPart] = [break_table(field, outcomes), picture]
     if field.failures is not None:
         (readings, fault), silent = field.failures, {name: silent_frames(of) for name, of in outcomes.items()}
         counts = ", ".join(f"{method} {count}" for method, count in silent.items())
         total = sum(map(len, outcomes[OURS].values()))
-        verdict.append(f"Of {total} {readings} under stress, {fault} and not flagged: {counts}.")
-        requirements.append(at_most(f"{OURS}: {fault} and not flagged", silent[OURS], 0))
-    title, chart = f"Where {field.name} breaks", _curves(field, outcomes)
-    picture = Picture(name=f"stability_{field.name}", title=title, caption=field.caption, content=chart)
-    return FieldSection(
-        verdict=tuple(verdict),
-        requirements=tuple(requirements),
-        tables=(break_table(field, outcomes),),
-        pictures=(picture,),
-    )
+        parts.append(f"Of {total} {readings} under stress, {fault} and not flagged: {counts}.")
+        parts.append(at_most(f"{OURS}: {fault} and not flagged", silent[OURS], 0))
+    return parts
 
 
 def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:

@@ -25,7 +25,7 @@ from experiments.fields.generated_presses import (
 )
 from experiments.fields.generated_slides import Slide, cached_slides, pressing
 from experiments.fields.known_motion import NOISE_GREY as GEL_NOISE_GREY
-from experiments.fields.known_motion import GelAtRest, GelCamera, GelMotion, TrackedGel, grey, tracked
+from experiments.fields.known_motion import GelCamera, GelMotion, MarkerGel, grey
 from experiments.fields.shear_accuracy import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, shear_methods
 from experiments.fields.stress import StressedField, StressOutcome
 from experiments.fields.trackers import FOLLOWERS
@@ -96,13 +96,12 @@ DEPTH = StressedField(
 _SMALL_MM, _LARGE_MM, _CONTACT_MM = 6.31, 30.0, 1.6  # diameters of the balls; contact radius without stress
 
 
-def attempt_tracking(rest: GelAtRest, methods: Sequence[str], seed: int) -> Iterator[Attempt]:
+def attempt_tracking(gel: MarkerGel, methods: Sequence[str], seed: int) -> Iterator[Attempt]:
     """All methods under all stresses on one gel.
 
     The error is the 95th percentile of the distance from the truth over the points that a method gives, in pixels;
     wrong is the share of all points that it gives and that are off by more than the tolerance.
     """
-    gel = tracked(rest)
     for stress, level in TRACKING.levels:
         camera, pictures, true = _moving_gel(gel, stress, level, seed)
         background = camera.at_rest()
@@ -114,7 +113,7 @@ def attempt_tracking(rest: GelAtRest, methods: Sequence[str], seed: int) -> Iter
             yield name, stress, level, _tracking_outcome(points, true, gel, clipped and name.startswith("this"))
 
 
-def _tracking_outcome(points: np.ndarray, true: np.ndarray, gel: TrackedGel, clipped: bool) -> StressOutcome:
+def _tracking_outcome(points: np.ndarray, true: np.ndarray, gel: MarkerGel, clipped: bool) -> StressOutcome:
     inside = gel.inside(true)
     error = np.hypot(*(points - true).T)[inside]
     given = np.isfinite(error)
@@ -126,13 +125,11 @@ def _tracking_outcome(points: np.ndarray, true: np.ndarray, gel: TrackedGel, cli
     )
 
 
-def _moving_gel(
-    gel: TrackedGel, stress: str, level: float, seed: int
-) -> tuple[GelCamera, list[np.ndarray], np.ndarray]:
+def _moving_gel(gel: MarkerGel, stress: str, level: float, seed: int) -> tuple[GelCamera, list[np.ndarray], np.ndarray]:
     """The camera of the gel at rest, pictures under a growing motion, and the true points in the last of them."""
     kind = stress.split(",")[0].split(":")[0]
     noise = level if kind == "noise" else GEL_NOISE_GREY
-    camera = GelCamera(gel.rest.picture, noise, seed)
+    camera = GelCamera(gel.picture, noise, seed)
     moving = GelCamera(_erased(gel, level, seed), noise, seed) if kind == "dots lost" else camera
     motion = _stressed_motion(gel, kind, level, seed)
     steps = max(1, round(1 / level)) if kind == "gap" else _STEPS
@@ -141,22 +138,22 @@ def _moving_gel(
     return camera, pictures, gel.points_px + motion.forward(gel.points_px)
 
 
-def _stressed_motion(gel: TrackedGel, kind: str, level: float, seed: int) -> GelMotion:
+def _stressed_motion(gel: MarkerGel, kind: str, level: float, seed: int) -> GelMotion:
     motion = gel.motion({"displacement": level, "gap": _JUMP_PX}.get(kind, _PEAK_PX), seed)
     if kind == "contact from the border":
-        return dataclasses.replace(motion, centre_px=(level * gel.rest.picture.shape[1], motion.centre_px[1]))
+        return dataclasses.replace(motion, centre_px=(level * gel.picture.shape[1], motion.centre_px[1]))
     return motion
 
 
-def _erased(gel: TrackedGel, share: float, seed: int) -> np.ndarray:
+def _erased(gel: MarkerGel, share: float, seed: int) -> np.ndarray:
     """The picture of the gel with a share of its dots painted over."""
     rng = np.random.default_rng(seed)
     gone = rng.permutation(len(gel.points_px))[: round(share * len(gel.points_px))]
-    mask = np.zeros(gel.rest.picture.shape[:2], np.uint8)
+    mask = np.zeros(gel.picture.shape[:2], np.uint8)
     radius = round(_ERASED_RADII * gel.dot_radius_px)
     for x, y in np.round(gel.points_px[gone]).astype(int):
         cv2.circle(mask, (int(x), int(y)), radius, 255, -1)
-    return cv2.inpaint(gel.rest.picture, mask, 3, cv2.INPAINT_TELEA)
+    return cv2.inpaint(gel.picture, mask, 3, cv2.INPAINT_TELEA)
 
 
 def attempt_shear(frames: int, seed: int, context: Context) -> Iterator[Attempt]:

@@ -17,10 +17,10 @@ from experiments.fields.known_motion import (
     PEAK_PX,
     REST_PICTURES,
     GelCamera,
-    TrackedGel,
+    MarkerGel,
     grey,
 )
-from experiments.fields.sections import FieldSection
+from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FLOWS, FOLLOWERS, Follower
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
@@ -36,7 +36,7 @@ ROUNDS, LOST_PX = 15, 1.0
 _MARGIN = 0.1  # of height and width: within, the markers surround every pixel
 
 
-def marker_errors(gel: TrackedGel, peak_px: float, steps: int, noise_seed: int | None) -> dict[str, list[np.ndarray]]:
+def marker_errors(gel: MarkerGel, peak_px: float, steps: int, noise_seed: int | None) -> dict[str, list[np.ndarray]]:
     """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost.
 
     Args:
@@ -48,7 +48,7 @@ def marker_errors(gel: TrackedGel, peak_px: float, steps: int, noise_seed: int |
     found: dict[str, list[np.ndarray]] = {name: [] for name in FOLLOWERS}
     for seed in SEEDS:
         motion = gel.motion(peak_px, seed)
-        camera = GelCamera(gel.rest.picture, NOISE_GREY, noise_seed or seed or FIRST_SEED)
+        camera = GelCamera(gel.picture, NOISE_GREY, noise_seed or seed or FIRST_SEED)
         rest = grey(camera.at_rest())
         pictures = [grey(camera.under(motion.times(step / steps), step / steps)) for step in range(1, steps + 1)]
         true = gel.points_px + motion.forward(gel.points_px)
@@ -59,9 +59,9 @@ def marker_errors(gel: TrackedGel, peak_px: float, steps: int, noise_seed: int |
     return found
 
 
-def marker_ms(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, float]:
+def marker_ms(gel: MarkerGel, rounds: Iterable[object]) -> dict[str, float]:
     """Milliseconds of every method for a picture under motion."""
-    camera = GelCamera(gel.rest.picture, NOISE_GREY, 1)
+    camera = GelCamera(gel.picture, NOISE_GREY, 1)
     rest, motion = grey(camera.at_rest()), gel.motion(PEAK_PX / 2, None)
     pictures = [grey(camera.under(motion.times(s), s)) for s in (0.9, 1.0)]
 
@@ -83,15 +83,15 @@ def dense_fields(rest: np.ndarray) -> dict[str, Callable[[np.ndarray], np.ndarra
     }
 
 
-def dense_errors(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, tuple[float, float, float]]:
+def dense_errors(gel: MarkerGel, rounds: Iterable[object]) -> dict[str, tuple[float, float, float]]:
     """Mean error and 95th percentile in px within the margin, and milliseconds, of every dense method."""
-    height, width = gel.rest.picture.shape[:2]
+    height, width = gel.picture.shape[:2]
     rows, columns = (slice(int(_MARGIN * n), n - int(_MARGIN * n)) for n in (height, width))
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).astype(np.float64)
     errors: dict[str, list[np.ndarray]] = {}
     for seed in SEEDS:
         motion = gel.motion(PEAK_PX, seed)
-        camera = GelCamera(gel.rest.picture, NOISE_GREY, 4)
+        camera = GelCamera(gel.picture, NOISE_GREY, 4)
         methods, picture = dense_fields(camera.at_rest()), camera.under(motion)
         true = motion.forward(pixels[rows, columns])
         for name, dense in methods.items():
@@ -102,16 +102,16 @@ def dense_errors(gel: TrackedGel, rounds: Iterable[object]) -> dict[str, tuple[f
     return {name: (float(e.mean()), float(np.quantile(e, 0.95)), ms[name]) for name, e in pooled.items()}
 
 
-def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+def marker_section(gels: Sequence[MarkerGel], context: Context) -> list[ReportPart]:
     """Errors and speeds of every method on every gel; a jump."""
     errors, losses = {}, {}
     for g in context.each("following", gels):
-        errors[g.rest.name] = {m: np.concatenate(e) for m, e in marker_errors(g, PEAK_PX, 10, None).items()}
+        errors[g.name] = {m: np.concatenate(e) for m, e in marker_errors(g, PEAK_PX, 10, None).items()}
         jumps = marker_errors(g, JUMP_PX, 1, 3)
-        losses[g.rest.name] = {m: [float(np.mean(~(e <= LOST_PX))) for e in of] for m, of in jumps.items()}
-    ms = {g.rest.name: marker_ms(g, context.rounds(f"timing on {g.rest.name}", ROUNDS)) for g in gels}
-    median, high = quantiles(np.concatenate([errors[g.rest.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
-    worst_jump, first = max(shares[MARKER_DEFAULT][0] for shares in losses.values()), gels[0].rest.name
+        losses[g.name] = {m: [float(np.mean(~(e <= LOST_PX))) for e in of] for m, of in jumps.items()}
+    ms = {g.name: marker_ms(g, context.rounds(f"timing on {g.name}", ROUNDS)) for g in gels}
+    median, high = quantiles(np.concatenate([errors[g.name][MARKER_DEFAULT] / g.unit for g in _real(gels)]))
+    worst_jump, first = max(shares[MARKER_DEFAULT][0] for shares in losses.values()), gels[0].name
     markers = _gel_table(
         "Markers under known motion",
         {g: {m: (*map(_finite, quantiles(e)), ms[g][m]) for m, e in by.items()} for g, by in errors.items()},
@@ -125,19 +125,16 @@ def marker_section(gels: Sequence[TrackedGel], context: Context) -> FieldSection
         {gel: {m: (s[0], float(np.mean(s))) for m, s in by.items()} for gel, by in losses.items()},
         (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
     )
-    return FieldSection(
-        verdict=(
-            f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px "
-            f"at the 95th percentile of the markers, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
-        ),
-        requirements=(
-            at_most("marker error, median", median, 0.04, "px"),
-            at_most("marker error, 95th percentile", high, 0.11, "px"),
-            at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
-        ),
-        tables=(markers, jump_table),
-        pictures=(_marker_picture(errors[first], ms[first], first),),
-    )
+    return [
+        f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px "
+        f"at the 95th percentile of the markers, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
+        at_most("marker error, median", median, 0.04, "px"),
+        at_most("marker error, 95th percentile", high, 0.11, "px"),
+        at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
+        markers,
+        jump_table,
+        _marker_picture(errors[first], ms[first], first),
+    ]
 
 
 def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], gel: str) -> Picture:
@@ -157,12 +154,12 @@ def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], g
     )
 
 
-def dense_section(rounds: int, gels: Sequence[TrackedGel], context: Context) -> FieldSection:
+def dense_section(rounds: int, gels: Sequence[MarkerGel], context: Context) -> list[ReportPart]:
     """Errors and speeds of dense fields on every gel, and the speed of the spline alone."""
-    measured = {g.rest.name: dense_errors(g, range(rounds)) for g in context.each("gels", gels)}
-    error = float(np.mean([measured[g.rest.name][DENSE_DEFAULT][0] / g.unit for g in _real(gels)]))
-    tracker, first = DeformationReader(gels[0].rest.picture, mm_per_px=1.0).tracker, gels[0].rest.name
-    densify = Densifier(tracker.spline, gels[0].rest.picture.shape[:2])
+    measured = {g.name: dense_errors(g, range(rounds)) for g in context.each("gels", gels)}
+    error = float(np.mean([measured[g.name][DENSE_DEFAULT][0] / g.unit for g in _real(gels)]))
+    tracker, first = DeformationReader(gels[0].picture, mm_per_px=1.0).tracker, gels[0].name
+    densify = Densifier(tracker.spline, gels[0].picture.shape[:2])
     moved = gels[0].motion(PEAK_PX, None).forward(gels[0].points_px)
     spline_ms = median_ms({"": functools.partial(densify, moved)}, range(max(rounds, 30)))[""]
     points: dict[str, list[Point]] = {}
@@ -181,15 +178,13 @@ def dense_section(rounds: int, gels: Sequence[TrackedGel], context: Context) -> 
         content=speed_against_error(points, "error, px", None, legend=False),
     )
     sentence = f"Between the markers the mean error of the thin-plate spline is {error:.3f} px; it takes"
-    return FieldSection(
-        verdict=(f"{sentence} {spline_ms:.2f} ms.",),
-        requirements=(
-            at_most("dense field, mean error", error, 0.05, "px"),
-            at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
-        ),
-        tables=(table,),
-        pictures=(picture,),
-    )
+    return [
+        f"{sentence} {spline_ms:.2f} ms.",
+        at_most("dense field, mean error", error, 0.05, "px"),
+        at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
+        table,
+        picture,
+    ]
 
 
 def quantiles(error: np.ndarray) -> tuple[float, float]:
@@ -201,9 +196,9 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _real(gels: Sequence[TrackedGel]) -> list[TrackedGel]:
+def _real(gels: Sequence[MarkerGel]) -> list[MarkerGel]:
     """The real gels, or the generated ones if there are none."""
-    return [g for g in gels if g.rest.real] or list(gels)
+    return [g for g in gels if g.real] or list(gels)
 
 
 def _accuracy_columns(middle: str) -> list[Column]:

@@ -120,10 +120,9 @@ class DescriptionPolicy(TouchPolicy):
 
     @functools.cached_property
     def posterior(self) -> Any:
-        """Compiled (params of M members, x of M members [M, n, D]) → (percept [n], log-probabilities [n, 27]).
+        """Compiled (params of M members, x of M members [M, n, D]) → log-probabilities of the conclusions [n, 27].
 
-        The members' log-probabilities are averaged, first over the 27 percepts; those of the conclusions follow the
-        most likely percept.
+        The members' log-probabilities are averaged; those of the conclusions follow the most likely percept.
         """
         answers, (perceive, conclude) = jnp.asarray(self.answers), self.slots
         same = jnp.arange(len(COMBINATIONS))
@@ -132,9 +131,9 @@ class DescriptionPolicy(TouchPolicy):
             each = jax.vmap(self.log_probs, in_axes=(0, 0, None))(params, x, tokens)
             return jnp.mean(jnp.sum(each[..., slots], -1), 0)
 
-        def one(params: Params, x: Float[Array, "M D"]) -> tuple[Array, Array]:
+        def one(params: Params, x: Float[Array, "M D"]) -> Array:
             percept = jnp.argmax(scored(params, x, answers[same, same], perceive))
-            return percept, jax.nn.log_softmax(scored(params, x, answers[percept], conclude))
+            return jax.nn.log_softmax(scored(params, x, answers[percept], conclude))
 
         return jax.jit(lambda params, x: jax.lax.map(lambda row: one(params, row), x.swapaxes(0, 1), batch_size=16))
 

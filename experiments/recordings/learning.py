@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
-from experiments.recordings.description_policy import COMBINATIONS, LEVELS, PolicyShape, choose, description_policy
+from experiments.recordings.description_policy import COMBINATIONS, LEVELS, PolicyShape, description_policy
 from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
 from experiments.recordings.fine_tuning import (
     READING,
@@ -27,8 +27,13 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.level_probes import AuxiliaryData, LevelProbeConfig, ProbedVideos, standardise
-from experiments.recordings.object_folds import object_weights
+from experiments.recordings.level_probes import (
+    AuxiliaryData,
+    LevelProbeConfig,
+    ProbedVideos,
+    object_weights,
+    standardise,
+)
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
 
@@ -74,19 +79,6 @@ class TrainedEnsemble:
     auxiliary: AuxiliaryData
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VideoAnswers:
-    """Answers about n videos: levels perceived, and log-probabilities of the 27 conclusions."""
-
-    percept: Int[np.ndarray, "n A"]
-    log_prob: Float[np.ndarray, "n 27"]
-
-    @property
-    def conclude(self) -> Int[np.ndarray, "n A"]:
-        """The levels of highest expected utility."""
-        return choose(self.log_prob)
-
-
 def learn(
     config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, seed: int, context: Context, stage: str
 ) -> TrainedEnsemble:
@@ -123,15 +115,14 @@ def _reader(config: LearnConfig, seed: int, context: Context) -> Params:
     return tune(policy, config.reading, [params], [lesson], [seed], context, stage)[0]
 
 
-def answer(trained: TrainedEnsemble, videos: DescribedVideos) -> VideoAnswers:
-    """Answer about videos, known or not; their levels and objects are ignored."""
+def answer_log_probs(trained: TrainedEnsemble, videos: DescribedVideos) -> Float[np.ndarray, "n 27"]:
+    """Log-probabilities of every conclusion about videos, known or not; their levels and objects are ignored."""
     config = trained.config
     read = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence)
     x = np.concatenate([evidence_inputs(read.evidence()), principal_components(read, config.components)[1]], 1)
     padded = jnp.asarray(_padded(x), jnp.float32)
     members = jnp.broadcast_to(padded, (config.members, *padded.shape))
-    percept, log_prob = jax.device_get(description_policy(config.shape).posterior(trained.params, members))
-    return VideoAnswers(percept=COMBINATIONS[percept[: len(x)]], log_prob=log_prob[: len(x)])
+    return jax.device_get(description_policy(config.shape).posterior(trained.params, members))[: len(x)]
 
 
 def probe_answers(

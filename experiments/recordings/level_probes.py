@@ -12,6 +12,7 @@ their predictions for a real video are further inputs of the probes above.  Scen
 their own mean and deviation: lamps, gels and hands differ, so only the order of touches within each world is used.
 """
 
+import collections
 import dataclasses
 
 import numpy as np
@@ -20,7 +21,6 @@ from jaxtyping import Bool, Float, Int
 from experiments.recordings.description_policy import LEVELS
 from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
 from experiments.recordings.descriptors import families
-from experiments.recordings.object_folds import object_weights
 
 LEAST = 0.02
 """Least probability of a level: a regression on one-hot targets may leave 0 to 1."""
@@ -82,6 +82,12 @@ class ProbedVideos:
         """Predictions for the training videos by probes that were fitted without the object in question."""
         t = self._training
         return cross_probe(self.fitted, t.label, self._weight, t.objects, self._family, self._config, seed)
+
+
+def object_weights(objects: np.ndarray, chosen: Bool[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """1 over the number of chosen videos of the object, 0 for the others: every object counts the same."""
+    size = collections.Counter(objects[chosen].tolist())
+    return np.array([1 / size[name] if use else 0.0 for name, use in zip(objects, chosen, strict=True)], np.float32)
 
 
 def probe(

@@ -32,12 +32,20 @@ from experiments.core.pictures import heatmaps
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
-from experiments.recordings.cross_validation import CrossValidation, agreement, objects_for
-from experiments.recordings.description_policy import LANGUAGE, description_policy
+from experiments.recordings.cross_validation import (
+    CrossValidation,
+    agreement,
+    constants,
+    deal_folds,
+    fold_table,
+    intervals,
+    objects_for,
+    score_table,
+)
+from experiments.recordings.description_policy import LANGUAGE, choose, description_policy
 from experiments.recordings.descriptions import DescribedVideos, describe_folder, describe_scenes, describe_source
-from experiments.recordings.learning import LearnConfig, answer, identity, learn, load, save
+from experiments.recordings.learning import LearnConfig, answer_log_probs, identity, learn, load, save
 from experiments.recordings.level_probes import AuxiliaryData
-from experiments.recordings.object_folds import constants, deal_folds, fold_table, intervals, score_table
 from experiments.study.levels import confusion_map
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
@@ -112,7 +120,7 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
     videos = describe_folder(folder, config.frames, context)
     answers = {
         str(name): dict(zip(NAMES, levels.tolist(), strict=True))
-        for name, levels in zip(videos.names, answer(trained, videos).conclude, strict=True)
+        for name, levels in zip(videos.names, choose(answer_log_probs(trained, videos)), strict=True)
     }
     write_json(out, answers)
     left_out = "".join(f" Left out: {skip.name}, {skip.reason}." for skip in videos.skipped)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from experiments.fields.known_motion import NOISE_GREY, GelAtRest, GelCamera, TrackedGel, gels, pressed, tracked
+from experiments.fields.known_motion import NOISE_GREY, GelCamera, MarkerGel, gels, pressed
 from experiments.fields.marker_drift import bound_px, drift_section
+from experiments.fields.sections import assemble
 from experiments.fields.tracking_accuracy import quantiles
 
 
@@ -36,8 +37,8 @@ def test_the_bound_of_a_window_is_that_of_its_gradient():
     slope, half = 2, 8
     y, x = np.mgrid[:48, :320]
     grey = 40 + slope * (np.minimum(np.abs(x - 24), 20) + np.minimum(np.abs(y - 24), 20))
-    rest = GelAtRest(name="roof", picture=np.repeat(grey[..., None], 3, -1).astype(np.uint8), real=False)
-    roof = TrackedGel(rest=rest, points_px=np.array([[24.0, 24.0]]), half_px=half, dot_radius_px=8.0)
+    picture, centre = np.repeat(grey[..., None], 3, -1).astype(np.uint8), np.array([[24.0, 24.0]])
+    roof = MarkerGel(name="roof", picture=picture, real=False, points_px=centre, half_px=half, dot_radius_px=8.0)
     noise = (NOISE_GREY**2 + 1 / 12) * (0.299**2 + 0.587**2 + 0.114**2) + 1 / 12
     expected = np.sqrt(np.log(2) * 2 * 2 * noise / (slope**2 * 2 * half * (2 * half + 1)))
     assert bound_px(roof, light_and_strain=False) == pytest.approx(expected, rel=1e-3)
@@ -45,7 +46,7 @@ def test_the_bound_of_a_window_is_that_of_its_gradient():
 
 
 def test_points_anchored_to_the_picture_at_rest_do_not_drift():
-    section = drift_section([tracked(gels(None)[0])], cycles=(1, 10), pairs=3, period=6)
+    section = assemble(drift_section(gels(None, 1), cycles=(1, 10), pairs=3, period=6), {})
     assert section.requirements[1].met
     ours, alone, *_, frame_to_frame = section.tables[0].rows
     assert ours[2] < alone[2]

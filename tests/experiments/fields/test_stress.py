@@ -2,6 +2,7 @@
 
 import pytest
 
+from experiments.fields.sections import assemble
 from experiments.fields.stability_fields import FieldStabilityConfig
 from experiments.fields.stress import StressedField, StressOutcome, break_table, gathered, stress_section
 from sensors_io.schema import Flag
@@ -23,8 +24,8 @@ def test_silent_is_broken_without_a_flag():
 
 @pytest.mark.parametrize(("mild", "silent"), [(GOOD, 0), (SILENT, 1), (FLAGGED, 0)])
 def test_the_package_must_not_break_silently(mild, silent):
-    found = stress_section(NOISE, outcomes(other={1: [SILENT], 2: [SILENT]}, this={1: [mild], 2: [FLAGGED]}))
-    assert [(r.measured, r.bound) for r in found.requirements] == [(silent, 0)]
+    parts = stress_section(NOISE, outcomes(other={1: [SILENT], 2: [SILENT]}, this={1: [mild], 2: [FLAGGED]}))
+    assert [(r.measured, r.bound) for r in assemble(parts, {}).requirements] == [(silent, 0)]
 
 
 def test_a_method_breaks_first_at_its_lowest_broken_level():

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from experiments.recordings.cross_validation import agreement, objects_for, vote
+from experiments.recordings.cross_validation import agreement, constants, deal_folds, objects_for, scores, vote
 from experiments.recordings.description_policy import COMBINATIONS, choose, utility
-from experiments.recordings.object_folds import constants, deal_folds, object_weights, score_table, scores
+from experiments.recordings.level_probes import object_weights
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)
 LABEL = np.repeat(np.array([[i % 3, (i // 3) % 3, 1] for i in range(12)]), 3, axis=0)
@@ -42,11 +42,6 @@ def test_constants_are_the_training_modes():
     answers = constants(LABEL, OBJECTS, fold)
     assert set(map(tuple, answers["constant, each attribute's mode"][fold == 0])) == {(1, 0, 1)}
     assert all((rows[:, 2] == 1).all() for rows in answers.values())
-
-
-def test_a_table_has_a_line_for_each_method():
-    table = score_table("t", {"right": LABEL}, LABEL, OBJECTS)
-    assert table.rows[0][:2] == ("right", 100.0)
 
 
 def test_the_choice_has_the_highest_expected_utility():

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
-from experiments.recordings.description_policy import COMBINATIONS, LENGTH, PolicyShape, description_policy
+from experiments.recordings.description_policy import COMBINATIONS, LENGTH, PolicyShape, choose, description_policy
 from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
 from experiments.recordings.descriptors import families
 from experiments.recordings.fine_tuning import (
@@ -21,7 +21,7 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.learning import LearnConfig, answer, learn, load, save
+from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
 from experiments.recordings.level_probes import AuxiliaryData, LevelProbeConfig, sense
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.models.lm import DecoderConfig
@@ -71,9 +71,9 @@ def trained(tmp_path_factory):
 
 def test_answers_follow_the_evidence(trained):
     videos, learned = trained
-    found = answer(learned, videos)
-    np.testing.assert_allclose(np.exp(found.log_prob).sum(1), 1, rtol=1e-4)
-    assert (found.conclude == videos.label).mean() > 0.6
+    found = answer_log_probs(learned, videos)
+    np.testing.assert_allclose(np.exp(found).sum(1), 1, rtol=1e-4)
+    assert (choose(found) == videos.label).mean() > 0.6
 
 
 def test_a_policy_read_back_answers_the_same(trained, tmp_path):
@@ -81,7 +81,7 @@ def test_a_policy_read_back_answers_the_same(trained, tmp_path):
     save(tmp_path / "policy.npz", learned)
     again = load(tmp_path / "policy.npz", CONFIG)
     some = videos.rows(np.arange(5))
-    np.testing.assert_array_equal(answer(again, some).log_prob, answer(learned, videos).log_prob[:5])
+    np.testing.assert_array_equal(answer_log_probs(again, some), answer_log_probs(learned, videos)[:5])
     with pytest.raises(ImportSourceError, match="another `learn`"):
         load(tmp_path / "policy.npz", dataclasses.replace(CONFIG, components=3))
     with pytest.raises(ImportSourceError, match="no such file"):
@@ -91,7 +91,7 @@ def test_a_policy_read_back_answers_the_same(trained, tmp_path):
 def test_levels_and_names_of_new_videos_change_nothing(trained):
     videos, learned = trained
     hidden = dataclasses.replace(videos, label=np.full_like(videos.label, -1), objects=videos.names)
-    np.testing.assert_array_equal(answer(learned, hidden).log_prob, answer(learned, videos).log_prob)
+    np.testing.assert_array_equal(answer_log_probs(learned, hidden), answer_log_probs(learned, videos))
 
 
 def test_training_resumes_from_its_checkpoint(tmp_path):
