@@ -24,9 +24,7 @@ from sensors_io.fields.depth import DepthReader
 from sensors_io.fields.sources import read_pictures
 from sensors_io.fields.types import Calibration
 
-PACKAGE = "polynomial, varying"
-"""The package's map among `MAPS`."""
-
+PACKAGE = "polynomial, varying"  # the package's map among `MAPS`
 BALL_MM, OTHER_BALLS_MM = 6.31, (4.0, 9.5)
 """Diameters of the calibration's ball and of the other generated balls that it is scored on."""
 

@@ -27,9 +27,7 @@ from sensors_io.fields.poisson import dirichlet, neumann
 from sensors_io.fields.slopes import SlopeReader
 from sensors_io.fields.types import Calibration
 
-SHAPE, PITCH_MM = (240, 320), 0.0634
-"""Size in pixels and pitch of the analytic surfaces."""
-
+SHAPE, PITCH_MM = (240, 320), 0.0634  # size in pixels and pitch of the analytic surfaces
 MOST_SCALE, MOST_UM, MOST_SHAPE_UM = 2.0, 55.0, 30.0
 """Bounds: error of the depth's scale in %, rmse at known depth in µm, and the same without its offset."""
 
@@ -79,11 +77,7 @@ def integrator_section(rounds: Iterable[object]) -> list[ReportPart]:
         note="Other projects' integrators are reimplemented with the faults that they ship with.",
     )
     scale = at_most("scale of depth from analytic slopes, worst of centre and border", worst, MOST_SCALE, "%")
-    return [
-        f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.",
-        scale,
-        table,
-    ]
+    return [f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.", scale, table]
 
 
 def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list[ReportPart]:

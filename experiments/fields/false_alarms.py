@@ -3,7 +3,7 @@
 import collections
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,11 +19,7 @@ from sensors_io.importers.video import read_video
 from sensors_io.quality import QualityConfig, saturated
 from sensors_io.schema import Flag
 
-Key = TypeVar("Key")
-
-SHOWN = (Flag.MARKER_LOSS, Flag.SATURATED)
-"""Flags of tracking."""
-
+SHOWN = (Flag.MARKER_LOSS, Flag.SATURATED)  # flags of tracking
 LOADED = {
     "GelSight Mini": ("FOTS/marker_calib/data/0.png", "FOTS/marker_calib/data/1.png"),
     "GelSlim": ("gelslim/test_data/ref.jpg", "gelslim/test_data/sample_*.jpg"),
@@ -117,8 +113,8 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> list
 
 
 def _present(
-    counts: Mapping[str, collections.Counter[Key]], data_dir: pathlib.Path, patterns: Sequence[str]
-) -> dict[str, collections.Counter[Key]]:
+    counts: Mapping[str, collections.Counter[Any]], data_dir: pathlib.Path, patterns: Sequence[str]
+) -> dict[str, collections.Counter[Any]]:
     """The recordings with pictures."""
     present = {name: count for name, count in counts.items() if count.total()}
     if not present:

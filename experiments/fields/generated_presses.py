@@ -11,17 +11,13 @@ from sensors_io.layer import Layer
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.fitting import Profiles
 
-WINDOW_PX, WINDOW_MM = 160, 15.2
-"""Side of the pictures."""
-
+WINDOW_PX, WINDOW_MM = 160, 15.2  # side of the pictures
 AXIS_MM = (np.arange(WINDOW_PX) - (WINDOW_PX - 1) / 2) * (WINDOW_MM / WINDOW_PX)
 """Centres of the pixels along a side, from the window's centre."""
 
 GEL = Layer(modulus_mpa=0.37, poisson=0.48, thickness_mm=4.5)
 
-NOISE_GREY = 1.2
-"""Standard deviation of the camera's noise in grey levels, fitted to the real camera."""
-
+NOISE_GREY = 1.2  # standard deviation of the camera's noise in grey levels, fitted to the real camera
 _WIDEST_RADII, _WIDEST_MM = 0.6, 2.2  # contact radius, in ball radii and at all
 
 Optics = Callable[[Profiles, np.ndarray | None, np.ndarray], np.ndarray]

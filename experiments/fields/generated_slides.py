@@ -14,9 +14,7 @@ from sensors_io.scenes import drag
 from sensors_io.scenes.sensors import SensorModel
 from sensors_io.scenes.traction import in_series, resultant, shear_displacement
 
-NODES = 20
-"""Rows and columns of the measured fields, as in the records of generated scenes."""
-
+NODES = 20  # rows and columns of the measured fields, as in the records of generated scenes
 _PER_NODE = 4  # contact pixels along a node's side
 _LOST_NODES = 0.004  # share of nodes that a frame cannot read, as in generated scenes
 _LEAST_FORCE_N = 0.5  # frames that press less have hardly any shear

@@ -1,8 +1,8 @@
 """Known motion of marker gels: gels at rest, real and generated, and the pictures that a camera takes as they move.
 
-A displacement b(y) says where the gel at y came from, so the picture at y is the picture at rest at y − b(y), and a
-point p moves by f(p) = b(p + f(p)).  Both are exact: b is a formula, the picture at rest a cubic spline.  (OpenCV's
-cubic `remap` rounds coordinates to 1/32 pixel, which is as large as the errors that are measured here.)
+The gel at y came from y − b(y), so the picture at y is the picture at rest at y − b(y), and a point p moves by
+f(p) = b(p + f(p)).  Both are exact: b is a formula, the picture at rest a cubic spline.  (OpenCV's cubic `remap` rounds
+coordinates to 1/32 pixel, which is as large as the errors that are measured here.)
 """
 
 import dataclasses
@@ -20,18 +20,12 @@ from sensors_io.scenes import optics
 from sensors_io.scenes.sensors import DMTAC_X, XENSE, SensorModel
 from sensors_io.scenes.units import unit_of
 
-PEAK_PX, JUMP_PX = 12.0, 28.0
-"""Greatest displacement of a motion and of a jump, on a picture 320 pixels wide."""
-
-NOISE_GREY = 2.0
-"""Standard deviation of the camera's noise, grey levels."""
-
+PEAK_PX, JUMP_PX = 12.0, 28.0  # greatest displacement of a motion and of a jump, on a picture 320 pixels wide
+NOISE_GREY = 2.0  # standard deviation of the camera's noise, grey levels
 FIRST_SEED = 400
 """Of motions and noise in reports: settings were chosen on motions of the seeds 0 to 3, on other pictures."""
 
-REST_PICTURES = 16
-"""Pictures whose mean is the background: one alone would add its noise to that of every later one."""
-
+REST_PICTURES = 16  # pictures whose mean is the background: one alone would add its noise to that of every later one
 _FIXED_POINT, _UNCHANGED_PX = 80, 1e-9  # iterations of f = b(p + f) at most, and the change that ends them
 _LIGHT_GREY, _LIGHT_WIDTH = 25.0, 0.18  # coloured shading of a contact: grey levels, and share of the shorter side
 _CENTRE = 0.55, 0.45  # of the contact, over width and height
@@ -208,10 +202,7 @@ def gels(data_dir: pathlib.Path | None, most: int | None = None) -> list[MarkerG
     if data_dir is not None and not real:
         wanted = ", ".join(pattern for pattern, _ in REAL_GELS.values())
         raise FileNotFoundError(f"data_dir is {data_dir}: must hold one of {wanted}; correct the path")
-    generated = [
-        ("Xense, generated", _generated(XENSE, 240, 1)),
-        ("DM-Tac, generated", _generated(DMTAC_X, 240, 3)),
-    ]
+    generated = [("Xense, generated", _generated(XENSE, 240, 1)), ("DM-Tac, generated", _generated(DMTAC_X, 240, 3))]
     return [_tracked(*gel, i < len(real)) for i, gel in enumerate([*real, *generated][:most])]
 
 

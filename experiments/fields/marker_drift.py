@@ -20,15 +20,11 @@ from experiments.fields.trackers import FOLLOWERS
 
 METHODS = ("this", "this, affine alone", "this, LK alone", "LK frame to frame")
 MAIN, UNSMOOTHED, FRAME_TO_FRAME = METHODS[0], METHODS[1], METHODS[-1]
-PERIOD, PUBLISHED = 90, 10
-"""Pictures of a cycle; cycles of the published figures."""
-
+PERIOD, PUBLISHED = 90, 10  # pictures of a cycle; cycles of the published figures
 CYCLES, OTHERS_CYCLES = (1, 2, 5, PUBLISHED, 30), (1, PUBLISHED)
 """Numbers of cycles after which the first gel and the others are measured."""
 
-PAIRS, BOUND_PX = 10, 0.006
-"""Pairs of still pictures; bound of the published error and of its growth."""
-
+PAIRS, BOUND_PX = 10, 0.006  # pairs of still pictures; bound of the published error and of its growth
 _FIRST_SEED = 450
 _LUMA = (0.299, 0.587, 0.114)  # weights of the colours in grey
 _ROUNDING = 1 / 12  # variance of rounding to whole grey levels

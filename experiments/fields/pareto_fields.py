@@ -32,8 +32,7 @@ from experiments.fields.sections import ReportPart, assemble
 from experiments.fields.shear_accuracy import layer_section, shear_section
 from experiments.fields.tracking_accuracy import dense_section, marker_section
 
-PICTURES = 20
-"""Pictures of each folder for the recognition of marker gels."""
+PICTURES = 20  # pictures of each folder for the recognition of marker gels
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
-"""The published recordings of real sensors: where their files lie in a data directory, and what is known about them."""
+"""The published recordings of real sensors: paths in a data directory, pitches, balls, and known depths."""
 
-import dataclasses
 import pathlib
 import re
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,17 +11,14 @@ from sensors_io.calibration.presses import BallPresses
 from sensors_io.fields.sources import read_picture, read_pictures
 
 SIM2REAL = "gelsight_sim2real/quantitative_real_gan"
-SIM2REAL_MM = 0.0592593
-"""Pitch of gelsight_sim2real, mm/px, as its code gives it."""
-
+SIM2REAL_MM = 0.0592593  # pitch of gelsight_sim2real, mm/px, as its code gives it
 _SPHERE_MM, _SPHERE_PX, _KEPT = 2.92, (208, 166), 0.85  # radius, centre, share of the contact radius that is scored
 _PRISM_PX = ((172, 114), (242, 220))
 _TRIANGLE_PX = ((161, 137), (212, 132), (250, 193))
 _WIDEST_PX = 480  # wider pictures are reduced: their pixels are finer than their optics
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordingFolder:
+class RecordingFolder(NamedTuple):
     """Pictures of one sensor in one folder of the data directory.
 
     Args:
@@ -40,53 +37,32 @@ class RecordingFolder:
 
 
 FOLDERS = {
-    "gelslam": RecordingFolder(
-        path="gelslam", pattern="6.310mm/*/gelsight.png", background="background.png",
-        mm_per_px=0.0634, ball_diameter_mm=6.31,
-    ),
+    "gelslam": RecordingFolder("gelslam", "6.310mm/*/gelsight.png", "background.png", 0.0634, 6.31),
     "gelsight sim2real": RecordingFolder(
-        path=SIM2REAL, pattern="calib_*.png", background="background_real.png",
-        mm_per_px=SIM2REAL_MM, ball_diameter_mm=2 * _SPHERE_MM,
+        SIM2REAL, "calib_*.png", "background_real.png", SIM2REAL_MM, 2 * _SPHERE_MM
     ),
     "FOTS Mini": RecordingFolder(
-        path="FOTS/mlp_calib", pattern="gelsight/*.png", background="0000.png",
-        mm_per_px=1 / 19.58, ball_diameter_mm=4.70,
-        remark="The gel slopes over the whole window, so there is no zero level: depth is known up to a tilt and a "
-        "constant",
+        "FOTS/mlp_calib", "gelsight/*.png", "0000.png", 1 / 19.58, 4.70,
+        "The gel slopes over the whole window, so there is no zero level: depth is known up to a tilt and a constant",
     ),
     "ShapeMap3D Mini": RecordingFolder(
-        path="gsmini_shapemap/calib_ball", pattern="frame_*.jpg", background="frame_0.png",
-        mm_per_px=0.08, ball_diameter_mm=4.0,
-        remark="Lens and light differ from the gel at rest along the whole border, so there is no zero level: absolute "
-        "depth and the outlines in the corners mean nothing",
+        "gsmini_shapemap/calib_ball", "frame_*.jpg", "frame_0.png", 0.08, 4.0,
+        "Lens and light differ from the gel at rest along the whole border, so there is no zero level: absolute depth "
+        "and the outlines in the corners mean nothing",
     ),
-    "FOTS DIGIT": RecordingFolder(
-        path="FOTS", pattern="mlp_calib/digit/*.png", background="assets/gel/digit_bg.png", mm_per_px=0.0657,
-    ),
+    "FOTS DIGIT": RecordingFolder("FOTS", "mlp_calib/digit/*.png", "assets/gel/digit_bg.png", 0.0657),
     "GelSlim": RecordingFolder(
-        path="gelslim/test_data", pattern="sample_*.jpg", background="ref.jpg",
-        mm_per_px=0.10577, ball_diameter_mm=7.6,
-        remark="The outlines at the upper and lower border are not contacts: the lamps there have drifted since the "
-        "gel at rest was recorded, and no threshold that keeps a light second touch removes them",
+        "gelslim/test_data", "sample_*.jpg", "ref.jpg", 0.10577, 7.6,
+        "The outlines at the upper and lower border are not contacts: the lamps there have drifted since the gel at "
+        "rest was recorded, and no threshold that keeps a light second touch removes them",
     ),
-    "GelSlim heightmap": RecordingFolder(
-        path="gelsight_heightmap/test_data", pattern="sample_*.jpg", background="ref.jpg",
-        mm_per_px=0.10577, ball_diameter_mm=7.6,
-    ),
-    "wedge": RecordingFolder(
-        path="wyh5625_wedge/calibration", pattern="ball-*.jpg", background="bg-0.jpg",
-        mm_per_px=0.1, ball_diameter_mm=3.96,
-    ),
+    "GelSlim heightmap": RecordingFolder("gelsight_heightmap/test_data", "sample_*.jpg", "ref.jpg", 0.10577, 7.6),
+    "wedge": RecordingFolder("wyh5625_wedge/calibration", "ball-*.jpg", "bg-0.jpg", 0.1, 3.96),
     "GelSight bench": RecordingFolder(
-        path="gelsight_driver/calibration/cali_180110", pattern="Im_*.jpg", background="frame0.jpg",
-        mm_per_px=0.0254, ball_diameter_mm=3.96,
+        "gelsight_driver/calibration/cali_180110", "Im_*.jpg", "frame0.jpg", 0.0254, 3.96
     ),
-    "FeelAnyForce, untouched": RecordingFolder(
-        path="feelanyforce", pattern="tactile/*.png", background="background.png", mm_per_px=0.0634,
-    ),
-    "gs_sdk objects": RecordingFolder(
-        path="gs_sdk/data", pattern="[bks]e*.png", background="background.png", mm_per_px=0.0634,
-    ),
+    "FeelAnyForce, untouched": RecordingFolder("feelanyforce", "tactile/*.png", "background.png", 0.0634),
+    "gs_sdk objects": RecordingFolder("gs_sdk/data", "[bks]e*.png", "background.png", 0.0634),
 }  # fmt: skip
 """Name → folder; pitches and diameters as the authors' code gives them."""
 

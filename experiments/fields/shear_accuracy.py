@@ -40,9 +40,7 @@ LAYERS = ((1.0, 0.48), (1.0, 0.45), (0.7, 0.48), (0.7, 0.45), (1.3, 0.48), (1.3,
 KINDS, MOTIONS, FRAMES = ("sphere", "rough", "patterned"), ("press", "slide_x", "slide_y", "twist"), 36
 """Objects, contacts and frames of the slides."""
 
-STRIDE, ROUNDS = 3, 9
-"""Every how many-th frame is scored; rounds of timing."""
-
+STRIDE, ROUNDS = 3, 9  # every how many-th frame is scored; rounds of timing
 ShearMethod = Callable[[Slide, int], np.ndarray]
 """From a slide and the index of a frame to its shear [h, w, 2], mm."""
 

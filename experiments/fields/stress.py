@@ -14,8 +14,7 @@ from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
 
-OURS = "this"
-"""The package's method."""
+OURS = "this"  # the package's method
 
 
 class StressOutcome(NamedTuple):

@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -240,20 +241,15 @@ class StressedPress:
 def stressed_press(stress: str, level: float, seed: int) -> StressedPress:
     """The press of one level of one stress, by default at a place near the centre that the seed draws."""
     x, y = np.random.default_rng(seed).uniform(-1, 1, 2)
-    usual = StressedPress(touch=(x, y, _CONTACT_MM))
-    match stress.split(",")[0]:
-        case "noise":
-            return dataclasses.replace(usual, noise=level)
-        case "exposure":
-            return dataclasses.replace(usual, gain=level)
-        case "lamps drift":
-            return dataclasses.replace(usual, drift=level)
-        case "contact from the border":
-            return dataclasses.replace(usual, touch=(WINDOW_MM / 2 - level, y, _CONTACT_MM))
-        case "contact radius":
-            return dataclasses.replace(usual, diameter_mm=_LARGE_MM, touch=(x, y, level))
-        case _:
-            return dataclasses.replace(usual, touch=(x, y, level * _SMALL_MM / 2))
+    changes: dict[str, dict[str, Any]] = {
+        "noise": {"noise": level},
+        "exposure": {"gain": level},
+        "lamps drift": {"drift": level},
+        "contact from the border": {"touch": (WINDOW_MM / 2 - level, y, _CONTACT_MM)},
+        "contact radius": {"diameter_mm": _LARGE_MM, "touch": (x, y, level)},
+        "contact": {"touch": (x, y, level * _SMALL_MM / 2)},
+    }
+    return StressedPress(**{"touch": (x, y, _CONTACT_MM)} | changes[stress.split(",")[0]])
 
 
 def _press_picture(press: StressedPress, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

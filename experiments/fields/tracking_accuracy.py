@@ -27,12 +27,8 @@ from sensors_io.fields.spline import Densifier
 
 MARKER_DEFAULT, UNSMOOTHED = "this", "this, affine alone"
 DENSE_DEFAULT = "this: markers, affine, spline"
-SEEDS = (None, *range(FIRST_SEED, FIRST_SEED + 4))
-"""Of the motions of each gel; `None` is the published one."""
-
-ROUNDS, LOST_PX = 15, 1.0
-"""Rounds of timing of the markers; distance from which a marker counts as lost."""
-
+SEEDS = (None, *range(FIRST_SEED, FIRST_SEED + 4))  # of the motions of each gel; `None` is the published one
+ROUNDS, LOST_PX = 15, 1.0  # rounds of timing of the markers; distance from which a marker counts as lost
 _MARGIN = 0.1  # of height and width: within, the markers surround every pixel
 
 

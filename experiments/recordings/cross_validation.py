@@ -13,16 +13,15 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
 from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose
-from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
-from experiments.recordings.descriptors import families
+from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.fine_tuning import ReinforceConfig
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_answers
-from experiments.recordings.level_probes import SCENES, AuxiliaryData, object_weights, standardise
+from experiments.recordings.level_probes import SCENES, object_weights, standardise
+from experiments.recordings.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 
-SHARES = (0.25, 0.5, 0.75, 1.0)
-"""Of the training objects, that the probes learn from."""
+SHARES = (0.25, 0.5, 0.75, 1.0)  # of the training objects, that the probes learn from
 
 
 SCORES: Mapping[str, str] = {
@@ -162,15 +161,15 @@ class CrossValidation:
         """Answers of the probes alone with something left out or added."""
         config, auxiliary, evidence = self.config, self.auxiliary, self.config.evidence
         with_probes = lambda **change: dataclasses.replace(config, evidence=dataclasses.replace(evidence, **change))
-        own, scenes = tuple(dict.fromkeys(families())), auxiliary.scenes
-        tenth = DescribedScenes(x=scenes.x[::10], target=scenes.target[::10])
+        own, bare = (
+            tuple(dict.fromkeys(families())),
+            dataclasses.replace(auxiliary, unlabelled=auxiliary.unlabelled[:0]),
+        )
+        fewer = {name: getattr(auxiliary, name)[::10] for name in ("scene_x", "scene_target")}
         variants = {
             "probe of what scenes teach": (config, auxiliary),
-            "the same, a tenth of the scenes": (config, dataclasses.replace(auxiliary, scenes=tenth)),
-            "the same, no unlabelled videos": (
-                config,
-                dataclasses.replace(auxiliary, unlabelled=auxiliary.unlabelled[:0]),
-            ),
+            "the same, a tenth of the scenes": (config, dataclasses.replace(auxiliary, **fewer)),
+            "the same, no unlabelled videos": (config, bare),
             "the same, scenes' ridge as the others'": (with_probes(scene_ridge=evidence.ridge), auxiliary),
             "probes of the description, no scenes": (with_probes(families=own), auxiliary),
             "probes of the description and of what scenes teach": (with_probes(families=(*own, SCENES)), auxiliary),

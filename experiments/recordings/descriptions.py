@@ -13,8 +13,7 @@ from jaxtyping import Float, Int
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.recordings.description_policy import LANGUAGE
-from experiments.recordings.descriptors import describe, families
-from experiments.recordings.touches import read_touch, touch_of_scene
+from experiments.recordings.touches import describe, families, read_touch, touch_of_scene
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
@@ -24,12 +23,8 @@ from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.schema import ATTRIBUTES
 from sensors_io.schema import LEVELS as SCENE_LEVELS
 
-VERSION = 1
-"""Raised when a description changes, so that no cache outlives it."""
-
-SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")
-"""File names that count as videos in a folder that no table lists."""
-
+VERSION = 1  # raised when a description changes, so that no cache outlives it
+SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
 SENSOR = "gelsight_mini"
 
 
@@ -54,11 +49,17 @@ class DescribedVideos:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DescribedScenes:
-    """n touches of generated objects: descriptions, and their properties one-hot, level by level."""
+class AuxiliaryData:
+    """Data without labels of real objects: touches of generated objects and unlabelled videos.
 
-    x: Float[np.ndarray, "n D"]
-    target: Float[np.ndarray, "n T"]
+    Args:
+      scene_x, scene_target: descriptions of the scenes, and their properties one-hot, level by level.
+      unlabelled: descriptions of the videos.
+    """
+
+    scene_x: Float[np.ndarray, "n D"]
+    scene_target: Float[np.ndarray, "n T"]
+    unlabelled: Float[np.ndarray, "m D"]
 
 
 def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> DescribedVideos:
@@ -123,8 +124,8 @@ def _describe_files(
     )
 
 
-def describe_scenes(config: SceneConfig, context: Context) -> DescribedScenes:
-    """Generate and describe presses as a GelSight Mini sees them."""
+def auxiliary_data(config: SceneConfig, every: DescribedVideos, context: Context) -> AuxiliaryData:
+    """Generate and describe presses as a GelSight Mini sees them, and take the videos without all levels."""
 
     def make() -> dict[str, np.ndarray]:
         source = SourceConfig(scenes=config)
@@ -141,7 +142,9 @@ def describe_scenes(config: SceneConfig, context: Context) -> DescribedScenes:
                 target.append(np.concatenate(one_hot))
         return {"x": np.array(x), "target": np.array(target)}
 
-    return DescribedScenes(**_cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make))
+    scenes = _cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make)
+    unlabelled = every.x[np.any(every.label < 0, 1)]
+    return AuxiliaryData(scene_x=scenes["x"], scene_target=scenes["target"], unlabelled=unlabelled)
 
 
 def _cached(

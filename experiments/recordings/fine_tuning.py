@@ -28,8 +28,7 @@ from touchr1_jax.training.sft import SFTState
 from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.types import Params
 
-REWARD = {"accuracy": 0.5, "exact": 0.5}
-"""Reward of GRPO → weight."""
+REWARD = {"accuracy": 0.5, "exact": 0.5}  # reward of GRPO → weight
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

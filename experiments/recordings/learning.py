@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
 from experiments.recordings.description_policy import COMBINATIONS, LEVELS, PolicyShape, description_policy
-from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
+from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.fine_tuning import (
     READING,
     Lesson,
@@ -27,21 +27,12 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.level_probes import (
-    AuxiliaryData,
-    LevelProbeConfig,
-    ProbedVideos,
-    object_weights,
-    standardise,
-)
+from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos, object_weights, standardise
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.types import Params
 
-READINGS = 8192
-"""Examples of made-up evidence."""
-
-ROWS = 64
-"""Numbers of videos are padded to a multiple of it."""
+READINGS = 8192  # examples of made-up evidence
+ROWS = 64  # numbers of videos are padded to a multiple of it
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -161,12 +152,10 @@ def _padded(x: np.ndarray) -> np.ndarray:
 
 def save(path: Path, trained: TrainedEnsemble) -> None:
     """Publish an ensemble as one file."""
-    scenes, videos = trained.auxiliary.scenes, trained.training
-    memory = {name: getattr(videos, name) for name in _VIDEOS} | {"unlabelled": trained.auxiliary.unlabelled}
-    memory |= {"scenes_x": scenes.x, "scenes_target": scenes.target}
-    arrays = traverse_util.flatten_dict({"params": trained.params, "memory": memory}, sep="/")
+    videos = {name: getattr(trained.training, name) for name in ("names", "objects", "label", "x")}
+    parts = {"params": trained.params, "training": videos, "auxiliary": dict(vars(trained.auxiliary))}
     buffer = io.BytesIO()
-    np.savez(buffer, identity=identity(trained.config), **arrays)
+    np.savez(buffer, identity=identity(trained.config), **traverse_util.flatten_dict(parts, sep="/"))
     write_bytes(path, buffer.getvalue())
 
 
@@ -187,14 +176,9 @@ def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
         if str(file["identity"]) != identity(config):
             raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
         found = traverse_util.unflatten_dict(dict(file), sep="/")
-    memory = found["memory"]
-    scenes = DescribedScenes(x=memory["scenes_x"], target=memory["scenes_target"])
     return TrainedEnsemble(
         config=config,
         params=found["params"],
-        training=DescribedVideos(**{name: memory[name] for name in _VIDEOS}),
-        auxiliary=AuxiliaryData(scenes=scenes, unlabelled=memory["unlabelled"]),
+        training=DescribedVideos(**found["training"]),
+        auxiliary=AuxiliaryData(**found["auxiliary"]),
     )
-
-
-_VIDEOS = ("names", "objects", "label", "x")

@@ -19,17 +19,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.recordings.description_policy import LEVELS
-from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
-from experiments.recordings.descriptors import families
+from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
+from experiments.recordings.touches import families
 
-LEAST = 0.02
-"""Least probability of a level: a regression on one-hot targets may leave 0 to 1."""
-
-CLIP = 4.0
-"""Standard deviations to which inputs are clipped."""
-
-SCENES = "scenes"
-"""Family of the numbers that scene probes predict."""
+LEAST = 0.02  # least probability of a level: a regression on one-hot targets may leave 0 to 1
+CLIP = 4.0  # standard deviations to which inputs are clipped
+SCENES = "scenes"  # family of the numbers that scene probes predict
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,14 +45,6 @@ class LevelProbeConfig:
     folds: int = 10
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class AuxiliaryData:
-    """Data without labels of real objects: scenes, and descriptions of unlabelled videos [m, D]."""
-
-    scenes: DescribedScenes
-    unlabelled: Float[np.ndarray, "m D"]
-
-
 class ProbedVideos:
     """Labelled training videos and others with the predictions of scene probes, as the level probes read them."""
 
@@ -65,7 +52,7 @@ class ProbedVideos:
         self, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos, config: LevelProbeConfig
     ) -> None:
         world = np.concatenate([training.x, auxiliary.unlabelled])
-        widen = lambda x: np.concatenate([x, sense(auxiliary.scenes, world, x, config)], 1).astype(np.float64)
+        widen = lambda x: np.concatenate([x, sense(auxiliary, world, x, config)], 1).astype(np.float64)
         self.fitted, self.others = widen(training.x), widen(videos.x)
         self._training, self._config = training, config
         self._family = np.array([*families(), *[SCENES] * (self.fitted.shape[1] - training.x.shape[1])])
@@ -140,18 +127,18 @@ def cross_probe(
 
 
 def sense(
-    scenes: DescribedScenes, world: Float[np.ndarray, "m D"], x: Float[np.ndarray, "n D"], config: LevelProbeConfig
+    auxiliary: AuxiliaryData, world: Float[np.ndarray, "m D"], x: Float[np.ndarray, "n D"], config: LevelProbeConfig
 ) -> Float[np.ndarray, "n T"]:
     """Predictions of scene probes for videos: each level of hardness, roughness and protrusion, and each material.
 
     `x` is standardised by mean and deviation of the descriptions of real videos in `world`, which need no label.
     """
-    count = len(scenes.x)
+    count = len(auxiliary.scene_x)
     known = np.arange(len(world) + len(x)) < len(world)
     real = standardise(np.concatenate([world, x]).astype(np.float64), known)[len(world) :]
-    made = standardise(scenes.x.astype(np.float64), np.ones(count, bool))
+    made = standardise(auxiliary.scene_x.astype(np.float64), np.ones(count, bool))
     both, fit = np.concatenate([made, real]), np.arange(count + len(x)) < count
-    return kernel_ridge(both, fit, np.full(count, 1 / count), scenes.target, config.scene_ridge)[count:]
+    return kernel_ridge(both, fit, np.full(count, 1 / count), auxiliary.scene_target, config.scene_ridge)[count:]
 
 
 def kernel_ridge(

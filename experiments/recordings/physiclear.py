@@ -43,9 +43,14 @@ from experiments.recordings.cross_validation import (
     score_table,
 )
 from experiments.recordings.description_policy import LANGUAGE, choose, description_policy
-from experiments.recordings.descriptions import DescribedVideos, describe_folder, describe_scenes, describe_source
+from experiments.recordings.descriptions import (
+    AuxiliaryData,
+    DescribedVideos,
+    auxiliary_data,
+    describe_folder,
+    describe_source,
+)
 from experiments.recordings.learning import LearnConfig, answer_log_probs, identity, learn, load, save
-from experiments.recordings.level_probes import AuxiliaryData
 from experiments.study.levels import confusion_map
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
@@ -53,16 +58,10 @@ from touchr1_jax.bench.statistics import Interval
 NAMES = ("hardness", "roughness", "bumps")
 """PhysiCLeAR's names of the attributes, in the order of the answers: it calls protrusion bumps."""
 
-POLICY = "policy.npz"
-"""File of the policy of all objects in a run."""
-
+POLICY = "policy.npz"  # file of the policy of all objects in a run
 GOALS: Mapping[str, float] = {"all right": 45.0, "mean": 75.0, "OMAE": 0.28}
-MINUTES = 60.0
-"""Bound of the training time, all folds together."""
-
-ABLATION_SEED = 101
-"""Of the partition that the ablations are measured on."""
-
+MINUTES = 60.0  # bound of the training time, all folds together
+ABLATION_SEED = 101  # of the partition that the ablations are measured on
 CACHED = {"descriptions": "descriptions of videos", "data": "scenes", "scenes": "descriptions of scenes"}
 """Stages that cost time only where the cache lacks their output, and that output."""
 
@@ -100,7 +99,7 @@ def run(config: PhysiclearStudy, context: Context) -> Results:
     """Validate and train, or predict.
 
     Raises:
-      ConfigurationError: neither or only half of what either needs.
+      ConfigurationError: data_dir is missing, or one of predict and out.
     """
     if (config.predict is None) != (config.out is None):
         raise ConfigurationError(f"predict is {config.predict}, out {config.out}: give both to predict, or neither")
@@ -115,7 +114,8 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
     """Answer for a folder of videos with a trained policy."""
     path = config.policy or cached_policy(config, context)
     if config.data_dir is not None and not path.exists():
-        train_policy(config, *read_data(config, config.data_dir, context)[:2], context)
+        every = describe_source(config.data_dir, config.frames, context, config.objects)
+        train_policy(config, every.labelled(), auxiliary_data(config.scenes, every, context), context)
     trained = load(path, config.learn)
     videos = describe_folder(folder, config.frames, context)
     answers = {
@@ -134,7 +134,8 @@ def predict(config: PhysiclearStudy, folder: Path, out: Path, context: Context) 
 
 def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Results:
     """Cross-validate, measure contributions and limits, train and keep a policy of all objects."""
-    videos, auxiliary, everything = read_data(config, data_dir, context)
+    everything = describe_source(data_dir, config.frames, context, config.objects)
+    videos, auxiliary = everything.labelled(), auxiliary_data(config.scenes, everything, context)
     split = lambda seed: CrossValidation(
         config=config.learn,
         videos=videos,
@@ -194,15 +195,6 @@ def train_policy(config: PhysiclearStudy, videos: DescribedVideos, auxiliary: Au
 def cached_policy(config: PhysiclearStudy, context: Context) -> Path:
     """Where the cache keeps the policy of all objects."""
     return context.cache_dir / f"physiclear-policy-{identity(config.learn)}.npz"
-
-
-def read_data(
-    config: PhysiclearStudy, data_dir: Path, context: Context
-) -> tuple[DescribedVideos, AuxiliaryData, DescribedVideos]:
-    """Labelled videos, scenes with the videos without labels, and all videos."""
-    every = describe_source(data_dir, config.frames, context, config.objects)
-    unlabelled = every.x[(every.label < 0).any(1)]
-    return every.labelled(), AuxiliaryData(scenes=describe_scenes(config.scenes, context), unlabelled=unlabelled), every
 
 
 def requirements(main: Mapping[str, Interval], spent: Mapping[str, float]) -> tuple[Requirement, ...]:

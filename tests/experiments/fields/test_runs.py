@@ -13,7 +13,7 @@ from experiments.fields.published import FOLDERS, read_folder
 from tests.experiments.shrunk import run_shrunk
 
 CLIPS = pathlib.Path(__file__).parents[2] / "data" / "gelslam"
-CLIP = dataclasses.replace(FOLDERS["gelslam"], path=".", pattern="press_*.png", mm_per_px=0.1902)
+CLIP = FOLDERS["gelslam"]._replace(path=".", pattern="press_*.png", mm_per_px=0.1902)
 """14 presses of gelslam at a third of their size."""
 
 
@@ -58,7 +58,7 @@ def test_a_folder_without_a_ball_is_reported_without_depth(tmp_path):
 
 def test_a_folder_without_its_pictures_is_refused():
     with pytest.raises(FileNotFoundError, match="must hold the recording"):
-        read_folder(dataclasses.replace(CLIP, pattern="*.bmp"), CLIPS)
+        read_folder(CLIP._replace(pattern="*.bmp"), CLIPS)
     frames, names, background = read_folder(CLIP, CLIPS)
     assert frames.shape[1:] == background.shape
     assert len(names) == len(frames) == 14

@@ -9,8 +9,7 @@ from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
 from experiments.recordings.description_policy import COMBINATIONS, LENGTH, PolicyShape, choose, description_policy
-from experiments.recordings.descriptions import DescribedScenes, DescribedVideos
-from experiments.recordings.descriptors import families
+from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.fine_tuning import (
     Lesson,
     ReinforceConfig,
@@ -22,7 +21,8 @@ from experiments.recordings.fine_tuning import (
     tune,
 )
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
-from experiments.recordings.level_probes import AuxiliaryData, LevelProbeConfig, sense
+from experiments.recordings.level_probes import LevelProbeConfig, sense
+from experiments.recordings.touches import families
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig
@@ -53,7 +53,7 @@ def worlds(objects=12, videos=2, seed=0):
     owners = np.array([name.split("_")[0] for name in names])
     real = DescribedVideos(names=names, objects=owners, label=level.astype(np.int32), x=described(level))
     x = described(made)
-    return real, AuxiliaryData(scenes=DescribedScenes(x=x, target=target), unlabelled=described(made)[:5])
+    return real, AuxiliaryData(scene_x=x, scene_target=target, unlabelled=described(made)[:5])
 
 
 def run_context(home):
@@ -134,7 +134,7 @@ def test_conclusions_from_made_up_evidence_are_as_frequent_as_their_probability(
 
 def test_scene_probes_keep_the_order_of_the_law():
     videos, auxiliary = worlds()
-    found = sense(auxiliary.scenes, videos.x, videos.x, LevelProbeConfig())
+    found = sense(auxiliary, videos.x, videos.x, LevelProbeConfig())
     assert found.shape == (24, 18)
     assert np.corrcoef(found[:, :3] @ np.arange(3), videos.label[:, 0])[0, 1] > 0.8
 

@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.recordings.descriptors import describe, families
-from experiments.recordings.touches import PROBE_PX, SIZE_PX, find_touch, touch_of_scene
+from experiments.recordings.touches import PROBE_PX, SIZE_PX, describe, families, find_touch, touch_of_scene
 from sensors_io.importers.video import VideoError
 from tests.experiments.recordings.presses import press
 
