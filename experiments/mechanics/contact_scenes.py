@@ -114,7 +114,7 @@ def batch_solver(solve: Callable[..., Any], scenes: ContactScenes, kernels: GelK
 
     Args:
       solve: maps gap [N, N] mm, force N, compliance of the gel and of the object [M, M//2 + 1] mm/MPa to arrays.
-      scenes: what to solve.
+      scenes: gaps, forces and moduli.
       kernels: of the gel and of an object of 1 MPa.
     """
     gel, body = jnp.asarray(kernels.gel, jnp.float32), jnp.asarray(kernels.body, jnp.float32)

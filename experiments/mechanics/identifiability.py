@@ -56,7 +56,7 @@ class IdentifiabilityConfig:
       exact_grid: that of the tier that stands for the exact solution.
       noise: multiples of the sensors' noise, 1 among them.
       motions: the protocol that slides and held presses are taken from.
-      moments: frames of a motion that are looked at.
+      moments: frames of a motion that are used.
       probe: folds and fit.
       batch: presses in one call of a compiled program.
     """
@@ -173,7 +173,7 @@ def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Result
 def _requirements(
     config: IdentifiabilityConfig, studied: StudyPredictions, made: ProbeFigures
 ) -> tuple[Requirement, ...]:
-    """Every tier in use against what it may lose, by its worst property.
+    """Loss of every tier in use, by its worst property.
 
     Springs, whose pressure is known to be wrong, must lose significantly more than that, or the comparison is blind.
     """

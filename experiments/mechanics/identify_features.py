@@ -30,7 +30,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 WINDOW_MM, POINTS = 18.0, 108
-"""Part of the skin that is looked at: as much as a sensor covers, six points per mm."""
+"""Part of the skin that is used: as much as a sensor covers, six points per mm."""
 
 WAVES_MM = (16.0, 8.0, 5.0, 3.5, 2.5, 1.8, 1.2, 0.7)
 """Edges of the bands of wavelength, from the width of the window to below the shortest wave of any skin."""
@@ -99,7 +99,7 @@ def force_of(force_n: np.ndarray) -> np.ndarray:
 def statistics(skins: Seq[surface.Skin]) -> np.ndarray:
     """Curvatures, roughness by band and bearing curve of every skin, all logarithmic, float32 [n, 14].
 
-    Per skin: the two principal curvatures of the least-squares paraboloid, the rms of what it leaves in each band of
+    Per skin: the two principal curvatures of the least-squares paraboloid, the rms of its residual in each band of
     `WAVES_MM` under a Hann window, and the share of the window below each of `HEIGHTS_MM` (Abbott & Firestone 1933).
     """
     spacing = WINDOW_MM / POINTS

@@ -35,7 +35,7 @@ def motion_data(
     Args:
       config: the protocol.
       motion: one of `MOTIONS`.
-      moments: frames of a sequence that are looked at.
+      moments: frames of a sequence that are used.
       advance: called after each contact.
       rows: indices of the contacts; all of the motion by default.
     """
@@ -45,7 +45,7 @@ def motion_data(
     def summarise(row: int) -> tuple[list[np.ndarray], np.ndarray, int]:
         by_sensor = scenes.contact(row)
         made = [by_sensor[name] for name in SENSORS]
-        chosen = look_at(made[0].phase, moments)
+        chosen = choose_frames(made[0].phase, moments)
         touch = [_touch(sequence, chosen) for sequence in made]
         force = np.stack([force_of(_known(sequence.force_n)[chosen]) for sequence in made])
         return touch, force, made[0].key.trial
@@ -65,8 +65,8 @@ def contacts_of(scenes: LiveScenes, motion: str) -> list[int]:
     return [i for i, key in enumerate(scenes.contacts) if key.motion == motion]
 
 
-def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
-    """Frames that are looked at: the untouched first one, then evenly among those in which something changes.
+def choose_frames(phase: np.ndarray, moments: int) -> np.ndarray:
+    """The untouched first frame, then frames spread evenly over those in which something changes.
 
     Args:
       phase: `Phase` of every frame [F].
@@ -77,7 +77,7 @@ def look_at(phase: np.ndarray, moments: int) -> np.ndarray:
     """
     busy = np.flatnonzero(~np.isin(phase, (Phase.APPROACH, Phase.HOLD)))
     if moments - 1 > len(busy):
-        raise ValueError(f"moments is {moments}: only {1 + len(busy)} frames are there to be looked at; lower moments")
+        raise ValueError(f"moments is {moments}: only {1 + len(busy)} frames differ; lower moments")
     return np.concatenate([[0], busy[np.round(np.linspace(0, len(busy) - 1, moments - 1)).astype(int)]])
 
 

@@ -274,7 +274,7 @@ def tier_picture(found: ProbeFigures) -> Picture:
         name="label_transfer",
         title="Loss by a cheaper contact",
         caption="Points lost about exact records by training at a tier, mean over sensors with 95 % interval; dots are "
-        f"single sensors, the dotted line is what may be lost, {MAY_LOSE:g} points.",
+        f"single sensors, the dotted line is the greatest loss allowed, {MAY_LOSE:g} points.",
         content=draw(panels, share_x=True, share_y=True, size=(9.7, 0.9 + 0.36 * len(tiers))),
     )
 

@@ -1,4 +1,4 @@
-"""Does the chooser keep its promise, and what does it pay for it?
+"""Does the chooser meet the error that it promises, and at what cost?
 
     python -m experiments pareto_chooser [--scale smoke]
 

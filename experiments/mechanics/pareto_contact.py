@@ -1,4 +1,4 @@
-"""What does a contact cost, and how wrong is it?
+"""Which contact method is how fast, and how accurate?
 
     python -m experiments pareto_contact [--scale smoke]
 

@@ -1,4 +1,4 @@
-"""What does friction cost, and how wrong is it?
+"""Which friction method is how fast, and how accurate?
 
     python -m experiments pareto_tangential [--scale smoke] [--data-dir DIR]
 
@@ -38,6 +38,8 @@ from experiments.mechanics import tangential_scenes as scenes
 from experiments.mechanics.tangential_checks import PromiseCheck
 from experiments.mechanics.tangential_methods import FROM_PRESS, MAIN, METHODS, PLAIN, SEQUENCE, SOLVER, SUPERPOSED
 from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
+from sensors_io.scenes import partial_slip
+from sensors_io.scenes.sensors import BODY
 from sensors_io.schema import SENSORS
 
 TITLES = {
@@ -227,7 +229,9 @@ def check_promises(gels: Sequence[GelContacts], superposed: MethodErrors) -> lis
         pressures, moduli = np.asarray(gel.cases.ramp_mpa[:, -1]), np.asarray(gel.cases.modulus_mpa)
         for kind, pressure, modulus in zip(gel.kinds, pressures, moduli, strict=True):
             radius = scenes.contact_radius_mm(pressure, float(gel.kernels.spacing_mm))
-            found.append(checks.promise(sensor, kind, next(errors), float(modulus), radius))
+            body = dataclasses.replace(BODY, modulus_mpa=float(modulus))
+            promised = partial_slip.promised_error(sensor.gel, body, radius)
+            found.append(PromiseCheck(kind=kind, sensor=sensor.name, error=next(errors), promised=promised))
     return found
 
 

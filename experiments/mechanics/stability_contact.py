@@ -21,7 +21,7 @@ every third case, and the package's solver nowhere without a flag.
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.pictures import Heatmap, heatmaps
-from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
+from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.mechanics import contact_scenes
 from experiments.mechanics.contact_methods import METHODS
@@ -47,6 +47,9 @@ OTHERS = {
     "PK-25": jax.jit(METHODS["PK-25"].solve),
     "plain SPG, published stop": jax.jit(METHODS["plain 1e-3 as published"].solve),
 }
+COLUMNS = {name: f"error of {name}" for name in OTHERS} | {NESTED: "error"}
+"""Method → column of its error."""
+
 MOST_ERROR = 2 * contact.TOLERANCE
 """Error above which a frame must be flagged."""
 
@@ -67,17 +70,12 @@ class StabilityContactConfig:
     seed: int = 5
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FailureOutcome:
-    """Error of every method on one scene; validity and convergence that the package's solver reports."""
+class FailureOutcome(NamedTuple):
+    """One scene: its row in the table of cases; whether the package's solver flags it, and returns finite numbers."""
 
-    errors: Mapping[str, float]
-    finite: bool
+    row: Mapping[str, Any]
     flagged: bool
-    reason: str
-    residual: float
-    iterations: int
-    strain: float
+    finite: bool
 
 
 def run(config: StabilityContactConfig, context: Context) -> Results:
@@ -92,7 +90,7 @@ def run(config: StabilityContactConfig, context: Context) -> Results:
     spheres = context.each("adhesion", itertools.product(MODELS, RADII_MM))
     adhesive = [adhesion_threshold(sensor, radius, config.adhesion_grid) for sensor, radius in spheres]
     every = [*suite.values(), *itertools.chain(*(row for outcomes in maps.values() for row in outcomes))]
-    silent = sum(o.errors[NESTED] > MOST_ERROR and not o.flagged for o in every)
+    silent = sum(o.row["error"] > MOST_ERROR and not o.flagged for o in every)
     missed = sum(case.must_flag and not suite[case.name].flagged for case in cases)
     adhesion_ratio = max(row["counts over flagged"] for row in adhesive)
     measured = {
@@ -105,7 +103,7 @@ def run(config: StabilityContactConfig, context: Context) -> Results:
     return Results(
         verdict=_verdict(suite, ordinary),
         requirements=tuple(at_most(name, found, bound) for name, (found, bound) in measured.items()),
-        tables=(_suite_table(cases, suite), _adhesion_table(adhesive)),
+        tables=(_suite_table(suite), _adhesion_table(adhesive)),
         pictures=(
             _failure_map("roughness", "roughness, factor", config.roughness, config.forces_n, maps["roughness"]),
             _failure_map("thickness", "thickness, mm", config.thickness_mm, config.forces_n, maps["thickness"]),
@@ -123,19 +121,22 @@ def attempt(case: FailureCase) -> FailureOutcome:
     true = exact(zip(*scene, strict=True), kernels)
     gap, gel = jnp.asarray(scene.gap_mm[0]), jnp.asarray(kernels.gel, jnp.float32)
     found = jax.device_get(contact.solve(gap, force[0], gel, 0 * gel, spacing, thickness_mm=kernels.thickness_mm))
-    fields = {name: solve(gap, force[0], gel, gel, spacing)[0] for name, solve in OTHERS.items()}
-    fields |= {NESTED: found.displacement_mm}
+    fields = {COLUMNS[name]: solve(gap, force[0], gel, gel, spacing)[0] for name, solve in OTHERS.items()}
+    error_of = lambda field: float(displacement_error(np.asarray(field)[None], true)[0])
     valid = found.validity
     failed = {"not converged": valid.converged, "strain": valid.small_strain, "unresolved": valid.resolved}
-    return FailureOutcome(
-        errors={name: float(displacement_error(np.asarray(u)[None], true)[0]) for name, u in fields.items()},
-        finite=all(bool(np.all(np.isfinite(leaf))) for leaf in jax.tree.leaves(found)),
-        flagged=not bool(valid.all),
-        reason=", ".join(name for name, ok in failed.items() if not ok) or "–",
-        residual=float(found.residual),
-        iterations=int(found.iterations),
-        strain=float(found.strain),
-    )
+    row = {
+        "case": case.name,
+        "error": error_of(found.displacement_mm),
+        "residual": float(found.residual),
+        "iterations": int(found.iterations),
+        "u/h": float(found.strain),
+        "flagged for": ", ".join(name for name, ok in failed.items() if not ok) or "–",
+        "must be flagged": case.must_flag,
+        **{column: error_of(field) for column, field in fields.items()},
+    }
+    finite = all(bool(np.all(np.isfinite(leaf))) for leaf in jax.tree.leaves(found))
+    return FailureOutcome(row, not bool(valid.all), finite)
 
 
 def swept_cases(config: StabilityContactConfig) -> dict[str, list[list[FailureCase]]]:
@@ -256,12 +257,12 @@ def _area_px(pressure: jax.Array) -> jax.Array:
 
 
 def _verdict(suite: Mapping[str, FailureOutcome], ordinary: Mapping[str, float]) -> tuple[str, ...]:
-    worst = max(suite, key=lambda name: suite[name].errors[NESTED])
-    broken = {name: sum(o.errors[name] > MOST_ERROR for o in suite.values()) for name in OTHERS}
+    worst = max(suite, key=lambda name: suite[name].row["error"])
+    broken = {name: sum(o.row[COLUMNS[name]] > MOST_ERROR for o in suite.values()) for name in OTHERS}
     return (
         f"The package's solver deviates most from the float64 solution at '{worst}', by "
-        f"{suite[worst].errors[NESTED]:.1e}; it takes at most {max(o.iterations for o in suite.values())} iterations "
-        "in the suite.",
+        f"{suite[worst].row['error']:.1e}; it takes at most {max(o.row['iterations'] for o in suite.values())} "
+        "iterations in the suite.",
         f"Number of the {len(suite)} cases in which a method errs by more than twice the tolerance: "
         + ", ".join(f"{name} {count}" for name, count in broken.items())
         + ".",
@@ -270,25 +271,11 @@ def _verdict(suite: Mapping[str, FailureOutcome], ordinary: Mapping[str, float])
     )
 
 
-def _suite_table(cases: Sequence[FailureCase], suite: Mapping[str, FailureOutcome]) -> Table:
-    rows: list[dict[str, Cell]] = [
-        {
-            "case": case.name,
-            "error": o.errors[NESTED],
-            "residual": o.residual,
-            "iterations": o.iterations,
-            "u/h": o.strain,
-            "flagged for": o.reason,
-            "must be flagged": case.must_flag,
-            **{f"error of {name}": o.errors[name] for name in OTHERS},
-        }
-        for case, o in zip(cases, suite.values(), strict=True)
-    ]
-    errors = dict.fromkeys(("error", "residual", *(f"error of {name}" for name in OTHERS)), ".1e")
+def _suite_table(suite: Mapping[str, FailureOutcome]) -> Table:
     return named_table(
         "The failure suite",
-        rows,
-        formats={"iterations": "d", "u/h": ".2f", **errors},
+        [outcome.row for outcome in suite.values()],
+        formats={"iterations": "d", "u/h": ".2f", **dict.fromkeys((*COLUMNS.values(), "residual"), ".1e")},
         meanings={"error": "relative, of the displacement"},
     )
 
@@ -321,7 +308,7 @@ def _failure_map(
         content=heatmaps(
             [
                 Heatmap(
-                    np.nan_to_num([[o.errors[method] for o in row] for row in cells], nan=1.0, posinf=1.0),
+                    np.nan_to_num([[o.row[COLUMNS[method]] for o in row] for row in cells], nan=1.0, posinf=1.0),
                     rows=[f"{v:g}" for v in reversed(rows)],
                     columns=[f"{v:g}" for v in forces],
                     title=method,

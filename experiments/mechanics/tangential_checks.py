@@ -15,7 +15,7 @@ from experiments.core.results import Cell, Table, named_table
 from experiments.core.timing import median_ms
 from experiments.mechanics import tangential_scenes as scenes
 from experiments.mechanics.tangential_methods import dragged
-from sensors_io.scenes import history, partial_slip, tangential
+from sensors_io.scenes import history, tangential
 from sensors_io.scenes.hertz import Hertz, half_space_spectrum
 from sensors_io.scenes.sensors import BODY, SensorModel
 from sensors_io.scenes.traction import Compliance, make_coupling, rigid_field
@@ -94,13 +94,6 @@ def lubkin(grid: int, context: Context) -> float:
     return max(off)
 
 
-def promise(sensor: SensorModel, kind: str, error: float, modulus_mpa: float, radius_mm: float) -> PromiseCheck:
-    """Error of the superposition on one contact, and the error that `promised_error` predicts for it."""
-    body = dataclasses.replace(BODY, modulus_mpa=modulus_mpa)
-    promised = partial_slip.promised_error(sensor.gel, body, radius_mm)
-    return PromiseCheck(kind=kind, sensor=sensor.name, error=error, promised=promised)
-
-
 def promise_table(promises: Sequence[PromiseCheck]) -> Table:
     """Errors and promises by kind of body, by sensor, and of all."""
     groups: dict[str, list[PromiseCheck]] = {}
@@ -109,22 +102,16 @@ def promise_table(promises: Sequence[PromiseCheck]) -> Table:
             groups.setdefault(group_of(p), []).append(p)
     rows: list[dict[str, Cell]] = []
     for name, group in groups.items():
-        errors = 100 * np.array([p.error for p in group])
-        rows.append(
-            {
-                "contacts": name,
-                "count": len(group),
-                "error": float(np.median(errors)),
-                "error, 95th": float(np.quantile(errors, 0.95)),
-                "promised": 100 * float(np.median([p.promised for p in group])),
-                "kept": 100 * float(np.mean([p.kept for p in group])),
-            }
-        )
+        errors, promised = 100 * np.array([p.error for p in group]), [p.promised for p in group]
+        row = {"error": float(np.median(errors)), "error, 95th": float(np.quantile(errors, 0.95))}
+        row |= {"promised": 100 * float(np.median(promised)), "kept": 100 * float(np.mean([p.kept for p in group]))}
+        rows.append({"contacts": name, "count": len(group), **row})
+    figures = ("error", "error, 95th", "promised")
     return named_table(
         "Promised errors of the superposition, on contacts to which its constants were not fitted",
         rows,
-        formats={"count": "d", "error": ".1f", "error, 95th": ".1f", "promised": ".1f", "kept": ".0f"},
-        units=dict.fromkeys(("error", "error, 95th", "promised", "kept"), "%"),
+        formats={"count": "d", **dict.fromkeys(figures, ".1f"), "kept": ".0f"},
+        units=dict.fromkeys((*figures, "kept"), "%"),
         meanings={
             "error": "median, of the marker displacement, relative L₂",
             "promised": "median of `promised_error`",
@@ -135,18 +122,17 @@ def promise_table(promises: Sequence[PromiseCheck]) -> Table:
 
 def decision_table(promises: Sequence[PromiseCheck]) -> Table:
     """Contacts on which the superposition is accepted at a tolerance, and the share of right decisions."""
-    rows: list[dict[str, Cell]] = []
-    for tolerance in ACCEPTED_AT:
-        taken = [p for p in promises if p.promised <= tolerance]
-        right = sum(p.error <= tolerance for p in taken)
-        rows.append(
-            {
-                "tolerance": f"{100 * tolerance:g} %",
-                "taken": 100 * len(taken) / len(promises),
-                "of these within": 100 * right / len(taken) if taken else None,
-                "in hindsight": 100 * sum(p.error <= tolerance for p in promises) / len(promises),
-            }
-        )
+    error, promised = (np.array([getattr(p, field) for p in promises]) for field in ("error", "promised"))
+    percent = lambda chosen: 100 * int(chosen.sum()) / len(chosen) if len(chosen) else None
+    rows: list[dict[str, Cell]] = [
+        {
+            "tolerance": f"{100 * tolerance:g} %",
+            "taken": percent(promised <= tolerance),
+            "of these within": percent(error[promised <= tolerance] <= tolerance),
+            "in hindsight": percent(error <= tolerance),
+        }
+        for tolerance in ACCEPTED_AT
+    ]
     figures = ("taken", "of these within", "in hindsight")
     return named_table(
         "The superposition, where it promises the tolerance",

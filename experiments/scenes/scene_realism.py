@@ -139,22 +139,22 @@ def _distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) -
                 "intensity": found.intensity,
                 "gradient": found.gradient,
                 "spectrum": found.spectrum_db,
-                "told apart": mean,
+                "right": mean,
                 "±": error,
             }
             for name, (found, mean, error) in rows.items()
         ],
-        formats={"told apart": ".1f", "±": ".1f"},
+        formats={"right": ".1f", "±": ".1f"},
         units={
             **{"difference": "levels", "intensity": "levels", "gradient": "levels/px"},
-            **{"spectrum": "dB", "told apart": "%", "±": "%"},
+            **{"spectrum": "dB", "right": "%", "±": "%"},
         },
         meanings={
             "difference": "rms difference of pictures of the same touch",
             "intensity": "Wasserstein-1 distance of the intensities",
             "gradient": "the same for the magnitude of the gradient",
             "spectrum": "rms of the ratio of the powers over rings of wave numbers",
-            "told apart": "patches assigned rightly; 50 is chance",
+            "right": "patches assigned to the right set; 50 is chance",
             "±": "its standard error over presses",
         },
     )
@@ -201,12 +201,12 @@ def _side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictu
 def _verdict(
     rows: Mapping[str, tuple[PictureDistances, float, float]], shadows: Mapping[str, float]
 ) -> tuple[str, ...]:
-    (before, told_before, _), (after, told_after, error) = rows["lamps by eye"], rows["fitted, with grain"]
+    (before, right_before, _), (after, right_after, error) = rows["lamps by eye"], rows["fitted, with grain"]
     return (
         f"Fitted optics bring generated presses from {before.pixel:.1f} to {after.pixel:.1f} grey levels of the real "
         f"ones, and the spectrum from {before.spectrum_db:.1f} to {after.spectrum_db:.1f} dB.",
-        f"A classifier assigns {told_after:.0f} ± {error:.0f} % of the patches rightly, {told_before:.0f} % with lamps "
-        "by eye; 50 % would be chance.",
+        f"A classifier assigns {right_after:.0f} ± {error:.0f} % of the patches to the right set, {right_before:.0f} % "
+        "with lamps by eye; 50 % would be chance.",
         f"Cast shadows would explain {100 * shadows['explained']:.1f} % of the residual of the fit: "
         f"{shadows['left_levels']:.2f} levels with them, {shadows['residual_levels']:.2f} without.",
     )

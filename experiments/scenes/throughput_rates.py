@@ -110,27 +110,26 @@ def part_costs(config: SceneConfig, order: int, objects: int) -> dict[str, float
     return {"pressure": normal, "friction": slid - fields, "fields": fields - normal, "picture": whole - fields}
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MachineRates:
-    """Measured rates of one core: float32 operations of matrix products, bytes copied, a pair of padded transforms."""
+def picture_floor(padded: int, grid: int, image_px: int) -> dict[str, float]:
+    """Lower bound of the time of a picture, ms, from its operations and bytes at measured rates of one core.
 
-    flops_per_s: float
-    bytes_per_s: float
-    transform_s: float
-
-
-def measure_machine(padded: int, grid: int, image_px: int) -> MachineRates:
-    """Rates at the sizes that records have: cubic resampling products, copies of a picture in floats, transforms."""
+    The rates are those of float32 matrix products (cubic resampling), GFLOP/s, and of copies of a picture, GB/s; also
+    given is the time of a pair of padded transforms, ms.
+    """
     left, field = jnp.ones((image_px, grid)), jnp.ones((grid, grid))
     product = jax.jit(lambda a, b: a @ b @ a.T)
     flops = 2 * (image_px * grid * grid + image_px * grid * image_px)
     picture = np.ones((image_px, image_px, 3), np.float32)
     forth = jax.jit(lambda p: jnp.fft.irfft2(jnp.fft.rfft2(p, s=(padded, padded)), s=(padded, padded))[:grid, :grid])
-    return MachineRates(
-        flops_per_s=flops / _seconds(lambda: product(left, field)),
-        bytes_per_s=2 * picture.nbytes / _seconds(picture.copy),
-        transform_s=_seconds(lambda: forth(field)),
-    )
+    flops_per_s = flops / _seconds(lambda: product(left, field))
+    bytes_per_s = 2 * picture.nbytes / _seconds(picture.copy)
+    size = image_px * image_px * 3 * 5  # each float of the picture written once, one byte of the result
+    return {
+        "products": flops_per_s / 1e9,
+        "copies": bytes_per_s / 1e9,
+        "pair of transforms": 1e3 * _seconds(lambda: forth(field)),
+        "floor": 1e3 * (4 * flops / flops_per_s + size / bytes_per_s),
+    }
 
 
 def _seconds(call: Callable[[], Any]) -> float:

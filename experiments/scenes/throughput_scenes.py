@@ -301,23 +301,10 @@ def _part_table(config: ThroughputConfig, parts: Parts) -> Table:
 
 
 def _floor_table(config: ThroughputConfig) -> Table:
-    """Time of the counted operations and bytes of a picture and of a solve at the machine's measured rates."""
     sensor, grid = MODELS[1], config.contact_grid
     padded = padded_size(grid, sensor.window_mm, sensor.gel.thickness_mm)
-    rows: list[dict[str, Cell]] = []
-    for px in (config.image_px, config.large_px):
-        machine = throughput_rates.measure_machine(padded, grid, px)
-        flops = 4 * 2 * (px * grid * grid + px * grid * px)
-        size = px * px * 3 * 5  # each float of the picture written once, one byte of the result
-        rows.append(
-            {
-                "picture": f"{px}²",
-                "products": machine.flops_per_s / 1e9,
-                "copies": machine.bytes_per_s / 1e9,
-                "pair of transforms": 1e3 * machine.transform_s,
-                "floor": 1e3 * (flops / machine.flops_per_s + size / machine.bytes_per_s),
-            }
-        )
+    sides = (config.image_px, config.large_px)
+    rows = [{"picture": f"{px}²", **throughput_rates.picture_floor(padded, grid, px)} for px in sides]
     return named_table(
         "Lower bound for a picture of markers",
         rows,

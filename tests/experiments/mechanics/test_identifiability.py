@@ -21,7 +21,7 @@ from experiments.mechanics.identify_probes import SOURCES, STATIC
 from sensors_io.scenes import schedule, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import make_kernels
-from sensors_io.scenes.sensors import MODELS, TAC3D, XENSE
+from sensors_io.scenes.sensors import MODELS, XENSE
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import SENSORS, Phase
 from tests.experiments.shrunk import run_shrunk
@@ -51,11 +51,7 @@ def test_a_shrunken_study_fills_every_table(tmp_path):
     assert len(moved) == 6
     for row in (*touch, *blind, *tiers, *moved):
         assert np.all(np.abs(row[1:]) <= 100), row  # a percentage or a difference of two
-    assert [r["name"].split(":")[0] for r in results["requirements"]] == [
-        "trained at 24², tested on exact records",
-        "trained at 24², 0.01, tested on exact records",
-        "control",
-    ]
+    assert len(results["requirements"]) == 3  # two tiers in use and the control
 
 
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
@@ -88,31 +84,24 @@ def test_a_press_is_the_generators_own(order):
 
 
 def test_noise_is_scaled_and_nothing_else():
-    assert identify_presses.noisier(XENSE, 1.0) == XENSE
     louder = identify_presses.noisier(XENSE, 3.0)
-    assert louder.depth_noise_mm == pytest.approx(3 * XENSE.depth_noise_mm)
-    assert louder.lateral_noise_mm == pytest.approx(3 * XENSE.lateral_noise_mm)
-    assert louder.shot_noise == pytest.approx(tuple(3 * s for s in XENSE.shot_noise))
-    silent = identify_presses.noisier(TAC3D, 0.0)
-    assert silent.read_noise == (0, 0, 0)
-    assert (silent.gel, silent.window_mm, silent.name) == (TAC3D.gel, TAC3D.window_mm, TAC3D.name)
+    assert (louder.depth_noise_mm, louder.lateral_noise_mm) == (3 * XENSE.depth_noise_mm, 3 * XENSE.lateral_noise_mm)
+    assert louder.shot_noise == tuple(3 * s for s in XENSE.shot_noise)
+    assert identify_presses.noisier(XENSE, 0.0).read_noise == (0, 0, 0)
+    noise = ("depth_noise_mm", "lateral_noise_mm", "read_noise", "shot_noise")
+    assert dataclasses.replace(louder, **{name: getattr(XENSE, name) for name in noise}) == XENSE
 
 
 def skin(radius_mm=(20.0, 40.0), wave_mm=1.5, amplitude_mm=0.0):
     """A paraboloid with one plane wave along x."""
-    f = lambda value: jnp.asarray(value, jnp.float32)
-    return surface.Skin(
-        curvature_per_mm=f(1 / np.array(radius_mm)),
-        turn_rad=f(0.3),
-        feature_height_mm=f(0.0),
-        feature_pitch_mm=f(3.0),
-        feature_width=f(0.2),
-        pattern=jnp.asarray(0),
-        site_mm=f(np.zeros(2)),
-        wave_numbers=f([[2 * np.pi / wave_mm, 0.0]]),
-        wave_amplitudes_mm=f([amplitude_mm]),
-        wave_phases_rad=f([0.0]),
-    )
+    features = {"feature_height_mm": 0.0, "feature_pitch_mm": 3.0, "feature_width": 0.2}
+    waves = {
+        "wave_numbers": [[2 * np.pi / wave_mm, 0.0]],
+        "wave_amplitudes_mm": [amplitude_mm],
+        "wave_phases_rad": [0.0],
+    }
+    fields = {"curvature_per_mm": 1 / np.array(radius_mm), "turn_rad": 0.3, "site_mm": np.zeros(2), **features, **waves}
+    return surface.Skin(pattern=jnp.asarray(0), **{name: jnp.asarray(v, jnp.float32) for name, v in fields.items()})
 
 
 def test_statistics_of_a_paraboloid():
@@ -199,10 +188,10 @@ def test_points_are_clustered_by_object():
 def test_frames_of_a_motion_are_those_in_which_something_changes():
     a, load, hold, un = (p.value for p in (Phase.APPROACH, Phase.LOAD, Phase.HOLD, Phase.UNLOAD))
     phase = np.array([a, a, load, load, hold, hold, hold, un, un])
-    np.testing.assert_array_equal(identify_motions.look_at(phase, 3), [0, 2, 8])
-    np.testing.assert_array_equal(identify_motions.look_at(phase, 5), [0, 2, 3, 7, 8])
-    with pytest.raises(ValueError, match="moments is 6: only 5 frames are there"):
-        identify_motions.look_at(phase, 6)
+    np.testing.assert_array_equal(identify_motions.choose_frames(phase, 3), [0, 2, 8])
+    np.testing.assert_array_equal(identify_motions.choose_frames(phase, 5), [0, 2, 3, 7, 8])
+    with pytest.raises(ValueError, match="moments is 6: only 5 frames differ"):
+        identify_motions.choose_frames(phase, 6)
 
 
 def test_jobs_keep_their_order_and_their_errors():

@@ -47,16 +47,9 @@ def test_hindsight_takes_the_cheapest_setting_that_meets_the_error():
 
 
 def test_a_summary_counts_shares_and_times():
-    made = ChooserTrial(
-        asked=0.1,
-        index=np.array([1, 0, 2]),
-        met=np.array([True, True, False]),
-        error=np.array([0.09, 0.16, 0.7]),
-        best=np.array([1, 2, -1]),
-        seconds=np.array([0.003]),
-        hindsight=np.array([0.006]),
-        possible=np.array([2]),
-    )
+    scenes = {"index": [1, 0, 2], "met": [True, True, False], "error": [0.09, 0.16, 0.7], "best": [1, 2, -1]}
+    times = {"seconds": [0.003], "hindsight": [0.006], "possible": [2]}
+    made = ChooserTrial(asked=0.1, **{name: np.array(values) for name, values in (scenes | times).items()})
     found = trial.summary(made, ERROR, COST)
     assert found["kept"] == 0.5
     assert found["kept of all"] == pytest.approx(1 / 3)
@@ -101,12 +94,8 @@ def test_the_fit_finds_the_law_that_made_the_errors():
 
 
 def test_frames_count_only_where_they_were_promised():
-    made = SequenceTrial(
-        asked=0.1,
-        grid=np.array([64, 128]),
-        met=np.array([True, False]),
-        error=np.array([[0.05, 0.16], [0.9, 0.9]]),
-    )
+    error = np.array([[0.05, 0.16], [0.9, 0.9]])
+    made = SequenceTrial(asked=0.1, grid=np.array([64, 128]), met=np.array([True, False]), error=error)
     assert made.kept_share == 0.5
     assert made.kept.tolist() == [[True, False], [False, False]]
 
@@ -136,13 +125,11 @@ def test_families_are_what_they_say():
 
 def measurements(error: np.ndarray, features: np.ndarray | None = None) -> MenuMeasurements:
     count, settings = error.shape
+    lengths = {"radius_mm": 3.0, "slope_share": 0.0, "window_mm": 18.0, "thickness_mm": 4.0}
     return MenuMeasurements(
         features=np.ones((count, len(FEATURES))) if features is None else features,
-        radius_mm=np.full(count, 3.0),
-        slope_share=np.zeros(count),
-        window_mm=np.full(count, 18.0),
-        thickness_mm=np.full(count, 4.0),
+        **{name: np.full(count, value) for name, value in lengths.items()},
         errors=error,
         ms=np.ones((1, settings)),
-        family=np.array(["balls"] * count),
+        family=np.full(count, "balls"),
     )
