@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Sequence
 
 import jax
@@ -145,15 +146,16 @@ def try_sequences(order: int, count: int, asked: Sequence[float], seed: int) -> 
     rng = np.random.default_rng([seed, order])
     chosen = range(0, config.contact_count, 2)
     drawn = [draw(config, index, protocol.slot(config, index), order) for index in chosen]
-    paths = [_some_frames(each, rng) for each in drawn]
-    true = [_reference_frames(each, path) for each, path in zip(drawn, paths, strict=True)]
+    sides, paths, true = GridSizes(contact_grid=REFERENCE_GRID, image_px=REFERENCE_GRID), [], []
+    for each in drawn:
+        touching = np.nonzero(np.asarray(each.press.path.force_n) > 0)[0]
+        frames = np.sort(rng.choice(touching, FRAMES, replace=len(touching) < FRAMES))
+        path = jax.tree.map(operator.itemgetter(frames), each.press.path)
+        kernels = _reference_kernels(each.sensor)
+        found = _solve(each.press, path, each.unit, kernels, REFERENCE_TOLERANCE, each.sensor, sides)
+        paths.append(path)
+        true.append(jax.vmap(lambda u: nested.coarsen(u, 2))(found))  # on half the reference's grid, [FRAMES, K, K]
     return [_solve_at(error, drawn, paths, true) for error in asked]
-
-
-def _some_frames(drawn: Draw, rng: np.random.Generator) -> Path:
-    touching = np.nonzero(np.asarray(drawn.press.path.force_n) > 0)[0]
-    frames = np.sort(rng.choice(touching, FRAMES, replace=len(touching) < FRAMES))
-    return jax.tree.map(lambda leaf: leaf[frames], drawn.press.path)
 
 
 def _solve_at(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: Sequence[Array]) -> SequenceTrial:
@@ -169,14 +171,6 @@ def _solve_at(asked: float, drawn: Sequence[Draw], paths: Sequence[Path], true: 
         met=np.array([e.met for e in efforts]),
         error=np.stack(errors),
     )
-
-
-def _reference_frames(drawn: Draw, path: Path) -> Array:
-    """Displacement on half the reference's grid, [FRAMES, K, K]."""
-    sides = GridSizes(contact_grid=REFERENCE_GRID, image_px=REFERENCE_GRID)
-    kernels = _reference_kernels(drawn.sensor)
-    found = _solve(drawn.press, path, drawn.unit, kernels, REFERENCE_TOLERANCE, drawn.sensor, sides)
-    return jax.vmap(lambda u: nested.coarsen(u, 2))(found)
 
 
 @functools.lru_cache(maxsize=2)

@@ -33,7 +33,7 @@ from experiments.mechanics.identify_features import ContactData
 from experiments.mechanics.identify_motions import MOTIONS, MotionData
 from experiments.mechanics.identify_presses import ContactTier, PressData, press
 from experiments.mechanics.identify_probes import DYNAMIC, FORCE, FUSED, SHAPE, STATIC
-from experiments.mechanics.identify_report import CHANCE, MAY_LOSE, ProbeFigures, StudyPredictions
+from experiments.mechanics.identify_report import CHANCE, MAY_LOSE, StudyPredictions
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig, require
 from sensors_io.scenes.validity import STRAIN_LIMIT
@@ -141,18 +141,18 @@ def _predict(
 
 def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Results:
     """The report."""
-    made, scenes, by_tier = report.figures(studied), config.presses, studied.pressed.by_tier
+    scenes, by_tier = config.presses, studied.pressed.by_tier
     strain = by_tier[studied.exact, 0].strain
     return Results(
-        verdict=_verdict(config, studied, made),
-        requirements=_requirements(config, studied, made),
+        verdict=_verdict(config, studied),
+        requirements=_requirements(config, studied),
         tables=(
-            report.touch_table(studied, made),
-            report.blind_table(studied, made),
-            report.tier_table(studied, made),
-            report.motion_table(studied, made),
+            report.touch_table(studied),
+            report.blind_table(studied),
+            report.tier_table(studied),
+            report.motion_table(studied),
         ),
-        pictures=(report.noise_picture(studied, made), report.tier_picture(made)),
+        pictures=(report.noise_picture(studied), report.tier_picture(studied)),
         settings={
             "presses": f"{len(studied.pressed.objects)} objects, {scenes.frame_count} frames of {scenes.min_force_n:g} "
             f"to {scenes.max_force_n:g} N, pictures of {scenes.image_px} px",
@@ -170,44 +170,45 @@ def findings(config: IdentifiabilityConfig, studied: StudyPredictions) -> Result
     )
 
 
-def _requirements(
-    config: IdentifiabilityConfig, studied: StudyPredictions, made: ProbeFigures
-) -> tuple[Requirement, ...]:
+def _requirements(config: IdentifiabilityConfig, studied: StudyPredictions) -> tuple[Requirement, ...]:
     """Loss of every tier in use, by its worst property.
 
     Springs, whose pressure is known to be wrong, must lose significantly more than that, or the comparison is blind.
     """
     kept = []
     for tier in (t.name for t in config.solved if t.grid >= config.coarsest_used):
-        name = max(STATIC, key=lambda name: made.lost[tier, name].mean)
-        worst = made.lost[tier, name]
+        name = max(STATIC, key=lambda name: studied.lost[tier, name].mean)
+        worst = studied.lost[tier, name]
         note = f"{name}, mean over sensors, 95 % from {worst.low:.1f} to {worst.high:.1f}"
         title = f"trained at {tier}, tested on exact records: lost at worst"
         kept.append(at_most(title, worst.mean, MAY_LOSE, "points", note))
-    control = made.lost[studied.springs, STATIC[0]]
+    control = studied.lost[studied.springs, STATIC[0]]
     note = f"lower end of the 95 % interval about {control.mean:.1f}"
     title = f"control: {STATIC[0]} lost by {studied.springs}, at least"
     return (*kept, at_least(title, control.low, MAY_LOSE, "points", note))
 
 
-def _verdict(config: IdentifiabilityConfig, studied: StudyPredictions, made: ProbeFigures) -> tuple[str, ...]:
+def _verdict(config: IdentifiabilityConfig, studied: StudyPredictions) -> tuple[str, ...]:
     own, last, hardness = studied.own, len(studied.noise) - 1, STATIC[0]
-    fused = {name: made.touch[name, FUSED, own].mean for name in STATIC}
+    accuracy = studied.accuracy
+    fused = {name: accuracy[name, FUSED, own].mean for name in STATIC}
     fall = {
-        name: float(np.mean([made.touch[name, s, own].mean - made.touch[name, s, last].mean for s in SENSORS]))
+        name: float(
+            np.mean([studied.accuracy[name, s, own].mean - studied.accuracy[name, s, last].mean for s in SENSORS])
+        )
         for name in STATIC
     }
-    moved = {key: one.mean for key, one in made.moved.items()}
+    moved = {key: one.mean for key, one in studied.moved_accuracy.items()}
     used = [t.name for t in config.solved if t.grid >= config.coarsest_used]
-    tier, name = max(((t, n) for t in used for n in STATIC), key=lambda key: made.lost[key].mean)
+    tier, name = max(((t, n) for t in used for n in STATIC), key=lambda key: studied.lost[key].mean)
     return (
         f"Right answers of all four sensors together about unseen objects: {_listed(fused, '%')}. For {hardness}, true "
-        f"shape alone gives {made.blind[hardness, SHAPE].mean:.0f} %, force alone "
-        f"{made.blind[hardness, FORCE].mean:.0f} %, guessing {CHANCE:.0f} %.",
+        f"shape alone gives {studied.blind_accuracy[hardness, SHAPE].mean:.0f} %, force alone "
+        f"{studied.blind_accuracy[hardness, FORCE].mean:.0f} %, guessing {CHANCE:.0f} %.",
         f"Noise ×{studied.noise[last]:g} instead of ×1 costs a sensor {_listed(fall, 'points')}.",
         "Trained at a tier in use and tested on exact records, a probe loses at most "
-        f"{made.lost[tier, name].mean:.1f} points ({name}, {tier}); trained on springs, "
-        f"{made.lost[studied.springs, hardness].mean:.0f} of {hardness}.",
+        f"{studied.lost[tier, name].mean:.1f} points ({name}, {tier}); trained on springs, "
+        f"{studied.lost[studied.springs, hardness].mean:.0f} of {hardness}.",
         f"Touch without force predicts friction from a slide in {moved['friction', 'slide_x']:.0f} % and from a press "
         f"in {moved['friction', 'press']:.0f} %, elasticity from a press that is released in "
         f"{moved['elasticity', 'hold']:.0f} % and from one that is not in {moved['elasticity', 'press']:.0f} %.",

@@ -1,6 +1,7 @@
 """Figures, tables and pictures of `identifiability`."""
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 
@@ -39,9 +40,10 @@ ENDS = {"from": "lower end of the 95 % interval over objects", "to": "upper end"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudyPredictions:
-    """Predictions of all probes, keyed as in `identify_probes`; `motion` and `still` by motion first, the press too.
+    """Predictions of all probes, and their accuracies in % and losses in points, with intervals over objects.
 
-    `solved`, `springs` and `exact` name the tiers, `noise` the multiples of the sensors' noise.
+    Predictions are keyed as in `identify_probes`; `motion` and `still` by motion first, the press too.  `solved`,
+    `springs` and `exact` name the tiers, `noise` the multiples of the sensors' noise.
     """
 
     noise: tuple[float, ...]
@@ -67,50 +69,45 @@ class StudyPredictions:
         cheap = [self.tiers[tier, name, source].exact.right for source in sources]
         return np.stack(exact, 1) - np.stack(cheap, 1)
 
+    @functools.cached_property
+    def accuracy(self) -> dict[tuple[str, str, int], Interval]:
+        """Accuracy by property, source and level of noise."""
+        return {key: points(answers.right, self.pressed.objects) for key, answers in self.touch.items()}
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ProbeFigures:
-    """Accuracies in % and losses in points, with intervals over objects.
+    @functools.cached_property
+    def blind_accuracy(self) -> dict[tuple[str, str], Interval]:
+        """Accuracy without touch by property and source."""
+        return {key: points(answers.right, self.pressed.objects) for key, answers in self.blind.items()}
 
-    `touch` by property, source and level of noise; `blind` by property and source; `lost` by tier and property, mean
-    over sensors; `lost_by` by tier, property and source, without interval; `moved` by property and motion, of all
-    sensors without force.
-    """
+    @functools.cached_property
+    def lost(self) -> dict[tuple[str, str], Interval]:
+        """Loss by tier and property, mean over sensors."""
+        keys = itertools.product((*self.solved, self.springs), STATIC)
+        return {key: points(self.losses(*key, SENSORS), self.pressed.objects) for key in keys}
 
-    touch: dict[tuple[str, str, int], Interval]
-    blind: dict[tuple[str, str], Interval]
-    lost: dict[tuple[str, str], Interval]
-    lost_by: dict[tuple[str, str, str], float]
-    moved: dict[tuple[str, str], Interval]
+    def lost_by(self, tier: str, name: str, source: str) -> float:
+        """Loss of one source, without interval."""
+        return 100 * float(self.losses(tier, name, (source,)).mean())
 
-
-def figures(studied: StudyPredictions) -> ProbeFigures:
-    """All figures of tables, pictures and sentences."""
-    objects = studied.pressed.objects
-    keys = [(tier, name) for tier in (*studied.solved, studied.springs) for name in STATIC]
-    moved = {"press": objects} | {motion: data.objects for motion, data in studied.moved.items()}
-    return ProbeFigures(
-        touch={key: points(answers.right, objects) for key, answers in studied.touch.items()},
-        blind={key: points(answers.right, objects) for key, answers in studied.blind.items()},
-        lost={key: points(studied.losses(*key, SENSORS), objects) for key in keys},
-        lost_by={(*key, s): 100 * float(studied.losses(*key, (s,)).mean()) for key in keys for s in SOURCES},
-        moved={
-            (name, motion): points(answers[name, FUSED].right, moved[motion])
-            for motion, answers in studied.motion.items()
-            for name in DYNAMIC
-        },
-    )
+    @functools.cached_property
+    def moved_accuracy(self) -> dict[tuple[str, str], Interval]:
+        """Accuracy of all sensors without force by property and motion."""
+        objects = {"press": self.pressed.objects} | {motion: data.objects for motion, data in self.moved.items()}
+        keys = itertools.product(DYNAMIC, self.motion)
+        return {
+            (name, motion): points(self.motion[motion][name, FUSED].right, objects[motion]) for name, motion in keys
+        }
 
 
-def touch_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+def touch_table(studied: StudyPredictions) -> Table:
     """Accuracy of every property by every source over the noise."""
     rows: list[dict[str, Cell]] = []
     for name, source in itertools.product(STATIC, SOURCES):
-        own = found.touch[name, source, studied.own]
+        own = studied.accuracy[name, source, studied.own]
         rows.append(
             {
                 "property, sensor": f"{name}, {source}",
-                **{f"noise ×{f:g}": found.touch[name, source, i].mean for i, f in enumerate(studied.noise)},
+                **{f"noise ×{f:g}": studied.accuracy[name, source, i].mean for i, f in enumerate(studied.noise)},
                 "×1 from": own.low,
                 "×1 to": own.high,
                 "two levels off": studied.touch[name, source, studied.own].far_off,
@@ -129,13 +126,13 @@ def touch_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     )
 
 
-def blind_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+def blind_table(studied: StudyPredictions) -> Table:
     """Accuracy without touch."""
     rows: list[dict[str, Cell]] = []
     for name in STATIC:
         row: dict[str, Cell] = {"property": name}
         for source in (SHAPE, FORCE):
-            one = found.blind[name, source]
+            one = studied.blind_accuracy[name, source]
             row |= {source: one.mean, f"{source}, from": one.low, f"{source}, to": one.high}
         counts = np.bincount(studied.pressed.levels[name])
         rows.append(row | {"commonest level": 100 * float(counts.max()) / len(studied.pressed.objects)})
@@ -153,10 +150,10 @@ def blind_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     )
 
 
-def tier_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+def tier_table(studied: StudyPredictions) -> Table:
     """Accuracy on exact records of probes trained at each tier."""
     rows: list[dict[str, Cell]] = []
-    for (tier, name), lost in found.lost.items():
+    for (tier, name), lost in studied.lost.items():
         answers = [studied.tiers[tier, name, sensor] for sensor in SENSORS]
         rows.append(
             {
@@ -166,7 +163,7 @@ def tier_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
                 "lost": lost.mean,
                 "from": lost.low,
                 "to": lost.high,
-                **{source: found.lost_by[tier, name, source] for source in SOURCES},
+                **{source: studied.lost_by(tier, name, source) for source in SOURCES},
             }
         )
     return _percent_table(
@@ -184,12 +181,12 @@ def tier_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     )
 
 
-def motion_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
+def motion_table(studied: StudyPredictions) -> Table:
     """Friction and elasticity by motion, by touch without force and without touch."""
     percent = lambda answers: 100 * float(answers.right.mean())
     rows: list[dict[str, Cell]] = []
     for name, motion in itertools.product(DYNAMIC, studied.motion):
-        fused = found.moved[name, motion]
+        fused = studied.moved_accuracy[name, motion]
         rows.append(
             {
                 "property by motion": f"{name} by {motion}",
@@ -214,14 +211,14 @@ def motion_table(studied: StudyPredictions, found: ProbeFigures) -> Table:
     )
 
 
-def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
+def noise_picture(studied: StudyPredictions) -> Picture:
     """Accuracy of every source over the noise."""
     at = range(len(studied.noise))
     shifts = dict(zip(SOURCES, np.linspace(-0.12, 0.12, len(SOURCES)), strict=True))
     panels = [
         Panel(
             [
-                estimates(s, [found.touch[name, s, level] for level in at], at=at, shift=float(shift))
+                estimates(s, [studied.accuracy[name, s, level] for level in at], at=at, shift=float(shift))
                 for s, shift in shifts.items()
             ],
             title=name,
@@ -230,8 +227,8 @@ def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
             x_ticks={float(i): f"×{factor:g}" for i, factor in enumerate(studied.noise)},
             x_limits=(-0.35, len(at) - 0.65),
             rules=[
-                Rule(y=found.blind[name, SHAPE].mean, name=SHAPE, line="--", colour=SHARED),
-                Rule(y=found.blind[name, FORCE].mean, name=FORCE, line=":", colour=SHARED),
+                Rule(y=studied.blind_accuracy[name, SHAPE].mean, name=SHAPE, line="--", colour=SHARED),
+                Rule(y=studied.blind_accuracy[name, FORCE].mean, name=FORCE, line=":", colour=SHARED),
                 Rule(y=CHANCE, name="guessing", line="-", colour=SHARED, width=0.6),
             ],
         )
@@ -246,14 +243,14 @@ def noise_picture(studied: StudyPredictions, found: ProbeFigures) -> Picture:
     )
 
 
-def tier_picture(found: ProbeFigures) -> Picture:
+def tier_picture(studied: StudyPredictions) -> Picture:
     """Points lost by tier."""
-    tiers = list(dict.fromkeys(tier for tier, _ in found.lost))
+    tiers = list(dict.fromkeys(tier for tier, _ in studied.lost))
     panels = []
     for name in STATIC:
-        lost = [found.lost[tier, name] for tier in tiers]
+        lost = [studied.lost[tier, name] for tier in tiers]
         colour = [PALETTE[0] if one.mean <= MAY_LOSE else PALETTE[1] for one in lost]
-        each = [(found.lost_by[tier, name, s], row) for row, tier in enumerate(tiers) for s in SENSORS]
+        each = [(studied.lost_by(tier, name, s), row) for row, tier in enumerate(tiers) for s in SENSORS]
         x, y = zip(*each, strict=True)
         panels.append(
             Panel(

@@ -78,8 +78,8 @@ def run(config: ParetoContactConfig, context: Context) -> Results:
             at_most("Hertz peak pressure, a/dx ≥ 4", hertz["peak"], 0.01),
             *(at_most(f"pressure against {name}", error, 1e-3) for name, error in oracles.items()),
         ),
-        tables=(_method_table(rows, config), _grid_table(ladder), contact_oracles.oracle_table(oracles), published),
-        pictures=(_method_picture(rows), _grid_picture(ladder)),
+        tables=(*_tables(rows, ladder, config), contact_oracles.oracle_table(oracles), published),
+        pictures=_pictures(rows, ladder),
         settings={
             "sensor": SENSOR.name,
             "grid": config.grid,
@@ -168,54 +168,52 @@ def _verdict(
     )
 
 
-def _method_table(rows: Rows, config: ParetoContactConfig) -> Table:
+def _tables(rows: Rows, ladder: Mapping[int, Mapping[str, float]], config: ParetoContactConfig) -> tuple[Table, ...]:
     ratio, errors = f"against {BASELINE}", ("u median", "u p95", "slope median", "slope p95")
-    return named_table(
-        f"Tiers at {config.grid}², {config.scenes} random scenes",
-        [{"method": name, **row} for name, row in rows.items()],
-        formats={"time": ".2f", ratio: ".2f", "convolutions": ".1f", **dict.fromkeys(errors, ".1e")},
-        units={"time": "ms"},
-        meanings={
-            ratio: "median over rounds of the ratio within a round",
-            "convolutions": "padded, on this grid, mean over scenes",
-        },
-        note="Errors are relative L₂, compared with the float64 solution on the same grid.",
+    return (
+        named_table(
+            f"Tiers at {config.grid}², {config.scenes} random scenes",
+            [{"method": name, **row} for name, row in rows.items()],
+            formats={"time": ".2f", ratio: ".2f", "convolutions": ".1f", **dict.fromkeys(errors, ".1e")},
+            units={"time": "ms"},
+            meanings={
+                ratio: "median over rounds of the ratio within a round",
+                "convolutions": "padded, on this grid, mean over scenes",
+            },
+            note="Errors are relative L₂, compared with the float64 solution on the same grid.",
+        ),
+        named_table(
+            "The package's solver at 1e-3 on every grid",
+            [{"grid": f"{n}²", **row} for n, row in ladder.items()],
+            formats={"time": ".2f", **dict.fromkeys(("u", "slope", "slope p95"), ".1e")},
+            units={"time": "ms"},
+            note=f"Errors compared with the solution on {max(ladder)}², to which the others are interpolated by cubic "
+            "splines.",
+        ),
     )
 
 
-def _grid_table(ladder: Mapping[int, Mapping[str, float]]) -> Table:
-    return named_table(
-        "The package's solver at 1e-3 on every grid",
-        [{"grid": f"{n}²", **row} for n, row in ladder.items()],
-        formats={"time": ".2f", **dict.fromkeys(("u", "slope", "slope p95"), ".1e")},
-        units={"time": "ms"},
-        note=f"Errors compared with the solution on {max(ladder)}², to which the others are interpolated by cubic "
-        "splines.",
-    )
-
-
-def _method_picture(rows: Rows) -> Picture:
+def _pictures(rows: Rows, ladder: Mapping[int, Mapping[str, float]]) -> tuple[Picture, Picture]:
     groups: dict[str, list[Point]] = {}
     for name, row in rows.items():
         label = name.removeprefix("nested ").removeprefix("plain ")
         groups.setdefault(METHODS[name].kind, []).append((label, row["time"], row["slope median"], row["slope p95"]))
-    return Picture(
-        name="pareto_contact",
-        title="Speed against error",
-        caption="Slope error compared with the float64 solution on the same grid; bars reach from the median to the "
-        "95th percentile; the dotted corner is the requirement for tolerance 1e-3.",
-        content=speed_against_error(groups, "slope error", (2.5, 0.05)),
-    )
-
-
-def _grid_picture(ladder: Mapping[int, Mapping[str, float]]) -> Picture:
     points = [(f"{n}²", r["time"], max(r["slope"], 1e-4), max(r["slope p95"], 1e-4)) for n, r in ladder.items()]
-    return Picture(
-        name="pareto_grid",
-        title="Speed against error by grid",
-        caption="Slope error compared with the finest grid's solution at 1e-4; bars reach from the median to the 95th "
-        "percentile. The error of the finest grid comes from its tolerance alone.",
-        content=speed_against_error({MAIN: points}, "slope error", None),
+    return (
+        Picture(
+            name="pareto_contact",
+            title="Speed against error",
+            caption="Slope error compared with the float64 solution on the same grid; bars reach from the median to "
+            "the 95th percentile; the dotted corner is the requirement for tolerance 1e-3.",
+            content=speed_against_error(groups, "slope error", (2.5, 0.05)),
+        ),
+        Picture(
+            name="pareto_grid",
+            title="Speed against error by grid",
+            caption="Slope error compared with the finest grid's solution at 1e-4; bars reach from the median to the "
+            "95th percentile. The error of the finest grid comes from its tolerance alone.",
+            content=speed_against_error({MAIN: points}, "slope error", None),
+        ),
     )
 
 

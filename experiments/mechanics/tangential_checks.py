@@ -1,6 +1,7 @@
 """Checks of friction: closed forms, promised errors, the effect of coupling, load–unload loops of real presses."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -199,16 +200,12 @@ def coupling_rows(sensor: SensorModel, grid: int, frames: int, bodies: int, seed
     gel, body = (make_coupling(layer, size, spacing) for layer in (sensor.gel, BODY))
     rng = np.random.default_rng([seed, 2])
     drawn = [scenes.draw(rng, scenes.KINDS[i % len(scenes.KINDS)]) for i in range(bodies)]
+    solve_all = lambda motions, couplings: [_frames(m, kernels, c) for m, c in zip(motions, couplings, strict=True)]
     rows = []
     for name in MOTIONS:
         motions = [scenes.make_motion(kernels, each, name, frames) for each in drawn]
         couplings = {"without": [None] * bodies, "with": [gel - body / m.modulus_mpa for m in motions]}
-        calls = {
-            key: lambda couplings=couplings[key], motions=motions: [
-                _frames(motion, kernels, each) for motion, each in zip(motions, couplings, strict=True)
-            ]
-            for key in couplings
-        }
+        calls = {key: functools.partial(solve_all, motions, each) for key, each in couplings.items()}
         without, coupled = (jax.device_get(call()) for call in calls.values())
         ms = {key: time / (bodies * frames) for key, time in median_ms(calls, range(_ROUNDS)).items()}
         before, after = (np.stack([f.displacement_mm[:, :2] for f in found]) for found in (without, coupled))
