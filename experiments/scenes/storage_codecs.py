@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import struct
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -100,17 +101,10 @@ def _arrays(
     return _entries(name, kind, options, encode, decode)
 
 
-def _left_differences(clip: np.ndarray, _: str) -> np.ndarray:
-    """Each pixel less the one to its left."""
-    residual = clip.copy()
-    residual[:, :, 1:] -= clip[:, :, :-1]
-    return residual
-
-
 _UNCHANGED: Transform = (lambda clip, _: clip, lambda flat, shape, _: flat.reshape(shape))
 _DELTAS: Transform = (difference, lambda flat, shape, name: accumulate(flat.reshape(shape), name))
-_COLUMNS: Transform = (
-    _left_differences,
+_COLUMNS: Transform = (  # each pixel less the one to its left
+    lambda clip, _: np.diff(clip, axis=2, prepend=np.uint8(0)),
     lambda flat, shape, _: np.cumsum(flat.reshape(shape), axis=2, dtype=np.uint8),
 )
 _PLANES: Transform = (  # Blosc's byte shuffle for pixels of three bytes: all first bytes, all second, all third
@@ -155,20 +149,16 @@ def _video(name: str, fourcc: str, suffix: str) -> Codec:
             writer.release()
 
     def load(folder: Path) -> list[np.ndarray]:
-        return [_decode(cv2.VideoCapture(str(file))) for file in sorted(folder.iterdir())]
+        clips = []
+        for file in sorted(folder.iterdir()):
+            capture = cv2.VideoCapture(str(file))
+            read = (capture.read()[1] for _ in itertools.count())
+            frames = list(itertools.takewhile(lambda frame: frame is not None, read))
+            capture.release()
+            clips.append(np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8))
+        return clips
 
     return Codec(name=name, kind="video", store=store, load=load)
-
-
-def _decode(capture: cv2.VideoCapture) -> np.ndarray:
-    frames = []
-    while True:
-        ok, frame = capture.read()
-        if not ok:
-            break
-        frames.append(frame)
-    capture.release()
-    return np.stack(frames) if frames else np.empty((0, 0, 0, 3), np.uint8)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
