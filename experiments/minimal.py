@@ -2,9 +2,9 @@
 
     python -m experiments.minimal
 
-Objects are generated and pressed by four sensors; a policy of half a million parameters learns from scratch to say how
-hard, rough and protruding they are, in a minute and a half on two cores.  Every step of the method is a plain call
-below; `EXP=ablation_ordinal` adds controls, baselines, checkpoints, five seeds and a report.
+Objects are generated and pressed by four sensors; a policy of half a million parameters learns from scratch how hard,
+rough and protruding they are, in a minute and a half on two cores.  Every step of the method is a plain call below;
+`EXP=ablation_ordinal` adds controls, baselines, checkpoints, five seeds and a report.
 """
 
 import tempfile
@@ -104,7 +104,7 @@ def train(store, key, log):
     imitated, reinforced = np.split(store.contacts_of_split("train"), [640])
     log(f"{len(imitated)} contacts to imitate, {len(reinforced)} to reinforce, one object in five to test")
 
-    # SFT: imitate answers in which every sensor perceives the true level (probes say what it perceives in the studies)
+    # SFT: imitate answers in which every sensor perceives the true level (in studies, what probes predict)
     truth = np.stack([store.objects[contact.object_id].label_row() for contact in store.contacts])
     perceived = np.log(np.eye(max(POLICY.levels))[truth] + 1e-9)[:, None].repeat(len(SENSORS), 1)
     answers = AnswerFeed(POLICY, read_clips(store, imitated), perceived, batch_size=CONTACTS, questions=3, seed=0)

@@ -37,7 +37,7 @@ from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
 OUT = Console(highlight=False)
 
 KNOWN_ERRORS = (card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, UserError, OSError)
-"""Errors whose message tells a user all that is needed."""
+"""Errors that are shown as their message, without a traceback."""
 
 Records = tyro.conf.Positional[Path]
 
@@ -241,7 +241,7 @@ def _publish(path: Path, found: FilteredItems, source: BenchSource) -> int:
     """Print the removed candidates and the data card, and write the items if all checks pass."""
     OUT.print("removed: " + ", ".join(f"{rule} {count}" for rule, count in found.counts.items()))
     if not found.kept:
-        raise card.CardError("no item is left; look at the rules that removed them")
+        raise card.CardError("no item is left: must be one at least; read the rules that removed them above")
     checks = card.checks(found.kept, source.bench, source.train)
     table = Table("check", "measured", "bound", "")
     for c in checks:

@@ -36,12 +36,7 @@ class CardError(ValueError):
 
 
 def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[Requirement, ...]:
-    """Every check of the card: figures that must not exceed their bounds.
-
-    Args:
-      items: the bench.
-      bench, train: contacts of its split and of the training split.
-    """
+    """Every check of the card: figures that must not exceed their bounds."""
     shown = {touch for item in items for touch in item.ask.touches}
     objects, known = {touch.object for touch in shown}, {contact.fingerprint for contact in train.contacts}
     copies = sum(contact.touch in shown and contact.fingerprint in known for contact in bench.contacts)

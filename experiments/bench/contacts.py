@@ -48,13 +48,7 @@ class SplitContacts:
 
 
 def measure_split(store: RecordStore, split: str, after_each: Callable[[], None] = lambda: None) -> SplitContacts:
-    """Read and measure all contacts of a split, those of unlabelled objects included.
-
-    Args:
-      store: the records.
-      split: name of the split in the records.
-      after_each: called after every contact, for a progress bar.
-    """
+    """Read and measure all contacts of a split, those of unlabelled objects included; `after_each` is for a bar."""
     contacts, skipped = [], collections.Counter[str]()
     for i in store.contacts_of_split(split):
         key, recorded, measured = store.contacts[i], store.contact(int(i)), {}

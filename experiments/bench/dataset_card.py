@@ -1,4 +1,4 @@
-"""Is the bench of questions fit to score anybody on: no leak, no free answers, every rationale supported?
+"""Is the benchmark sound: no leak between splits, no answer that a constant guesses, every rationale supported?
 
     make experiment EXP=dataset_card
     make experiment EXP=dataset_card ARGS="--data records --data-dir RECORDS"
@@ -177,7 +177,7 @@ def _threshold_table(source: BenchSource) -> Table:
             }
         )
     return named_table(
-        "What one number tells",
+        "Levels read from one number",
         rows,
         formats={"training": ".1f", "bench": ".1f"},
         units={"training": "%", "bench": "%"},

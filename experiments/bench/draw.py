@@ -63,11 +63,7 @@ def draw(contacts: Sequence[MeasuredContact], sensors: Sequence[str], quota: Quo
     could give an answer, the next one shows an object that was used least.  No two questions show the same touches in
     the same words.
 
-    Args:
-      contacts: of the bench's split.
-      sensors: of the data set; a question shows those that measured all of its touches.
-      quota: number of questions of each kind.
-      seed: of the random choices.
+    A question shows those of the data set's sensors that measured all of its touches.
 
     Raises:
       QuotaError: too few contacts for a quota.

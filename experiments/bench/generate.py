@@ -107,11 +107,7 @@ def author_requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContac
 
 
 def read_candidates(rows: Iterable[tuple[int, Mapping[str, Any]]], asks: Sequence[Ask]) -> Iterator[CandidateItem]:
-    """The candidates of a file in its order; questions without a candidate are left out.
-
-    Args:
-      rows: line numbers and objects, as `read_lines` gives them.
-      asks: the questions of the requests.
+    """The candidates to some questions, from the rows of `read_lines`; questions without a candidate are left out.
 
     Raises:
       LinesError: missing or additional fields, a field of another type, an unknown id, or one that occurs twice.

@@ -64,8 +64,8 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
             at_most("statements taken to hold that fail", failed, 0),
         ),
         tables=(
-            _statement_table("What does not stand", wrong),
-            _statement_table("What holds", right),
+            _statement_table("Statements that do not hold", wrong),
+            _statement_table("Statements that hold", right),
             _average_table(),
             _distance_table(),
             _vtv_table(config),

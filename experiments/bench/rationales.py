@@ -29,13 +29,7 @@ PHRASES = {sensor.name: sensor.phrases[0] for sensor in SENSORS}
 
 
 def compose_item(ask: Ask, contacts: Mapping[Touch, MeasuredContact], reader: ThresholdReader) -> Item:
-    """The item with its question, rationale and evidence.
-
-    Args:
-      ask: what is asked, with the right answer.
-      contacts: measured contacts, all touches of the question included.
-      reader: thresholds fitted on the training objects.
-    """
+    """The item with its question, rationale and evidence; `contacts` must include all touches of the question."""
     shown = [contacts[touch] for touch in ask.touches]
     evidence: list[Citation] = []
     write = _about_one if len(shown) == 1 else _about_several

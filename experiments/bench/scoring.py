@@ -37,12 +37,7 @@ def ask_all(items: Iterable[Item], answer: Callable[[Item], str]) -> dict[str, t
 def read_answers(
     rows: Iterable[tuple[int, Mapping[str, Any]]], items: Sequence[Item], where: str = "answers"
 ) -> dict[str, tuple[int, ...]]:
-    """The levels of the answers in a file; a question without an answer counts as unparsable.
-
-    Args:
-      rows: line numbers and objects {"id", "text"}, as `read_lines` gives them.
-      items: the bench.
-      where: name of the file, for errors.
+    """The levels of the answers {"id", "text"} in rows of `read_lines`; a question without an answer is unparsable.
 
     Raises:
       LinesError: other fields, an unknown id, one that occurs twice, or a text that is not a string.

@@ -1,6 +1,6 @@
 """Levels read from measurements: two thresholds on one quantity of one sensor, fitted on the training objects.
 
-Rationales cite them to say what a number suggests.  They are no policy: each reads one number of one sensor.
+Rationales cite them with the level that a number suggests.  They are no policy: each reads one number of one sensor.
 """
 
 import dataclasses

@@ -82,10 +82,7 @@ class VTVTasks:
 def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks:
     """Draw `count` questions of each comparing task; attributes, levels, assignments and scenarios take turns.
 
-    Args:
-      label: levels of the recordings.
-      count: a multiple of 24, so that orders, rotations, assignments and attributes come equally often.
-      seed: of the draw.
+    `count` is a multiple of 24, so that orders, rotations, assignments and attributes come equally often.
 
     Raises:
       ValueError: another count; a level that no recording has; recordings that are all alike.
@@ -147,10 +144,6 @@ def score(tasks: VTVTasks, log_probs: Float[np.ndarray, "n A K"]) -> dict[str, S
     """Percent right in every task, keyed as `averages.VTV`.
 
     `Scores.items` names a recording of each question, the same one in all orders.
-
-    Args:
-      tasks: the questions.
-      log_probs: of each level of each recording.
     """
     label = tasks.label
     right = log_probs.argmax(-1) == label
@@ -189,12 +182,7 @@ def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:
 
 
 def averaged(scores: Mapping[str, Scores], objects: np.ndarray) -> dict[str, Interval]:
-    """Means of every task and of "average", with 95 % intervals from the same resamples of whole objects.
-
-    Args:
-      scores: as `score` gives them.
-      objects: [n], the object of each recording.
-    """
+    """Means of every task and of "average", with 95 % intervals from the same resamples of whole objects [n]."""
     cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
     drawn = {name: drawn_means(s.values, cluster[s.items], s.strata, weights) for name, s in scores.items()}
     means = {name: s.mean() for name, s in scores.items()}

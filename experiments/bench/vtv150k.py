@@ -1,4 +1,4 @@
-"""What do touch, force and guessing score by the protocol of VTV150K, and what does that leave of the paper's table?
+"""What do touch, force and guessing score under the protocol of VTV150K, compared with the paper's table?
 
     make experiment EXP=vtv150k [ARGS="--scale smoke"]
 
@@ -16,8 +16,8 @@ Cost: about four minutes of one core, nearly all of it to make the recordings; `
 
 Expected: all sensors together well above guessing in every task; about half of the levels of friction and elasticity,
 which the motions reveal; three quarters of those of hardness and protrusion.  The commonest levels lie a few points
-above guessing, since the protocol spares objects that stand out; in the paper's table no model that was not trained for
-touch even reaches guessing.
+above guessing, since the protocol rarely moves objects of high relief; in the paper's table no model that was not
+trained for touch even reaches guessing.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Charts as SVG in one look; a caller describes the data and never touches matplotlib.
+"""Charts as SVG in one style; a caller describes the data and never uses matplotlib.
 
 A chart is a sequence of `Panel`s, a panel a sequence of `Series`:
 

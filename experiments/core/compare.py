@@ -20,18 +20,11 @@ CHANCE = 0.05
 
 
 class ComparisonError(ValueError):
-    """Runs that cannot be compared; the message says why and what to do."""
+    """Runs that cannot be compared; the message names the reason and the fix."""
 
 
 class ComparedFigure(NamedTuple):
-    """One figure of both runs.
-
-    Attributes:
-      where: arm and metric, requirement, or cell of a table.
-      a, b: its value in either run, as shown.
-      change: B − A, with its interval where seeds are paired.
-      verdict: kind of the difference.
-    """
+    """One figure of both runs as it is shown; `change` is B − A, with its interval where seeds are paired."""
 
     where: str
     a: str
@@ -41,11 +34,7 @@ class ComparedFigure(NamedTuple):
 
 
 def compare_runs(a: PastRun, b: PastRun, most: int) -> str:
-    """Compare two runs as text: runs, differing settings, figures, cost.
-
-    Args:
-      a, b: finished runs.
-      most: figures to show, the most important differences first; the others are counted.
+    """Compare two runs as text: runs, differing settings, at most `most` figures that differ, cost.
 
     Raises:
       ComparisonError: the same run twice, an unfinished run, or two runs without a common figure.

@@ -52,7 +52,7 @@ class MetricLog:
             watcher.rewound(stage, step)
 
     def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
-        """Add one line and hand it to the operating system.
+        """Add one line and flush it.
 
         Raises:
           ValueError: a scalar is not finite, or takes the name of a field.
@@ -70,7 +70,7 @@ class MetricLog:
 
     def close(self) -> None:
         """Flush the file to the disk and close it."""
-        if not self._file.closed:  # a signal may have struck inside `rewind`
+        if not self._file.closed:  # a signal may have come inside `rewind`
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
@@ -137,13 +137,9 @@ class Context:
 
     @contextlib.contextmanager
     def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
-        """Show a progress bar for one loop.
+        """Show a progress bar for one loop of `total` steps, of which earlier sessions `completed` some.
 
-        Args:
-          title: of the bar.
-          total: steps of the whole loop.
-          completed: steps done before this session.
-          still: redraw this bar and those inside with each step only, so that they take no time from what is timed.
+        A `still` bar and those inside are redrawn with each step only, so that they take no time from what is timed.
         """
         loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops))
         self.loops.append(loop)

@@ -14,7 +14,7 @@ STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
 
 KEPT = "kept"
-"""Stages whose results say how much of a stage's adapters is in the merged weights (see `lora.kept_share`)."""
+"""Stages whose result is the share of a stage's adapters that its merged weights keep (see `lora.kept_share`)."""
 
 
 MakeLog = Callable[[Context, str, int], Log]

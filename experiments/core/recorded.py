@@ -61,11 +61,7 @@ def _placeless(value: Any) -> Any:
 
 
 def filled(text: str, root: Path = ROOT) -> str:
-    """A document with the table between `BEGIN` and `END` as the recorded runs have it.
-
-    Args:
-      text: the document.
-      root: the checkout, whose recorded runs and rows count.
+    """A document with the table between `BEGIN` and `END` as the runs recorded in a checkout have it.
 
     Raises:
       FigureError: no such block, or a figure whose run, key or format is unknown.

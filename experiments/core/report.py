@@ -91,15 +91,7 @@ def _pairs(comparisons: Sequence[Comparison]) -> dict[tuple[str, str, str], dict
 def render(
     template: str, *, about: str, description: Mapping[str, Any], timing: Mapping[str, float], **rest: Any
 ) -> str:
-    """Fill a page of a run.
-
-    Args:
-      template: name of a file that extends `page.jinja`.
-      about: docstring of the experiment; its first line is the question.
-      description: content of the run's `config.json`.
-      timing: stage, or stage and seed → seconds.
-      rest: what else the template names.
-    """
+    """Fill a template that extends `page.jinja`; `timing` is stage, or stage and seed → seconds."""
     question, _, more = about.strip().partition("\n")
     times: dict[str, list[float]] = {}
     for stage, seconds in timing.items():
@@ -126,11 +118,7 @@ def pieces(text: str, slots: Sequence[Slot]) -> Iterator[tuple[str, str]]:
 
 
 def strip(frames: np.ndarray) -> np.ndarray:
-    """The frames of a sensor side by side with two white pixels between them, uint8 [H, F (W + 2), 3].
-
-    Args:
-      frames: uint8 [F, H, W, 3].
-    """
+    """Frames [F, H, W, 3] side by side with two white pixels between them, uint8 [H, F (W + 2), 3]."""
     return np.concatenate(list(np.pad(frames, ((0, 0), (0, 0), (1, 1), (0, 0)), constant_values=255)), axis=1)
 
 

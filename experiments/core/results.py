@@ -23,7 +23,7 @@ Cell = str | float | int | bool | None
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Requirement:
-    """A figure and the bound that it must keep; `better` says on which side of the bound it must lie."""
+    """A figure and the bound that it must keep; `better` is the side of the bound on which it must lie."""
 
     name: str
     measured: float
@@ -107,7 +107,7 @@ def named_table(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A chart or an image: `kind` says what `content` is; `name` is its file's in `plots/`, without the ending."""
+    """A chart or an image: `kind` is the format of `content`, `name` the name of its file in `plots/`."""
 
     name: str
     title: str
@@ -141,7 +141,7 @@ class Estimate(_Ci95):
 class Comparison(_Ci95):
     """`arm` minus `against` on one metric, paired.
 
-    `over` says what the interval generalises to: other training `seeds` (Student t on paired per-seed differences) or
+    `over` is what the interval generalises to: other training `seeds` (Student t on paired per-seed differences) or
     other `objects` (clustered bootstrap of paired answers).  `p_value` is that of the sign-flip test over seeds,
     `improvement` the probability of improvement; both `None` where `over` is `objects`.
     """
@@ -178,7 +178,7 @@ class Trace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutExample:
-    """One answer to look at, with the touch behind it.
+    """One answer of the report, with the touch that it is about.
 
     Args:
       arm, object_id: policy and object.

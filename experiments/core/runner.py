@@ -118,12 +118,7 @@ class Experiment(Generic[C]):
 
 
 def main(arguments: Sequence[str] | None = None, package: str = "experiments") -> int:
-    """The command line; returns the exit code.
-
-    Args:
-      arguments: those after the program's name, by default the process's.
-      package: the package to find experiments in.
-    """
+    """The command line, by default the process's, for the experiments of a package; returns the exit code."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     status = run_command(arguments, package)
     return run(arguments, package) if status is None else status

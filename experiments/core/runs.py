@@ -77,12 +77,7 @@ def versions() -> dict[str, str]:
 
 
 def create(home: Path, description: dict[str, Any]) -> Path:
-    """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the local time, made unique by a suffix.
-
-    Args:
-      home: `runs/NAME`.
-      description: the resolved `config` and its provenance, in JSON's types.
-    """
+    """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the local time, made unique by a suffix."""
     home.mkdir(parents=True, exist_ok=True)
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
@@ -142,13 +137,7 @@ def started(home: Path) -> list[Path]:
 
 
 def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
-    """The newest finished, or unfinished, run under `runs/NAME` with this configuration, or `None`.
-
-    Args:
-      home: `runs/NAME`.
-      config: the resolved configuration in JSON's types.
-      finished: whether it must have results or must have none.
-    """
+    """The newest finished, or unfinished, run under `runs/NAME` with this configuration in JSON's types, or `None`."""
     of_kind = (run for run in started(home) if (run / "results.json").exists() == finished)
     return next((run for run in of_kind if read_json(run / "config.json")["config"] == config), None)
 

@@ -39,9 +39,7 @@ class LivePage(Watcher):
     """Writes `report.html` during a run, until the report replaces it; no server, no script.
 
     Args:
-      directory: the run's.
-      about: docstring of the experiment; its first line is the question.
-      description: content of the run's `config.json`.
+      directory, about, description: of the run, as `write_report` takes them.
       curves: phase → scalars to draw.
       usual_s: duration of the last run of the same configuration; `None` if there was none.
       clock: seconds.
@@ -131,9 +129,6 @@ class Events(Watcher):
 
     A continued stage gets one more file, whose first event makes TensorBoard drop the events of the last session at or
     past its step.  Events have a time, lines of `metrics.jsonl` do not.
-
-    Args:
-      folder: a folder for each stage is made in it.
 
     Raises:
       ModuleNotFoundError: tensorboardX is not installed.

@@ -26,8 +26,7 @@ def directory(tmp_path_factory, records):
 def test_everything_is_reported(directory):
     results = read_json(directory / "results.json")
     assert all(r["met"] for r in results["requirements"])
-    titles = [table["title"] for table in results["tables"]]
-    assert titles == ["Questions", "Answers", "Rules", "What one number tells", "Objects of the bench", "One of each"]
+    assert [len(table["columns"]) for table in results["tables"]] == [7, 5, 3, 5, 2, 3]
     assert {row[0]: row[2] for row in results["tables"][0]["rows"]} == {
         kind: count for kind, count in dataclasses.asdict(QUOTA).items() if count
     }
