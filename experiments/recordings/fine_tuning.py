@@ -184,7 +184,7 @@ def reinforce(
     context: Context,
     stage: str,
 ) -> Params:
-    """GRPO of one member's decoder, whose encoder stays as it is; 0 steps leave it as it is."""
+    """GRPO of one member's decoder; the encoder stays as it is, and so does the decoder with 0 steps."""
     if not config.steps:
         return params
     rng = np.random.default_rng(seed)
