@@ -10,6 +10,7 @@ from experiments.core.look import PALETTE
 from experiments.core.pictures import Heatmap, heatmaps
 from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.core.text import interval
+from experiments.study.sampled import sampled_report
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
@@ -44,7 +45,7 @@ class LevelAnswers:
 
 
 def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
-    """Confusions of every policy, accuracy by agreement of its sensors, and the reliability of each level."""
+    """Confusions of every policy, accuracy by agreement of its sensors, the reliability of levels, sampled answers."""
     objects = study.data.object_ids[study.data.parts["test"]]
     rows = {name: _level_answers(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
     language = study.policy.language
@@ -55,10 +56,11 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
         caption="Share of each answer among the test questions with one label, and their number; seeds pooled.",
         content=confusion_chart(rows, words),
     )
-    tables = (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words),)
+    pictures, tables = sampled_report(study)
+    tables = (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words), *tables)
     with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
     if not with_agreement:
-        return (confusions,), tables
+        return (confusions, *pictures), tables
     if len(with_agreement) > len(PALETTE):  # more lines than colours: keep where training begins and where it ends
         with_agreement = {name: rows[name] for name in (SFT, list(study.arms)[-1]) if name in with_agreement}
     trust = Picture(
@@ -69,7 +71,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
         "pooled.",
         content=agreement_chart(with_agreement),
     )
-    return (confusions, trust), tables
+    return (confusions, trust, *pictures), tables
 
 
 def _level_answers(seeds: Sequence[Evaluation], objects: np.ndarray) -> LevelAnswers:

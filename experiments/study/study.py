@@ -80,11 +80,12 @@ class StudySeed:
     context: Context
     seed: int
 
-    def ask(self, params: Params, features: Features, *, alone: bool = True) -> Evaluation:
+    def ask(self, params: Params, features: Features, *, alone: bool = True, samples: int = 0) -> Evaluation:
         """Answers about encoded test contacts, asked under a progress bar; arguments of `evaluate_policy`."""
         label = self.data.labels("test")
         with self.context.progress_callback("asking") as progress:
-            return evaluate_policy(self.policy, params, features, label, alone=alone, progress=progress)
+            order: dict[str, Any] = {"alone": alone, "samples": samples, "progress": progress}
+            return evaluate_policy(self.policy, params, features, label, **order)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -282,7 +283,7 @@ class _Seed(StudySeed):
     def _blind(self) -> Evaluation:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
         features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return self.ask(params, features)
+        return self.ask(params, features, samples=self.config.samples)
 
     def _sft(self, config: StudySFT, stage: str, **options: Any) -> Params:
         order: dict[str, Any] = {"seed": self.seed, "stage": stage, "share": self.share}
@@ -290,7 +291,7 @@ class _Seed(StudySeed):
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Evaluate a policy, then all variants of it."""
-        self._evaluate(name, lambda: self.ask(params, test))
+        self._evaluate(name, lambda: self.ask(params, test, samples=self.config.samples))
         of_study = {field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}
         for title, variant in self.variants.items():
             if variant.of == name:

@@ -55,6 +55,8 @@ class TrainingConfig(SourceConfig):
     grpo_save_every: int = 200
     grpo_lora_rank: int = 0
     """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
+    samples: int = 8
+    """Sampled answers to each test question, for pass@k, maj@k and calibration; 0 asks for greedy answers only."""
 
     @property
     def grpo_loop(self) -> LoopConfig:
@@ -69,7 +71,7 @@ class TrainingConfig(SourceConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
-        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples")
         require_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(

@@ -28,6 +28,7 @@ STUDY = StudyConfig(
     blind=StudySFT(steps=2, batch_size=4),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,
+    samples=0,
 )
 
 

@@ -1,4 +1,4 @@
-"""Greedy answers of a policy to every question about some contacts, and the reward that each answer earns."""
+"""Greedy and sampled answers of a policy to every question about some contacts, and the reward that each earns."""
 
 import dataclasses
 import functools
@@ -14,7 +14,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rewards.base import GROUP, Decode
-from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, make_answer
+from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, SampleConfig, make_answer, sample_group
 from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
 from touchr1_jax.types import Params, Parsed
 
@@ -32,6 +32,7 @@ class Evaluation:
       label: −1 where not asked.
       truth: level of every attribute, −1 unknown, which rewards see; `None` where only `label` was kept.
       alone: conclusions of the policy that is shown each stream alone; `None` where it was not asked so.
+      sampled: conclusions of n answers sampled at temperature 1 with all streams; `None` where none was.
     """
 
     contact: Int[np.ndarray, "N"]
@@ -42,6 +43,7 @@ class Evaluation:
     label: Int[np.ndarray, "N A"]
     alone: Int[np.ndarray, "N S A"] | None
     truth: Int[np.ndarray, "N A"] | None = None
+    sampled: Int[np.ndarray, "N n A"] | None = None
 
 
 def evaluate_policy(
@@ -51,6 +53,7 @@ def evaluate_policy(
     label: Int[np.ndarray, "n A"],
     *,
     alone: bool = True,
+    samples: int = 0,
     batch_size: int = EVAL_BATCH,
     answer: Callable[[Params, GRPOBatch], GreedyAnswers] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -62,6 +65,7 @@ def evaluate_policy(
       features: of the contacts, from `encoding.encode_contacts`.
       label: −1 for unknown, which is not asked about.
       alone: ask with each stream alone too, where there are several.
+      samples: answers to each question that are sampled as well, with all streams.
       batch_size: questions that are answered at once.
       answer: from (decoder, questions) to answers; by default the policy's own (`answer_program`).
       progress: receives how many of how many answers are done.
@@ -73,16 +77,22 @@ def evaluate_policy(
     if alone and present.any() and s > 1:
         shown += [present & (np.arange(s) == i) for i in range(s)]
     answer, decoder = answer or answer_program(policy), {"decoder": params["decoder"]}
+    rounds: list[tuple[np.ndarray, Callable[[GRPOBatch, int], Any]]]
+    rounds = [(streams, lambda batch, block: answer(decoder, batch)) for streams in shown]
+    if samples:
+        draw, key = sample_program(policy, samples), jax.random.key(0)
+        rounds.append((present, lambda batch, block: draw(decoder, batch, jax.random.fold_in(key, block))))
     found, done = [], 0
-    progress(0, len(shown) * len(contact))
-    for streams in shown:
+    progress(0, len(rounds) * len(contact))
+    for streams, ask in rounds:
         blocks = []
-        for rows, real in equal_blocks(len(contact), batch_size):
+        for block, (rows, real) in enumerate(equal_blocks(len(contact), batch_size)):
             batch = question_batch(policy, features, label, contact[rows], attribute[rows], streams[rows])
-            blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], answer(decoder, batch)))
+            blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(batch, block)))
             done += real
-            progress(done, len(shown) * len(contact))
+            progress(done, len(rounds) * len(contact))
         found.append(jax.tree.map(lambda *x: np.concatenate(x), *blocks))
+    sampled = found.pop() if samples else None
     together, *each_alone = found
     return Evaluation(
         contact=contact,
@@ -93,6 +103,7 @@ def evaluate_policy(
         label=np.where(policy.layout.asked[attribute], label[contact], -1),
         alone=np.stack([x.parsed.conclude for x in each_alone], 1) if each_alone else None,
         truth=label[contact],
+        sampled=sampled,
     )
 
 
@@ -100,6 +111,19 @@ def evaluate_policy(
 def answer_program(policy: TouchPolicy) -> Any:
     """Compiled greedy decoder and parser, made once."""
     return make_answer(policy.fns, policy.parser, policy.model.completion_tokens)
+
+
+@functools.cache
+def sample_program(policy: TouchPolicy, samples: int) -> Any:
+    """Compiled sampler and parser, (params, questions, key) → conclusions [P, samples, A], made once."""
+    fns, length = policy.fns, policy.model.completion_tokens
+    draw = SampleConfig(group=samples, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id)
+
+    @jax.jit
+    def sample(params: Params, batch: GRPOBatch, key: jax.Array) -> jax.Array:
+        return jax.vmap(jax.vmap(policy.parser))(sample_group(fns, params, batch, key, draw).tokens).conclude
+
+    return sample
 
 
 def reward_terms(

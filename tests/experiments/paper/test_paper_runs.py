@@ -45,7 +45,7 @@ def test_arms_and_pairs_fit_together(module):
 
 
 def run_ablation(module, home, cache_dir, steps):
-    config = dataclasses.replace(tiny.STUDY, grpo_steps=7)
+    config = dataclasses.replace(tiny.STUDY, grpo_steps=7, samples=2)
     return run_shrunk(module, config, home, "--cache-dir", str(cache_dir), "--grpo-steps", str(steps))
 
 
@@ -76,6 +76,10 @@ def test_results_hold_every_arm_and_baseline(directory):
     assert results["config"]["grpo_steps"] == 2
     page = (directory / "report.html").read_text(encoding="utf-8")
     assert all(name in page for name in (*ARMS, *BASELINES))
+    (sampled,) = (table for table in results["tables"] if table["title"] == "Sampled answers")
+    assert [column["name"] for column in sampled["columns"]] == ["policy", "greedy", "pass@1", "pass@2", "maj@2", "ECE"]
+    assert [row[0] for row in sampled["rows"]] == [*ARMS, "tactile_blind"]
+    assert (directory / "plots" / "calibration.svg").exists()
 
 
 def test_comparisons_pair_arms_by_seed_and_baselines_by_object(directory):

@@ -57,7 +57,7 @@ def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(p
 @pytest.fixture
 def ask(policy, params):
     """Evaluate some contacts in blocks of eight questions, two contacts each."""
-    return lambda features, label: evaluate_policy(policy, params, features, label, batch_size=8)
+    return lambda features, label, **more: evaluate_policy(policy, params, features, label, batch_size=8, **more)
 
 
 LABEL = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, 1, 1, 4]], np.int32)
@@ -74,6 +74,14 @@ def test_padding_the_last_block_changes_nothing(policy, ask):
     assert np.array_equal(last.tokens, padded.tokens[8:])
     assert np.array_equal(last.alone, padded.alone[8:])
     assert len(np.unique(padded.tokens, axis=0)) > 1, "a policy that says one thing tests nothing"
+
+
+def test_sampled_answers_differ_from_each_other_and_repeat(ask):
+    features = tiny.features(3)
+    one, again = (ask(features, LABEL, alone=False, samples=3) for _ in range(2))
+    assert one.sampled.shape == (12, 3, 4)
+    assert np.array_equal(one.sampled, again.sampled)
+    assert np.array_equal(one.tokens, ask(features, LABEL, alone=False).tokens)
 
 
 def felt_sum(decoder, batch):

@@ -1,0 +1,84 @@
+"""Metrics of several sampled answers to each question: pass@k, majority votes, calibration."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from touchr1_jax.bench.metrics import BOTTOM
+
+
+class Votes(NamedTuple):
+    """The most frequent answer to each of N questions among its samples.
+
+    `right` [N] is true where it answers every asked attribute right, `confidence` [N] is the share of the samples that
+    give it; 0, and wrong, where no sample could be parsed.
+    """
+
+    right: np.ndarray
+    confidence: np.ndarray
+
+
+class Bin(NamedTuple):
+    """Answers of similar confidence: its mean, the share of right answers, and their number."""
+
+    confidence: float
+    right: float
+    number: int
+
+
+def samples_right(sampled: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Samples, bool [N, n], that answer every asked attribute right.
+
+    Args:
+      sampled: int [N, n, A], conclusions of n samples, `BOTTOM` where unparsed.
+      label: int [N, A], `BOTTOM` where not asked.
+    """
+    asked = (label != BOTTOM)[:, None]
+    return np.all((sampled == label[:, None]) | ~asked, -1) & asked.any(-1)
+
+
+def pass_at_k(right: np.ndarray, k: int) -> np.ndarray:
+    """Probability [N] that one of k samples is right, 1 − C(n − c, k)/C(n, k) of c right ones among n, unbiased.
+
+    Args:
+      right: bool [N, n].
+      k: 1 … n.
+
+    Raises:
+      ValueError: k is no such number.
+
+    Source: Chen et al., arXiv 2107.03374, eq. 1.
+    """
+    n = right.shape[1]
+    if not 1 <= k <= n:
+        raise ValueError(f"k is {k}: must be 1 … {n}, the number of samples; draw more")
+    wrong = n - right.sum(1)
+    return 1 - np.prod([np.maximum(wrong - i, 0) / (n - i) for i in range(k)], axis=0)
+
+
+def majority(sampled: np.ndarray, label: np.ndarray) -> Votes:
+    """Votes of the samples (maj@n, arXiv 2203.11171); among equals the answer that was sampled first wins.
+
+    Args:
+      sampled, label: as in `samples_right`.
+    """
+    asked = (label != BOTTOM)[:, None]
+    parsed = np.all((sampled != BOTTOM) | ~asked, -1)
+    same = np.all((sampled[:, :, None] == sampled[:, None]) | ~asked[:, :, None], -1)
+    votes = (same & parsed[:, None]).sum(-1) * parsed
+    best = votes.argmax(1)[:, None]
+    right = np.take_along_axis(samples_right(sampled, label), best, 1)[:, 0]
+    confidence = np.take_along_axis(votes, best, 1)[:, 0] / sampled.shape[1]
+    return Votes(right=right & (confidence > 0), confidence=confidence)
+
+
+def reliability(votes: Votes, bins: int = 10) -> tuple[Bin, ...]:
+    """Bins of equal width in confidence, without the empty ones; a calibrated policy has `confidence` = `right`."""
+    place = np.minimum((votes.confidence * bins).astype(int), bins - 1)
+    found = [place == b for b in np.unique(place)]
+    return tuple(Bin(float(votes.confidence[at].mean()), float(votes.right[at].mean()), int(at.sum())) for at in found)
+
+
+def calibration_error(votes: Votes, bins: int = 10) -> float:
+    """ECE = Σ_b n_b/N |right_b − confidence_b| over `reliability` (Guo et al., arXiv 1706.04599, eq. 3)."""
+    return sum(b.number * abs(b.right - b.confidence) for b in reliability(votes, bins)) / len(votes.right)
