@@ -50,7 +50,7 @@ def make_rewards(prior: np.ndarray) -> dict[str, AnyReward]:
         "exact": Reward(exact),
         "accuracy_debiased": accuracy_debiased(prior),
         "accuracy_strict": accuracy_strict(prior),
-        "consistency": Reward(consistency, consistency_applies),
+        "consistency": Reward(consistency, consistency_applies, settled="compare"),
         "consistency_gated": Reward(consistency_gated, consistency_applies),
         "consistency_strict": consistency_strict(prior),
         "format": Reward(formatted),

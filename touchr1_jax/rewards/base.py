@@ -3,7 +3,7 @@
 import math
 import traceback
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from touchr1_jax.types import Parsed, Target
 UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError)
 """Errors of JAX where Python or NumPy needs a number that the compiled program will compute."""
 
+
+Segment = Literal["perceive", "compare", "conclude"]
 
 GROUP = "group"
 """Name of the `vmap` axis over the rollouts of one prompt."""
@@ -38,10 +40,13 @@ class Reward(NamedTuple):
       value: (parsed, target) → float scalar, finite even where the reward does not apply.
       applies: target → boolean scalar, true if the reward is defined for this question.  It depends on the target
         alone: an answer must not be able to escape a term.
+      settled: the segment at whose end the value is known, so that later tokens need no credit for it
+        (`rl.advantages.segment_advantages`).
     """
 
     value: Callable[[Parsed, Target], Float[Array, ""]]
     applies: Callable[[Target], Bool[Array, ""]] = always
+    settled: Segment = "conclude"
 
 
 class GroupReward(NamedTuple):

@@ -6,7 +6,7 @@ from typing import assert_never
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.rl.config import Advantage, Algorithm
@@ -24,6 +24,8 @@ def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
     """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
+    if algorithm.segment_credit:  # equal totals may be made of different terms, of which tokens get a part
+        return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
     match algorithm.advantage:
         case Advantage.GLOBAL:
             every = best_of(reward, algorithm.best_of).reshape(-1)
@@ -86,10 +88,38 @@ def advantages(
         case Advantage.GLOBAL:
             return group_advantage(reward.reshape(-1), epsilon=epsilon).reshape(reward.shape)
         case Advantage.PER_REWARD:
-            total = sum((group_advantage(term, epsilon=epsilon) for term in terms.values()), start=jnp.zeros(()))
+            total = sum(
+                (group_advantage(term, epsilon=epsilon) for term in terms.values()), start=jnp.zeros_like(reward)
+            )
             return total / (jnp.std(total) + epsilon)
         case _:
             assert_never(algorithm.advantage)
+
+
+def segment_advantages(
+    algorithm: Algorithm,
+    reward: Float[Array, "P G"],
+    terms: Mapping[str, Float[Array, "P G"]],
+    settled: Mapping[str, int],
+    segment: Int[Array, "P G T"],
+) -> Float[Array, "P G T"]:
+    """Advantage of each token from the rewards that are not settled before its segment: the return from there on.
+
+    What is settled before a token does not depend on it, so that leaving it out keeps the policy gradient and takes
+    variance away.  The published agreement of the slots is known at the end of `compare`: the conclusion is then not
+    paid for it.  Each segment's advantages are compared by themselves, as `advantages` does.
+
+    Args:
+      algorithm, reward, terms: as for `advantages`.
+      settled: number of the segment at whose end a term is known; without one, the last.
+      segment: number of each token's segment: 0 up to the end of `perceive`, 1 up to that of `compare`, then 2.
+    """
+    left, rest, each = reward, dict(terms), []
+    for s in range(3):
+        each.append(advantages(algorithm, left, rest))
+        for name in [name for name in rest if settled.get(name, 2) == s]:
+            left = left - rest.pop(name)
+    return jnp.take_along_axis(jnp.stack(each, -1), segment, -1)
 
 
 def group_advantage(

@@ -78,6 +78,8 @@ class Algorithm:
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
     best_of: int = 1
     """Rewards count by the best of k rollouts, pass@k or max@k (see `best_of`); 1 counts each by itself."""
+    segment_credit: bool = False
+    """Credit a token only with rewards that are not settled before its segment (`advantages.segment_advantages`)."""
     stable_rewards: bool = False
     """Take each published reward in the form that no answer without touch outwits (`rewards.STABLE`)."""
     epsilon: float = 1e-4
@@ -249,7 +251,10 @@ class Cispo(Algorithm):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rloo(Algorithm):
-    """RLOO (arXiv 2402.14740): REINFORCE of whole answers against the mean of the others in the group, no σ, no KL."""
+    """RLOO (arXiv 2402.14740): REINFORCE of whole answers against the mean of the others in the group, without σ.
+
+    Its KL in the reward is `beta` with `kl_in_reward`; here there is none.
+    """
 
     average: Average = Average.LENGTH
     advantage: Advantage = Advantage.LEAVE_ONE_OUT

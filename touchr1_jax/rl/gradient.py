@@ -38,6 +38,8 @@ class Experience(NamedTuple):
     old: Float[Array, "P G T"]
     advantage: Float[Array, "P G"]
     weight: Float[Array, "P"]
+    token_advantage: Float[Array, "P G T"] | None = None
+    """Advantage of each token, in the place of the rollout's, where segments are credited apart."""
 
 
 def grpo_gradient(
@@ -72,7 +74,8 @@ def grpo_gradient(
         old = micro.old
         if ratio_to_learner(algorithm):
             old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
-        rollout, a, w = micro.rollout, micro.advantage, micro.weight
+        rollout, w = micro.rollout, micro.weight
+        a = micro.advantage if micro.token_advantage is None else micro.token_advantage
         value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest)
         return value, (parts | {"loss": value}, old)
 

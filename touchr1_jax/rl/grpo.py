@@ -38,7 +38,7 @@ from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.metrics import advantage_metrics, answer_metrics, reward_metrics, rollout_metrics, touch_metrics
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn, left_out_groups
+from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout
@@ -132,12 +132,17 @@ def make_grpo_step(
         `distributed.placement.gather_params`); by default they are read as they are.
 
     Raises:
-      ValueError: an algorithm that samples constrained, without a constraint; lean compilation where jax has none.
+      ValueError: an algorithm that samples constrained, without a constraint; one that credits segments, with a score
+        that `make_score` did not make; lean compilation where jax has none.
     """
     if config.lean_compilation and not compiles_leanly():
         raise ValueError(
             f"lean_compilation is True, but jax {jax.__version__} has one code generator only; leave it False, or "
             f"install jax < {'.'.join(map(str, LEAN_BEFORE))}"
+        )
+    if config.algorithm.segment_credit and not isinstance(score, WeightedScore):
+        raise ValueError(
+            "segment_credit is True, but the score does not say when rewards are settled; use `make_score`"
         )
     if config.algorithm.constrained and constraint is None:
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
@@ -240,9 +245,12 @@ class _Engine:
     def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
-        advantage = advantages(algorithm, group.reward, group.terms)
+        advantage, by_token = advantages(algorithm, group.reward, group.terms), None
+        if isinstance(self.score, WeightedScore) and algorithm.segment_credit:
+            by_token = self.score.segment_advantages(algorithm, group.reward, group.terms, group.rollout.tokens)
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
-            advantage += added_after(group.bonus, algorithm.tactile_weight)
+            bonus = added_after(group.bonus, algorithm.tactile_weight)
+            advantage, by_token = advantage + bonus, by_token if by_token is None else by_token + bonus[..., None]
         advantage = jnp.where(group.finite[:, None], advantage, 0.0)
         no_signal = self.no_signal(group)
         rollout, weight = group.rollout, jnp.full(no_signal.shape, 1 / self.config.prompts)
@@ -260,6 +268,7 @@ class _Engine:
             rollout=rollout,
             old=rollout.log_prob,
             advantage=advantage,
+            token_advantage=by_token if by_token is None else jnp.where(group.finite[:, None, None], by_token, 0.0),
             weight=weight,
         )
 

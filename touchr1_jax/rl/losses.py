@@ -35,7 +35,7 @@ def grpo_loss(
     old: Float[Array, "P G T"],
     sampler: Float[Array, "P G T"],
     mask: Bool[Array, "P G T"],
-    advantage: Float[Array, "P G"],
+    advantage: Float[Array, "P G *t"],
     weight: Float[Array, "P"],
     config: GRPOConfig,
     longest: int | Float[Array, ""] | None = None,
@@ -54,7 +54,7 @@ def grpo_loss(
       old: log-probabilities that ratios are taken to.
       sampler: log-probabilities that the tokens were drawn with.
       mask: which tokens exist.
-      advantage: A of each rollout.
+      advantage: A of each rollout, or of each of its tokens.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
       longest: `divisor` of the whole batch; by default that of these rollouts.
@@ -109,7 +109,7 @@ def surrogate(
     log_prob: Float[Array, "*n T"],
     old: Float[Array, "*n T"],
     mask: Bool[Array, "*n T"],
-    advantage: Float[Array, "*n"],
+    advantage: Float[Array, "*n"] | Float[Array, "*n T"],
 ) -> tuple[Float[Array, "*n T"], Bool[Array, "*n T"]]:
     """Clipped policy-gradient objective of every token, to be maximised, and where the clip cut its gradient off.
 
@@ -123,9 +123,10 @@ def surrogate(
       log_prob: the learner's log-probabilities of the sampled tokens.
       old: those of the policy that the ratio is taken to.
       mask: which tokens exist; the others have values of no meaning.
-      advantage: one number for a whole rollout.
+      advantage: one number for a whole rollout, or one for each token.
     """
-    a, low, high = advantage[..., None], algorithm.clip_low, algorithm.clip_high
+    a = advantage if advantage.ndim == log_prob.ndim else advantage[..., None]
+    low, high = algorithm.clip_low, algorithm.clip_high
     log_ratio = log_prob - old
     if algorithm.surrogate is Surrogate.SEQUENCE:
         log_ratio = masked.mean(log_ratio, mask, -1, keepdims=True)

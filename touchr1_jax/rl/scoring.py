@@ -3,18 +3,23 @@
 Both are a `ScoreFn`, so that the step needs no distinction.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.rewards import stable_weights
-from touchr1_jax.rewards.base import AnyReward, Decode, on_host, total_reward
+from touchr1_jax.rewards.base import AnyReward, Decode, Reward, on_host, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
+from touchr1_jax.rl.advantages import segment_advantages
 from touchr1_jax.rl.config import Algorithm
+from touchr1_jax.text.language import SEGMENTS
+from touchr1_jax.text.parser import Parser
 from touchr1_jax.types import Parsed, Target
 
 ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, Array], Parsed]]
@@ -38,7 +43,7 @@ def make_score(
     rewards: Mapping[str, AnyReward],
     weights: Mapping[str, float],
     decode: Decode | None = None,
-) -> ScoreFn:
+) -> "WeightedScore":
     """Score by weighted rewards (see `rewards.base.total_reward`), each proved finite when the step is traced.
 
     Args:
@@ -51,14 +56,43 @@ def make_score(
       RewardError: a reward that gives NaN or infinity for some answer; it names the reward and the answer.
     """
 
-    def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
-        parsed = parser(tokens)
-        reward, terms = total_reward(rewards, weights, parsed, target, tokens, decode)
+    return WeightedScore(parser, rewards, weights, decode)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WeightedScore:
+    """A `ScoreFn` of weighted rewards that also knows when each of them is settled; made by `make_score`."""
+
+    parser: Callable[[Int[Array, "T"]], Parsed]
+    rewards: Mapping[str, AnyReward]
+    weights: Mapping[str, float]
+    decode: Decode | None
+
+    def __call__(self, tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
+        """Total reward, its terms and the parsed answer of one rollout."""
+        parsed = self.parser(tokens)
+        reward, terms = total_reward(self.rewards, self.weights, parsed, target, tokens, self.decode)
         sensors, attributes = parsed.perceive.shape
-        prove_rewards(rewards, weights, sensors, attributes, tokens.shape[-1])
+        prove_rewards(self.rewards, self.weights, sensors, attributes, tokens.shape[-1])
         return reward, terms, parsed
 
-    return score
+    def segment_advantages(
+        self,
+        algorithm: Algorithm,
+        reward: Float[Array, "P G"],
+        terms: Mapping[str, Float[Array, "P G"]],
+        tokens: Int[Array, "P G T"],
+    ) -> Float[Array, "P G T"]:
+        """`advantages.segment_advantages` of rollouts.
+
+        Raises:
+          ValueError: a parser that knows no segments.
+        """
+        if not isinstance(self.parser, Parser):
+            raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to tell segments; use one")
+        settled = {n: SEGMENTS.index(r.settled) for n, r in self.rewards.items() if isinstance(r, Reward)}
+        segment = jax.vmap(jax.vmap(self.parser.segments))(tokens)
+        return segment_advantages(algorithm, reward, terms, settled, segment)
 
 
 def left_out_groups(

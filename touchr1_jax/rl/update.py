@@ -104,7 +104,8 @@ def bucketed_gradient(
 
     def over(length: int) -> Callable[[Params], Gradient]:
         cut = lambda x: x[..., :length]
-        short = learn._replace(rollout=jax.tree.map(cut, learn.rollout), old=cut(learn.old))
+        rollout, by_token = jax.tree.map(cut, (learn.rollout, learn.token_advantage))
+        short = learn._replace(rollout=rollout, old=cut(learn.old), token_advantage=by_token)
 
         def of(params: Params) -> Gradient:
             grads, parts, old = grpo_gradient(fns, config, params, reference, short, first=first)

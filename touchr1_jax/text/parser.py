@@ -62,6 +62,13 @@ class Parser:
             length=jnp.sum(~ended, dtype=jnp.int32),
         )
 
+    def segments(self, tokens: Int[Array, "T"]) -> Int[Array, "T"]:
+        """Segment of each token: 0 up to the end of `perceive`, 1 up to the end of `compare` after it, then 2."""
+        events = self._events(self._classes(tokens)).reshape(len(tokens) + 1, -1)[:-1]
+        perceived, compared = (jnp.any(events == FIRST_TAG + closing, -1).astype(jnp.int32) for closing in (1, 3))
+        before = lambda x: (jnp.cumsum(x) - x > 0).astype(jnp.int32)
+        return before(perceived) * (1 + before(compared))
+
     def _classes(self, tokens: Int[Array, "T"]) -> Int[Array, "T"]:
         """Class of each token after those before it, of which it may complete a character."""
         lexer, whole = self.lexer, jnp.asarray(self.lexer.token_class)

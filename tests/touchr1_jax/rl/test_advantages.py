@@ -3,6 +3,7 @@
 import itertools
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from touchr1_jax.rl.advantages import (
     group_advantage,
     no_signal,
     prompt_weights,
+    segment_advantages,
     zero_variance,
 )
 from touchr1_jax.rl.config import Advantage, Paper
@@ -168,6 +170,36 @@ def test_the_best_of_a_group_is_all_that_counts_where_k_is_its_size():
     algorithm, reward = Paper(best_of=4), jnp.array([[1.0, 0.0, 0.4, 0.0]])
     assert no_signal(algorithm, reward, {}).all()
     assert not advantages(algorithm, reward, {}).any()
+
+
+def test_a_token_is_credited_with_what_is_not_settled_before_it():
+    a, b = jnp.array([[1.0, 0.0, 1.0, 0.0]]), jnp.array([[0.0, 0.0, 1.0, 1.0]])
+    algorithm = Paper(advantage=Advantage.NONE, segment_credit=True)
+    segment = jnp.broadcast_to(jnp.array([0, 1, 1, 2]), (1, 4, 4))
+    found = segment_advantages(algorithm, a + b, {"a": a, "b": b}, {"a": 1}, segment)
+    np.testing.assert_allclose(found[..., 0], a + b - 1, atol=1e-6)
+    np.testing.assert_allclose(found[..., 2], a + b - 1, atol=1e-6)
+    np.testing.assert_allclose(found[..., 3], b - 0.5, atol=1e-6)
+    same = segment_advantages(algorithm, a + b, {"a": a, "b": b}, {}, segment)
+    np.testing.assert_allclose(same, jnp.broadcast_to((a + b - 1)[..., None], same.shape), atol=1e-6)
+    assert not no_signal(algorithm, jnp.ones((1, 2)), {"a": a[:, :2], "b": 1 - a[:, :2]}).any()
+
+
+def test_leaving_out_what_is_settled_keeps_the_gradient():
+    """Two tokens of three words, all nine answers with their probabilities; a is known at the first token."""
+    rng = np.random.default_rng(0)
+    log_p = jnp.asarray(rng.normal(size=(2, 3)), jnp.float32)
+    words = np.array(list(itertools.product(range(3), repeat=2)))
+    a, b = jnp.asarray(rng.random(3)[words[:, 0]]), jnp.asarray(rng.random((3, 3))[words[:, 0], words[:, 1]])
+
+    def objective(log_p, credit):
+        each = jax.nn.log_softmax(log_p)[jnp.arange(2), words]
+        weight = jax.lax.stop_gradient(jnp.exp(each.sum(1)))
+        return jnp.sum(weight[:, None] * each * credit)
+
+    whole = jax.grad(objective)(log_p, jnp.stack([a + b, a + b], 1))
+    parts = jax.grad(objective)(log_p, jnp.stack([a + b, b], 1))
+    np.testing.assert_allclose(whole, parts, atol=1e-6)
 
 
 def test_weights_of_prompts_that_count():

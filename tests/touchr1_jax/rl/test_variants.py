@@ -10,6 +10,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.config import (
     Advantage,
     Cispo,
@@ -25,6 +26,8 @@ from touchr1_jax.rl.config import (
     left_out,
 )
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.scoring import make_score
+from touchr1_jax.text.parser import compile_parser
 
 G, T = 3, 6
 OPTIMIZER = optax.sgd(0.05)
@@ -214,3 +217,25 @@ def test_only_the_number_zero_leaves_a_term_out():
 def test_constrained_sampling_needs_a_constraint():
     with pytest.raises(ValueError, match="constrained is True, but there is no constraint"):
         make_grpo_step(FNS, score, OPTIMIZER, of(Paper(constrained=True)))
+
+
+def test_a_score_that_knows_no_rewards_cannot_credit_segments():
+    with pytest.raises(ValueError, match="segment_credit is True"):
+        make_grpo_step(FNS, score, OPTIMIZER, of(Paper(segment_credit=True)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("buckets", [(), (2, 4)])
+def test_without_a_reward_that_is_settled_early_segments_change_nothing(buckets):
+    rewards, parser = make_rewards(uniform_prior((3, 3, 3, 9))), compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
+    found = []
+    for segment_credit in (False, True):
+        config = of(Paper(segment_credit=segment_credit), buckets=buckets)
+        step = make_grpo_step(FNS, make_score(parser, rewards, {"accuracy": 0.9, "format": 0.1}), OPTIMIZER, config)
+        state, metrics = step(
+            start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config), tiny.question_batch(1, P), FROZEN
+        )
+        assert all(np.isfinite(v) for v in metrics.values())
+        found.append(state.params)
+    for a, b in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)

@@ -198,6 +198,16 @@ def test_jit_and_vmap_change_nothing():
     chex.assert_trees_all_equal(batched, jax.tree.map(lambda *rows: jnp.stack(rows), *one_by_one))
 
 
+def test_tokens_belong_to_the_segment_that_is_not_over():
+    """A closing tag ends its own segment; one of `compare` before that of `perceive` ends none."""
+    tokenizer = word_level(TOUCH_LANGUAGE)
+    parser = compile_parser(TOUCH_LANGUAGE, tokenizer)
+    of = lambda text: parser.segments(jnp.array([*tokenizer.encode(text), *tokenizer.end_ids])).tolist()
+    assert of("<perceive> soft </perceive> <compare> soft </compare> <conclude> soft") == [0] * 3 + [1] * 3 + [2] * 3
+    assert of("</compare> soft </perceive> soft </compare> soft") == [0, 0, 0, 2, 2, 2, 2]
+    assert of("soft firm") == [0, 0, 0]
+
+
 def test_shapes_and_types():
     parsed = jax.eval_shape(PARSE, jax.ShapeDtypeStruct((24,), jnp.int32))
     assert (parsed.perceive.shape, parsed.compare.shape, parsed.conclude.shape) == ((4, 4), (4,), (4,))
