@@ -15,6 +15,7 @@ from experiments.core.context import Context
 from experiments.recordings.description_policy import LANGUAGE
 from experiments.recordings.touches import describe, families, read_touch, touch_of_scene
 from experiments.study.sources import SourceConfig, prepare_records
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
@@ -153,10 +154,13 @@ def _cached(
     """Arrays from a file of the cache that is named by the hash of an identity; made first if it is missing."""
     digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
     path = context.cache_dir / f"{name}-{digest}.npz"
-    if not path.exists():
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **make())  # type: ignore[arg-type]
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_bytes(path, buffer.getvalue())
-    with np.load(path) as file:
-        return dict(file)
+    if path.exists():
+        try:
+            return load_arrays(path)
+        except ArraysError as error:
+            context.print(f"{error}: it is made again")
+    buffer = io.BytesIO()
+    arrays = make()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, buffer.getvalue())
+    return arrays

@@ -22,6 +22,7 @@ from flax import traverse_util
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context, read_metrics
 from experiments.core.runs import ROOT, versions
+from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
 
 NEVER = ("touchr1_jax/bench/", "touchr1_jax/distributed/", "sensors_io/commands/", "sensors_io/viewer/")
@@ -39,6 +40,9 @@ LATER = (
 
 USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
+
+DAMAGED = (ValueError, KeyError)
+"""Errors of a file of the cache that is not what was written."""
 
 _LINES = "metrics"  # entry of the file that holds the logged lines as JSON; parameters are named by their path
 
@@ -62,9 +66,13 @@ def cached(
     digest = fingerprint(values, arrays, source_digest(LATER if kind == "sft" else NEVER))
     path = context.cache_dir / kind / f"{digest}.npz"
     if path.exists():
-        context.print(f"{stage}: made before, {path}")
-        with context.timed(stage):
-            return _found(path, context, stage)
+        try:
+            with context.timed(stage):
+                found = _found(path, context, stage)
+            context.print(f"{stage}: made before, {path}")
+            return found
+        except DAMAGED as error:
+            context.print(f"{stage}: {path} is damaged ({error}), and is made again")
     params = train()
     context.processes.write_once(lambda: _publish(path, params, _logged(context, stage)))
     return params
@@ -106,9 +114,9 @@ def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
 
 
 def _found(path: Path, context: Context, stage: str) -> Params:
-    with np.load(path) as file:
-        lines = json.loads(file[_LINES].tobytes())
-        params = {name: jnp.asarray(file[name]) for name in file.files if name != _LINES}
+    arrays = load_arrays(path)
+    lines = json.loads(arrays.pop(_LINES).tobytes())
+    params = {name: jnp.asarray(x) for name, x in arrays.items()}
     if _logged(context, stage) != lines:  # a resumed run has them already, and its log must not be reordered
         context.rewind(stage, 0)
         for line in lines:

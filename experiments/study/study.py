@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
+from experiments.study.cache import DAMAGED
 from experiments.study.dataset import Dataset
 from experiments.study.stages import (
     EncodedContacts,
@@ -31,6 +32,7 @@ from experiments.study.stages import (
     run_sft,
 )
 from experiments.study.training import GRPO_ATTRIBUTES, TrainingConfig, open_data, require_derived, starting_model
+from sensors_io.arrays import load_arrays
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
@@ -262,6 +264,8 @@ class _Seed(StudySeed):
     def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
         names = (SFT, *self.arms, BLIND, *self.variants)
+        for name in names:
+            self._drop_damaged(self._path(name))
         if not all(self._path(name).exists() for name in names):
             self._train()
             self._evaluate(BLIND, self._blind)
@@ -305,6 +309,15 @@ class _Seed(StudySeed):
                 evaluation = evaluate()
                 self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
 
+    def _drop_damaged(self, path: Path) -> None:
+        """Remove answers that cannot be read, so that they are made again."""
+        if path.exists():
+            try:
+                load_answers(path)
+            except DAMAGED as error:
+                self.context.print(f"{path} is damaged ({error}), and is made again")
+                self.context.processes.write_once(path.unlink)
+
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
 
@@ -320,10 +333,14 @@ def save_answers(path: Path, evaluation: Evaluation) -> None:
 
 
 def load_answers(path: Path) -> Evaluation:
-    """Answers that `save_answers` published."""
-    with np.load(path) as file:
-        flat: dict[str, Any] = {f: file.get(f) for f in _FLAT}
-        return Evaluation(**flat, parsed=Parsed(**{f: file[f"parsed_{f}"] for f in _PARSED}))
+    """Answers that `save_answers` published.
+
+    Raises:
+      ValueError, KeyError: the file is damaged.
+    """
+    arrays = load_arrays(path)
+    flat: dict[str, Any] = {f: arrays.get(f) for f in _FLAT}
+    return Evaluation(**flat, parsed=Parsed(**{f: arrays[f"parsed_{f}"] for f in _PARSED}))
 
 
 _FLAT = tuple(f.name for f in dataclasses.fields(Evaluation) if f.name != "parsed")
