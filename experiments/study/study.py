@@ -340,7 +340,8 @@ def load_answers(path: Path) -> Evaluation:
     """
     arrays = load_arrays(path)
     flat: dict[str, Any] = {f: arrays.get(f) for f in _FLAT}
-    return Evaluation(**flat, parsed=Parsed(**{f: arrays[f"parsed_{f}"] for f in _PARSED}))
+    parsed: dict[str, Any] = {f: arrays[f"parsed_{f}"] for f in _PARSED}
+    return Evaluation(**flat, parsed=Parsed(**parsed))
 
 
 _FLAT = tuple(f.name for f in dataclasses.fields(Evaluation) if f.name != "parsed")
