@@ -24,7 +24,9 @@ def digests(directory: Path) -> dict[str, str]:
     found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
     checkpoints = directory / "checkpoints"
     for stage in sorted({s.parent.parent for s in checkpoints.rglob("state") if s.parent.name.isdigit()}):
-        kept = sorted((path for path in stage.iterdir() if path.name.isdigit()), key=lambda path: int(path.name))
+        # a kill during the deletion of an old checkpoint leaves a part of it, which no later session reads
+        whole = (path for path in stage.iterdir() if path.name.isdigit() and (path / "data" / "metadata").exists())
+        kept = sorted(whole, key=lambda path: int(path.name))
         found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
     return found
 

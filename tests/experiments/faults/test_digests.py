@@ -38,3 +38,12 @@ def test_the_file_that_names_the_devices_does_not_count(run):
     sharding = damaged / "checkpoints" / "sft" / "0" / "12" / "state" / "_sharding"
     sharding.write_bytes(b"\x80" + sharding.read_bytes()[1:])
     assert digests(whole) == digests(damaged)
+
+
+def test_a_half_deleted_old_checkpoint_does_not_count_and_a_missing_one_does(run):
+    whole, killed = run("a"), run("b")
+    stage = killed / "checkpoints" / "sft" / "0"
+    (stage / "8" / "state").mkdir(parents=True)
+    assert digests(whole) == digests(killed)
+    (stage / "12" / "data" / "metadata").unlink()
+    assert differences(digests(whole), digests(killed)) == ("state of sft/0",)
