@@ -119,5 +119,13 @@ def test_the_truth_about_what_is_not_asked_is_seen():
     assert next(iter(rows[2].cells)) == "1.000"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "status"), [([], 0), (["--weights", "accuracy", "0.6", "consistency", "0.3", "format", "0.1"], 1)]
+)
+def test_the_search_fails_where_an_answer_outwits_the_last_rewards(capsys, arguments, status):
+    assert main(["adversary", "--prior", "0.5", "0.3", "0.2", *arguments]) == status
+    assert "of 3274 answers earn more than the honest" in " ".join(capsys.readouterr().out.split())
+
+
 def test_the_published_weights_are_those_that_reports_use():
     assert dict(PUBLISHED) == dict(REPORTED)
