@@ -277,7 +277,8 @@ def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
     rows: list[dict[str, Cell]] = []
     for o in outcomes:
         failed, others, firsts = o.noticed(failed=True), o.noticed(failed=False), o.first_alarms()
-        bounds = [f"{r.code} {'<' if r.below else '>'} {r.bound:g}" for r in RULES if r.code in o.scenario.alarms]
+        rules = [rule for rule in RULES if rule.code in o.scenario.alarms and not rule.at_once]
+        bounds = [f"{rule.code} {'<' if rule.below else '>'} {rule.bound:g}" for rule in rules]
         rows.append(
             {
                 "failure": o.name,

@@ -78,7 +78,7 @@ def diagnose(arm: ArmMeasurements) -> tuple[str, ...]:
 
 def _failures(arm: ArmMeasurements) -> Iterator[str]:
     history, both = arm.history or TrainingHistory(start={}, end={}, alarms={}), arm.before.keys() & arm.after.keys()
-    meanings = {rule.code: rule.meaning for rule in RULES}
+    meanings = {rule.code: rule.meaning for rule in RULES if not rule.at_once}
     for code, share in history.alarms.items():
         if share >= MOST:
             yield f"{code}: {meanings[code]} (alarm in {100 * share:.0f} % of the seeds)"
@@ -93,7 +93,7 @@ def _failures(arm: ArmMeasurements) -> Iterator[str]:
         slots, right = (arm.after[m] - arm.before[m] for m in ("csc_slot", "csc"))
         if slots > POINTS and right < slots - POINTS:
             yield f"F2: agreement of slots {slots:+.0f} points, right conclusions by single sensors {right:+.0f}"
-    if (degenerate := history.end.get("degenerate_share", 0.0)) > MOST:
+    if (degenerate := history.end.get("drawn_degenerate_share", history.end.get("degenerate_share", 0.0))) > MOST:
         yield f"F7: {100 * degenerate:.0f} % of the groups earn one reward and teach nothing"
     before, after = (steps.get("entropy", 0.0) for steps in (history.start, history.end))
     if "entropy" in history.end and before > 0 and after < MOST * before:
