@@ -266,11 +266,7 @@ Command = (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; known errors become one line on stderr and exit status 1.
-
-    Args:
-      arguments: the command line; that of the process by default.
-    """
+    """Run one command, by default the process's; known errors become one line on stderr and exit status 1."""
     command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
     try:
         return command.run()

@@ -158,14 +158,9 @@ def draw(
     share_y: bool = False,
     legend: bool = True,
 ) -> bytes:
-    """Draw the panels in rows of `columns`, with one legend above them, as SVG.
+    """Draw the panels in rows of `columns`, with one legend of the named series and rules above them, as SVG.
 
-    Args:
-      panels: one at least.
-      columns: of panels, at most.
-      size: of the figure in inches; by default it grows with panels and rows.
-      share_x, share_y: whether all panels have the same axis.
-      legend: of the named series and rules.
+    The `size` is in inches and by default grows with panels and rows; all panels may share an axis.
     """
     columns = min(columns, len(panels))
     lines = math.ceil(len(panels) / columns)
@@ -220,11 +215,7 @@ def speed_against_error(
 ) -> bytes:
     """Draw error over time a frame, logarithmic; each point's bar reaches from the median to the 95th percentile.
 
-    Args:
-      groups: points by kind; those of a kind are joined in the order given.
-      error: label of the error axis.
-      goal: time and error that must be kept, drawn as a corner; `None` for none.
-      legend: of the kinds; without one the names of the points must show them.
+    Points of a kind are joined in the order given; a goal of time and error is drawn as a corner.
     """
     series = []
     for kind, points in groups.items():

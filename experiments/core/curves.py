@@ -51,13 +51,11 @@ def draw_phases(
     *,
     most: int | None = None,
 ) -> dict[str, PhaseCurves]:
-    """Draw the training curves of every phase that has any.
+    """Draw the training curves in logged lines by phase.
 
     Args:
-      rows: logged lines.
-      wanted: phase → scalars to draw; all of a phase that is not named, up to `most`.
+      wanted: phase → scalars to draw; of a phase that is not named all, or the first `most`.
       colour: that of each arm; by default in the order of their first line.
-      most: `None` for any number.
     """
     drawn = {}
     for phase, scalars in curves_by_phase(rows).items():

@@ -33,14 +33,8 @@ def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) ->
 
     Everything is checked before the first file is written; if one cannot be written, the others are removed.
 
-    Args:
-      root: top of a checkout.
-      name: of the experiment and the reward.
-      reward: whether it tries a new reward.
-      taken: names that an experiment cannot have.
-
     Returns:
-      the new files and the changed ones, relative to the checkout.
+      the new files and the changed ones, relative to the top of the checkout, `root`.
 
     Raises:
       NewError: a name that is no lower-case Python name or taken, a file that exists, or no checkout.

@@ -50,15 +50,12 @@ def heatmaps(
     """Draw matrices side by side on one scale of colours, as SVG.
 
     Args:
-      maps: one at least.
-      x_label, y_label: of all.
+      maps: one at least, with common labels of their axes.
       columns: of matrices, at most.
       limits: values of the first and the last colour; values outside take these.
       logarithmic: whether equal ratios are equal steps of colour.
-      colour_map: matplotlib's.
-      colour_bar: label of a bar that explains the colours; none by default.
-      mark: value to mark on it.
-      size: of the figure in inches.
+      colour_map, size: matplotlib's colour map, inches.
+      colour_bar, mark: label of a bar that explains the colours, and a value to mark on it; no bar by default.
     """
     columns = min(columns, len(maps))
     lines = math.ceil(len(maps) / columns)

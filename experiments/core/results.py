@@ -86,10 +86,9 @@ def named_table(
     """A table from rows that name their cells; the first column names the row.
 
     Args:
-      title: heading.
+      title, note: heading, and a sentence above the table.
       rows: column → cell; columns are in the order in which rows first name them; a missing cell is `None`.
       formats, units, meanings: column → format of its numbers (".3g" by default), unit, explanation.
-      note: a sentence above the table.
 
     Raises:
       ResultsError: a format, unit or meaning of a column that no row names.

@@ -27,8 +27,8 @@ FLAGS = "XLA_FLAGS"
 
 
 @contextlib.contextmanager
-def compilations_kept(directory: Path) -> Iterator[None]:
-    """Let XLA read and write compiled programs below a directory, inside the block and for the whole process.
+def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iterator[None]:
+    """Let XLA read and write programs that took `least_s` or longer to compile, inside the block, in a directory.
 
     A program is found again by its code, its shapes and the versions of the compiler.  Programs of another kind of
     processor lie in another folder, for they may hold instructions that this one lacks, so that all machines may share
@@ -45,7 +45,7 @@ def compilations_kept(directory: Path) -> Iterator[None]:
     settings = {
         "jax_compilation_cache_dir": str(folder),
         "jax_compilation_cache_max_size": MOST_BYTES,
-        "jax_persistent_cache_min_compile_time_secs": WORTH_KEEPING_S,
+        "jax_persistent_cache_min_compile_time_secs": least_s,
     }
     before = {name: jax.config.values[name] for name in settings}
     _set(settings)

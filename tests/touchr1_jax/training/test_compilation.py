@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
 
-from touchr1_jax.training import compilation
 from touchr1_jax.training.compilation import (
     FLAGS,
     OLDER_LOOPS,
@@ -23,9 +22,8 @@ from touchr1_jax.training.compilation import (
 
 
 @pytest.fixture
-def keeping(monkeypatch):
-    """No cache of the session's own, and no compilation too small for one."""
-    monkeypatch.setattr(compilation, "WORTH_KEEPING_S", 0.0)
+def keeping():
+    """No cache of the session's own."""
     session = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
     compilation_cache.reset_cache()
@@ -48,7 +46,7 @@ def compiled(x: float) -> float:
 
 
 def test_a_program_is_kept_and_found_again(keeping, tmp_path):
-    with compilations_kept(tmp_path):
+    with compilations_kept(tmp_path, least_s=0.0):
         first = compiled(0.5)
         kept = entries(tmp_path)
         jax.clear_caches()
@@ -59,7 +57,7 @@ def test_a_program_is_kept_and_found_again(keeping, tmp_path):
 
 
 def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
-    with compilations_kept(tmp_path):
+    with compilations_kept(tmp_path, least_s=0.0):
         pass
     compiled(0.7)
     assert jax.config.values["jax_compilation_cache_dir"] is None
@@ -68,7 +66,7 @@ def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
 
 def test_a_half_written_entry_does_not_stop_the_keeping(keeping, tmp_path):
     """A killed process left the program without the time of its use: JAX would warn and never write again."""
-    with compilations_kept(tmp_path):
+    with compilations_kept(tmp_path, least_s=0.0):
         compiled(0.5)
     folder = tmp_path / processor()
     (whole,) = folder.glob("*-cache")
@@ -93,7 +91,7 @@ def test_freed_memory_goes_back_to_the_system():
 
 def test_a_cache_of_the_users_own_stays(keeping, tmp_path):
     mine, other = tmp_path / "mine", tmp_path / "other"
-    with compilations_kept(mine), compilations_kept(other):
+    with compilations_kept(mine, least_s=0.0), compilations_kept(other, least_s=0.0):
         compiled(0.9)
     assert entries(mine)
     assert not other.exists()
