@@ -42,7 +42,7 @@ def stage_hooks(
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)
     with (
-        Checkpoints(folder, better="higher" if scored else None, say=context.print) as checkpoints,
+        Checkpoints(folder, better="higher" if scored else None, print_=context.print) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         contextlib.ExitStack() as bar,

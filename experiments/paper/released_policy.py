@@ -36,7 +36,7 @@ from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.load import Checkpoint, WeightsError
 from touchr1_jax.models.qwen.config import read_config
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
-from touchr1_jax.models.qwen.safetensors import Tell
+from touchr1_jax.models.qwen.safetensors import ReportBytes
 from touchr1_jax.models.qwen.weights import INDEX, SINGLE, load_params, save_params
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy, language_of
@@ -255,7 +255,7 @@ def file_fingerprint(path: Path) -> list[int]:
 
 
 def write_policy(
-    directory: Path, source: Path, params: Params, progress: Tell = lambda done_bytes, all_bytes: None
+    directory: Path, source: Path, params: Params, progress: ReportBytes = lambda done_bytes, all_bytes: None
 ) -> None:
     """Publish a policy in one move, so that `directory` is never half written; one that exists is replaced.
 
@@ -278,7 +278,7 @@ def write_policy(
 
 
 def read_policy(
-    directory: Path, dtype: jnp.dtype | type, progress: Tell = lambda done_bytes, all_bytes: None
+    directory: Path, dtype: jnp.dtype | type, progress: ReportBytes = lambda done_bytes, all_bytes: None
 ) -> Params:
     """The parameters that `write_policy` wrote, those of the released towers as `dtype`.
 

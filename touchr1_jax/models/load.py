@@ -25,7 +25,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from touchr1_jax.models.qwen.config import QwenConfig, read_config
 from touchr1_jax.models.qwen.pictures import PixelBudget, read_budget
-from touchr1_jax.models.qwen.safetensors import Tell
+from touchr1_jax.models.qwen.safetensors import ReportBytes
 from touchr1_jax.models.qwen.weights import load_params
 from touchr1_jax.text.chat import VISION, VISION_END, check_template
 from touchr1_jax.text.tokenizer import Tokenizer, from_file
@@ -51,7 +51,7 @@ class Checkpoint:
 def load_checkpoint(
     directory: str | Path,
     dtype: jnp.dtype | type = jnp.bfloat16,
-    progress: Tell = lambda done_bytes, all_bytes: None,
+    progress: ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> Checkpoint:
     """Read a checkpoint; small files first, so that a wrong one is refused before the weights are read.
 
@@ -71,7 +71,7 @@ def load_checkpoint(
         raise WeightsError(str(error)) from error
 
 
-def _read(directory: Path, dtype: jnp.dtype | type, progress: Tell) -> Checkpoint:
+def _read(directory: Path, dtype: jnp.dtype | type, progress: ReportBytes) -> Checkpoint:
     config = read_config(directory)
     tokenizer = from_file(directory / TOKENIZER_FILE, vocab_size=config.decoder.vocab_size)
     check_ids(tokenizer, config)
@@ -101,7 +101,7 @@ def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:
             )
 
 
-def check_finite(params: Params, progress: Tell = lambda done_bytes, all_bytes: None) -> None:
+def check_finite(params: Params, progress: ReportBytes = lambda done_bytes, all_bytes: None) -> None:
     """Refuse weights that are no numbers; a loader that reads every release need not look, the command does.
 
     Args:
@@ -125,7 +125,7 @@ def check_finite(params: Params, progress: Tell = lambda done_bytes, all_bytes: 
 
 
 @contextlib.contextmanager
-def _bar(title: str) -> Iterator[Tell]:
+def _bar(title: str) -> Iterator[ReportBytes]:
     """Bytes, rate and time left on stderr; where that is no terminal, its last state alone."""
     columns = (
         TextColumn("{task.description}"),

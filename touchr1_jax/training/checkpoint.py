@@ -66,7 +66,7 @@ class Checkpoints:
       directory: where they lie; created if need be.
       keep: how many of the newest stay.
       better: which held-out scores are better, to keep the best scored checkpoint too; `None` where none has a score.
-      say: told of damage that was got round; standard error by default.
+      print_: receives a line about each damaged checkpoint that is passed over; standard error by default.
 
     Raises:
       CheckpointError: the directory cannot be read or written.
@@ -78,11 +78,11 @@ class Checkpoints:
         keep: int = 2,
         *,
         better: Literal["higher", "lower"] | None = None,
-        say: Callable[[str], None] = _complain,
+        print_: Callable[[str], None] = _complain,
     ) -> None:
         if keep < 1:
             raise ValueError(f"keep is {keep}: must be at least 1; raise it")
-        self._directory, self._scored, self._say = directory.absolute(), better is not None, say
+        self._directory, self._scored, self._print = directory.absolute(), better is not None, print_
         self._saving: int | None = None
         policy = LatestN(keep)
         if better is not None:
@@ -151,7 +151,7 @@ class Checkpoints:
     def restore(self, like: Any) -> Restored | None:
         """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none.
 
-        Damaged ones are renamed, to `damaged-STEP`, and told of.
+        Damaged ones are renamed to `damaged-STEP` and reported.
 
         Raises:
           CheckpointError: it holds another tree or other shapes.
@@ -163,7 +163,7 @@ class Checkpoints:
                 return self._read(step, like)
             except DamagedCheckpointError as error:
                 damaged.append(step)
-                self._say(f"{error}; it is kept as {self._set_aside(step).name}")
+                self._print(f"{error}; it is kept as {self._set_aside(step).name}")
         if damaged:
             raise DamagedCheckpointError(
                 f"{self._directory}: no checkpoint is intact, {damaged} are damaged and were set aside as damaged-*; "

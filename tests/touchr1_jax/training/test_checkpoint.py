@@ -116,7 +116,7 @@ class TestDamage:
 
     def restored(self, stage):
         told = []
-        with Checkpoints(stage, say=told.append) as checkpoints:
+        with Checkpoints(stage, print_=told.append) as checkpoints:
             return checkpoints.restore(self.numbers(0)), told
 
     @pytest.mark.parametrize("at", [0.5, *(pytest.param(at, marks=pytest.mark.slow) for at in (0.3, 0.7))])

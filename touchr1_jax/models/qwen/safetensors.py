@@ -30,11 +30,11 @@ MAX_HEADER = 100_000_000
 """Longest header, bytes; the format forbids more, and a file of another format would seem to ask for exabytes."""
 
 
-Tell = Callable[[int, int], None]
-"""Hears how many bytes are done, and of how many."""
+ReportBytes = Callable[[int, int], None]
+"""Called with the bytes done, and all bytes."""
 
 
-class Entry(NamedTuple):
+class TensorEntry(NamedTuple):
     """Where a tensor lies: its type by the format's name, its shape, its bytes from `start` to `end` of the file."""
 
     path: Path
@@ -49,7 +49,7 @@ class Entry(NamedTuple):
         return self.end - self.start
 
 
-def read_header(path: Path) -> dict[str, Entry]:
+def read_header(path: Path) -> dict[str, TensorEntry]:
     """Tensors of a file.
 
     Raises:
@@ -71,7 +71,7 @@ def read_header(path: Path) -> dict[str, Entry]:
     return {name: _entry(path, name, x, 8 + length, size) for name, x in tensors.items()}
 
 
-def read_tensor(entry: Entry) -> np.ndarray:
+def read_tensor(entry: TensorEntry) -> np.ndarray:
     """One tensor, read into fresh memory.
 
     Raises:
@@ -86,7 +86,7 @@ def read_tensor(entry: Entry) -> np.ndarray:
 
 
 def write_file(
-    path: Path, tensors: Mapping[str, np.ndarray], progress: Tell = lambda done_bytes, all_bytes: None
+    path: Path, tensors: Mapping[str, np.ndarray], progress: ReportBytes = lambda done_bytes, all_bytes: None
 ) -> None:
     """Write tensors to a file, whole or not at all.
 
@@ -117,13 +117,13 @@ def write_file(
     os.replace(partial, path)
 
 
-def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int) -> Entry:
+def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int) -> TensorEntry:
     """One entry of a header whose tensors start at byte `body`, held against its own shape and the file."""
     fields = {"dtype", "shape", "data_offsets"} - found.keys()
     if fields:
         raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")
     start, end = (body + offset for offset in found["data_offsets"])
-    entry = Entry(path, found["dtype"], tuple(found["shape"]), start, end)
+    entry = TensorEntry(path, found["dtype"], tuple(found["shape"]), start, end)
     if entry.dtype in DTYPES:
         needed = DTYPES[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
         if entry.size != needed:

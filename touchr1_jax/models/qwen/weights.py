@@ -32,7 +32,7 @@ def load_params(
     config: QwenConfig,
     dtype: jnp.dtype | type = jnp.bfloat16,
     device: jax.Device | None = None,
-    progress: safetensors.Tell = lambda done_bytes, all_bytes: None,
+    progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> Params:
     """Parameters of `QwenVL` from the safetensors files of a directory.
 
@@ -72,14 +72,14 @@ def load_params(
     return flax.traverse_util.unflatten_dict(loaded)
 
 
-def find_tensors(directory: Path) -> dict[str, safetensors.Entry]:
+def find_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
     """All tensors of a checkpoint by key without prefix.
 
     Raises:
       FileNotFoundError: no weights, or a shard that is missing.
       ValueError: an index that contradicts its shards, or two keys that mean the same tensor.
     """
-    found: dict[str, safetensors.Entry] = {}
+    found: dict[str, safetensors.TensorEntry] = {}
     for name, entry in _raw_tensors(directory).items():
         if canonical(name) in found:
             raise ValueError(f"{entry.path}: {name} is there twice, under an old and a new name; delete one file")
@@ -87,7 +87,7 @@ def find_tensors(directory: Path) -> dict[str, safetensors.Entry]:
     return found
 
 
-def compare(entries: Mapping[str, safetensors.Entry], wanted: Mapping[str, tuple[int, ...]]) -> list[str]:
+def compare(entries: Mapping[str, safetensors.TensorEntry], wanted: Mapping[str, tuple[int, ...]]) -> list[str]:
     """Mismatches, one line each, by published keys: missing, extra, shape, type."""
     missing = [f"missing: {published(key)} {shape}" for key, shape in wanted.items() if key not in entries]
     strangers = [(published(key), entry) for key, entry in entries.items() if key not in wanted]
@@ -105,7 +105,10 @@ def compare(entries: Mapping[str, safetensors.Entry], wanted: Mapping[str, tuple
 
 
 def save_params(
-    path: Path, params: Params, config: QwenConfig, progress: safetensors.Tell = lambda done_bytes, all_bytes: None
+    path: Path,
+    params: Params,
+    config: QwenConfig,
+    progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> None:
     """Write parameters to one file with the published keys, in their own type.
 
@@ -127,7 +130,7 @@ def save_params(
     safetensors.write_file(path, tensors, progress)
 
 
-def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
+def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
     """All tensors by the keys that the files have."""
     index = directory / INDEX
     if not index.is_file():
@@ -146,7 +149,7 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
         place = dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
-    entries: dict[str, safetensors.Entry] = {}
+    entries: dict[str, safetensors.TensorEntry] = {}
     for shard in sorted(set(place.values())):
         if not (directory / shard).is_file():
             raise FileNotFoundError(f"{directory / shard} is named by {INDEX} and is not there; fetch it")
@@ -161,11 +164,11 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.Entry]:
     return entries
 
 
-def _file_of(name: str, entries: Mapping[str, safetensors.Entry]) -> str | None:
+def _file_of(name: str, entries: Mapping[str, safetensors.TensorEntry]) -> str | None:
     return entries[name].path.name if name in entries else None
 
 
-def _place(entry: safetensors.Entry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None) -> Array:
+def _place(entry: safetensors.TensorEntry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None) -> Array:
     """One parameter on its device; waits for it, so that no two tensors are on their way at once."""
     raw = jax.device_put(safetensors.read_tensor(entry), device)
     return jax.block_until_ready(_lay_out(raw, turned, dtype))
