@@ -126,17 +126,14 @@ def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
     assert len(err.strip().splitlines()) == 1
 
 
-def test_a_wrong_command_is_told_the_right_ones(run):
+def test_help_names_every_command_and_a_wrong_one_is_told_the_right_ones(run):
+    status, out, _ = run("--help")
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()[1:]] == list(cli.COMMANDS)
     status, out, err = run("lst")
     assert (status, out) == (2, "")
     assert "There is no command 'lst'. Did you mean list?" in err
     assert "  label       Give recorded objects labels" in err
-
-
-def test_help_names_every_command(run):
-    status, out, _ = run("--help")
-    assert status == 0
-    assert [line.split()[0] for line in out.splitlines()[1:]] == list(cli.COMMANDS)
 
 
 def test_only_generating_scenes_waits_for_jax():

@@ -66,14 +66,6 @@ def test_presses_do_not_move_sideways_and_those_of_a_tap_let_go(motion: str, pre
     assert np.sum(made.phase == Phase.HOLD) >= held
 
 
-@pytest.mark.parametrize("frames", [36, 64, 200])
-def test_other_lengths(frames: int) -> None:
-    for motion in ("press", *EXPLORATORY):
-        made = plan(motion, 2.0, Pace(frames=frames))
-        assert len(made) == frames
-        assert made.force_n.max() == pytest.approx(2.0)
-
-
 POSE = surface.SensorPose(offset_mm=jnp.array([0.4, -0.2]), turn_rad=jnp.array(0.3), tilt=jnp.array([0.01, 0.0]))
 
 

@@ -100,11 +100,8 @@ def test_skins_move_rigidly(dx: int, dy: int, seed: int) -> None:
     skin = surface.make_skin(objects.sample(np.random.default_rng(seed), 0.3, 0.8), np.array([1.0, -2.0]), 1.0)
     x = (jnp.arange(n) + 0.5) * spacing - n * spacing / 2
 
-    def gap(offset: tuple[float, float]) -> np.ndarray:
-        pose = surface.SensorPose(offset_mm=jnp.array(offset), turn_rad=jnp.array(0.4), tilt=jnp.zeros(2))
-        return np.asarray(surface.gap(skin, pose, x))
-
-    here, there = gap((0.0, 0.0)), gap((dx * spacing, dy * spacing))
+    offsets = ((0.0, 0.0), (dx * spacing, dy * spacing))
+    here, there = (np.asarray(surface.gap(skin, _pose(0.4, offset), x)) for offset in offsets)
     rows, columns = slice(max(0, -dy), n - max(0, dy)), slice(max(0, -dx), n - max(0, dx))
     moved = there[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
     difference = moved - here[rows, columns]
@@ -112,30 +109,27 @@ def test_skins_move_rigidly(dx: int, dy: int, seed: int) -> None:
     assert there.min() == 0
 
 
+def _pose(turn: float = 0.0, offset: tuple[float, float] = (0.0, 0.0)) -> surface.SensorPose:
+    return surface.SensorPose(offset_mm=jnp.array(offset), turn_rad=jnp.array(turn), tilt=jnp.zeros(2))
+
+
 def test_a_quarter_turn_of_the_sensor_turns_the_gap() -> None:
     skin = surface.make_skin(objects.sample(np.random.default_rng(3), 0.3, 0.8), np.zeros(2), 1.2)
     x = (jnp.arange(40) + 0.5) * 0.3 - 6.0
-
-    def gap(turn: float) -> np.ndarray:
-        return np.asarray(
-            surface.gap(skin, surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=turn, tilt=jnp.zeros(2)), x)
-        )
-
-    np.testing.assert_allclose(gap(0.3 + np.pi / 2), np.rot90(gap(0.3), -1), atol=2e-4)
+    turned, still = (np.asarray(surface.gap(skin, _pose(turn), x)) for turn in (0.3 + np.pi / 2, 0.3))
+    np.testing.assert_allclose(turned, np.rot90(still, -1), atol=2e-4)
 
 
 def test_roughness_and_relief_show_in_the_gap() -> None:
     x = (jnp.arange(64) + 0.5) * 0.25 - 8.0
-    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
     for seed in range(5):
         solid = objects.sample(np.random.default_rng(seed), 0.0, 0.8)
         skin = surface.make_skin(solid, np.zeros(2), 1.0)
         smooth = skin.replace(wave_amplitudes_mm=jnp.zeros_like(skin.wave_amplitudes_mm))
-        roughness = np.asarray(surface.gap(skin, pose, x) - surface.gap(smooth, pose, x))
-        assert roughness.std() == pytest.approx(solid.rms_mm, rel=0.35)
         bare = smooth.replace(feature_height_mm=jnp.array(0.0))
-        relief = np.asarray(surface.gap(bare, pose, x) - surface.gap(smooth, pose, x))
-        assert np.ptp(relief) == pytest.approx(solid.feature_height_mm, rel=0.2)
+        rough, even, flat = (np.asarray(surface.gap(s, _pose(), x)) for s in (skin, smooth, bare))
+        assert (rough - even).std() == pytest.approx(solid.rms_mm, rel=0.35)
+        assert np.ptp(flat - even) == pytest.approx(solid.feature_height_mm, rel=0.2)
 
 
 @pytest.mark.parametrize("material", range(len(MATERIALS)))
@@ -212,12 +206,8 @@ def test_the_skin_over_a_seam_is_that_of_each_side() -> None:
     direction = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
     site = direction * v.offset_mm
     x = (jnp.arange(96) + 0.5) * 0.25 - 12.0
-    pose = surface.SensorPose(offset_mm=jnp.zeros(2), turn_rad=jnp.array(0.0), tilt=jnp.zeros(2))
-
-    def heights(what: objects.Solid) -> np.ndarray:
-        return np.asarray(surface.gap(surface.make_skin(what, site, 0.0), pose, x))
-
-    both, near, far = heights(solid), heights(solid.at(-99 * direction)), heights(solid.at(99 * direction))
+    parts = (solid, solid.at(-99 * direction), solid.at(99 * direction))
+    both, near, far = (np.asarray(surface.gap(surface.make_skin(s, site, 0.0), _pose(), x)) for s in parts)
     x_n = np.asarray(x)
     along = x_n[None] * np.cos(v.direction_rad) + x_n[:, None] * np.sin(v.direction_rad)
     for side, alone in ((along < -2, near), (along > 2, far)):

@@ -8,6 +8,7 @@ import pytest
 
 from sensors_io.scenes import motions, schedule
 from sensors_io.scenes.config import SceneConfig
+from sensors_io.scenes.motions import Pace
 from sensors_io.scenes.strength import Limits
 from sensors_io.schema import EXPLORATORY, FORCES_N, PRESS_FORCE_N
 from tests.sensors_io.checks import refused
@@ -86,11 +87,11 @@ def test_left_out_frames_are_counted(made, limits):
     assert counts.past_limit[limits.actual_n < 9][:, 3:].sum() > 0
 
 
-@pytest.mark.parametrize("frames", [20, 40, 90, 137])
-def test_the_pace_fits_any_length(frames):
+@pytest.mark.parametrize("pace", [*map(schedule.pace, (20, 40, 90, 137)), *(Pace(frames=n) for n in (36, 64, 200))])
+def test_the_pace_fits_any_length(pace):
     for motion in ("press", *EXPLORATORY):
-        hand = motions.plan(motion, 5.0, schedule.pace(frames))
-        assert len(hand) == frames
+        hand = motions.plan(motion, 5.0, pace)
+        assert len(hand) == pace.frames
         assert hand.force_n.max() == pytest.approx(5)
 
 
