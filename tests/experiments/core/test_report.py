@@ -166,10 +166,9 @@ def test_bold_needs_a_paired_interval_without_zero(results):
     assert is_best("omae", "unpaid", results)  # lower is better, and the pair may be given either way round
     assert not is_best("h_acc", "paid", results)  # never compared
     assert not is_best("middle_rate", "paid", results)  # no direction
-    doubtful = dataclasses.replace(
-        results, comparisons=(*results.comparisons, compared("acc", "paid", "unpaid", -1, 9))
-    )
-    assert not is_best("acc", "paid", doubtful)
+    for low in (-1, 0):  # an interval that ends at 0 holds it
+        doubtful = (*results.comparisons, compared("acc", "paid", "unpaid", low, 9))
+        assert not is_best("acc", "paid", dataclasses.replace(results, comparisons=doubtful))
 
 
 def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_path):

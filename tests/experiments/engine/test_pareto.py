@@ -31,6 +31,7 @@ def test_a_point_is_dominated_where_another_is_nowhere_worse_and_somewhere_bette
     assert not A.beats(B)
     assert front([A, B, C, D]) == (A, B, D)
     assert dominators("c", [A, B, C, D]) == (B, D)
+    assert dominators("e", [C, B, ParetoPoint("e", (4, 4))]) == (B, C)  # those of the front first
     assert dominators("a", [A, B, C, D]) == ()
     assert dominators("e", [A, B]) is None
 

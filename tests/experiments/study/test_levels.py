@@ -8,6 +8,7 @@ from experiments.study.levels import (
     accuracy_by_agreement,
     agreement_chart,
     confusion_chart,
+    confusion_map,
     reliability_table,
 )
 
@@ -31,6 +32,13 @@ def test_reliability_by_hand():
     assert answered == pytest.approx(20)
     assert right is None  # answered about one object: no interval over objects
     assert str(found).startswith("33.3 [")  # of three that are hard one was read as soft, one not at all
+
+
+def test_confusions_are_shares_of_each_label():
+    """Two soft ones read as soft; of three hard ones one was read as soft, one as hard, one not at all."""
+    found = confusion_map(ANSWERS.answer[:, 0], ANSWERS.label[:, 0], WORDS["hardness"], "hardness")
+    np.testing.assert_allclose(found.values, [[1, 0, 0], [1 / 3, 1 / 3, 1 / 3]])
+    assert list(found.columns) == ["soft", "hard", "unread"]
 
 
 def test_accuracy_by_agreement_by_hand():

@@ -57,6 +57,7 @@ def test_rewards_of_equal_value_but_unequal_rounding_have_zero_variance():
     reward = jnp.array([0.6 + 0.3 + 0.1, 1.0, 0.1 + 0.2 + 0.7, np.float32(1) + np.float32(2e-7)], jnp.float32)
     assert zero_variance(reward)
     assert not group_advantage(reward).any()
+    np.testing.assert_array_equal(zero_variance(jnp.array([[0.5, 0.500005], [0.5, 0.50002]])), [True, False])
 
 
 def test_groups_are_normalised_apart():

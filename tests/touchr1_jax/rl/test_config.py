@@ -34,6 +34,14 @@ def test_paper_preset():
     assert a.tactile_use is TactileUse.OFF
     assert (a.surrogate, a.average, a.updates, a.candidates) == (Surrogate.TOKEN, Average.ROLLOUT, 1, 1)
     assert c.algorithm == a == GRPOConfig().algorithm
+    assert not c.lean_compilation
+
+
+@pytest.mark.parametrize("kind", [GRPOConfig, Paper, Stable, Dapo, DrGrpo, Gspo, Cispo, ReinforcePlusPlus, Rloo])
+def test_settings_are_given_by_name_and_never_change(kind):
+    assert all(field.kw_only for field in dataclasses.fields(kind))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(kind(), dataclasses.fields(kind)[0].name, None)
 
 
 def test_stable_preset():

@@ -42,6 +42,9 @@ def test_noise_is_a_draw_of_the_same_sensor():
     for p in range(P):
         for s in range(tiny.S):
             assert any((touch[p, s] == np.asarray(NOISE[k, s])).all() for k in range(7))
+    present = FEATURES.stream_mask.at[2].set(False).at[0, 1].set(False)
+    applies = noise_touch(FEATURES.replace(stream_mask=present), NOISE, jax.random.key(1)).applies
+    np.testing.assert_array_equal(applies, [True, True, False, True, True])
 
 
 @pytest.mark.parametrize("steps", [2, 3, 5])
@@ -75,6 +78,14 @@ def test_shuffle_leaves_steps_alone_that_do_not_exist():
     order = np.asarray(shuffled.features.touch)[:, 0, 0, :, 0]
     np.testing.assert_array_equal(order[:, 2:4], np.tile([2, 3], (200, 1)))
     assert (order[:, [0, 4, 6]] != [0, 4, 6]).any(-1).all()
+
+
+def test_steps_of_unequal_length_keep_their_order():
+    features = longer(1, 3)
+    uneven = features.replace(touch_time=jnp.broadcast_to(jnp.array([0, 0, 0, 3, 3, 6]), features.touch_time.shape))
+    shuffled = shuffle_touch(uneven, jax.random.key(0))
+    assert not shuffled.applies.any()
+    np.testing.assert_array_equal(shuffled.features.touch, uneven.touch)
 
 
 def test_swap_gives_each_prompt_the_touch_of_another():

@@ -128,6 +128,14 @@ def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     assert any(jnp.abs(a - b).max() > 1e-4 for a, b in zip(*map(jax.tree.leaves, (free, held)), strict=True))
 
 
+def test_grounding_is_logged_for_every_stream(one_stream):
+    """Prompts 0 and 2 perturb stream 0, prompts 1 and 3 stream 1."""
+    parts = compute(one_stream, PARAMS)[1]
+    assert [parts[f"perturbed_stream_{s}"] for s in range(tiny.S)] == [2, 2]
+    by_stream = np.mean([parts[f"grounding_stream_{s}"] for s in range(tiny.S)])
+    np.testing.assert_allclose(by_stream, parts["grounding"], rtol=1e-5)
+
+
 def test_blocks_of_tokens_give_the_gradient_of_all_of_them(one_stream):
     """Three tokens' logits at a time, of policy, reference and perturbed policy, each with its KL."""
     whole = compute(one_stream, PARAMS)

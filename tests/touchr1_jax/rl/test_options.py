@@ -16,7 +16,7 @@ from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.rollout import SampleConfig, drawn_log_probs, nucleus, sample_group
-from touchr1_jax.rl.update import update_policy
+from touchr1_jax.rl.update import bucketed_gradient, update_policy
 
 G, T, RATE = 3, 4, 1e-3
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=Paper(beta=0.0, gamma=0.0))
@@ -153,6 +153,34 @@ def learn() -> Experience:
     advantage = jnp.asarray(rng.normal(size=(P, G)), jnp.float32)
     stream = jnp.zeros(P, jnp.int32)
     return Experience(BATCH, BATCH.features.touch, stream, off, off.log_prob, advantage, jnp.full(P, 1 / P))
+
+
+def test_a_bucket_holds_the_longest_rollout(learn):
+    """Whether the longest rollout has 3 or 4 tokens, a gradient in buckets is that over all tokens."""
+    tokens = jnp.arange(T)
+    gradient = lambda config: jax.jit(lambda e: bucketed_gradient(FNS, config, START, START, e, first=False))
+    whole, cut = gradient(CONFIG), gradient(dataclasses.replace(CONFIG, buckets=(3,)))
+    for longest in (3, T):
+        mask = jnp.broadcast_to(tokens < jnp.array([1, 2, longest])[:, None], (P, G, T))
+        ended = learn._replace(rollout=learn.rollout.replace(mask=mask))
+        (grads, parts, old), (expected, values, before) = cut(ended), whole(ended)
+        close(grads, expected, rtol=1e-4, atol=1e-6)
+        close(parts, values, rtol=1e-4, atol=1e-6)
+        close(old[mask], before[mask], rtol=1e-6)
+
+
+def test_parts_of_several_updates_are_those_of_the_first(learn):
+    """But the share of clipped tokens is that of the last, which is off policy at a large rate."""
+    optimizer = optax.sgd(30.0)
+    state = optimizer.init(START)
+    found = []
+    for updates in (1, 2):
+        config = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, updates=updates))
+        run = jax.jit(lambda config=config: update_policy(FNS, optimizer, config, START, state, START, learn)[2])
+        found.append(run())
+    one, two = found
+    assert one.pop("clip_share") == 0 < two.pop("clip_share")
+    close(two, one, rtol=1e-4, atol=1e-6)
 
 
 def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.lm import PrefixCache
-from touchr1_jax.rl.rollout import SampleConfig, make_answer, sample
+from touchr1_jax.rl.rollout import SampleConfig, inverse_draw, make_answer, sample
 from touchr1_jax.text.parser import compile_parser
 
 V, PAD, END, STOP = 8, 0, 1, 2
@@ -104,6 +104,18 @@ def test_tokens_follow_the_softmax():
     assert count[PAD] == 0
     np.testing.assert_allclose(count / n, p, atol=5 * np.sqrt(p.max() / n))
     np.testing.assert_allclose(said.log_prob, np.log(np.maximum(p, 1e-99))[said.tokens], rtol=1e-5)
+
+
+def test_inverse_draws_by_hand():
+    """Probabilities 0, .5, .3, 0, .2: a word is drawn where u lies between its cumulative probabilities."""
+    logits = jnp.log(jnp.array([1e-30, 0.5, 0.3, 1e-30, 0.2]))
+    u = jnp.array([0.0, 0.49, 0.51, 0.79, 0.81, 0.999])
+    np.testing.assert_array_equal(inverse_draw(jnp.tile(logits, (6, 1)), u), [0, 1, 2, 2, 4, 4])
+
+
+def test_settings_of_the_sampler_never_change():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        CONFIG.greedy = False
 
 
 def test_tokens_of_a_rollout_are_independent_draws():

@@ -1,13 +1,17 @@
 """R_tu by hand, and how often it pays by chance, enumerated."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rewards.examples import make_parsed, make_target
-from touchr1_jax.rl.config import Stable
+from touchr1_jax.rl.advantages import advantages
+from touchr1_jax.rl.config import Paper, Stable, TactileUse
 from touchr1_jax.rl.credit_odds import CREDIT, HELPED, HINDERED, credit_odds, false_credit
-from touchr1_jax.rl.tactile_use import bar, literal, recommended, right
+from touchr1_jax.rl.tactile_use import TERM, bar, bonus_metrics, literal, recommended, right, tactile_bonus
+from touchr1_jax.types import Parsed
 
 SIZES = {"group": 8, "rollouts": Stable().controls, "controls": 3}
 
@@ -80,3 +84,44 @@ def test_the_bar_is_the_best_control_that_counts():
     assert bar(control, jnp.array([True, False, True])) == pytest.approx(0.2)
     assert bar(control, jnp.array([True, True, True])) == 1
     assert bar(control, jnp.zeros(3, bool)) == 1  # nothing passes where no control could be made
+
+
+def test_bonuses_and_their_metrics_by_hand():
+    """Of three groups one is right, and no control ever is."""
+    batch = tiny.question_batch(0, 3)
+    says = lambda level: jnp.where(batch.target.asked, level[:, None], -1)[:, None]
+    answered = lambda level: Parsed(
+        perceive=jnp.full((3, 2, tiny.S, tiny.A), -1),
+        compare=jnp.full((3, 2, tiny.A), -1),
+        conclude=jnp.broadcast_to(says(level), (3, 2, tiny.A)),
+        formatted=jnp.ones((3, 2), bool),
+        truncated=jnp.zeros((3, 2), bool),
+        length=jnp.zeros((3, 2), jnp.int32),
+    )
+    none = jnp.full(3, -1)
+    noise = jnp.zeros((2, *batch.features.touch.shape[1:]))
+    answer = lambda features, key: answered(none)
+    rollouts = answered(none.at[0].set(batch.target.label[0].max()))
+    bonus, metrics = tactile_bonus(Stable(), rollouts, batch, noise, answer, jax.random.key(0))
+    np.testing.assert_allclose(bonus, [[1, 1], [0, 0], [0, 0]])
+    third = pytest.approx(1 / 3)
+    shares = {"touch_score": third, "tactile_credit_share": third}
+    shares |= {"control_missing_share": 0, "credit_unearned_share": 0}
+    for name in ("drop", "noise", "order"):
+        shares |= {f"control_{name}": 0, f"control_{name}_share": 1}
+    assert metrics == shares
+
+
+@pytest.mark.parametrize(("form", "cancelled"), [(TactileUse.LITERAL, 1 / 3), (TactileUse.RECOMMENDED, 0)])
+def test_a_literal_bonus_that_follows_the_reward_is_cancelled(form, cancelled):
+    """Where σ takes it away: of the two groups with different bonuses the one whose rewards differ as they do."""
+    algorithm = Paper(tactile_use=form)
+    base, bonus = jnp.array([[1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), jnp.array([[1.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    added = algorithm.tactile_weight * bonus
+    reward, terms = (base + added, {"a": base, TERM: added}) if form is TactileUse.LITERAL else (base, {"a": base})
+    after = advantages(algorithm, reward, terms)
+    if form is TactileUse.RECOMMENDED:
+        after += added - added.mean(-1, keepdims=True)
+    found = bonus_metrics(algorithm, reward, terms, bonus, after)
+    assert found["bonus_telling_share"] == pytest.approx(2 / 3)
+    assert found["bonus_cancelled_share"] == pytest.approx(cancelled)

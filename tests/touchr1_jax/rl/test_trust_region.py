@@ -10,7 +10,7 @@ from tests.touchr1_jax.rl.test_grpo import FNS, P
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
-from touchr1_jax.rl.trust_region import NEAR, within_trust
+from touchr1_jax.rl.trust_region import within_trust
 
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
@@ -58,10 +58,17 @@ def test_a_long_update_ends_near_its_bound(shorten, size):
     assert long["update_kl"] > 2 * DELTA
     assert long["update_scale"] < 1
     _, again = shorten(size * long["update_scale"])
-    assert 0.3 * DELTA < again["update_kl"] <= NEAR * DELTA
+    assert 0.3 * DELTA < again["update_kl"] <= 1.5 * DELTA
     assert again["update_scale"] == 1
 
 
 def test_a_far_update_is_shortened_more_than_once(shorten):
     _, far = shorten(3.0)
     assert far["update_scale"] < 0.9 * np.sqrt(DELTA / far["update_kl"])
+
+
+def test_an_update_of_twice_the_bound_is_shortened(shorten):
+    size = 0.1 * np.sqrt(2 * DELTA / shorten(0.1)[1]["update_kl"])
+    _, twice = shorten(size)
+    assert 1.6 * DELTA < twice["update_kl"] < 2.4 * DELTA
+    assert twice["update_scale"] < 1

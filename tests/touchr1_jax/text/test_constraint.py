@@ -71,7 +71,9 @@ def test_tags_of_another_language_need_no_code():
         assert constraint.allowed(state, jnp.int32(100))[token]
         state = constraint.advance(state, jnp.int32(token))
     assert constraint.allowed(state, jnp.int32(1))[1]
-    assert not constraint.allowed(state, jnp.int32(100))[character_level().encode("x")[0]]
+    letter = jnp.int32(character_level().encode("x")[0])
+    assert not constraint.allowed(state, jnp.int32(100))[letter]
+    assert constraint.advance(state, letter) == constraint.advance(state, jnp.int32(1)) == state
 
 
 def test_a_vocabulary_without_tags_is_refused():

@@ -1,9 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from tests.touchr1_jax.text.vocabularies import LANGUAGES, TRICKY, make_tokenizer
 from touchr1_jax.text.language import TOUCH_LANGUAGE
-from touchr1_jax.text.lexer import EMPTY_CLASS, FIRST_PHRASE, FIRST_TAG, TEXT, compile_lexer, phrases_of
+from touchr1_jax.text.lexer import EMPTY_CLASS, FIRST_PHRASE, FIRST_TAG, TEXT, compile_lexer, phrases_of, tags_of
 from touchr1_jax.text.tokenizer import Tokenizer
 
 
@@ -27,7 +29,7 @@ def events_of(language, text: str) -> list[str]:
     [
         ("very hard", ["text", "very hard"]),
         ("very soft", ["text", "very", "soft"]),
-        ("very  \n hard", ["text", "very hard"]),
+        ("very  \n\t\r\v\f hard", ["text", "very hard"]),
         ("very-hard", ["text", "very", "hard"]),
         ("x-y", ["text", "x-y"]),
         ("x -y", ["text"]),
@@ -50,6 +52,12 @@ def events_of(language, text: str) -> list[str]:
 )
 def test_events(text, events):
     assert events_of(TRICKY, text) == events
+
+
+@pytest.mark.parametrize("tags", [("a", "b", "a"), ("a b", "c", "d"), ("A", "b", "c")])
+def test_tags_are_different_lower_case_words(tags):
+    with pytest.raises(ValueError, match=r"tags: .* must be one lower-case ASCII word and differ"):
+        tags_of(dataclasses.replace(TOUCH_LANGUAGE, tags=tags))
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
