@@ -34,10 +34,10 @@ OPTIMIZER = optax.sgd(0.05)
 SIZES = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2)
 
 
-def take(config: GRPOConfig, steps: int = 1, prompts: int = P, **kwargs):
+def take(config: GRPOConfig, steps: int = 1, prompts: int = P, seed: int = 1):
     """State and metrics after some steps on one batch."""
-    step = make_grpo_step(FNS, score, OPTIMIZER, config, **kwargs)
-    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), config)
+    step = make_grpo_step(FNS, score, OPTIMIZER, config)
+    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(seed), config)
     batch = tiny.question_batch(1, prompts).replace(ordered=jnp.arange(prompts) % 2 == 0)
     for _ in range(steps):
         state, metrics = step(state, batch, FROZEN)
@@ -154,21 +154,34 @@ def test_buckets_must_ascend_below_the_length():
 @pytest.mark.parametrize(
     "algorithm",
     [
-        Stable(),
+        Stable(tactile_margin=0.0, controls=1),
         pytest.param(Paper(tactile_use=TactileUse.LITERAL), marks=pytest.mark.slow),
         pytest.param(Paper(tactile_use=TactileUse.LITERAL, advantage=Advantage.PER_REWARD), marks=pytest.mark.slow),
     ],
     ids=["stable", "literal", "literal, per reward"],
 )
 def test_tactile_use_samples_the_controls(algorithm):
-    state, metrics = take(of(algorithm))
+    state, metrics = take(of(algorithm), seed=0)
     assert {"touch_score", "control_drop", "control_noise", "control_order", "tactile_credit_share"} <= set(metrics)
     assert all(np.isfinite(v) for v in metrics.values())
     assert 0 <= metrics["control_noise"] <= 1
     assert metrics["credit_unearned_share"] == 0
     missing = 0.0 if isinstance(algorithm, Stable) else 1 / 6  # the literal shuffle counts for every other prompt
-    assert metrics["control_missing_share"] == pytest.approx(missing)
+    assert metrics["control_missing_share"] == pytest.approx(missing, abs=1e-6)
+    if algorithm.tactile_use is TactileUse.LITERAL:
+        paid = metrics["reward_tactile_use"]
+        assert 0 <= paid <= algorithm.tactile_weight * metrics["tactile_credit_share"]
+    else:
+        assert metrics["bonus_cancelled_share"] < metrics["bonus_telling_share"]
     assert moved(state) > 0
+
+
+def test_a_literal_bonus_is_a_term_of_the_reward():
+    config = of(Paper(tactile_use=TactileUse.LITERAL))
+    step = make_grpo_step(FNS, score, OPTIMIZER, config)
+    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(0), config)
+    _, metrics = jax.eval_shape(step, state, tiny.question_batch(1, P), FROZEN)
+    assert {"reward_right", "reward_tactile_use"} <= set(metrics)
 
 
 @pytest.mark.slow
