@@ -166,8 +166,8 @@ def test_bold_needs_a_paired_interval_without_zero(results):
     assert is_best("omae", "unpaid", results)  # lower is better, and the pair may be given either way round
     assert not is_best("h_acc", "paid", results)  # never compared
     assert not is_best("middle_rate", "paid", results)  # no direction
-    for low in (-1, 0):  # an interval that ends at 0 holds it
-        doubtful = (*results.comparisons, compared("acc", "paid", "unpaid", low, 9))
+    for low, high in ((-1, 9), (0, 9), (-9, 0)):  # an interval that ends at 0 holds it
+        doubtful = (*results.comparisons, compared("acc", "paid", "unpaid", low, high))
         assert not is_best("acc", "paid", dataclasses.replace(results, comparisons=doubtful))
 
 

@@ -135,7 +135,7 @@ def test_level_words_match_whole_and_alone(body, level):
             id="interleaved bodies overlap",
         ),
         pytest.param(
-            "xense <perceive> hard gelsight  mini soft, then DM-Tac x: hard </perceive>",
+            "xense <perceive> hard gelsight \f mini soft, then DM-Tac x: hard </perceive>",
             ([0, -1, -1, 2], -1, -1, False),
             id="a level belongs to the sensor named before it in the body",
         ),
