@@ -254,7 +254,7 @@ def run_files(unfinished: Path) -> tuple[BadInput, ...]:
         dataclasses.replace(locked, around=lambda folder: runs.locked(run_directory(folder))),
         case("checkpoint", "every checkpoint cut", none_left, "damaged-*", "put copies", _every_state(cut)),
         case("checkpoint", "every checkpoint empty", none_left, "[12, 8]", "put copies", _every_state(emptied)),
-        case("checkpoint", "a changed iterator", none_left, "its data does not hold", "copies", _changed_iterator),
+        case("checkpoint", "a changed iterator", none_left, "data/metadata does not hold", "copies", _changed_iterator),
         case("checkpoint", "other shapes", "CheckpointError", "holds another state", "go back to", _other_shapes),
         case("checkpoint", "a file in their place", unwritten, "count/0", "move away", _file_for_folder),
         BadInput("run", "targets that are NaN from step 5 on", f"{COUNTING} --poison-from 5", "NonFiniteGradientError",
