@@ -4,7 +4,6 @@ import lzma
 import math
 import os
 import pathlib
-import struct
 import tokenize
 import zipfile
 import zlib
@@ -12,11 +11,10 @@ from typing import IO
 
 import numpy as np
 
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 
 _BROKEN = (
-    OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError,
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError,
+    *MALFORMED, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError,
 )  # fmt: skip
 """Errors that damaged bytes raise in NumPy and zipfile."""
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.deltas import FILTERS, accumulate, choose_filter, difference
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, ObjectCard, SchemaError, Sequence, Spec
 
 TOLERANCE: Mapping[str, float] = {
@@ -46,11 +46,6 @@ WIDEST: Mapping[str, float] = {
     name: 32767 * 2.0 ** math.floor(math.log2(2 * tolerance)) for name, tolerance in TOLERANCE.items()
 }
 """Largest value of each quantised array that int16 carries within its tolerance: 32 mm, 64 N, 512 N mm."""
-
-_FOREIGN = (
-    ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, SyntaxError,
-)  # fmt: skip
-"""Errors of a header that this code did not write; NumPy raises the last for the name of a type."""
 
 _MAGIC, _OLD_MAGIC = b"TCH2", b"TCH1"
 _PREFIX = struct.Struct("<4sII")
@@ -132,7 +127,7 @@ def _checked() -> Iterator[None]:
         yield
     except CorruptRecordsError:
         raise
-    except _FOREIGN as error:
+    except MALFORMED as error:
         reason = error if isinstance(error, UserError) else repr(error)
         raise CorruptRecordsError(f"the entry is not laid out as this version writes it ({reason})") from error
 

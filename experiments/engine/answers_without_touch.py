@@ -29,16 +29,14 @@ ACCURACIES = tuple(np.linspace(1 / 3, 1, 13).tolist())
 @functools.cache
 def preset_earnings() -> dict[str, dict[str, Earnings]]:
     """Presets that share their rewards, by name → labels → what every program earns."""
-    presets: dict[bool, list[str]] = {False: [], True: []}
-    for algorithm in get_args(AnyAlgorithm):
-        presets[algorithm().stable_rewards].append(algorithm.__name__)
-    algorithms = {algorithm.__name__: algorithm() for algorithm in get_args(AnyAlgorithm)}
+    presets = [kind() for kind in get_args(AnyAlgorithm)]
+    groups = [[preset for preset in presets if preset.stable_rewards == stable] for stable in (False, True)]
     return {
-        ", ".join(names): {
-            labels: earnings(make_rewards(with_prior(prior)), reward_weights(algorithms[names[0]], PUBLISHED), prior)
+        ", ".join(type(preset).__name__ for preset in group): {
+            labels: earnings(make_rewards(with_prior(prior)), reward_weights(group[0], PUBLISHED), prior)
             for labels, prior in PRIORS.items()
         }
-        for names in presets.values()
+        for group in groups
     }
 
 

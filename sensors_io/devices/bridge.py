@@ -30,6 +30,7 @@ import numpy as np
 from sensors_io.devices import bridge_server
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.errors import MALFORMED
 
 _SERVER = pathlib.Path(bridge_server.__file__)
 _LARGEST_HEADER = 1 << 16  # bytes: a few names and shapes
@@ -89,7 +90,7 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
             arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
             start += count * dtype.itemsize
         int(described["number"] or 0), int(described["stamp_ns"])
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, SyntaxError) as error:
+    except MALFORMED as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
         raise DeviceDataError(

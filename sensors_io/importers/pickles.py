@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.errors import MALFORMED
 from sensors_io.importers.keep import UnreadableError
 
 _DEPTH = 64
@@ -111,17 +112,18 @@ _ALLOWED: Mapping[tuple[str, str], Callable[..., Any]] = {
     ("_codecs", "encode"): _latin1,
     ("__builtin__", "bytes"): _bytes,
     **{
-        (f"numpy.{core}.{module}", function.__name__.replace("_scalar", "scalar")): function
+        (f"numpy.{core}.{module}", name): function
         for core in ("core", "_core")  # the first until NumPy 2
-        for module, function in (("multiarray", _reconstruct), ("multiarray", _scalar), ("numeric", _frombuffer))
+        for module, name, function in (
+            ("multiarray", "_reconstruct", _reconstruct),
+            ("multiarray", "scalar", _scalar),
+            ("numeric", "_frombuffer", _frombuffer),
+        )
     },
 }
 """All that a pickle may ask for."""
 
-_BROKEN = (
-    pickle.UnpicklingError, EOFError, ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError,
-    RecursionError, MemoryError, SyntaxError, tokenize.TokenError,
-)  # fmt: skip
+_BROKEN = (*MALFORMED, pickle.UnpicklingError, EOFError, tokenize.TokenError)
 """Errors that truncated or foreign bytes raise during unpickling."""
 
 
@@ -174,7 +176,8 @@ def _plain(data: Any, depth: int) -> Any:
         if data.value is None:
             raise pickle.UnpicklingError("an array without its data")
         if data.value.dtype == object:
-            data.value[...] = _array_of(data.value, depth)
+            for i, item in enumerate(data.value.flat):
+                data.value.flat[i] = _plain(item, depth - 1)
         return data.value
     if isinstance(data, _DType):
         return data.dtype
@@ -185,10 +188,3 @@ def _plain(data: Any, depth: int) -> Any:
     if isinstance(data, type) or callable(data):
         raise PickleError(f"holds the name {data!r} as data: only numbers, text and arrays are read")
     return data
-
-
-def _array_of(values: np.ndarray, depth: int) -> np.ndarray:
-    out = np.empty(values.shape, object)
-    for i, value in enumerate(values.flat):
-        out.flat[i] = _plain(value, depth - 1)
-    return out

@@ -14,7 +14,7 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.codec import FIELDS, WIDEST
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.force import ForceError, at_frames
 from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
@@ -59,7 +59,7 @@ def assemble(path: pathlib.Path) -> Assembled | None:
         return _assembled(start, entries, torn)
     except UserError:
         raise
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError) as error:
+    except MALFORMED as error:
         raise JournalError(
             f"{path} holds entries of another layout ({error!r}): move it away, or bring it in with the version that "
             "wrote it"

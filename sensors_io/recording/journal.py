@@ -20,15 +20,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 
 _MAGIC = b"TJR1"
 _PREFIX = struct.Struct("<4sII")
-_FOREIGN = (
-    ValueError, KeyError, TypeError, IndexError, OverflowError, MemoryError, SyntaxError, struct.error,
-)  # fmt: skip
-"""Errors of a body that this code did not write; NumPy raises `SyntaxError` for the name of a type."""
-
 _HEADER_SIZE = struct.Struct("<I")
 _SYNC_EVERY_S = 1.0
 
@@ -123,7 +118,7 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
             return
         try:
             entry = _decode(body)
-        except _FOREIGN as error:
+        except MALFORMED as error:
             raise JournalError(
                 f"{path} holds an entry of another layout at byte {start} ({error!r}): move it away, or bring it in "
                 "with the version that wrote it"

@@ -24,16 +24,13 @@ def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
     """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
-    if algorithm.segment_credit:  # equal totals may be made of different terms, of which tokens get a part
+    if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
+        # equal totals may be made of different terms, which count by themselves
         return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
-    match algorithm.advantage:
-        case Advantage.GLOBAL:
-            every = best_of(reward, algorithm.best_of).reshape(-1)
-            return jnp.broadcast_to(zero_variance(every), reward.shape[:1])
-        case Advantage.PER_REWARD:
-            return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
-        case _:
-            return zero_variance(best_of(reward, algorithm.best_of))
+    reward = best_of(reward, algorithm.best_of)
+    if algorithm.advantage is Advantage.GLOBAL:
+        return jnp.broadcast_to(zero_variance(reward.reshape(-1)), reward.shape[:1])
+    return zero_variance(reward)
 
 
 def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:

@@ -1,12 +1,14 @@
 """Presets as they are published, chosen and reported."""
 
 import dataclasses
+from typing import get_args
 
 import pytest
 import tyro
 
 from touchr1_jax.rl.config import (
     Advantage,
+    AnyAlgorithm,
     Average,
     Cispo,
     Dapo,
@@ -37,7 +39,7 @@ def test_paper_preset():
     assert not c.lean_compilation
 
 
-@pytest.mark.parametrize("kind", [GRPOConfig, Paper, Stable, Dapo, DrGrpo, Gspo, Cispo, ReinforcePlusPlus, Rloo])
+@pytest.mark.parametrize("kind", [GRPOConfig, *get_args(AnyAlgorithm)])
 def test_settings_are_given_by_name_and_never_change(kind):
     assert all(field.kw_only for field in dataclasses.fields(kind))
     with pytest.raises(dataclasses.FrozenInstanceError):
