@@ -97,8 +97,6 @@ class Hyperparameters(NamedTuple):
 
 Setting = tuple[World, Hyperparameters]  # values of all knobs
 
-Program = Callable[..., Any]
-
 
 def hyperparameters_of(variant: GrpoVariant) -> Hyperparameters:
     """The preset's own weights."""

@@ -264,8 +264,7 @@ class _Seed(StudySeed):
     def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
         names = (SFT, *self.arms, BLIND, *self.variants)
-        for name in names:
-            self._drop_damaged(self._path(name))
+        self.context.processes.write_once(lambda: self._drop_damaged(names))
         if not all(self._path(name).exists() for name in names):
             self._train()
             self._evaluate(BLIND, self._blind)
@@ -309,14 +308,14 @@ class _Seed(StudySeed):
                 evaluation = evaluate()
                 self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
 
-    def _drop_damaged(self, path: Path) -> None:
+    def _drop_damaged(self, names: Sequence[str]) -> None:
         """Remove answers that cannot be read, so that they are made again."""
-        if path.exists():
+        for path in filter(Path.exists, map(self._path, names)):
             try:
                 load_answers(path)
             except DAMAGED as error:
                 self.context.print(f"{path} is damaged ({error}), and is made again")
-                self.context.processes.write_once(path.unlink)
+                path.unlink()
 
     def _path(self, name: str) -> Path:
         return self.context.directory / "answers" / f"{name}-{self.seed}.npz"

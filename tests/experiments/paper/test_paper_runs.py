@@ -125,6 +125,16 @@ def test_a_run_without_results_goes_on_from_the_answers(home, cache_dir, directo
     assert all(second[part] == first[part] for part in ("arms", "baselines", "comparisons", "data"))
 
 
+def test_damaged_answers_are_made_again(home, cache_dir, directory, capsys):
+    first, (path, *_) = read_json(directory / "results.json"), sorted((directory / "answers").glob("*.npz"))
+    path.write_bytes(path.read_bytes()[:-40])
+    (directory / "results.json").unlink()
+    assert run_ablation(ablation_ordinal, home, cache_dir, 2) == directory
+    assert f"{path.name} is damaged" in capsys.readouterr().out.replace("\n", "")
+    second = read_json(directory / "results.json")
+    assert all(second[part] == first[part] for part in ("arms", "baselines", "comparisons"))
+
+
 @pytest.mark.slow
 def test_every_arm_of_tactile_use_is_trained_by_its_own_algorithm(tmp_path, cache_dir):
     directory = run_ablation(ablation_tactile_use, tmp_path, cache_dir, 1)
