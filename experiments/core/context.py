@@ -9,7 +9,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -229,6 +229,12 @@ class Context:
         if not path.exists():
             raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")
         return read_json(path)
+
+    def once(self, stage: str, compute: Callable[[], Any]) -> Any:
+        """The saved result of a stage, in JSON's types; it is computed and saved first if the stage is not done."""
+        if not self.done(stage):
+            self.save_stage(stage, compute())
+        return self.load_stage(stage)
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:

@@ -127,17 +127,14 @@ def learn(
     store = FieldsOnly(data.store) if variant.fields else data.store
     rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
     state = pretrain(variant.config, store, rows, data.clip, context, stage=stage, seed=SEED)
-    if not context.done(answers := f"probes/{name}"):
-        both = np.concatenate([data.parts["val"], data.parts["test"]])
-        unseen = dataclasses.replace(
-            held_out_contacts(data, "test", config.touch),
-            store=store,
-            clip=clip_of(variant.config, data.clip),
-            read_rows=both,
-        )
-        found = probe_encoder(variant.config.dynamics(len(data.clip.sensors)), state.target, unseen, context)
-        context.save_stage(answers, found)
-    right = np.array(context.load_stage(answers))
+    unseen = dataclasses.replace(
+        held_out_contacts(data, "test", config.touch),
+        store=store,
+        clip=clip_of(variant.config, data.clip),
+        read_rows=np.concatenate([data.parts["val"], data.parts["test"]]),
+    )
+    networks = variant.config.dynamics(len(data.clip.sensors))
+    right = np.array(context.once(f"probes/{name}", lambda: probe_encoder(networks, state.target, unseen, context)))
     context.print(f"{variant.name}: {100 * right.mean():.1f} %")
     return state.target, right
 

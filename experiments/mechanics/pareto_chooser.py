@@ -116,12 +116,11 @@ def hash_seed(seed: int, name: str, sensor: int, index: int) -> int:
 
 def _stages(name: str, stages: Mapping[str, Callable[[], Any]], context: Context) -> list[Any]:
     """The saved results of stages; those that are missing are computed first."""
+    found = []
     for stage, compute in context.each(name, stages.items(), still=True):
-        if not context.done(stage):
-            with context.timed(stage):
-                context.save_stage(stage, compute())
-            context.print(f"{stage} is measured")
-    return [context.load_stage(stage) for stage in stages]
+        with context.timed(stage):
+            found.append(context.once(stage, compute))
+    return found
 
 
 def _measurements(

@@ -16,7 +16,7 @@ Expected: some 800 records a second at 112², so that the paper's 1.32 million r
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,13 +107,11 @@ class NamedRate(NamedTuple):
 
 def run(config: ThroughputConfig, context: Context) -> Results:
     """Feed, write, kill, time the parts; what was measured before an interruption is not measured again."""
-    feed = RecordRate(**_once(context, "feed/0", lambda: _feed(config, context, config.feed_contacts, config.image_px)))
-    large = RecordRate(
-        **_once(context, "large/0", lambda: _feed(config, context, config.large_contacts, config.large_px))
-    )
+    feed = _feed(config, context, "feed/0", config.feed_contacts, config.image_px)
+    large = _feed(config, context, "large/0", config.large_contacts, config.large_px)
     to_write = config.scenes(config.written_contacts, config.image_px)
     write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills, config.seed)
-    found = _once(context, "written/0", write)
+    found = context.once("written/0", write)
     written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": ResumedSet(**found["kept"])})
     scenes = config.scenes(config.feed_contacts, config.image_px)
     parts = {
@@ -144,17 +142,12 @@ def run(config: ThroughputConfig, context: Context) -> Results:
     )
 
 
-def _once(context: Context, stage: str, measure: Callable[[], RecordRate | WrittenSet]) -> dict[str, Any]:
-    """The fields of a measurement, from the run's directory where it was made before."""
-    if not context.done(stage):
-        context.save_stage(stage, measure())
-    found: dict[str, Any] = context.load_stage(stage)
-    return found
+def _feed(config: ThroughputConfig, context: Context, stage: str, contacts: int, image_px: int) -> RecordRate:
+    def measure() -> RecordRate:
+        with context.progress(f"feeding {image_px}²", contacts) as advance:
+            return throughput_rates.feed_rate(config.scenes(contacts, image_px), contacts, config.threads, advance)
 
-
-def _feed(config: ThroughputConfig, context: Context, contacts: int, image_px: int) -> RecordRate:
-    with context.progress(f"feeding {image_px}²", contacts) as advance:
-        return throughput_rates.feed_rate(config.scenes(contacts, image_px), contacts, config.threads, advance)
+    return RecordRate(**context.once(stage, measure))
 
 
 # Force alone ---------------------------------------------------------------------------------------------------------

@@ -74,6 +74,10 @@ def test_a_stage_is_done_once_it_is_saved(context):
     assert context.load_stage("sft/0") == {"answers": [0, 1, 2]}
 
 
+def test_a_result_is_computed_once(context):
+    assert [context.once("sft/0", iter([(1, 2), (3, 4)]).__next__) for _ in range(2)] == [[1, 2], [1, 2]]
+
+
 def test_times_add_up_over_errors_and_interruptions(context):
     for _ in range(2):
         before = context.timing().get("sft/0", 0.0)
