@@ -15,7 +15,17 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
-from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, read_json, write_json, write_text
+from experiments.core.artifacts import (
+    CHECKSUM,
+    DamagedFileError,
+    UnwrittenError,
+    jsonable,
+    read_json,
+    seal,
+    unseal,
+    write_sealed,
+    write_text,
+)
 from experiments.core.machine import SINGLE_PROCESS, ProcessGroup, SingleDevice
 from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, show_progress
 from experiments.core.stopping import Stopping
@@ -26,7 +36,7 @@ _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-
 
 
 class MetricLog:
-    """`metrics.jsonl`: one line per logged step, each passed to the watchers.
+    """`metrics.jsonl`: one sealed line per logged step, each passed to the watchers.
 
     Lines hold no clock: the file is the same, byte for byte, whether or not the run was ever interrupted.
     """
@@ -57,13 +67,13 @@ class MetricLog:
         Raises:
           ValueError: a scalar is not finite, or takes the name of a field.
         """
-        taken = {"stage", "step"} & set(scalars)
+        taken = {"stage", "step", CHECKSUM} & set(scalars)
         if taken:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
         if stage not in self._seen:
             self.rewind(stage, step)
         values = jsonable(scalars, where=f"{stage} step {step}")
-        self._file.write(json.dumps({"stage": stage, "step": step, **values}) + "\n")
+        self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
         self._file.flush()
         for watcher in self._watchers:
             watcher.logged(stage, step, values)
@@ -212,23 +222,33 @@ class Context:
         return path
 
     def done(self, stage: str) -> bool:
-        """True if the stage has a saved result."""
-        return self._stage_file(stage).exists()
+        """True if the stage has a saved result; one that is damaged is reported, for the stage is then done again."""
+        path = self._stage_file(stage)
+        if not path.exists():
+            return False
+        try:
+            _saved_result(path)
+        except DamagedFileError as error:
+            self.print(f"{path} is damaged ({error.__cause__}), and stage {stage} is done again")
+            return False
+        return True
 
     def save_stage(self, stage: str, result: Any) -> None:
         """Write the result of a finished stage as JSON, which marks the stage as done."""
-        self.processes.write_once(lambda: write_json(self._stage_file(stage), result))
+        content = {"stage": stage, "result": result}
+        self.processes.write_once(lambda: write_sealed(self._stage_file(stage), content))
 
     def load_stage(self, stage: str) -> Any:
         """The saved result of a finished stage, in JSON's types.
 
         Raises:
           FileNotFoundError: the stage is not done.
+          DamagedFileError: its result is damaged.
         """
         path = self._stage_file(stage)
         if not path.exists():
             raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")
-        return read_json(path)
+        return _saved_result(path)
 
     def once(self, stage: str, compute: Callable[[], Any]) -> Any:
         """The saved result of a stage, in JSON's types; it is computed and saved first if the stage is not done."""
@@ -249,7 +269,7 @@ class Context:
         """Add to the wall time under a name in `timing`."""
         if self.processes.writes:
             kept = self.timing()
-            write_json(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
+            write_sealed(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
 
     def timing(self) -> dict[str, float]:
         """Wall seconds of every timed stage so far."""
@@ -272,6 +292,12 @@ class Context:
         return path.with_name(path.name + ".json")
 
 
+def _saved_result(path: Path) -> Any:
+    """The result in the file of a stage; earlier versions wrote the result alone."""
+    content = read_json(path)
+    return content["result"] if isinstance(content, dict) and content.keys() == {"stage", "result"} else content
+
+
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """The logged lines of a run, in order."""
     path = directory / "metrics.jsonl"
@@ -285,12 +311,19 @@ def _whole_lines(path: Path) -> list[str]:
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     except UnicodeDecodeError as error:
         raise _damaged(path, str(error)) from error
-    return lines[:-1] if lines and not lines[-1].endswith("\n") else lines
+    if not lines or lines[-1].endswith("\n"):
+        return lines
+    torn = lines.pop()
+    for text in (torn, torn[:-1]):  # a whole line of which the last byte, its end, is lost or flipped
+        with contextlib.suppress(ValueError):
+            unseal(text)
+            return [*lines, f"{text}\n"]
+    return lines
 
 
 def _row(line: str, path: Path) -> dict[str, Any]:
     try:
-        row: dict[str, Any] = json.loads(line)
+        row: dict[str, Any] = unseal(line)
     except ValueError as error:
         raise _damaged(path, f"{error} in {line[:80]!r}") from error
     return row

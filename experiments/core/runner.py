@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_json
+from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import left_out_tables
@@ -232,7 +232,7 @@ def _announce(directory: Path, resumed: bool) -> None:
     """Print whether the run is new, the path of its page, and a note if the code has changed since it began."""
     print_lines(f"continuing {directory} (--fresh starts a new run)" if resumed else f"new run {directory}")
     print_lines(f"to watch: {directory / 'report.html'}")
-    began, now = runs.Revision(**read_json(directory / "config.json")["git"]), runs.revision()
+    began, now = runs.Revision(**runs.read_description(directory)["git"]), runs.revision()
     if resumed and began != now:
         print_lines(f"note: this run began at {began}, the code is now at {now}")
 
@@ -249,7 +249,7 @@ def _compute(
         with contextlib.closing(make_context(Console(quiet=True))) as context:
             experiment.run(command.config, context)
         return
-    description = read_json(directory / "config.json")
+    description = runs.read_description(directory)
     last = runs.newest(directory.parent, description["config"], finished=True)
     usual_s = None if last is None else runs.read_run(last).seconds
     page = watchers.LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
@@ -261,7 +261,7 @@ def _compute(
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         results = dataclasses.replace(results, timing={**context.timing(), **results.timing}, tables=tables)
         report = write_report(directory, results, about=about, description=description)
-        write_json(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
+        write_sealed(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
     except BaseException as error:
         page.end(error)
         raise

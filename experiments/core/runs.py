@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import point_link, read_json, write_json
+from experiments.core.artifacts import DamagedFileError, point_link, read_json, write_sealed
 from experiments.core.text import duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
@@ -84,7 +84,7 @@ def create(home: Path, description: dict[str, Any]) -> Path:
         directory = home / f"{stamp}{suffix}"
         with contextlib.suppress(FileExistsError):
             directory.mkdir()
-            write_json(directory / "config.json", description)
+            write_sealed(directory / "config.json", description)
             return directory
     raise RuntimeError(f"{home / stamp} and 98 more were made within this second; wait for the next second")
 
@@ -139,7 +139,23 @@ def started(home: Path) -> list[Path]:
 def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
     """The newest finished, or unfinished, run under `runs/NAME` with this configuration in JSON's types, or `None`."""
     of_kind = (run for run in started(home) if (run / "results.json").exists() == finished)
-    return next((run for run in of_kind if read_json(run / "config.json")["config"] == config), None)
+    return next((run for run in of_kind if read_description(run)["config"] == config), None)
+
+
+def read_description(directory: Path) -> dict[str, Any]:
+    """The content of `config.json` of a run.
+
+    Raises:
+      DamagedFileError: it is damaged, or not that of a run.
+    """
+    path = directory / "config.json"
+    found = read_json(path)
+    if not isinstance(found, dict) or not found.keys() >= FIELDS:
+        raise DamagedFileError(
+            f"{path} is not that of a run (must hold {', '.join(sorted(FIELDS))}): put a copy back, or move its run "
+            "away and start a new one"
+        )
+    return found
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -201,18 +217,15 @@ def read_run(directory: Path) -> PastRun:
     """Read the directory of a run.
 
     Raises:
-      FileNotFoundError: no `config.json`, or not that of a run.
-      DamagedFileError: a damaged file.
+      FileNotFoundError: no `config.json`.
+      DamagedFileError: a damaged file, or not that of a run.
     """
     path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
     if not path.exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
-    description = read_json(path)
-    if not isinstance(description, Mapping) or not description.keys() >= FIELDS:
-        raise FileNotFoundError(f"{path} is not that of a run: must be its directory; correct the path")
     return PastRun(
         directory=directory,
-        description=description,
+        description=read_description(directory),
         seconds=read_json(times).get("total") if times.exists() else None,  # stages come before the total
         results=read_json(results) if results.exists() else None,
         in_use=_in_use(directory),

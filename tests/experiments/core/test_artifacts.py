@@ -1,7 +1,9 @@
 """Atomic files and JSON values."""
 
+import contextlib
 import dataclasses
 import enum
+import json
 import os
 from pathlib import Path
 
@@ -24,7 +26,7 @@ class Inner:
 
 
 @pytest.mark.parametrize(
-    ("value", "json"),
+    ("value", "tree"),
     [
         (Inner(Path("a/b"), (1, 2)), {"path": "a/b", "sizes": [1, 2]}),
         (Colour.RED, "red"),
@@ -34,9 +36,9 @@ class Inner:
         (None, None),
     ],
 )
-def test_configs_and_results_have_a_json_form(tmp_path, value, json):
+def test_configs_and_results_have_a_json_form(tmp_path, value, tree):
     artifacts.write_json(tmp_path / "value.json", {"value": value})
-    assert artifacts.read_json(tmp_path / "value.json") == {"value": json}
+    assert artifacts.read_json(tmp_path / "value.json") == {"value": tree}
 
 
 @pytest.mark.parametrize(
@@ -63,6 +65,30 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
     path.write_text("{")
     with pytest.raises(artifacts.DamagedFileError, match="put a copy back"):
         artifacts.read_json(path)
+
+
+@pytest.mark.parametrize("value", [{}, {"a": 1, "b": {"crc32": 2}}, {"stage": "sft/0", "result": [0.5, None, "ä"]}])
+@pytest.mark.parametrize("indented", [True, False])
+def test_every_flipped_bit_of_a_sealed_file_is_named_or_harmless(tmp_path, value, indented):
+    path = tmp_path / "value.json"
+    artifacts.write_sealed(path, value)
+    if not indented:
+        path.write_text(artifacts.seal(json.dumps(value)))
+    sealed = path.read_bytes()
+    assert json.loads(sealed).keys() == {*value, "crc32"}
+    assert artifacts.read_json(path) == value
+    for bit in range(8 * len(sealed)):
+        content = bytearray(sealed)
+        content[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(content)
+        with contextlib.suppress(artifacts.DamagedFileError):
+            assert artifacts.read_json(path) == value, bit
+
+
+@pytest.mark.parametrize("value", [{}, {"a": 1}, {"a": {"b": 3}}, {"crc": 7}, [1, 2], 5])
+def test_files_of_earlier_versions_have_no_checksum_and_are_read(tmp_path, value):
+    artifacts.write_json(tmp_path / "old.json", value)
+    assert artifacts.read_json(tmp_path / "old.json") == value
 
 
 def test_a_link_is_replaced_but_a_folder_is_not(tmp_path):

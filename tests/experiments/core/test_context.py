@@ -1,5 +1,6 @@
 """Logging, stages, timing and progress of a run."""
 
+import contextlib
 import io
 import time
 
@@ -59,6 +60,27 @@ def test_a_log_with_a_flipped_byte_is_named(context, flipped):
         read_metrics(context.directory)
 
 
+def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
+    """The end of the last line too, without which a line that was torn by a crash is dropped."""
+    path = tmp_path / "metrics.jsonl"
+    log_steps(path, "sft/0", range(3))
+    rows, content = read_metrics(tmp_path), path.read_bytes()
+    for bit in range(8 * len(content)):
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        with contextlib.suppress(DamagedFileError):
+            MetricLog(path).close()
+            assert read_metrics(tmp_path) == rows, bit
+
+
+def test_lines_of_earlier_versions_have_no_checksum_and_are_read(context):
+    context.log("sft/0", 0, loss=1.0)
+    path = context.directory / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"stage": "sft/0", "step": 1, "loss": 0.5}\n')
+    assert [row["loss"] for row in read_metrics(context.directory)] == [1.0, 0.5]
+
+
 @pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
 def test_a_stage_name_is_a_safe_path(context, stage):
     with pytest.raises(ValueError, match="stage is"):
@@ -72,6 +94,23 @@ def test_a_stage_is_done_once_it_is_saved(context):
     context.save_stage("sft/0", {"answers": np.arange(3)})
     assert context.done("sft/0")
     assert context.load_stage("sft/0") == {"answers": [0, 1, 2]}
+    path = context.directory / "stages" / "sft" / "0.json"
+    path.write_text('{"answers": [3]}')  # as earlier versions wrote it
+    assert context.load_stage("sft/0") == {"answers": [3]}
+
+
+@pytest.mark.parametrize("result", [[1, 2], {"answers": 3}, None])
+def test_a_stage_with_a_damaged_result_is_done_again(context, result):
+    context.save_stage("sft/0", result)
+    assert context.load_stage("sft/0") == result
+    path = context.directory / "stages" / "sft" / "0.json"
+    path.write_text(path.read_text().replace("result", "resulu"))
+    assert not context.done("sft/0")
+    assert "stage sft/0 is done again" in context.console.file.getvalue()
+    with pytest.raises(DamagedFileError, match="checksum"):
+        context.load_stage("sft/0")
+    context.save_stage("sft/0", result)
+    assert context.done("sft/0")
 
 
 def test_a_result_is_computed_once(context):

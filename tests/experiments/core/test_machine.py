@@ -15,7 +15,7 @@ import pytest
 from jax.experimental import multihost_utils
 from rich.console import Console
 
-from experiments.core.context import Context
+from experiments.core.context import Context, read_metrics
 from experiments.core.machine import (
     GIB,
     SINGLE_PROCESS,
@@ -172,7 +172,7 @@ def two(folder: Path, name: str, *, code: int = 0, struck: tuple[str, ...] = ())
 
 
 def lines_of(folder: Path) -> list[dict]:
-    return [json.loads(line) for line in (folder / "latest/metrics.jsonl").read_text().splitlines()]
+    return read_metrics(folder / "latest")
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from experiments.core import runs
-from experiments.core.artifacts import write_json
+from experiments.core.artifacts import DamagedFileError, write_json
 from experiments.core.runner import main
 from experiments.core.text import aligned, duration
 
@@ -39,7 +39,7 @@ def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
 
 
 def test_runs_of_one_second_get_their_own_directories(tmp_path):
-    made = {runs.create(tmp_path / "coin", {"config": {}}) for _ in range(3)}
+    made = {runs.create(tmp_path / "coin", dict.fromkeys(runs.FIELDS, {})) for _ in range(3)}
     assert len(made) == 3
     assert runs.newest(tmp_path / "coin", {}, finished=False) == max(made)
     write_json(max(made) / "results.json", FINISHED)
@@ -111,6 +111,13 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260101-000000  smoke, code 0123456+: finished, 2 s" in out
         assert "20260102-000000/config.json is damaged" in out
         assert "20260103-000000/config.json is not that of a run" in out
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "7", '{"config": {}}'])
+def test_a_foreign_configuration_is_named(tmp_path, content):
+    (make_run(tmp_path, "20260101-000000") / "config.json").write_text(content)
+    with pytest.raises(DamagedFileError, match=r"config.json is not that of a run"):
+        runs.newest(tmp_path / "coin", {}, finished=False)
 
 
 def test_a_run_of_an_installed_package_shows_its_version(tmp_path):
