@@ -39,7 +39,7 @@ def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
 
 
 def test_runs_of_one_second_get_their_own_directories(tmp_path):
-    made = {runs.create(tmp_path / "coin", dict.fromkeys(runs.FIELDS, {})) for _ in range(3)}
+    made = {runs.create(tmp_path / "coin", {field: {} for field in runs.FIELDS}) for _ in range(3)}
     assert len(made) == 3
     assert runs.newest(tmp_path / "coin", {}, finished=False) == max(made)
     write_json(max(made) / "results.json", FINISHED)
