@@ -90,6 +90,8 @@ MATERIAL = Attribute(
     levels=tuple((w,) for w in ("plastic", "metal", "fabric", "food", "paper", "glass", "leather", "wood", "other")),
     ordinal=False,
 )
+ELASTICITY = Attribute(name="elasticity", levels=(("inelastic",), ("semi-elastic",), ("elastic",)))
+FRICTION = Attribute(name="friction", levels=(("slippery",), ("medium",), ("sticky",)))
 
 SENSORS = (
     Sensor(name="gelsight_mini", phrases=("gelsight_mini", "gelsight mini")),
@@ -99,3 +101,6 @@ SENSORS = (
 )
 
 TOUCH_LANGUAGE = Language(attributes=(HARDNESS, ROUGHNESS, PROTRUSION, MATERIAL), sensors=SENSORS)
+
+EXPLORED_ATTRIBUTES = (HARDNESS, ROUGHNESS, PROTRUSION, ELASTICITY, FRICTION)
+"""Attributes that a policy which chooses its touches is asked for; no touch alone reveals all of them."""

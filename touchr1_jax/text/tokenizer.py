@@ -82,7 +82,12 @@ def word_level(language: Language, extra_words: Iterable[str] = ()) -> Tokenizer
     tags = [tag for name in language.tags for tag in (f"<{name}>", f"</{name}>")]
     phrases = [p for sensor in language.sensors for p in sensor.phrases]
     phrases += [p for attribute in language.attributes for level in attribute.levels for p in level]
-    words = list(dict.fromkeys([*tags, *" ".join([*phrases, *extra_words]).split()]))
+    return word_tokenizer([*tags, *phrases, *extra_words])
+
+
+def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
+    """A tokenizer with one id for each blank-separated word of some phrases; the first word has no blank before it."""
+    words = list(dict.fromkeys(" ".join(phrases).split()))
     specials = [PAD, END, TACTILE, VIEW]
     vocabulary = {word: i for i, word in enumerate([*specials, *words])}
     library = tokenizers.Tokenizer(models.WordLevel(vocabulary, unk_token=PAD))
@@ -94,7 +99,7 @@ def word_level(language: Language, extra_words: Iterable[str] = ()) -> Tokenizer
             raise ValueError(f"words {unknown} of {text!r} are not in the vocabulary; add them to extra_words")
         return library.encode(text).ids
 
-    pieces = [b""] * len(specials) + [(w if w == tags[0] else f" {w}").encode() for w in words]
+    pieces = [b""] * len(specials) + [(w if w == words[0] else f" {w}").encode() for w in words]
     return Tokenizer(pieces=tuple(pieces), pad_id=0, end_ids=(1,), tactile_id=2, view_id=3, encoder=encode)
 
 
