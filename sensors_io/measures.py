@@ -78,6 +78,11 @@ class Measured:
     at: tuple[float, float]
     box: Box
 
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Every quantity and its unit."""
+        return UNITS
+
 
 def measure(sequence: Sequence) -> Measured:
     """Measure a recording.

@@ -49,7 +49,7 @@ LAYERS = {
         "records",
         "cards",
         "pipeline importers scenes",
-        "fields",
+        "fields touches",
         "calibration",
         "devices",
         "recording viewer",
@@ -84,7 +84,7 @@ REWARDS_MAY_IMPORT = {
     "jaxtyping",
     *sys.stdlib_module_names,
 }
-BENCH_MAY_IMPORT = {"touchr1_jax.types", "touchr1_jax.masked", "touchr1_jax.bench"}
+BENCH_MAY_IMPORT = {"touchr1_jax.types", "touchr1_jax.masked", "touchr1_jax.text", "touchr1_jax.bench"}
 
 
 def name_of(path: Path) -> str:

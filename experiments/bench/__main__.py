@@ -12,20 +12,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.bench import annotate, audit, card, scoring
-from experiments.bench.contacts import ContactError, measure_split
-from experiments.bench.draw import Quota, QuotaError
-from experiments.bench.generate import (
-    BenchSource,
-    author_requests,
-    draw_questions,
-    generate,
-    read_candidates,
-    read_source,
-    rejected_rows,
-)
-from experiments.bench.rules import FilteredItems, apply_rules
-from experiments.bench.sheets import SheetError
+from experiments.bench import card
+from experiments.bench.contacts import measure_split, read_source
 from experiments.core.artifacts import write_json
 from experiments.core.text import number
 from sensors_io.commands.console import complain, progress_bar
@@ -33,6 +21,20 @@ from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import ItemError, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
+from touchr1_jax.bench.people import annotate, audit
+from touchr1_jax.bench.people.sheets import SheetError
+from touchr1_jax.bench.questions.answers import average_line, metric_rows, parsed_share, read_answers
+from touchr1_jax.bench.questions.contacts import ContactError
+from touchr1_jax.bench.questions.draw import Quota, QuotaError
+from touchr1_jax.bench.questions.generate import (
+    BenchSource,
+    author_requests,
+    draw_questions,
+    generate,
+    read_candidates,
+    rejected_rows,
+)
+from touchr1_jax.bench.questions.rules import FilteredItems, apply_rules
 
 OUT = Console(highlight=False)
 
@@ -114,15 +116,15 @@ class Score:
 
     def run(self) -> int:
         items = read_items(self.items)
-        read = lambda path: scoring.read_answers(read_lines(path), items, str(path))
+        read = lambda path: read_answers(read_lines(path), items, str(path))
         answers = read(self.answers)
         table = Table("metric", "", "95 %, over objects", "values", "meaning")
-        for row in scoring.metric_rows(items, answers, None if self.by_sight is None else read(self.by_sight)):
+        for row in metric_rows(items, answers, None if self.by_sight is None else read(self.by_sight)):
             found, metric = row.interval, row.metric
             mean, low, high = (format(x, metric.format) for x in (found.mean, found.low, found.high))
             table.add_row(metric.title, mean, f"{low} – {high}", str(row.values), metric.meaning)
         OUT.print(table)
-        OUT.print(f"parsed {100 * scoring.parsed_share(answers):.1f} %; {scoring.average_line(items, answers)}")
+        OUT.print(f"parsed {100 * parsed_share(answers):.1f} %; {average_line(items, answers)}")
         return 0
 
 

@@ -8,10 +8,10 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 
-from experiments.bench.contacts import MeasuredContact, SplitContacts
-from experiments.bench.wording import answer_choices, read_answer
 from experiments.core.results import Requirement, at_most
 from touchr1_jax.bench.items import Ask, Item
+from touchr1_jax.bench.questions.contacts import MeasuredContact, SplitContacts
+from touchr1_jax.bench.questions.wording import answer_choices, read_answer
 
 BALANCE, CONSTANT, WORDING = 3.0, 3.0, 6.0
 """Points above equal shares allowed to the commonest answer, the training mode and the best answer to each wording.

@@ -1,7 +1,6 @@
-"""The measured contacts of a data set that questions are made from: labels, measurements by sensor, a fingerprint."""
+"""The bridge from records to the bench: contacts measured by every sensor, with a fingerprint of their recordings."""
 
 import collections
-import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping
 
@@ -11,47 +10,28 @@ from sensors_io.measures import Measured, MeasureError, measure
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, UNKNOWN, Sequence
 from touchr1_jax.bench.items import Touch
+from touchr1_jax.bench.questions.contacts import ContactError, MeasuredContact, SplitContacts
+from touchr1_jax.bench.questions.generate import BenchSource
+from touchr1_jax.bench.questions.thresholds import fit_thresholds
 
 
-class ContactError(ValueError):
-    """Records from which no questions can be made; the message names what is missing and the fix."""
+def read_source(store: RecordStore, after_each: Callable[[], None] = lambda: None) -> BenchSource:
+    """Measure the contacts of the test and of the training split; `after_each` is called after every contact.
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MeasuredContact:
-    """One contact: labels by attribute, measurements by sensor, a fingerprint of the recordings.
-
-    `deceptive` is true where the object's picture suggests another material; `None` where that is unknown.
+    Raises:
+      ContactError: no labelled test contact, or too few training contacts to fit thresholds on.
     """
-
-    touch: Touch
-    labels: Mapping[str, int]
-    deceptive: bool | None
-    measured: Mapping[str, Measured]
-    fingerprint: str
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SplitContacts:
-    """The contacts of one split, and the number of recordings that could not be measured, by reason."""
-
-    contacts: tuple[MeasuredContact, ...]
-    skipped: Mapping[str, int]
-
-    def objects(self) -> set[str]:
-        """The labelled objects."""
-        return {contact.touch.object for contact in self.contacts if contact.labels}
-
-    def by_touch(self) -> dict[Touch, MeasuredContact]:
-        """Contacts by touch."""
-        return {contact.touch: contact for contact in self.contacts}
+    bench, train = measure_split(store, "test", after_each), measure_split(store, "train", after_each)
+    if not bench.objects():
+        raise ContactError("split is 'test': must hold labelled contacts that could be measured; use other records")
+    return BenchSource(bench=bench, train=train, reader=fit_thresholds(train.contacts), sensors=store.meta.sensors)
 
 
 def measure_split(store: RecordStore, split: str, after_each: Callable[[], None] = lambda: None) -> SplitContacts:
     """Read and measure all contacts of a split, those of unlabelled objects included; `after_each` is for a bar."""
     contacts, skipped = [], collections.Counter[str]()
     for i in store.contacts_of_split(split):
-        key, recorded, measured = store.contacts[i], store.contact(int(i)), {}
+        key, recorded, measured = store.contacts[i], store.contact(int(i)), dict[str, Measured]()
         for sensor, sequence in recorded.items():
             try:
                 measured[sensor] = measure(sequence)

@@ -20,9 +20,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 from experiments.bench import card
-from experiments.bench.draw import Quota
-from experiments.bench.generate import BenchSource, generate, read_source, share_at_odds
-from experiments.bench.rules import FilteredItems, count_found_errors
+from experiments.bench.contacts import read_source
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
@@ -33,6 +31,9 @@ from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import KINDS, Item, write_items
+from touchr1_jax.bench.questions.draw import Quota
+from touchr1_jax.bench.questions.generate import BenchSource, generate, share_at_odds
+from touchr1_jax.bench.questions.rules import FilteredItems, count_found_errors
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -28,8 +28,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from experiments.bench import vtv
-from experiments.bench.vtv import ATTRIBUTES, CHANCE
 from experiments.core.charts import Panel, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.errors import DataError
@@ -44,8 +42,10 @@ from experiments.study.paper_numbers import differences_table
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
+from touchr1_jax.bench import vtv
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.bench.vtv import ATTRIBUTES, CHANCE
 from touchr1_jax.training.linear_probe import ProbeConfig
 
 MOTIONS = ("slide_x", "hold")

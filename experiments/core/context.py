@@ -26,9 +26,9 @@ from experiments.core.artifacts import (
     write_sealed,
     write_text,
 )
-from experiments.core.machine import SINGLE_PROCESS, ProcessGroup, SingleDevice
 from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, show_progress
 from experiments.core.stopping import Stopping
+from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 
 T = TypeVar("T")
 

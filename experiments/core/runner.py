@@ -26,7 +26,11 @@ from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import left_out_tables
-from experiments.core.machine import (
+from experiments.core.report import write_report
+from experiments.core.results import Results
+from experiments.core.stopping import Stopped, Stopping
+from sensors_io.errors import UserError
+from touchr1_jax.distributed.processes import (
     Accelerators,
     Launch,
     MachineError,
@@ -36,10 +40,6 @@ from experiments.core.machine import (
     require_accelerators,
     select_devices,
 )
-from experiments.core.report import write_report
-from experiments.core.results import Results
-from experiments.core.stopping import Stopped, Stopping
-from sensors_io.errors import UserError
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.rewards import RewardError

@@ -30,12 +30,11 @@ from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.mechanics import chooser_fit as fit
 from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_trial as trial
 from experiments.mechanics.chooser_measure import FAMILIES, MenuMeasurements, SceneBatch
 from experiments.mechanics.chooser_trial import SHARE, ChooserTrial, SequenceTrial
-from sensors_io.scenes import chooser_law, effort
+from sensors_io.scenes import chooser_fit, chooser_law, effort
 from sensors_io.scenes.chooser_law import MENU, SLACK, Law, Setting, make_menu
 from sensors_io.scenes.sensors import MODELS
 
@@ -77,8 +76,8 @@ def run(config: ChooserConfig, context: Context) -> Results:
     selected = _measurements("chosen", config.chosen_batches, config, menu, context)
     tested = _measurements("unseen", config.tested_batches, config, menu, context)
     both = measured.join(MenuMeasurements, [vars(fitted), vars(selected)])
-    law = fit.fit(fitted, menu)
-    refitted = fit.promised(law, fit.predict(law, both, menu), both.errors, config.asked)
+    law = chooser_fit.fit(fitted.survey, fitted.errors, menu)
+    refitted = chooser_fit.promised(law, chooser_fit.predict(law, both.survey, menu), both.errors, config.asked)
     cost = np.median(np.concatenate([fitted.ms, selected.ms, tested.ms]), 0)
     trials = _trials(config, menu, tested, cost, context)
     summaries = [trial.summary(t, tested.errors, cost) for t in trials]

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Int
 
 from experiments.bench.contacts import measure_split
-from experiments.bench.draw import Quota, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Estimate, Table, named_table
 from experiments.core.text import ABSENT, bounds, number
@@ -25,6 +24,7 @@ from touchr1_jax.bench.averages import AVERAGED, WORST_OMAE, touch_average
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM, Scores
+from touchr1_jax.bench.questions.draw import Quota, draw
 from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
 from touchr1_jax.bench.statistics import draw_clusters, drawn_means, improvement_interval, stratified_bootstrap_iqm
 from touchr1_jax.training.evaluation import Evaluation

@@ -22,7 +22,6 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from experiments.bench.draw import Quota
 from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results, at_most
 from experiments.core.text import bounds
@@ -38,6 +37,7 @@ from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig
 from touchr1_jax.bench.averages import AVERAGED
+from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.training.evaluation import Evaluation
 
 ENCODER_PROBE, SWAPPED = "encoder_probe", "shuffled_touch"

@@ -15,15 +15,15 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-from experiments.bench.draw import Quota
 from experiments.core.context import Context
-from experiments.core.machine import Accelerators
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.study import paper_numbers as paper
 from experiments.study.stages import StudySFT
 from experiments.study.study import SMOKE, StudyConfig
 from sensors_io.scenes.config import SceneConfig
+from touchr1_jax.bench.questions.draw import Quota
+from touchr1_jax.distributed.processes import Accelerators
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.qwen.config import RELEASED
 from touchr1_jax.models.tactile_vit import TactileViTConfig

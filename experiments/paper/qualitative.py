@@ -20,8 +20,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Int
 
-from experiments.bench.draw import Quota
-from experiments.bench.wording import answer_words, question
 from experiments.core.context import Context
 from experiments.core.results import Results, RolloutExample, Table, named_table
 from experiments.paper import presets
@@ -42,6 +40,8 @@ from experiments.study.study import BLIND, SFT, Study, StudyConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM
+from touchr1_jax.bench.questions.draw import Quota
+from touchr1_jax.bench.questions.wording import answer_words, question
 from touchr1_jax.training.evaluation import Evaluation
 
 REPLACEMENTS = {

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from experiments.bench.draw import Quota
 from experiments.core.context import Context
 from experiments.core.results import Estimate, Picture, Results, RolloutExample
 from experiments.core.text import bounds
@@ -34,6 +33,7 @@ from experiments.study.examples import rollout_examples
 from experiments.study.scores import PUBLISHED, score_study, study_settings
 from experiments.study.study import BLIND, SFT, SMOKE, StudyConfig
 from touchr1_jax.bench.items import Ask
+from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig

@@ -27,8 +27,9 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos, object_weights, standardise
+from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos
 from sensors_io.importers.keep import ImportSourceError
+from touchr1_jax.training.kernel_probe import object_weights, standardise
 from touchr1_jax.types import Params
 
 READINGS = 8192  # examples of made-up evidence

@@ -210,7 +210,7 @@ LAW = Law(
     ease=np.array(0.14),
     doubt=np.array(1.261),
 )
-"""Fitted to 384 scenes on four gels, margins chosen on these and 192 others: `experiments.mechanics.chooser_fit`."""
+"""Fitted to 384 scenes on four gels, margins chosen on these and 192 others: `sensors_io.scenes.chooser_fit`."""
 
 
 def log_error(seen: Survey, law: Law, menu: tuple[Setting, ...]) -> Float[Array, "... T"]:

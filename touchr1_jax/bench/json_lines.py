@@ -13,11 +13,16 @@ class LinesError(ValueError):
 
 def write_lines(path: str | os.PathLike[str], trees: Iterable[Mapping[str, Any]]) -> None:
     """Replace a file of JSON Lines in one step."""
-    path = pathlib.Path(path)
+    lines = (json.dumps(tree, ensure_ascii=False, allow_nan=False) + "\n" for tree in trees)
+    write_text(pathlib.Path(path), "".join(lines))
+
+
+def write_text(path: pathlib.Path, text: str) -> None:
+    """Replace a text file in one step; a folder that is missing is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     with temporary.open("w", encoding="utf-8") as file:
-        for tree in trees:
-            file.write(json.dumps(tree, ensure_ascii=False, allow_nan=False) + "\n")
+        file.write(text)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)

@@ -6,12 +6,12 @@ import pytest
 
 from experiments.bench import dataset_card
 from experiments.bench.__main__ import main
-from experiments.bench.draw import Quota
 from experiments.core.artifacts import read_json
 from sensors_io.records import RecordStore
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.bench.items import KINDS, read_items
 from touchr1_jax.bench.json_lines import read_lines, write_lines
+from touchr1_jax.bench.questions.draw import Quota
 
 NONE = dict.fromkeys(KINDS, 0)
 QUOTA = Quota(**NONE | {"identify": 12, "scale": 6, "compose": 4, "compare": 4, "one_sensor": 16})

@@ -5,12 +5,12 @@ import json
 
 import pytest
 
-from experiments.bench import annotate, audit
 from experiments.bench.__main__ import main
-from experiments.bench.sheets import SheetError, read_sheet, write_sheet
 from experiments.core.artifacts import read_json, write_json
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import write_items
+from touchr1_jax.bench.people import annotate, audit
+from touchr1_jax.bench.people.sheets import SheetError, read_sheet, write_sheet
 
 OBJECTS = ("cup", "ball", "leaf", "brick")
 SAME = {"cup": (0, 0, 0, 1), "ball": (1, 1, 1, 0), "leaf": (2, 2, 2, 7), "brick": (2, 0, 1, 4)}
@@ -18,7 +18,7 @@ SAME = {"cup": (0, 0, 0, 1), "ball": (1, 1, 1, 0), "leaf": (2, 2, 2, 7), "brick"
 
 def labels(**changes):
     rows = {o: changes.get(o, levels) for o, levels in SAME.items()}
-    return {o: dict(zip(annotate.ATTRIBUTES, levels, strict=True)) for o, levels in rows.items()}
+    return {o: dict(zip(annotate.LEVELS, levels, strict=True)) for o, levels in rows.items()}
 
 
 def fill(path, change):
@@ -75,7 +75,7 @@ def test_agreement_by_hand():
     # observed .75; expected by the margins (1, 1, 2) and (0, 2, 2) of 4: (0 + 2 + 4) / 16
     assert rows["hardness"].kappa == pytest.approx((0.75 - 0.375) / (1 - 0.375))
     assert rows["material"].weighted is None
-    constant = {o: dict.fromkeys(annotate.ATTRIBUTES, 0) for o in OBJECTS}
+    constant = {o: dict.fromkeys(annotate.LEVELS, 0) for o in OBJECTS}
     assert annotate.agreement(constant, constant)[0].kappa is None
 
 

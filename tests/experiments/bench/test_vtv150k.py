@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 from experiments.bench import vtv150k
-from experiments.bench.vtv import (
+from experiments.core.artifacts import read_json
+from experiments.mechanics.identify_motions import MotionData
+from sensors_io.schema import SENSORS
+from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.bench.averages import VTV, vtv_average
+from touchr1_jax.bench.vtv import (
     ASSIGNMENTS,
     ATTRIBUTES,
     CHANCE,
@@ -17,11 +22,6 @@ from experiments.bench.vtv import (
     prior_log_probs,
     score,
 )
-from experiments.core.artifacts import read_json
-from experiments.mechanics.identify_motions import MotionData
-from sensors_io.schema import SENSORS
-from tests.experiments.shrunk import run_shrunk
-from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.training.linear_probe import ProbeConfig
 
 TINY = dataclasses.replace(vtv150k.EXPERIMENT.scales["smoke"], probe=ProbeConfig(folds=3, iterations=4), questions=24)

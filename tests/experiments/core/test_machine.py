@@ -16,7 +16,10 @@ from jax.experimental import multihost_utils
 from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
-from experiments.core.machine import (
+from experiments.core.runner import Experiment, run_experiment
+from tests.experiments.fakes import coin
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.processes import (
     GIB,
     SINGLE_PROCESS,
     Accelerators,
@@ -29,9 +32,6 @@ from experiments.core.machine import (
     require_accelerators,
     select_devices,
 )
-from experiments.core.runner import Experiment, run_experiment
-from tests.experiments.fakes import coin
-from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.training.compilation import OLDER_LOOPS
 from touchr1_jax.training.loop import SingleDevice
 

@@ -2,19 +2,16 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.core.artifacts import jsonable, read_json
-from experiments.mechanics import chooser_fit as fit
 from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_trial as trial
 from experiments.mechanics import pareto_chooser
 from experiments.mechanics.chooser_measure import FAMILIES, MenuMeasurements, draw
 from experiments.mechanics.chooser_trial import ChooserTrial, SequenceTrial
 from sensors_io.scenes import chooser_law
-from sensors_io.scenes.chooser_law import LAW, MENU
 from sensors_io.scenes.chooser_survey import FEATURES
 from sensors_io.scenes.sensors import XENSE
 from tests.experiments.shrunk import run_shrunk
@@ -60,39 +57,6 @@ def test_a_summary_counts_shares_and_times():
     assert found["fixed"] is None  # the third scene is met by none
 
 
-def test_the_host_picks_as_the_device_does():
-    rng = np.random.default_rng(0)
-    expected = rng.uniform(0.01, 1, (20, 6)).astype(np.float32)
-    index, met = fit.chosen(LAW, expected, 0.1)
-    for row, i, m in zip(expected, index, met, strict=True):
-        found = chooser_law.pick(0.1, jnp.log(row), LAW)
-        assert (int(found[0]), bool(found[2])) == (i, m)
-
-
-def test_the_least_margins_keep_enough():
-    errors, predicted = np.full((100, 1), 0.2), np.full((100, 1), 0.1)
-    found = fit.promised(fit.start(), predicted, errors, [0.1])
-    assert found.margin == pytest.approx(1.5, rel=0.03)  # past it nothing is promised any more
-    assert found.doubt == pytest.approx(1.5, rel=0.03)
-
-
-def test_an_unfit_law_is_refused():
-    with pytest.raises(ValueError, match="the law does not fit"):
-        fit.promised(fit.start(), np.full((9, 1), 1e-6), np.ones((9, 1)), [0.1])
-
-
-def test_the_fit_finds_the_law_that_made_the_errors():
-    rng = np.random.default_rng(1)
-    features = np.concatenate([np.ones((80, 1)), rng.normal(0, 0.5, (80, len(FEATURES) - 1))], 1)
-    made = measurements(np.ones((80, len(MENU))), features)
-    truth = fit.start()
-    truth = dataclasses.replace(truth, grid=truth.grid + 0.1, rate=truth.rate - 0.05)
-    exact = fit.predict(truth, made, MENU)
-    found = fit.predict(fit.fit(dataclasses.replace(made, errors=exact), MENU), made, MENU)
-    counts = (exact > fit.RANGE[0]) & (exact < fit.RANGE[1])
-    assert np.quantile(np.abs(np.log(found / exact))[counts], 0.95) < 0.1
-
-
 def test_frames_count_only_where_they_were_promised():
     error = np.array([[0.05, 0.16], [0.9, 0.9]])
     made = SequenceTrial(asked=0.1, grid=np.array([64, 128]), met=np.array([True, False]), error=error)
@@ -123,11 +87,11 @@ def test_families_are_what_they_say():
     assert np.diff(ball, 2, axis=0).std() < 0.05 * np.diff(ball, 2, axis=0).mean()  # one curvature everywhere
 
 
-def measurements(error: np.ndarray, features: np.ndarray | None = None) -> MenuMeasurements:
+def measurements(error: np.ndarray) -> MenuMeasurements:
     count, settings = error.shape
     lengths = {"radius_mm": 3.0, "slope_share": 0.0, "window_mm": 18.0, "thickness_mm": 4.0}
     return MenuMeasurements(
-        features=np.ones((count, len(FEATURES))) if features is None else features,
+        features=np.ones((count, len(FEATURES))),
         **{name: np.full(count, value) for name, value in lengths.items()},
         errors=error,
         ms=np.ones((1, settings)),

@@ -6,7 +6,6 @@ import shutil
 
 import pytest
 
-from experiments.bench.draw import Quota
 from experiments.core.artifacts import read_json
 from experiments.core.context import read_metrics
 from experiments.core.loops import STEPPING, WAITING
@@ -27,6 +26,7 @@ from experiments.paper import (
 from experiments.paper.components import BASE, COMPONENTS
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.rl.config import TactileUse
 
 PLAIN = (ablation_consistency, ablation_format, ablation_grounding)

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.recordings.cross_validation import agreement, constants, deal_folds, objects_for, scores, vote
 from experiments.recordings.description_policy import COMBINATIONS, choose, utility
-from experiments.recordings.level_probes import object_weights
+from touchr1_jax.training.kernel_probe import object_weights
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)
 LABEL = np.repeat(np.array([[i % 3, (i // 3) % 3, 1] for i in range(12)]), 3, axis=0)

@@ -22,8 +22,8 @@ from experiments.recordings.fine_tuning import (
 )
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
 from experiments.recordings.level_probes import LevelProbeConfig, sense
-from experiments.recordings.touches import families
 from sensors_io.importers.keep import ImportSourceError
+from sensors_io.touches import families
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig

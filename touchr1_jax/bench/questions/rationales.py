@@ -7,12 +7,11 @@ median of these levels, and `conclude` the label: the first two may differ from 
 import collections
 from collections.abc import Mapping, Sequence
 
-from experiments.bench.contacts import MeasuredContact
-from experiments.bench.thresholds import ThresholdReader
-from experiments.bench.wording import PLACES, answer_words, language_of, level_words, question
-from sensors_io.measures import UNITS
 from touchr1_jax.bench.items import Ask, Citation, Item, Touch
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.questions.contacts import MeasuredContact
+from touchr1_jax.bench.questions.thresholds import ThresholdReader
+from touchr1_jax.bench.questions.wording import PLACES, answer_words, language_of, level_words, question
 from touchr1_jax.text.language import SENSORS
 
 DIGITS = 3
@@ -87,7 +86,7 @@ def _numbers(
     read = [reader.thresholds[sensor, a].quantity for a in attributes if (sensor, a) in reader.thresholds]
 
     def cite(quantity: str) -> str:
-        value, unit = float(f"{measured.quantities[quantity]:.{DIGITS}g}"), UNITS[quantity]
+        value, unit = float(f"{measured.quantities[quantity]:.{DIGITS}g}"), measured.units[quantity]
         at = (round(measured.at[0], 3), round(measured.at[1], 3))  # no digits beyond the resolution of a window
         citation = Citation(touch=touch, sensor=sensor, quantity=quantity, value=value, unit=unit, at=at)
         if citation not in evidence:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.bench.contacts import MeasuredContact
-from experiments.bench.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
-from experiments.bench.wording import answer_words, level_words
 from touchr1_jax.bench.items import Item, Touch
+from touchr1_jax.bench.people.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
+from touchr1_jax.bench.questions.contacts import MeasuredContact
+from touchr1_jax.bench.questions.wording import answer_words, level_words
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, wilson_interval
 
 AXES = ("grounded", "fits the labels", "self-consistent")

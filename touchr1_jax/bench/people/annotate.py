@@ -12,11 +12,10 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from experiments.bench.contacts import MeasuredContact
-from experiments.bench.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
-from experiments.bench.wording import level_words
-from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.people.sheets import SheetError, kappa_unless_constant, read_sheet, write_sheet
+from touchr1_jax.bench.questions.contacts import MeasuredContact
+from touchr1_jax.bench.questions.wording import LEVELS, level_words
 
 KEY, CASE, DECISION = "object", "case", "decision"
 
@@ -26,7 +25,7 @@ PHYSICAL: Mapping[str, str] = {"hardness": "stiffness", "roughness": "fine textu
 LEAST_RHO = 0.3
 """Least |Spearman's ρ| between labels and quantity for a sensor to have a vote on a label."""
 
-WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(level_words(name)) for name in ATTRIBUTES}
+WORDS: Mapping[str, tuple[str, ...]] = {name: tuple(level_words(name)) for name in LEVELS}
 """Words for the levels on a sheet."""
 
 Labels = Mapping[str, Mapping[str, int]]
@@ -65,7 +64,7 @@ def write_blank(paths: Sequence[Path], objects: Sequence[str], seed: int) -> Non
     """
     for n, path in enumerate(paths):
         order = np.random.default_rng([seed, n]).permutation(len(objects))
-        write_sheet(path, (KEY, *ATTRIBUTES), ({KEY: objects[i]} for i in order))
+        write_sheet(path, (KEY, *LEVELS), ({KEY: objects[i]} for i in order))
 
 
 def read_labels(path: Path, objects: Sequence[str]) -> dict[str, dict[str, int]]:
@@ -81,7 +80,7 @@ def read_labels(path: Path, objects: Sequence[str]) -> dict[str, dict[str, int]]
 def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
     """Agreement of two annotators on the same objects, by attribute."""
     found = []
-    for name in ATTRIBUTES:
+    for name in LEVELS:
         x, y = (np.array([labels[o][name] for o in sorted(a)]) for labels in (a, b))
         kappa = kappa_unless_constant(x, y, LEVELS[name])
         weighted = kappa_unless_constant(x, y, LEVELS[name], "quadratic") if name in ORDINAL else None
@@ -92,7 +91,7 @@ def agreement(a: Labels, b: Labels) -> tuple[AnnotatorAgreement, ...]:
 
 def open_cases(a: Labels, b: Labels) -> dict[str, tuple[str, str]]:
     """The disagreements: name of the case → object and attribute."""
-    return {f"{o}: {name}": (o, name) for o in sorted(a) for name in ATTRIBUTES if a[o][name] != b[o][name]}
+    return {f"{o}: {name}": (o, name) for o in sorted(a) for name in LEVELS if a[o][name] != b[o][name]}
 
 
 def write_open(path: Path, a: Labels, b: Labels) -> None:
@@ -132,7 +131,7 @@ def adjudicate(a: Labels, b: Labels, decided: Mapping[tuple[str, str], int]) -> 
       KeyError: a disagreement without a decision.
     """
     final = lambda o, name: a[o][name] if a[o][name] == b[o][name] else decided[o, name]
-    return {o: {name: final(o, name) for name in ATTRIBUTES} for o in sorted(a)}
+    return {o: {name: final(o, name) for name in LEVELS} for o in sorted(a)}
 
 
 def rank_correlations(labels: Labels, contacts: Sequence[MeasuredContact]) -> dict[tuple[str, str], float]:

@@ -8,12 +8,11 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 
 import numpy as np
 
-from experiments.bench.contacts import MeasuredContact
-from experiments.bench.wording import WORDINGS
-from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import KINDS, Ask
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.questions.contacts import MeasuredContact
+from touchr1_jax.bench.questions.wording import LEVELS, WORDINGS
 
 COMPOSED = (*itertools.combinations(ORDINAL, 2), ORDINAL)
 """The sets of attributes that one question asks for together."""
@@ -70,13 +69,13 @@ def draw(contacts: Sequence[MeasuredContact], sensors: Sequence[str], quota: Quo
     """
     dealer = _Dealer(contacts, np.random.default_rng(seed))
     draw_kind: Mapping[str, Callable[[_Dealer, Sequence[str], int], Iterator[Ask]]] = {
-        "identify": functools.partial(_singles, "identify", ATTRIBUTES),
+        "identify": functools.partial(_singles, "identify", tuple(LEVELS)),
         "scale": functools.partial(_singles, "scale", ORDINAL),
         "compose": _composed,
         "compare": _pairs,
         "order": _orders,
         "one_sensor": _by_one_sensor,
-        "conflict": functools.partial(_singles, "conflict", ATTRIBUTES),
+        "conflict": functools.partial(_singles, "conflict", tuple(LEVELS)),
     }
     return tuple(
         dataclasses.replace(ask, id=f"{kind}-{number:04d}")
@@ -213,7 +212,7 @@ def _by_one_sensor(dealer: _Dealer, sensors: Sequence[str], quota: int) -> Itera
             f"quota.one_sensor is {quota}: must be a multiple of the {len(sensors)} sensors, of which there must be "
             "two; change it, 0 for none"
         )
-    for attribute, count in zip(ATTRIBUTES, _split(quota // len(sensors), len(ATTRIBUTES)), strict=True):
+    for attribute, count in zip(LEVELS, _split(quota // len(sensors), len(LEVELS)), strict=True):
         for number, level in enumerate(dealer.levels("one_sensor", attribute, count)):
             ranked = dealer.with_level("one_sensor", attribute, level)
             complete = [contact for contact in ranked if set(contact.measured) == set(sensors)]

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from experiments.core import artifacts
+from touchr1_jax.bench.json_lines import write_text
 from touchr1_jax.bench.statistics import cohens_kappa
 
 
@@ -28,7 +28,7 @@ def write_sheet(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, 
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    artifacts.write_text(path, text.getvalue())
+    write_text(path, text.getvalue())
 
 
 def read_sheet(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from experiments.recordings.level_probes import LevelProbeConfig, cross_probe, kernel_ridge, probe, standardise
+from touchr1_jax.training.kernel_probe import KernelProbeConfig, cross_probe, kernel_ridge, probe, standardise
 
-CONFIG = LevelProbeConfig(families=("a", "b"), folds=3)
+CONFIG = KernelProbeConfig(families=("a", "b"), folds=3)
 FAMILY = np.array(["a", "a", "a", "b", "b"])
 WEIGHT = np.full(18, 0.5)
 OBJECTS = np.repeat([f"o{i}" for i in range(9)], 2)
@@ -58,6 +58,6 @@ def test_standardise_uses_the_fitted_rows_alone():
 
 def test_errors_name_the_family_and_the_weight(videos):
     with pytest.raises(ValueError, match="families holds 'c'"):
-        probe(*videos, WEIGHT, FAMILY, LevelProbeConfig(families=("c",)))
+        probe(*videos, WEIGHT, FAMILY, KernelProbeConfig(families=("c",)))
     with pytest.raises(ValueError, match="weight is 0 everywhere"):
         probe(*videos, 0 * WEIGHT, FAMILY, CONFIG)

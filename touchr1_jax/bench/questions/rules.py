@@ -11,11 +11,10 @@ import collections
 import dataclasses
 from collections.abc import Iterable, Mapping
 
-from experiments.bench.contacts import MeasuredContact
-from experiments.bench.wording import answer_choices, answer_words, language_of, read_answer
-from sensors_io.measures import UNITS, Box
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import Ask, Citation, Item, Touch
+from touchr1_jax.bench.questions.contacts import MeasuredContact
+from touchr1_jax.bench.questions.wording import answer_choices, answer_words, language_of, read_answer
 
 RULES = ("missing answer", "label conflict", "outside contact", "unmeasured", "contradiction")
 """In the order in which they are applied; an item counts under the first rule that it breaks."""
@@ -110,16 +109,16 @@ def _is_inside(citation: Citation, ask: Ask, shown: list[MeasuredContact]) -> bo
     return measured is not None and _contains(measured.box, citation.at)
 
 
-def _contains(box: Box, at: tuple[float, float]) -> bool:
+def _contains(box: tuple[float, float, float, float], at: tuple[float, float]) -> bool:
     left, top, right, bottom = box
     return left - MARGIN <= at[0] <= right + MARGIN and top - MARGIN <= at[1] <= bottom + MARGIN
 
 
 def _is_measured(citation: Citation, shown: list[MeasuredContact]) -> bool:
-    quantities = shown[citation.touch].measured[citation.sensor].quantities
-    if citation.quantity not in quantities or citation.unit != UNITS[citation.quantity]:
+    measured = shown[citation.touch].measured[citation.sensor]
+    if citation.quantity not in measured.quantities or citation.unit != measured.units[citation.quantity]:
         return False
-    value = quantities[citation.quantity]
+    value = measured.quantities[citation.quantity]
     return abs(citation.value - value) <= TOLERANCE * abs(value)
 
 

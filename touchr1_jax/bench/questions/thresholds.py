@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.bench.contacts import ContactError, MeasuredContact
-from sensors_io.schema import LEVELS
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.questions.contacts import ContactError, MeasuredContact
+from touchr1_jax.bench.questions.wording import LEVELS
 
 QUANTITIES: Mapping[str, tuple[str, ...]] = {
     "hardness": ("stiffness", "indentation", "contact area", "spread", "marker displacement"),

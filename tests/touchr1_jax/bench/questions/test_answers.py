@@ -2,8 +2,8 @@
 
 import pytest
 
-from experiments.bench.scoring import ask_all, average_line, metric_rows, parsed_share, read_answers
 from touchr1_jax.bench.json_lines import LinesError
+from touchr1_jax.bench.questions.answers import ask_all, average_line, metric_rows, parsed_share, read_answers
 
 
 def test_right_answers_have_the_full_score(items):

@@ -5,10 +5,10 @@ import dataclasses
 
 import pytest
 
-from experiments.bench.draw import Quota, QuotaError, draw
-from experiments.bench.rules import true_answer
-from tests.experiments.bench.conftest import SENSORS
+from tests.touchr1_jax.bench.questions.conftest import SENSORS
 from touchr1_jax.bench.comparison import ORDERS
+from touchr1_jax.bench.questions.draw import Quota, QuotaError, draw
+from touchr1_jax.bench.questions.rules import true_answer
 
 
 def of_kind(items, kind):

@@ -1,4 +1,4 @@
-"""The machine of a run: its processes, its devices, and the accelerators that a scale needs.
+"""Processes and devices of a run, and the accelerators that it needs.
 
     python -m experiments NAME --distributed --mesh.fsdp 8                                  Slurm, MPI, Kubernetes
     python -m experiments NAME --distributed --mesh.fsdp 8 --coordinator HOST:PORT --processes N --process I

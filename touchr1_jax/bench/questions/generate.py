@@ -11,19 +11,17 @@ answers are in the requests, but are drawn anew when candidates come back, so th
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from experiments.bench.contacts import ContactError, MeasuredContact, SplitContacts, measure_split
-from experiments.bench.draw import Quota, draw
-from experiments.bench.rationales import compose_item
-from experiments.bench.rules import CandidateItem, FilteredItems, apply_rules
-from experiments.bench.thresholds import ThresholdReader, fit_thresholds
-from experiments.bench.wording import answer_choices, answer_words, read_answer, slots_of
-from sensors_io.measures import UNITS
-from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import KINDS, Ask, Item, Touch, citation_of
 from touchr1_jax.bench.json_lines import LinesError
+from touchr1_jax.bench.questions.contacts import MeasuredContact, SplitContacts
+from touchr1_jax.bench.questions.draw import Quota, draw
+from touchr1_jax.bench.questions.rationales import compose_item
+from touchr1_jax.bench.questions.rules import CandidateItem, FilteredItems, apply_rules
+from touchr1_jax.bench.questions.thresholds import ThresholdReader
+from touchr1_jax.bench.questions.wording import answer_choices, answer_words, read_answer, slots_of
 
 TASK = (
     "Write one question about what the sensors felt, and its rationale. The rationale has three segments, "
@@ -45,18 +43,6 @@ class BenchSource:
     train: SplitContacts
     reader: ThresholdReader
     sensors: tuple[str, ...]
-
-
-def read_source(store: RecordStore, after_each: Callable[[], None] = lambda: None) -> BenchSource:
-    """Measure the contacts of the test and of the training split; `after_each` is called after every contact.
-
-    Raises:
-      ContactError: no labelled test contact, or too few training contacts to fit thresholds on.
-    """
-    bench, train = measure_split(store, "test", after_each), measure_split(store, "train", after_each)
-    if not bench.objects():
-        raise ContactError("split is 'test': must hold labelled contacts that could be measured; use other records")
-    return BenchSource(bench=bench, train=train, reader=fit_thresholds(train.contacts), sensors=store.meta.sensors)
 
 
 def draw_questions(source: BenchSource, quota: Quota, seed: int) -> tuple[Ask, ...]:
@@ -83,14 +69,15 @@ def share_at_odds(items: Sequence[Item]) -> float:
 
 def author_requests(asks: Iterable[Ask], contacts: Mapping[Touch, MeasuredContact]) -> Iterator[dict[str, Any]]:
     """One request for each question."""
-    value = lambda name, number: {"value": float(f"{number:.4g}"), "unit": UNITS[name]}
     for ask in asks:
         touches = []
         for touch in ask.touches:
             measured = {}
             for sensor in ask.sensors:
                 m = contacts[touch].measured[sensor]
-                quantities = {name: value(name, x) for name, x in m.quantities.items()}
+                quantities = {
+                    name: {"value": float(f"{x:.4g}"), "unit": m.units[name]} for name, x in m.quantities.items()
+                }
                 measured[sensor] = {"quantities": quantities, "at": list(m.at), "box": list(m.box)}
             touches.append(dataclasses.asdict(touch) | {"measured": measured})
         yield {

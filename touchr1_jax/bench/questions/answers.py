@@ -4,11 +4,11 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-from experiments.bench.wording import read_answer
 from touchr1_jax.bench.averages import AVERAGED, touch_average
 from touchr1_jax.bench.items import Item
 from touchr1_jax.bench.json_lines import LinesError
 from touchr1_jax.bench.metrics import Metric
+from touchr1_jax.bench.questions.wording import read_answer
 from touchr1_jax.bench.scoring import BENCH_METRICS, clusters, score
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 

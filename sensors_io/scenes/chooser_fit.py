@@ -9,8 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import least_squares
 
-from experiments.mechanics.chooser_measure import MenuMeasurements
-from sensors_io.scenes.chooser_law import EASY_ABOVE, SLACK, Law, Setting, log_error, margin_at
+from sensors_io.scenes.chooser_law import EASY_ABOVE, SLACK, Law, Setting, Survey, log_error, margin_at
 from sensors_io.scenes.chooser_survey import FEATURES
 
 RANGE = (2e-3, 0.6)
@@ -41,14 +40,14 @@ def start() -> Law:
     )
 
 
-def fit(measured: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
-    """Fit the law's coefficients to measured errors; its margins are left at 1."""
-    counts = (measured.errors > RANGE[0]) & (measured.errors < RANGE[1])
+def fit(survey: Survey, errors: np.ndarray, menu: tuple[Setting, ...]) -> Law:
+    """Fit the law's coefficients to the surveys and measured errors [S, T] of S scenes; its margins are left at 1."""
+    counts = (errors > RANGE[0]) & (errors < RANGE[1])
     theta, unravel = ravel_pytree(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), start()))
-    where, logs = np.nonzero(counts.ravel())[0], np.log(measured.errors[counts])
+    where, logs = np.nonzero(counts.ravel())[0], np.log(errors[counts])
 
     def residual(theta: jax.Array) -> jax.Array:
-        predicted = log_error(measured.survey, unravel(theta), menu)
+        predicted = log_error(survey, unravel(theta), menu)
         return jnp.concatenate([predicted.ravel()[where] - logs, _RIDGE * (theta - begin)])
 
     begin, jacobian = theta, jax.jit(jax.jacfwd(residual))
@@ -63,9 +62,9 @@ def fit(measured: MenuMeasurements, menu: tuple[Setting, ...]) -> Law:
     return jax.tree.map(np.asarray, unravel(jnp.asarray(found.x, jnp.float32)))
 
 
-def predict(law: Law, measured: MenuMeasurements, menu: tuple[Setting, ...]) -> np.ndarray:
+def predict(law: Law, survey: Survey, menu: tuple[Setting, ...]) -> np.ndarray:
     """ê of every scene and setting, [S, T]."""
-    return np.exp(np.asarray(log_error(measured.survey, law, menu)))
+    return np.exp(np.asarray(log_error(survey, law, menu)))
 
 
 def promised(law: Law, predicted: np.ndarray, errors: np.ndarray, asked: Sequence[float]) -> Law:

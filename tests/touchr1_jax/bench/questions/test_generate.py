@@ -5,14 +5,20 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.bench.generate import author_requests, generate, read_candidates, rejected_rows, share_at_odds
-from experiments.bench.rationales import compose_item
-from experiments.bench.rules import RULES, CandidateItem, apply_rules, broken_rule, count_found_errors
-from experiments.bench.thresholds import LevelThresholds, fit_thresholds
-from experiments.bench.wording import WORDINGS, answer_words, read_answer
-from tests.experiments.bench.conftest import SENSORS
+from tests.touchr1_jax.bench.questions.conftest import SENSORS
 from touchr1_jax.bench.items import Ask, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError
+from touchr1_jax.bench.questions.generate import (
+    author_requests,
+    generate,
+    read_candidates,
+    rejected_rows,
+    share_at_odds,
+)
+from touchr1_jax.bench.questions.rationales import compose_item
+from touchr1_jax.bench.questions.rules import RULES, CandidateItem, apply_rules, broken_rule, count_found_errors
+from touchr1_jax.bench.questions.thresholds import LevelThresholds, fit_thresholds
+from touchr1_jax.bench.questions.wording import WORDINGS, answer_words, read_answer
 from touchr1_jax.bench.scoring import score
 
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.recordings.touches import PROBE_PX, SIZE_PX, describe, families, find_touch, touch_of_scene
 from sensors_io.importers.video import VideoError
+from sensors_io.touches import PROBE_PX, SIZE_PX, describe, families, find_touch, touch_of_scene
 from tests.experiments.recordings.presses import press
 
 

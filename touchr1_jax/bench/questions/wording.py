@@ -25,6 +25,9 @@ ORDER_LANGUAGE = Language(
     sensors=SENSORS,
 )
 
+LEVELS: Mapping[str, int] = {a.name: len(a.levels) for a in TOUCH_LANGUAGE.attributes}
+"""Attribute → number of its levels."""
+
 WORDINGS = 4
 """Number of wordings of every kind of question."""
 
