@@ -148,3 +148,9 @@ def test_contact_by_colour_is_where_the_ball_is() -> None:
 
 def test_thresholds_in_the_wrong_order_are_refused() -> None:
     refused(ValueError, "must be 0 < low ≤ high", ContactConfig, low_mm=0.2, high_mm=0.1)
+
+
+@pytest.mark.parametrize("field", ["least_mm2", "rim", "steepness", "smoothing_mm"])
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_criteria_of_contact_are_positive(field: str, value: float) -> None:
+    refused(ValueError, f"{field} is {value}: must be > 0", lambda: ContactConfig(**{field: value}))

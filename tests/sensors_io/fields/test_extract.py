@@ -97,7 +97,9 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
     assert fields.force_n is not None
     assert fields.shear_mm.shape == fields.deformation_mm.shape  # type: ignore[union-attr]
     noisy = Extractor(dotted(), 0.1, calibration(dotted()), ExtractConfig(nodes=12, shear="subtracted"))
-    assert not np.allclose(noisy.read(dotted(0.5)).shear_mm, fields.shear_mm, atol=1e-3)  # type: ignore[arg-type]
+    subtracted = noisy.read(dotted(0.5)).shear_mm
+    assert not np.allclose(subtracted, fields.shear_mm, atol=1e-3)  # type: ignore[arg-type]
+    np.testing.assert_allclose(subtracted, fields.deformation_mm, atol=1e-3)  # type: ignore[arg-type]
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
@@ -111,6 +113,17 @@ def test_what_does_not_fit_together_is_refused() -> None:
     refused(SchemaError, "grid_mm is None", Fields, contact=contact, flags=flags, mm_per_px=0.1, shear_mm=wrong)
     with pytest.raises(SchemaError, match=r"shape \[80, 214, 3\]: must be \[160, 214, 3\]"):
         Extractor(bare(), 0.1).read(bare()[:80])
+
+
+@pytest.mark.parametrize("stated", ["0" * 16, "f" * 16])
+def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathlib.Path, stated: str) -> None:
+    made = calibration(dotted())
+    made.save(tmp_path / "c.npz")
+    assert Calibration.load(tmp_path / "c.npz").hash == made.hash
+    arrays = dict(np.load(tmp_path / "c.npz"))
+    arrays["plain"] = np.array(str(arrays["plain"]).replace(made.hash, stated))
+    np.savez(tmp_path / "d.npz", **arrays)
+    refused(CalibrationError, f"its hash is {made.hash}, not {stated}", Calibration.load, tmp_path / "d.npz")
 
 
 def test_frames_are_joined_in_order() -> None:

@@ -20,6 +20,17 @@ def test_every_dot_is_found_to_a_tenth_of_a_pixel(radius, missing):
     assert found.radius_px == pytest.approx(radius, rel=0.35)
 
 
+def test_scatter_is_the_quartile_range_of_the_gaps_over_their_median():
+    """Three pairs of dots each 20, 25 and 30 pixels apart, in nine of the sixteen parts of the picture or more."""
+    at = np.array([[x, y] for y in (40, 120, 200) for x in (40, 120, 200)], float)
+    gap = np.repeat([20.0, 25.0, 30.0], 3)
+    points = np.concatenate([at, at + np.column_stack([gap, np.zeros(9)])])
+    found = find_markers(gels.dots(points, 3.0, shape=(240, 260)))
+    assert len(found) == 18
+    assert (found.pitch_px, found.scatter) == (pytest.approx(25, abs=0.2), pytest.approx(0.4, abs=0.02))
+    assert found.spread == len({(4 * x // 260, 4 * y // 240) for x, y in points}) / 16
+
+
 def test_contrast_is_that_of_the_dots():
     assert find_markers(gels.dots(gels.lattice(24), 5.0, contrast=60.0)).contrast == pytest.approx(60, rel=0.15)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache, _write_row
+from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache
 
 CONFIG = dataclasses.replace(tiny.CONFIG.decoder, tie_embedding=False)
 DECODER = Decoder(CONFIG)
@@ -25,6 +25,12 @@ def params():
 def prefill(params, x):
     positions = jnp.tile(jnp.arange(L), (3, 1))
     return DECODER.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.prefill)
+
+
+def filled(value):
+    """Caches of all layers, every entry `value`."""
+    rows = jnp.full((CONFIG.num_kv_heads, T, CONFIG.head_dim), value)
+    return (LayerCache(rows, rows),) * CONFIG.num_layers
 
 
 def test_prefix_is_causal_by_zero_gradients(params):
@@ -63,12 +69,10 @@ def test_decode_reads_no_row_of_the_cache_after_its_own(params):
     rng = np.random.default_rng(2)
     x = jnp.asarray(rng.normal(size=(L, D)), jnp.float32)
     prefix = prefill(params, x)[1]
-    shape = (CONFIG.num_kv_heads, T, CONFIG.head_dim)
     step = jax.jit(
         lambda c: DECODER.apply({"params": params}, jnp.int32(7), jnp.int32(0), prefix, c, method=Decoder.decode)
     )
-    caches = [tuple(LayerCache(jnp.full(shape, v), jnp.full(shape, v)) for _ in range(2)) for v in (0.0, 5.0)]
-    hidden = [step(c)[0] for c in caches]
+    hidden = [step(filled(value))[0] for value in (0.0, 5.0)]
     np.testing.assert_array_equal(*hidden)
 
 
@@ -83,23 +87,22 @@ def test_banned_ids_have_no_probability():
     assert logits.dtype == jnp.float32
 
 
-def test_row_write_batches_over_both_axes():
-    rng = np.random.default_rng(3)
-    caches, rows = rng.normal(size=(4, 2, 5, 3)).astype(np.float32), rng.normal(size=(4, 2, 1, 3)).astype(np.float32)
-    ours = jax.vmap(_write_row, in_axes=(0, 0, None))(jnp.asarray(caches), jnp.asarray(rows), jnp.int32(2))
-    caches[:, :, 2] = rows[:, :, 0]
-    np.testing.assert_array_equal(ours, caches)
+@pytest.mark.parametrize("cache_axis", [None, 0], ids=["one cache for all", "a cache each"])
+def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_axis):
+    prefix, tokens, t = prefill(params, jnp.ones((L, D)))[1], jnp.array([7, 9]), jnp.int32(2)
 
+    def step(token, t, caches):
+        return DECODER.apply({"params": params}, token, t, prefix, caches, method=Decoder.decode)[1]
 
-def test_row_write_broadcasts_a_shared_cache():
-    rows = jnp.asarray(np.arange(6.0).reshape(2, 1, 1, 3))
-    ours = jax.vmap(_write_row, in_axes=(None, 0, None))(jnp.zeros((1, 4, 3)), rows, jnp.int32(3))
-    np.testing.assert_array_equal(ours[:, 0, 3], rows[:, 0, 0])
-
-
-def test_row_write_refuses_an_index_per_rollout():
+    fresh = filled(5.0)
+    given = fresh if cache_axis is None else jax.tree.map(lambda x: jnp.stack([x, x]), fresh)
+    together = jax.jit(jax.vmap(step, (0, None, cache_axis)))(tokens, t, given)
+    for i, token in enumerate(tokens):
+        alone = step(token, t, fresh)
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-5), together, alone)
+    np.testing.assert_array_equal((together[0].k == 5).all((0, 1, 3)), np.arange(T) != 2)
     with pytest.raises(ValueError, match="do not batch t"):
-        jax.vmap(_write_row, in_axes=(None, None, 0))(jnp.zeros((1, 4, 3)), jnp.zeros((1, 1, 3)), jnp.arange(2))
+        jax.vmap(step, (None, 0, None))(tokens[0], jnp.arange(2), fresh)
 
 
 def test_heads_must_group():

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from touchr1_jax.rl.advantages import (
+    added_after,
     advantages,
     batch_advantage,
     best_of,
@@ -201,6 +202,11 @@ def test_leaving_out_what_is_settled_keeps_the_gradient():
     whole = jax.grad(objective)(log_p, jnp.stack([a + b, a + b], 1))
     parts = jax.grad(objective)(log_p, jnp.stack([a + b, b], 1))
     np.testing.assert_allclose(whole, parts, atol=1e-6)
+
+
+def test_a_bonus_after_normalisation_is_centred_in_its_own_group():
+    found = added_after(jnp.array([[0.1, 0.1, 0.0], [0.1, 0.0, 0.0]]), 3.0)
+    np.testing.assert_allclose(found, [[0.1, 0.1, -0.2], [0.2, -0.1, -0.1]], atol=1e-7)
 
 
 def test_weights_of_prompts_that_count():

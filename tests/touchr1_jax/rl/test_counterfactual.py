@@ -38,10 +38,11 @@ def test_drop_leaves_no_stream():
 
 
 def test_noise_is_a_draw_of_the_same_sensor():
-    touch = np.asarray(noise_touch(FEATURES, NOISE, jax.random.key(1)).features.touch)
-    for p in range(P):
-        for s in range(tiny.S):
-            assert any((touch[p, s] == np.asarray(NOISE[k, s])).all() for k in range(7))
+    touch = np.asarray(jax.vmap(lambda key: noise_touch(FEATURES, NOISE, key))(many()).features.touch)
+    drawn = (touch[:, :, None] == np.asarray(NOISE)).all((-1, -2))  # [key, P, K, S]
+    assert (drawn.sum(2) == 1).all()
+    n = 200 * P * tiny.S
+    assert np.abs(drawn.sum((0, 1, 3)) - n / 7).max() < 5 * (n / 7) ** 0.5
     present = FEATURES.stream_mask.at[2].set(False).at[0, 1].set(False)
     applies = noise_touch(FEATURES.replace(stream_mask=present), NOISE, jax.random.key(1)).applies
     np.testing.assert_array_equal(applies, [True, True, False, True, True])
