@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.extend.core import Jaxpr
 
 from experiments.engine.peers import BETA, LEARNING_RATE, JobSize
 from touchr1_jax.models.lm import DecoderConfig
@@ -21,10 +22,11 @@ from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.rewards import HostReward
 from touchr1_jax.rl.config import Advantage, AnyAlgorithm, GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
-from touchr1_jax.rl.scoring import ScoreFn, make_host_score
+from touchr1_jax.rl.scoring import ScoreFn, make_score
 from touchr1_jax.types import Params, Parsed, Target
 
 PLAIN = Paper(beta=BETA, gamma=0.0)  # GRPO with a reference policy and without the counterfactual pass
@@ -82,6 +84,10 @@ class Job:
     def compilations(self) -> int:
         """Number of programs that the steps so far compiled."""
         return self._step._cache_size()
+
+    def traced(self) -> Jaxpr:
+        """The step as a program of JAX's primitives."""
+        return self._step.trace(self.state, self.batch, self.frozen).jaxpr.jaxpr
 
     def lowered(self) -> jax.stages.Lowered:
         """The step before compilation."""
@@ -165,16 +171,15 @@ def init_decoder(fns: PolicyFns, batch: GRPOBatch) -> Params:
 
 def low_ids(vocab_size: int, *, host: bool) -> ScoreFn:
     """Share of token ids in the lower half of the vocabulary; on the host to measure the cost of leaving the device."""
+    if host:  # the text has one character for each token
+        low = lambda text, parsed, target: sum(ord(c) < vocab_size // 2 for c in text) / len(text)
+        return make_score(parsed_without_tags, {"low": HostReward(low)}, {"low": 1.0}, lambda t: "".join(map(chr, t)))
 
     def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.Array], Parsed]:
         del target
         return jnp.mean(tokens < vocab_size // 2), {}, parsed_without_tags(tokens)
 
-    def reward(tokens: np.ndarray, parsed: Parsed, target: Target) -> dict[str, float]:
-        del parsed, target
-        return {"low": float(np.mean(tokens < vocab_size // 2))}
-
-    return make_host_score(parsed_without_tags, reward, ("low",)) if host else score
+    return score
 
 
 def parsed_without_tags(tokens: jax.Array) -> Parsed:

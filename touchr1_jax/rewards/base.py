@@ -65,7 +65,7 @@ class HostReward(NamedTuple):
     """A reward that Python computes from the text on the host, for what cannot be traced: slower, the device waits.
 
     Attributes:
-      value: (text, parsed answer, target), all NumPy → a finite number; pure, for it may be called again.
+      value: (text, parsed answer, target), all NumPy → one number; pure, for it may be called again.
       applies: as in `Reward`, traced.
     """
 
@@ -113,7 +113,7 @@ def total_reward(
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
     in_force = sum(share.values())
     scale = jnp.where(in_force > 0, sum(weights.values()) / jnp.where(in_force > 0, in_force, 1.0), 0.0)
-    parts = {name: scale * share[name] * values[name] for name in weights}
+    parts = {name: jnp.where(share[name] > 0, scale * share[name] * values[name], 0.0) for name in weights}
     return sum(parts.values(), start=jnp.float32(0)), parts
 
 
@@ -131,8 +131,7 @@ def reward_value(
     if tokens is None or (decode is None and isinstance(reward, HostReward)):
         raise RewardError(f"reward {name!r} sees tokens or text: must be given them; pass `tokens` and `decode`")
     if isinstance(reward, HostReward) and decode is not None:
-        of_text = lambda t, p, y: {name: reward.value(decode(t), p, y)}
-        return on_host(of_text, (name,), tokens, parsed, target)[0]
+        return _on_host(name, lambda t, p, y: reward.value(decode(t), p, y), tokens, parsed, target)
     try:
         row = jax.lax.axis_index(GROUP)
     except NameError as error:
@@ -144,38 +143,31 @@ def reward_value(
     return _checked(name, "value", jnp.floating, tokens.shape[:1], reward.value, tokens, parsed, target)[row]
 
 
-def on_host(
-    score: Callable[[np.ndarray, Parsed, Target], Mapping[str, float]],
-    terms: tuple[str, ...],
-    tokens: Int[Array, "T"],
-    parsed: Parsed,
-    target: Target,
-) -> Float[Array, "n"]:
-    """Terms of one rollout by a Python function on the host, called once a step for all rollouts of the batch.
-
-    Raises (when run):
-      ValueError: other terms than announced, or one that is not finite.
-    """
+def _on_host(
+    name: str, value: Callable[[np.ndarray, Parsed, Target], float], tokens: Array, parsed: Parsed, target: Target
+) -> Float[Array, ""]:
+    """Value of one rollout by a Python function on the host, called once a step for all rollouts of the batch."""
 
     def rows(tokens: np.ndarray, parsed: Parsed, target: Target) -> np.ndarray:
         batch = tokens.shape[:-1]
         row = lambda tree, i: jax.tree.map(lambda x: np.broadcast_to(x, (*batch, *x.shape[len(batch) :]))[i], tree)
-        out = np.empty((*batch, len(terms)), np.float32)
+        out = np.empty(batch, np.float32)
         for i in np.ndindex(batch):
-            out[i] = _host_terms(score(np.asarray(tokens[i]), row(parsed, i), row(target, i)), terms)
+            out[i] = _one_number(name, value, np.asarray(tokens[i]), row(parsed, i), row(target, i))
         return out
 
-    shape = jax.ShapeDtypeStruct((len(terms),), jnp.float32)
+    shape = jax.ShapeDtypeStruct((), jnp.float32)
     return jax.pure_callback(rows, shape, tokens, parsed, target, vmap_method="broadcast_all")
 
 
-def _host_terms(found: Mapping[str, float], terms: tuple[str, ...]) -> list[float]:
-    if set(found) != set(terms):
-        raise ValueError(f"host reward returned terms {sorted(found)}: must be {sorted(terms)}; correct `terms`")
-    for name, value in found.items():
-        if not np.isfinite(value):
-            raise ValueError(f"host reward {name!r} is {value}: must be finite; give an undefined answer a number")
-    return [float(found[name]) for name in terms]
+def _one_number(name: str, value: Callable[..., float], *of: Any) -> float:
+    try:
+        found = value(*of)
+    except Exception as error:
+        raise RewardError(f"reward {name!r} raised {error!r} on the host; correct its function") from error
+    if np.ndim(found) or np.asarray(found).dtype.kind not in "biuf":
+        raise RewardError(f"reward {name!r} is {found!r}: must be one number per rollout; return a float")
+    return float(found)
 
 
 def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]) -> None:

@@ -21,7 +21,8 @@ def prove_rewards(
 
     Answers: every slot ⊥, lowest or highest, or sensors that disagree; formatted or not, cut off or not, of no, one or
     twenty tokens.  Targets: no attribute asked, one or all; labels unknown, lowest or highest of two, three or nine
-    levels; ordinal or not; no sensor, one, two or all.  A reward on the host is checked where it runs.
+    levels; ordinal or not; no sensor, one, two or all.  A reward on the host is not proved: where it is NaN,
+    its group is left out.
 
     Args:
       rewards: the choices, by name.

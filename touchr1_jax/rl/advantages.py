@@ -26,6 +26,8 @@ def no_signal(
     """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
     if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
         # equal totals may be made of different terms, which count by themselves
+        if not terms:
+            raise ValueError("terms is empty: must name each reward to credit it by itself; score with `make_score`")
         return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
     reward = best_of(reward, algorithm.best_of)
     if algorithm.advantage is Advantage.GLOBAL:

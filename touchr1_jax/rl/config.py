@@ -148,7 +148,7 @@ class Algorithm:
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:
-    """True where ratios are to the learner before its first update, false where to a sampler that lags behind it.
+    """True where ratios are to the learner before its first update, false where to the older parameters that sampled.
 
     Under an importance cap the weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
     """

@@ -50,6 +50,7 @@ def grpo_gradient(
     experience: Experience,
     *,
     first: bool | Bool[Array, ""] = True,
+    longest: int | Float[Array, ""] | None = None,
 ) -> tuple[Params, dict[str, Array], Float[Array, "P G T"]]:
     """Gradient of `grpo_loss` with respect to the parameters, summed over micro-batches of `micro_prompts` prompts.
 
@@ -59,15 +60,16 @@ def grpo_gradient(
       reference: the policy that the KL is taken to.
       experience: rollouts with their advantages.
       first: true before the first update from this experience: the learner's own log-probabilities are then the old
-        ones, so that every ratio is 1 whatever precision the sampler computed in.  Where a
-        sampler lags behind and no weights correct for it, `old` are the sampler's at every update.
+        ones, so that every ratio is 1 whatever precision the sampler computed in.  Where a sampler lags behind and no
+        weights correct for it, ratios are to `experience.old` at every update.
+      longest: `losses.divisor` of the whole batch, where this experience is a part of it.
 
     Returns:
       The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest); and the
       log-probabilities that the ratios were taken to.
     """
     algorithm = config.algorithm
-    longest = divisor(config, experience.rollout.mask)
+    longest = divisor(config, experience.rollout.mask) if longest is None else longest
 
     def loss(params: Params, micro: Experience) -> tuple[Array, tuple[dict[str, Array], Array]]:
         terms = experience_terms(fns, config, params, reference, micro)

@@ -32,7 +32,7 @@ from touchr1_jax.rl.advantages import (
     prompt_weights,
     zero_variance,
 )
-from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision
+from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision, ratio_to_learner
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import over_tokens
@@ -180,6 +180,8 @@ class _Engine:
         reference = frozen.reference if state.reference is None else state.reference
         group = self.penalised(group, reference) if self.config.algorithm.kl_in_reward else group
         learn = self.experience(group, frozen.noise, mask_key)
+        if not ratio_to_learner(self.config.algorithm):  # by the learner's pass: the sampler's own may round otherwise
+            learn = learn._replace(old=log_probs(self.fns, self.config, sampler, group.batch, learn.rollout))
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )

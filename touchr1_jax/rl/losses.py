@@ -140,8 +140,13 @@ def surrogate(
 
 
 def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:
-    """N of `group_mean`: the mean length of the rollouts where tokens are averaged over the batch, otherwise T."""
-    return jnp.mean(jnp.sum(mask, -1)) if config.algorithm.average is Average.BATCH else config.length
+    """N of `group_mean`: the mean length of the rollouts where tokens are averaged over the batch, otherwise T.
+
+    1 for a batch without a token, whose means are 0.
+    """
+    if config.algorithm.average is not Average.BATCH:
+        return config.length
+    return jnp.where(jnp.any(mask), jnp.mean(jnp.sum(mask, -1)), 1.0)
 
 
 def over_tokens(weight: Float[Array, "P"], mask: Bool[Array, "P G T"]) -> Float[Array, "P"]:

@@ -1,7 +1,4 @@
-"""Reward of one rollout from its tokens: in-graph for traceable rewards, on the host for any other.
-
-Both are a `ScoreFn`, so that the step needs no distinction.
-"""
+"""Reward of one rollout from its tokens, and groups that are left out because of it."""
 
 import dataclasses
 import functools
@@ -9,12 +6,11 @@ from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.rewards import stable_weights
-from touchr1_jax.rewards.base import AnyReward, Decode, Reward, on_host, total_reward
+from touchr1_jax.rewards.base import AnyReward, Decode, Reward, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.rl.advantages import segment_advantages
 from touchr1_jax.rl.config import Algorithm
@@ -24,9 +20,6 @@ from touchr1_jax.types import Parsed, Target
 
 ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, Array], Parsed]]
 """(tokens, target) → (total reward, its named terms, parsed completion), for one rollout."""
-
-HostTerms = Callable[[np.ndarray, Parsed, Target], Mapping[str, float]]
-"""(tokens, parsed completion, target) of one rollout, all NumPy → its named terms; the reward is their sum."""
 
 
 def reward_weights(algorithm: Algorithm, weights: Mapping[str, float]) -> dict[str, float]:
@@ -112,25 +105,3 @@ def left_out_groups(
     shares = {f"{NONFINITE_IN}{name}": jnp.mean(~each) for name, each in by_term.items()}
     shares[f"{NONFINITE_IN}total"] = jnp.mean(all_terms & ~finite)
     return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares
-
-
-def make_host_score(parser: Callable[[Int[Array, "T"]], Parsed], reward: HostTerms, terms: tuple[str, ...]) -> ScoreFn:
-    """Score by a Python function on the host, for rewards that cannot be traced: slower, the same interface.
-
-    The device waits while Python runs, once per step for all rollouts of the batch.
-
-    Args:
-      parser: in-graph parser.
-      reward: the function; it must be pure, for it may be called again with the same arguments.
-      terms: names of the terms that it returns.
-
-    Raises (when run):
-      ValueError: other terms than announced, or one that is not finite.
-    """
-
-    def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
-        parsed = parser(tokens)
-        found = on_host(reward, terms, tokens, parsed, target)
-        return jnp.sum(found), dict(zip(terms, found, strict=True)), parsed
-
-    return score

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, ratio_to_learner
 from touchr1_jax.rl.gradient import Experience, batches_of, grpo_gradient, log_probs
+from touchr1_jax.rl.losses import divisor
 from touchr1_jax.rl.trust_region import within_trust
 from touchr1_jax.skipping import Skipping
 from touchr1_jax.types import Params
@@ -37,7 +38,7 @@ def update_policy(
     Returns:
       Parameters, state of the optimizer, and parts of the first pass, but `clip_share` of the last one.
     """
-    algorithm = config.algorithm
+    algorithm, longest = config.algorithm, divisor(config, learn.rollout.mask)
     number, count = algorithm.minibatches, algorithm.updates
     if number > 1:
         alone = dataclasses.replace(algorithm, minibatches=1)
@@ -50,7 +51,7 @@ def update_policy(
         params, opt_state, old = carry
         first, which = place
         part = learn._replace(old=old) if number == 1 else jax.tree.map(lambda x: x[which], minibatches)
-        grads, parts, old = bucketed_gradient(fns, config, params, reference, part, first)
+        grads, parts, old = bucketed_gradient(fns, config, params, reference, part, first, longest)
         norm = optax.tree.norm(grads)
         moved, opt_state = finite_update(optimizer, grads, norm, opt_state, params)
         parts = parts | {"grad_norm": norm}
@@ -98,6 +99,7 @@ def bucketed_gradient(
     reference: Params,
     learn: Experience,
     first: bool | Bool[Array, ""] = True,
+    longest: int | Float[Array, ""] | None = None,
 ) -> Gradient:
     """`grpo_gradient` over as many tokens as the shortest sufficient bucket has."""
     lengths = (*config.buckets, config.length)
@@ -108,13 +110,13 @@ def bucketed_gradient(
         short = learn._replace(rollout=rollout, old=cut(learn.old), token_advantage=by_token)
 
         def of(params: Params) -> Gradient:
-            grads, parts, old = grpo_gradient(fns, config, params, reference, short, first=first)
+            grads, parts, old = grpo_gradient(fns, config, params, reference, short, first=first, longest=longest)
             return grads, parts, jnp.pad(old, [(0, 0), (0, 0), (0, config.length - length)])
 
         return of
 
     if len(lengths) == 1:
         return over(config.length)(params)
-    longest = jnp.max(jnp.sum(learn.rollout.mask, -1))
-    bucket = jnp.sum(jnp.asarray(lengths) < longest)
+    tokens = jnp.max(jnp.sum(learn.rollout.mask, -1))
+    bucket = jnp.sum(jnp.asarray(lengths) < tokens)
     return jax.lax.switch(bucket, [over(length) for length in lengths], params)

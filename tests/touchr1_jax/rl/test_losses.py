@@ -12,6 +12,7 @@ from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Stable, Surrogate
 from touchr1_jax.rl.losses import (
     TokenTerms,
     at_most,
+    divisor,
     entropy,
     estimated_kl,
     exact_kl,
@@ -96,6 +97,12 @@ def test_every_surrogate_equals_an_independent_reference(kind, low, high):
     np.testing.assert_array_equal(np.where(MASK, clipped, False), np.where(MASK, expected["clipped"], False))
     np.testing.assert_allclose(gradient, expected["gradient"], rtol=2e-4, atol=1e-6)
     assert 0 < np.asarray(clipped)[MASK].sum() < MASK.sum()
+
+
+def test_a_batch_whose_rollouts_are_all_masked_has_a_mean_of_0():
+    config = GRPOConfig(algorithm=Paper(average=Average.BATCH))
+    mask = jnp.zeros((2, 3, 4), bool)
+    np.testing.assert_array_equal(group_mean(Average.BATCH, jnp.ones((2, 3, 4)), mask, divisor(config, mask)), [0, 0])
 
 
 def test_group_means_by_hand():

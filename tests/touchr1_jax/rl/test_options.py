@@ -11,7 +11,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import Average, GRPOConfig, Gspo, Paper
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 from touchr1_jax.rl.losses import over_tokens
@@ -75,6 +75,16 @@ def test_a_lagging_sampler_draws_with_the_parameters_before_the_last_update(on_p
     assert metrics[1]["reward_right"] == expected["reward_right"]
     assert metrics[0]["sampler_gap_peak"] < 1e-4 < metrics[1]["sampler_gap_peak"]
     assert early.behind == after.behind == ()
+
+
+def test_without_an_update_in_between_bfloat16_clips_nothing_though_the_sampler_lags():
+    """The old log-probabilities are those of the learner's pass with the parameters that sampled."""
+    algorithm = Gspo(stale=1, clip_low=1e-5, clip_high=1e-5)
+    config = dataclasses.replace(CONFIG, algorithm=algorithm, bfloat16=True)
+    state = start_state(START, OPTIMIZER, jax.random.key(1), config)
+    _, metrics = make_grpo_step(FNS, score, OPTIMIZER, config)(state, BATCH, FROZEN)
+    assert metrics["clip_share"] == 0
+    assert metrics["sampler_gap_peak"] > 1e-4
 
 
 def test_without_a_lag_the_step_is_on_policy(on_policy):
@@ -184,8 +194,15 @@ def test_parts_of_several_updates_are_those_of_the_first(learn):
 
 
 def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
-    """At a small rate two halves move twice as far as the whole; at a large one the second is off policy."""
-    halves = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, minibatches=2))
+    """At a small rate two halves move twice as far as the whole; at a large one the second is off policy.
+
+    The mean is that over the tokens of the batch, of which one half has more.
+    """
+    average = dataclasses.replace(CONFIG.algorithm, average=Average.BATCH)
+    batch = dataclasses.replace(CONFIG, algorithm=average)
+    halves = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(average, minibatches=2))
+    mask = jnp.broadcast_to(jnp.arange(T) < 1 + jnp.arange(P)[:, None, None], (P, G, T))
+    learn = learn._replace(rollout=learn.rollout.replace(mask=mask))
 
     def move(config):
         def run(rate):
@@ -195,7 +212,7 @@ def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
 
         return jax.jit(run)
 
-    (whole, _), (both, parts), (_, far) = move(CONFIG)(1e-3), move(halves)(1e-3), move(halves)(30.0)
+    (whole, _), (both, parts), (_, far) = move(batch)(1e-3), move(halves)(1e-3), move(halves)(30.0)
     scale = max(float(jnp.abs(x).max()) for x in jax.tree.leaves(whole))
     close(jax.tree.map(lambda x: x / 2, both), whole, atol=0.01 * scale)
     assert parts["clip_share"] == 0

@@ -8,7 +8,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.rewards import GroupReward, HostReward, Reward, RewardError, make_rewards
 from touchr1_jax.rewards.base import GROUP
-from touchr1_jax.rl.scoring import make_host_score, make_score
+from touchr1_jax.rl.scoring import left_out_groups, make_score
 from touchr1_jax.text.parser import compile_parser
 
 PARSER = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
@@ -22,29 +22,46 @@ def batched(score):
     return jax.jit(jax.vmap(jax.vmap(score, in_axes=(0, None))))(TOKENS, TARGET)
 
 
-def test_host_reward_equals_the_traced_one():
-    """The same formula in NumPy, called once per rollout on the host."""
-
-    def plain(tokens, parsed, target):
-        assert tokens.shape == (8,)
-        return {
-            "format": 0.1 * float(parsed.formatted),
-            "length": float(parsed.length) / 8 * float(target.label[0] == 1),
-        }
-
-    reward, terms, parsed = batched(make_host_score(PARSER, plain, ("format", "length")))
-    np.testing.assert_allclose(terms["format"], 0.1 * np.asarray(parsed.formatted))
-    np.testing.assert_allclose(terms["length"], np.asarray(parsed.length) / 8 * (np.arange(3) == 1)[:, None])
-    np.testing.assert_allclose(reward, terms["format"] + terms["length"], rtol=1e-6)
+def scored(value, **others):
+    """Scores of all rollouts by a reward on the host, alone or with others."""
+    rewards = {"mine": HostReward(value), **others}
+    return batched(make_score(PARSER, rewards, dict.fromkeys(rewards, 0.5), tiny.TOKENIZER.decode))
 
 
 @pytest.mark.parametrize(
     ("returned", "message"),
-    [({"b": 1.0}, r"returned terms \['b'\]: must be \['a'\]"), ({"a": np.nan}, "'a' is nan: must be finite")],
+    [
+        (np.ones(2), r"reward 'mine' is array\(\[1., 1.\]\): must be one number per rollout"),
+        (None, "reward 'mine' is None: must be one number"),
+        ("0.5", "reward 'mine' is '0.5': must be one number"),
+    ],
 )
-def test_faults_of_a_host_reward_are_named(returned, message):
+def test_what_is_no_number_is_named(returned, message):
     with pytest.raises(Exception, match=message):
-        jax.block_until_ready(batched(make_host_score(PARSER, lambda *_: returned, ("a",))))
+        jax.block_until_ready(scored(lambda *_: returned))
+
+
+def test_an_error_of_a_host_reward_names_the_reward():
+    with pytest.raises(Exception, match=r"reward 'mine' raised KeyError\('no'\) on the host"):
+        jax.block_until_ready(scored(lambda *_: {}["no"]))
+
+
+def test_a_host_reward_that_is_nan_costs_its_group_alone():
+    wrong = lambda text, parsed, target: np.nan if target.label[0] == 1 else float(parsed.formatted)
+    reward, terms, _ = scored(wrong, format=REWARDS["format"])
+    _, _, finite, shares = left_out_groups(reward, terms)
+    np.testing.assert_array_equal(finite, [True, False, True])
+    assert (shares["nonfinite_in_mine"], shares["nonfinite_in_format"]) == (pytest.approx(1 / 3), 0)
+
+
+def test_a_reward_that_does_not_count_cannot_harm():
+    """At weight 0, and where it does not apply."""
+    nan = lambda text, parsed, target: np.nan
+    rewards = {**REWARDS, "off": HostReward(nan), "elsewhere": HostReward(nan, lambda target: jnp.array(False))}
+    score = make_score(PARSER, rewards, {"format": 0.5, "off": 0.0, "elsewhere": 0.5}, tiny.TOKENIZER.decode)
+    reward, terms, parsed = batched(score)
+    np.testing.assert_allclose(reward, 1.0 * np.asarray(parsed.formatted))  # format takes the other's weight over
+    assert not np.any([terms["off"], terms["elsewhere"]])
 
 
 def test_a_reward_that_is_not_finite_somewhere_fails_when_traced():
