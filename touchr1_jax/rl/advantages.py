@@ -95,6 +95,19 @@ def advantages(
             assert_never(algorithm.advantage)
 
 
+def of_kept_groups(
+    algorithm: Algorithm, advantage: Float[Array, "P G *t"], finite: Bool[Array, "P"]
+) -> Float[Array, "P G *t"]:
+    """Advantages as they would be without the groups that are left out, whose own become 0.
+
+    Such a group has the mean of all others as its reward (`scoring.left_out_groups`): it leaves the mean of the batch
+    as it is and multiplies σ of the batch by the square root of the share of groups that stay.
+    """
+    of_batch = algorithm.advantage in (Advantage.GLOBAL, Advantage.PER_REWARD)
+    scale = jnp.sqrt(jnp.mean(finite.astype(jnp.float32))) if of_batch else 1.0
+    return jnp.where(finite.reshape(-1, *(1,) * (advantage.ndim - 1)), scale * advantage, 0.0)
+
+
 def segment_advantages(
     algorithm: Algorithm,
     reward: Float[Array, "P G"],

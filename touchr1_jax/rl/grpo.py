@@ -10,6 +10,7 @@ the device between the first line and the metrics.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -29,6 +30,7 @@ from touchr1_jax.rl.advantages import (
     advantages,
     dynamic_sampling_rows,
     no_signal,
+    of_kept_groups,
     prompt_weights,
     zero_variance,
 )
@@ -247,13 +249,14 @@ class _Engine:
     def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
         """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
-        advantage, by_token = advantages(algorithm, group.reward, group.terms), None
+        kept = functools.partial(of_kept_groups, algorithm, finite=group.finite)
+        advantage, by_token = kept(advantages(algorithm, group.reward, group.terms)), None
         if isinstance(self.score, WeightedScore) and algorithm.segment_credit:
-            by_token = self.score.segment_advantages(algorithm, group.reward, group.terms, group.rollout.tokens)
+            tokens = group.rollout.tokens
+            by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens))
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
-            bonus = added_after(group.bonus, algorithm.tactile_weight)
+            bonus = jnp.where(group.finite[:, None], added_after(group.bonus, algorithm.tactile_weight), 0.0)
             advantage, by_token = advantage + bonus, by_token if by_token is None else by_token + bonus[..., None]
-        advantage = jnp.where(group.finite[:, None], advantage, 0.0)
         no_signal = self.no_signal(group)
         rollout, weight = group.rollout, jnp.full(no_signal.shape, 1 / self.config.prompts)
         if algorithm.mask_truncated:
@@ -270,7 +273,7 @@ class _Engine:
             rollout=rollout,
             old=rollout.log_prob,
             advantage=advantage,
-            token_advantage=by_token if by_token is None else jnp.where(group.finite[:, None, None], by_token, 0.0),
+            token_advantage=by_token,
             weight=weight,
         )
 

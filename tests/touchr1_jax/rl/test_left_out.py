@@ -10,7 +10,8 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.advantages import advantages, of_kept_groups
+from touchr1_jax.rl.config import Advantage, GRPOConfig, Paper
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.update import finite_update
@@ -53,6 +54,20 @@ def test_a_group_that_is_left_out_has_the_mean_of_the_others():
     np.testing.assert_allclose(terms["b"], [[0.1, 0.1], [0.05, 0.05], [0.0, 0.0]], rtol=1e-6)
     expected = {"nonfinite_in_a": 0, "nonfinite_in_b": 1 / 3, "nonfinite_in_total": 0}
     assert {name: pytest.approx(float(share)) for name, share in shares.items()} == expected
+
+
+@pytest.mark.parametrize("comparison", Advantage)
+def test_the_other_advantages_are_those_of_a_batch_without_the_group(comparison):
+    """Also where they are compared with σ of the whole batch."""
+    rng = np.random.default_rng(0)
+    a, b = (jnp.asarray(rng.normal(size=(5, 4)), jnp.float32) for _ in range(2))
+    algorithm, kept = Paper(advantage=comparison, epsilon=1e-9), np.array([0, 1, 3, 4])
+    alone = advantages(algorithm, (a + b)[kept], {"a": a[kept], "b": b[kept]})
+    b = b.at[2, 1].set(jnp.nan)
+    reward, terms, finite, _ = left_out_groups(a + b, {"a": a, "b": b})
+    found = of_kept_groups(algorithm, advantages(algorithm, reward, terms), finite)
+    np.testing.assert_allclose(found[kept], alone, rtol=1e-4)
+    np.testing.assert_array_equal(found[2], np.zeros(4))
 
 
 def test_a_sum_that_overflows_is_named_too():
