@@ -3,16 +3,16 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
+from experiments.engine.matrix_floor import count_flops
 from experiments.study.dataset import Dataset
 from experiments.study.stages import StudySFT, answer_feed
 from experiments.study.study import StudyConfig
@@ -77,15 +77,6 @@ def questions(policy: TouchPolicy, touch: TouchBatch, data: Dataset, scale: Feed
     return QuestionFeed(policy, features, data.label, batch_size=drawn, seed=0, own=np.arange(drawn // scale.devices))
 
 
-def count_flops(function: Callable[..., Any], *arguments: Any) -> float:
-    """Floating-point operations of the products and convolutions of a call, a loop's as often as it turns.
-
-    Raises:
-      ValueError: a product within a loop of unknown length.
-    """
-    return _flops(jax.make_jaxpr(function)(*arguments).jaxpr)
-
-
 def sft_seconds(policy: TouchPolicy, config: StudySFT, batch: SFTBatch, devices: int, machine: Machine) -> float:
     """Least seconds of a step of SFT, W / (devices · peak · share), where W are the step's operations.
 
@@ -110,29 +101,6 @@ def grpo_seconds(policy: TouchPolicy, config: GRPOConfig, devices: int, machine:
         prompt_tokens=policy.layout.ids.shape[1],
     )
     return math.fsum(seconds(shape, machine).values())
-
-
-def _flops(jaxpr: Jaxpr) -> float:
-    return math.fsum(_equation_flops(equation) for equation in jaxpr.eqns)
-
-
-def _equation_flops(equation: Any) -> float:
-    name, params = equation.primitive.name, equation.params
-    made = lambda: 2.0 * math.prod(equation.outvars[0].aval.shape)
-    if name == "dot_general":
-        ((contracted, _), _) = params["dimension_numbers"]
-        return made() * math.prod(equation.invars[0].aval.shape[i] for i in contracted)
-    if name == "conv_general_dilated":
-        kernel = equation.invars[1].aval.shape
-        return made() * math.prod(kernel) / kernel[params["dimension_numbers"].rhs_spec[0]]
-    leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, (Jaxpr, ClosedJaxpr)))
-    programs = [x.jaxpr if isinstance(x, ClosedJaxpr) else x for x in leaves if isinstance(x, (Jaxpr, ClosedJaxpr))]
-    inner = [_flops(jaxpr) for jaxpr in programs]  # a loop's body, the branches of a choice, a function that is called
-    if name == "scan":
-        return params["length"] * math.fsum(inner)
-    if name == "while" and any(inner):
-        raise ValueError("a product stands in a while loop: how often it turns is unknown; count it by hand")
-    return max(inner, default=0.0) if name == "cond" else math.fsum(inner)
 
 
 class BatchCost(NamedTuple):

@@ -6,9 +6,13 @@ Every preset at every group size learns to write low token ids (see `experiments
 prompts, at one learning rate, with the same number of rollouts and steps: a larger group has fewer prompts.  The score
 is the mean reward over the last tenth of the steps; a run reaches the target at the first step whose mean reward passes
 it.  Time is the number of steps times the median seconds of a step, which is measured in rounds with all other
-programs, so that neither compilation nor other load on the machine counts.
+programs, so that neither compilation nor other load on the machine counts.  Where a preset passes groups over, the
+reward is that of all rollouts that were drawn, which can be compared.
 
-Cost: about ten minutes on one core, most of it compilation; `--scale smoke` under one.
+Options of sampling, advantage, reward, lag and reference are charted one by one against the published objective in the
+small world of touch, by accuracy and time (see `experiments.engine.grpo_options`).
+
+Cost: about twenty minutes on one core, most of it compilation; `--scale smoke` under two.
 
 Expected: on policy all clipped surrogates have the same gradient, so presets differ only in their averages and weights:
 Dr. GRPO and the token means equal GRPO up to scale where all completions have one length; dynamic sampling draws twice
@@ -31,8 +35,10 @@ from experiments.core.progress import Advance
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.timing import interleaved
+from experiments.engine.grpo_options import NAMES, measure_options, option_pictures, option_table, option_verdict
 from experiments.engine.job import Job, config_of
 from experiments.engine.peers import JobSize
+from experiments.engine.world_training import TrainingBudget
 from touchr1_jax.rl import config as rl
 
 ALGORITHMS: Mapping[str, rl.AnyAlgorithm] = {
@@ -46,8 +52,9 @@ DEFAULT_KEY: Key = ("paper", rl.GRPOConfig().group)  # setting of the studies, m
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ParetoGrpoConfig:
-    """Rollouts of a step, group sizes, length of a run, and the reward to reach."""
+    """Algorithms, group sizes, rollouts of a step, length of a run, the reward to reach, and the options."""
 
+    algorithms: tuple[str, ...] = tuple(ALGORITHMS)
     groups: tuple[int, ...] = (4, 8, 16)
     rollouts: int = 32
     prefix: int = 64
@@ -59,8 +66,19 @@ class ParetoGrpoConfig:
     learning_rate: float = 1e-3
     seeds: int = 3
     size: JobSize = JobSize(length=16, num_layers=2)
+    options: tuple[str, ...] = NAMES
+    """Options that are compared with the published objective in the world of touch."""
+    option_seeds: int = 10
+    effort: TrainingBudget = TrainingBudget()
+    """Training of the options."""
 
     def __post_init__(self) -> None:
+        for field, known in (("algorithms", tuple(ALGORITHMS)), ("options", NAMES)):
+            unknown = [name for name in getattr(self, field) if name not in known]
+            if unknown:
+                raise ValueError(f"{field} holds {unknown}: must be of {', '.join(known)}; correct the names")
+        if self.options and self.option_seeds < 2:
+            raise ValueError(f"option_seeds is {self.option_seeds}: must be at least 2 for an interval; raise it")
         uneven = [g for g in self.groups if self.rollouts % g]
         if uneven:
             raise ValueError(f"groups holds {uneven}: must divide rollouts = {self.rollouts}; choose divisors of it")
@@ -99,8 +117,8 @@ Curves = Mapping[Key, LearningCurves]
 def run(config: ParetoGrpoConfig, context: Context) -> Results:
     """Train every algorithm at every group size, then time their steps in turn."""
     rewards, last = {}, {}
-    with context.progress("seeds", len(ALGORITHMS) * len(config.groups) * config.seeds) as advance:
-        for name, group in itertools.product(ALGORITHMS, config.groups):
+    with context.progress("seeds", len(config.algorithms) * len(config.groups) * config.seeds) as advance:
+        for name, group in itertools.product(config.algorithms, config.groups):
             key = name, group
             rewards[key], last[key] = learn(config, ALGORITHMS[name], group, advance)
             context.print(f"{name}, groups of {group}: {rewards[key][:, -1].mean():.3f} after {config.steps} steps")
@@ -110,9 +128,12 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
         key: LearningCurves(rewards=rewards[key], step_s=float(np.median(s)))
         for key, s in zip(last, seconds, strict=True)
     }
+    options = {}
+    if config.options:
+        options = measure_options(config.options, config.effort, config.option_seeds, config.timed, context)
     return Results(
-        verdict=verdict(config, curves),
-        tables=(cost_table(config.target, curves),),
+        verdict=(*verdict(config, curves), *(option_verdict(options) if options else ())),
+        tables=(cost_table(config.target, curves), *((option_table(options),) if options else ())),
         pictures=(
             Picture(
                 name="pareto_grpo",
@@ -128,6 +149,7 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
                 caption="Mean over the seeds; the dotted line is the target.",
                 content=reward_over_time(config.target, curves),
             ),
+            *(option_pictures(options) if options else ()),
         ),
         settings={
             "learning_rate": config.learning_rate,
@@ -139,14 +161,15 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
 
 
 def learn(config: ParetoGrpoConfig, algorithm: rl.AnyAlgorithm, group: int, advance: Advance) -> tuple[np.ndarray, Job]:
-    """Mean reward of every seed's steps, [seeds, steps], and the last seed's job; `advance` is called after a seed."""
+    """Mean reward of all that each step drew, [seeds, steps], and the last seed's job; a seed calls `advance`."""
     prompts = config.rollouts // group
     size = dataclasses.replace(config.size, prompts=prompts, group=group)
     step = config_of(size, algorithm)
     rewards = []
     for seed in range(config.seeds):
         job = Job(size, config.prefix, step, learning_rate=config.learning_rate, seed=seed)
-        rewards.append(jax.device_get([job.step()["reward"] for _ in range(config.steps)]))
+        steps = (job.step() for _ in range(config.steps))
+        rewards.append(jax.device_get([metrics.get("drawn_reward", metrics["reward"]) for metrics in steps]))
         advance()
     return np.array(rewards), job
 
@@ -235,8 +258,10 @@ def reward_over_time(target: float, curves: Curves) -> bytes:
 
 DEFAULT = ParetoGrpoConfig()
 SMOKE = ParetoGrpoConfig(
-    groups=(2,), rollouts=4, prefix=16, steps=2, timed=1, seeds=1,
+    algorithms=("paper", "DAPO"), groups=(2,), rollouts=4, prefix=16, steps=2, timed=1, seeds=1,
     size=JobSize(length=4, vocab_size=32, hidden_size=16, num_layers=1, num_heads=1, num_kv_heads=1, head_dim=16),
+    options=("2 minibatches",), option_seeds=2,
+    effort=TrainingBudget(pretrain_steps=4, pretrain_batch=8, steps=4, prompts=2, group=4, examined=8, answers=2),
 )  # fmt: skip
 
 EXPERIMENT = Experiment(name="pareto_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -8,7 +8,8 @@ prefixes of 64 to 1024 tokens, each in two processes of its own: one that compil
 programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, and with
 TRL and Tunix where they can be imported (see `harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
 thousand steps, whose time and memory must stay constant, are measured too.  Matrix products are timed in the same
-process, so that shares of the peak need no data sheet.
+process, so that shares of the peak need no data sheet, and every shape of product of an iteration is timed alone: their
+sum is the least time that an iteration of these shapes can take (see `matrix_floor.py`).
 
 Cost: about six minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 
@@ -32,7 +33,8 @@ from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.engine import speed
 from experiments.engine import speed_report as report
-from experiments.engine.job import config_of
+from experiments.engine.job import Job, config_of
+from experiments.engine.matrix_floor import TimedProduct, floor_table, time_products
 from experiments.engine.peers import BETA, JobSize, Peer, PeerFailed, PeerJob, PeerTimes, installed_peers
 from experiments.engine.processes import in_own_process
 from touchr1_jax.rl.config import GRPOConfig
@@ -61,7 +63,8 @@ class SpeedConfig:
     options_at: int = 64
     """Prefix at which the options are timed."""
     repeated_at: tuple[int, ...] = (64, 512)
-    """Prefixes at which repeated prefixes are timed, and lean compilation at the last; they must be in `prefixes`."""
+    """Prefixes at which repeated prefixes and single products are timed, and lean compilation at the last; they must be
+    in `prefixes`."""
     buckets: tuple[int, ...] = (16, 32, 48)
     """Lengths that updates from short answers may pay for."""
     words: int = 131_072
@@ -95,6 +98,7 @@ def run(config: SpeedConfig, context: Context) -> Results:
     found = speed.side_by_side(makers, config.rounds, "options", context)
     few = max(2, config.rounds // 2)
     twice = {p: speed.side_by_side(speed.repeated(size, p), few, f"prefix {p}", context) for p in config.repeated_at}
+    floors = measure_floors(config, context)
     with context.progress_callback("steps", still=True) as progress:
         progress(0, config.steps)
         long = in_own_process(
@@ -104,10 +108,14 @@ def run(config: SpeedConfig, context: Context) -> Results:
     compiled = {"as it is": first[lean_at]} | ({"lean": lean[lean_at]} if lean else {})
     return Results(
         verdict=(*report.verdict(alone, twice, peers), *failed),
-        requirements=report.requirements(alone, first, lean, peers, long, speed.parser_seconds(size)),
+        requirements=(
+            *report.requirements(alone, first, lean, peers, long, speed.parser_seconds(size)),
+            *report.peak_shares(size, alone, floors),
+        ),
         pictures=report.pictures(size, alone, first, peers, long),
         tables=(
             report.alone_table(size, alone, first),
+            *(floor_table(p, found, min(alone[p].seconds)) for p, found in floors.items()),
             *((report.peer_table(size, alone, first, peers),) if peers else ()),
             report.compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
             report.compare_table("Repeating the prefix: time over that of the engine as it is", twice),
@@ -126,6 +134,16 @@ def time_in_processes(
     for name, job in context.each(title, jobs.items(), still=True):
         found[name] = t = in_own_process(speed.time_alone, *job, cache)
         context.print(f"{title} {name}: {t.median_s:.3f} s, {t.peak_gb:.2f} GB")
+    return found
+
+
+def measure_floors(config: SpeedConfig, context: Context) -> dict[int, tuple[TimedProduct, ...]]:
+    """Every shape of product of an iteration alone."""
+    found = {}
+    for prefix in context.each("single products", config.repeated_at):
+        step = Job(config.size, prefix, config_of(config.size)).traced()
+        found[prefix] = timed = time_products(step, config.size.length, config.rounds)
+        context.print(f"prefix {prefix}: {len(timed)} shapes of products, {sum(t.seconds for t in timed):.3f} s alone")
     return found
 
 

@@ -1,12 +1,13 @@
 """Requirements, tables and charts of the speed of GRPO."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.results import Cell, Picture, Requirement, Table, at_least, at_most, named_table
+from experiments.engine.matrix_floor import TimedProduct
 from experiments.engine.peers import JobSize, PeerTimes
 from experiments.engine.speed import RESIDENT_EVERY, LongRun, ProcessTiming
 
@@ -16,6 +17,7 @@ PEER_S = {("TRL", 64): 1.36, ("Tunix", 64): 1.77, ("TRL", 512): 13.1, ("Tunix", 
 """Seconds of the peers on the machine for which the limits were set; elsewhere the ratio counts."""
 
 MEMORY_LIMIT_GB, MEMORY_AT = 1.0, 512  # most memory of a process, up to this prefix
+PEAK_SHARE = 0.55  # least share of the speed of large products that an iteration should reach
 EARLY = 1000  # steps over which time must stay constant; memory must over all
 Timings = Mapping[int, ProcessTiming]  # prefix → timing
 Peers = Mapping[tuple[str, int], PeerTimes]  # (Peer, prefix) → its times
@@ -71,6 +73,22 @@ def requirements(
         at_most("programs for one shape", max(a.programs for a in alone.values()), 1),
         *steadiness(long),
     )
+
+
+def peak_shares(size: JobSize, alone: Timings, floors: Mapping[int, Sequence[TimedProduct]]) -> list[Requirement]:
+    """Share of the speed of large products, and the largest share that products of these shapes allow."""
+    share = lambda prefix, seconds: size.gflop(prefix) / seconds / alone[prefix].gflops_peak
+    note = "at most {:.2f} where nothing but the products of these shapes takes time"
+    return [
+        at_least(
+            f"share of the peak at prefix {prefix}",
+            share(prefix, alone[prefix].median_s),
+            PEAK_SHARE,
+            note=note.format(share(prefix, sum(t.seconds for t in found))),
+        )
+        for prefix, found in floors.items()
+        if prefix in LIMITS_S
+    ]
 
 
 def _time_limits(timings: Timings, how: str = "") -> list[Requirement]:

@@ -43,12 +43,12 @@ from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.losses import entropy, exact_kl, token_log_probs
 from touchr1_jax.rl.metrics import answer_metrics
 from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn, reward_weights
+from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.rl.stream_check import check_streams
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
-FORMAT = 0.1  # weight of the format reward; accuracy and consistency share the rest
+FORMAT, CONSISTENCY = 0.1, 0.3  # weights of the rewards; accuracy has the rest
 
 LEARNING_RATE, FINAL_SHARE = 3e-3, 0.2
 """3,000 times the paper's 1e-6: at less the small policy hardly changes; the share of it at the last step."""
@@ -73,11 +73,18 @@ class TrainingBudget:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GrpoVariant:
-    """The static part of a program: the algorithm, and the reward that stands for accuracy."""
+    """The static part of a program: the algorithm, the reward that stands for accuracy, and what else differs.
+
+    Attributes:
+      sampling: fields of `GRPOConfig` with their values.
+      more_rewards: further rewards and their weights, where a setting has no hyperparameters of its own.
+    """
 
     name: str
     algorithm: AnyAlgorithm
     accuracy: str = "accuracy"
+    sampling: tuple[tuple[str, float], ...] = ()
+    more_rewards: tuple[tuple[str, float], ...] = ()
 
 
 class Hyperparameters(NamedTuple):
@@ -91,11 +98,12 @@ class Hyperparameters(NamedTuple):
     beta: Scalar
     gamma: Scalar
     entropy_weight: Scalar
-    consistency: Scalar = 0.3
+    consistency: Scalar = CONSISTENCY
     lenient: Scalar = 0.0
 
 
-Setting = tuple[World, Hyperparameters]  # values of all knobs
+Setting = tuple[World, Hyperparameters | None]
+"""Values of all knobs; without hyperparameters the preset's own, static: a term of weight 0 is then not computed."""
 
 
 def hyperparameters_of(variant: GrpoVariant) -> Hyperparameters:
@@ -167,15 +175,20 @@ class VariantRuns:
         return dataclasses.replace(run, refused=checked and not run.streams_pass())
 
     def _train(self, variant: GrpoVariant, setting: Setting) -> VariantRun:
-        world, hyperparameters = setting
+        world, _ = setting
         start = self._supervised(world)
         evaluator = seeds_program(evaluate, (self._budget,), 1, 3)
         if world not in self._before:
             self._before[world] = evaluator(world, start, start, self._keys)
-        training = seeds_program(reinforce, (self._budget, variant), 2, 2)
-        end, metrics = training(world, hyperparameters, start, self._keys)
+        end, metrics = self.training(variant, setting)()
         after = evaluator(world, end, start, self._keys)
         return VariantRun(**jax.device_get({"before": self._before[world], "after": after, "metrics": metrics}))
+
+    def training(self, variant: GrpoVariant, setting: Setting) -> Callable[[], tuple[Params, dict[str, Array]]]:
+        """Reinforcement of all seeds as a call: their parameters and the metrics of every step."""
+        world, values = setting
+        program, start = seeds_program(reinforce, (self._budget, variant), 2, 2), self._supervised(world)
+        return lambda: program(world, values, start, self._keys)
 
     def _supervised(self, world: World) -> Params:
         """The policies that supervised training makes of a world, with their logits scaled."""
@@ -213,15 +226,26 @@ def pretrain(budget: TrainingBudget, world: World, key: Array) -> Params:
 
 
 def reinforce(
-    budget: TrainingBudget, variant: GrpoVariant, world: World, values: Hyperparameters, start: Params, key: Array
+    budget: TrainingBudget,
+    variant: GrpoVariant,
+    world: World,
+    values: Hyperparameters | None,
+    start: Params,
+    key: Array,
 ) -> tuple[Params, dict[str, Float[Array, "n"]]]:
     """GRPO from a supervised policy, which is also the reference: its parameters, and all metrics of every step."""
-    algorithm = dataclasses.replace(
-        variant.algorithm, beta=values.beta, gamma=values.gamma, entropy_weight=values.entropy_weight
-    )
-    sizes: dict[str, Any] = {"prompts": budget.prompts, "group": budget.group, "micro_prompts": budget.prompts}
+    algorithm, rate = variant.algorithm, LEARNING_RATE
+    if values is not None:
+        weights = {name: getattr(values, name) for name in ("beta", "gamma", "entropy_weight")}
+        algorithm, rate = dataclasses.replace(algorithm, **weights), values.learning_rate
+    sizes: dict[str, Any] = {
+        "prompts": budget.prompts,
+        "group": budget.group,
+        "micro_prompts": budget.prompts // algorithm.minibatches,
+        **dict(variant.sampling),
+    }
     config = GRPOConfig(**sizes, length=LENGTH, algorithm=algorithm, inverse_draws=True)
-    optimizer = falling_adamw(values.learning_rate, FINAL_SHARE, budget.steps, config.max_grad_norm)
+    optimizer = falling_adamw(rate, FINAL_SHARE, budget.steps, config.max_grad_norm)
     step = make_grpo_step(FNS, make_world_score(variant, values), optimizer, config)
     noise_key, run_key, scene_key = jax.random.split(key, 3)
     frozen = FrozenInputs(reference=start, noise=noise_bank(world, noise_key))
@@ -235,11 +259,14 @@ def reinforce(
     return end.params, metrics
 
 
-def make_world_score(variant: GrpoVariant, values: Hyperparameters) -> ScoreFn:
-    """R = (.9 − w) accuracy + w consistency + .1 format, with the library's rewards and a traced w."""
+def make_world_score(variant: GrpoVariant, values: Hyperparameters | None) -> ScoreFn:
+    """R = (.9 − w) accuracy + w consistency + .1 format, with the library's rewards and a w that may be traced."""
     rewards = make_rewards(np.full((A, K), 1 / K, np.float32))
-    shares = {variant.accuracy: 1 - FORMAT - values.consistency, "consistency": values.consistency, "format": FORMAT}
+    consistency = CONSISTENCY if values is None else values.consistency
+    shares = {variant.accuracy: 1 - FORMAT - consistency, "consistency": consistency, "format": FORMAT}
     weights = reward_weights(variant.algorithm, shares)
+    if values is None:
+        return make_score(PARSER, rewards, {**weights, **dict(variant.more_rewards)})
 
     def score(tokens: Int[Array, "T"], target: Target) -> tuple[Array, dict[str, Array], Parsed]:
         parsed = PARSER(tokens)

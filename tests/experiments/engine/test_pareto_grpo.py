@@ -5,7 +5,8 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import pareto_grpo
-from experiments.engine.pareto_grpo import ALGORITHMS, SMOKE, LearningCurves, ParetoGrpoConfig, cost_table
+from experiments.engine.grpo_options import OptionRun, gain, option_table, option_verdict
+from experiments.engine.pareto_grpo import SMOKE, LearningCurves, ParetoGrpoConfig, cost_table
 from tests.experiments.shrunk import run_shrunk
 
 
@@ -41,9 +42,41 @@ def test_groups_must_divide_the_rollouts():
         ParetoGrpoConfig(groups=(4, 5))
 
 
+def run_of(accuracy: list[float], step_s: float) -> OptionRun:
+    seeds = np.array(accuracy)
+    return OptionRun(accuracy=seeds, entropy=seeds, kl=seeds, right=np.tile(seeds[:, None], (1, 3)), step_s=step_s)
+
+
+RUNS = {
+    "published": run_of([0.5, 0.6, 0.7], 0.010),
+    "top-p .9": run_of([0.6, 0.7, 0.8], 0.012),
+    "max@2": run_of([0.4, 0.6, 0.9], 0.010),
+}
+
+
+def test_an_option_is_compared_seed_by_seed():
+    """Ten points more with every seed are beyond chance, −10, 0 and 20 are not."""
+    rows = {row[0]: row[1:] for row in option_table(RUNS).rows}
+    assert rows["published"][:4] == (10.0, 1.0, pytest.approx(60.0), None)
+    assert rows["top-p .9"][:2] == (12.0, pytest.approx(1.2))
+    assert gain(RUNS, "top-p .9").low == pytest.approx(10.0)
+    assert gain(RUNS, "max@2").mean == pytest.approx(10 / 3)
+    (verdict,) = option_verdict(RUNS)
+    assert "top-p .9" in verdict
+    assert "max@2" not in verdict
+
+
+def test_unknown_options_are_named():
+    with pytest.raises(ValueError, match=r"options holds \['top-k'\]: must be of "):
+        ParetoGrpoConfig(options=("top-k",))
+
+
 @pytest.mark.slow
-def test_every_algorithm_has_a_row(tmp_path):
+def test_every_algorithm_and_option_has_a_row(tmp_path):
     directory = run_shrunk(pareto_grpo, SMOKE, tmp_path)
     results = read_json(directory / "results.json")
-    assert [row[0] for row in results["tables"][0]["rows"]] == list(ALGORITHMS)
-    assert {p.name for p in (directory / "plots").iterdir()} == {"pareto_grpo.svg", "courses.svg"}
+    presets, options = ([row[0] for row in table["rows"]] for table in results["tables"])
+    assert presets == list(SMOKE.algorithms)
+    assert options == ["published", *SMOKE.options]
+    names = ("pareto_grpo", "courses", "options", "option_courses")
+    assert {p.name for p in (directory / "plots").iterdir()} == {f"{name}.svg" for name in names}

@@ -11,10 +11,12 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.engine import throughput_feed
-from experiments.engine.feeding import FeedScale, SimulatedDevice, count_flops, idle_share, make_seconds
+from experiments.engine.feeding import FeedScale, SimulatedDevice, idle_share, make_seconds
+from experiments.engine.matrix_floor import count_flops
 from experiments.engine.throughput_feed import SMOKE, FeedingConfig
 from experiments.paper import presets
 from tests.experiments import tiny
+from touchr1_jax.models.vmappable_dense import linear
 
 STUDY = dataclasses.replace(tiny.STUDY, clip_memory_gib=0.0002)  # of a quarter of the clips, more or less
 
@@ -71,6 +73,13 @@ def of(*shape: int) -> jax.ShapeDtypeStruct:
 def test_a_product_is_two_operations_for_each_pair():
     assert count_flops(lambda a, b: jnp.tanh(a @ b) + 1, of(3, 4), of(4, 5)) == 2 * 3 * 4 * 5
     assert count_flops(lambda a, b: jnp.einsum("bij,bkj->bik", a, b), of(7, 3, 4), of(7, 5, 4)) == 7 * 2 * 3 * 4 * 5
+
+
+def test_a_dense_layer_is_a_product():
+    """Also inside of `jit` and in the gradient, whose products for the input and for the weight are as large."""
+    assert count_flops(jax.jit(linear), of(3, 4), of(4, 5)) == 2 * 3 * 4 * 5
+    gradient = jax.grad(lambda x, w: jnp.sum(linear(x, w) ** 2), (0, 1))
+    assert count_flops(gradient, of(3, 4), of(4, 5)) == 3 * 2 * 3 * 4 * 5
 
 
 def test_a_convolution_is_two_operations_for_each_weight_that_an_output_reads():
