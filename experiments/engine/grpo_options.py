@@ -196,8 +196,9 @@ def right_over_time(runs: Runs) -> bytes:
         lines = []
         for i, name in enumerate([PUBLISHED.name, *(v.name for v in variants if v.name in runs)]):
             x = runs[name].step_s * np.arange(1, runs[name].right.shape[1] + 1)
-            y, look = running_mean(runs[name].right.mean(0)), {"marker": "", "colour": ("black", *PALETTE)[i]}
-            lines += [Series(x=x, y=y, **look), Series(x=x[-1:], y=y[-1:], labels=[name], **look)]
+            y, colour = running_mean(runs[name].right.mean(0)), ("black", *PALETTE)[i]
+            lines.append(Series(x=x, y=y, marker="", colour=colour))
+            lines.append(Series(x=x[-1:], y=y[-1:], labels=[name], marker="", colour=colour))
         if len(lines) > 2:
             panels.append(Panel(lines, title=family, x_label="time of all seeds, s", y_label="accuracy of rollouts"))
     return draw(panels, columns=2, size=(9.6, 8.4), share_y=True, legend=False)

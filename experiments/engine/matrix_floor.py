@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 from experiments.core.results import Table, named_table
 from experiments.core.timing import interleaved
@@ -53,12 +53,12 @@ class TimedProduct(NamedTuple):
     """Products of one name in an iteration: their number, operations, and seconds of all of them alone."""
 
     name: str
-    count: int
+    number: int
     flops: float
     seconds: float
 
 
-def equations(jaxpr: Jaxpr, loops: int | None = None) -> Iterator[tuple[JaxprEqn, int]]:
+def equations(jaxpr: Jaxpr, loops: int | None = None) -> Iterator[tuple[Any, int]]:
     """Every product and convolution of a program and how often it is computed; of a choice those of the longest branch.
 
     Args:
@@ -88,7 +88,7 @@ def _programs(params: Mapping[str, Any]) -> list[Jaxpr]:
     return [x.jaxpr if isinstance(x, ClosedJaxpr) else x for x in leaves if isinstance(x, (Jaxpr, ClosedJaxpr))]
 
 
-def flops(eqn: JaxprEqn) -> float:
+def flops(eqn: Any) -> float:
     """Multiplications and additions of a product or a convolution."""
     made = 2.0 * math.prod(eqn.outvars[0].aval.shape)
     left, right = (v.aval.shape for v in eqn.invars)
@@ -98,7 +98,7 @@ def flops(eqn: JaxprEqn) -> float:
     return made * math.prod(left[i] for i in contracted)
 
 
-def _axes(eqn: JaxprEqn) -> Any:
+def _axes(eqn: Any) -> Any:
     """Contracted and batched axes; those of `linear` are always the last of the rows and the first of the weights."""
     return eqn.params.get("dimension_numbers", (((len(eqn.invars[0].aval.shape) - 1,), (0,)), ((), ())))
 
@@ -120,15 +120,15 @@ def products(jaxpr: Jaxpr, loops: int) -> Counter[Product]:
 def time_products(jaxpr: Jaxpr, loops: int, rounds: int) -> tuple[TimedProduct, ...]:
     """Time every shape of a program's `products` alone, fastest of the rounds; the slowest in sum first."""
     counts = products(jaxpr, loops)
-    calls = {product: _repeated(product) for product in counts}
+    calls = {str(product): _repeated(product) for product in counts}
     for call in calls.values():
         jax.block_until_ready(call())
-    fastest = {p: float(s.min()) / REPEATS for p, s in interleaved(calls, range(rounds)).items()}
+    fastest = {key: float(s.min()) / REPEATS for key, s in interleaved(calls, range(rounds)).items()}
     merged: dict[str, TimedProduct] = {}
     for p, count in counts.items():
         before = merged.get(p.name, TimedProduct(p.name, 0, 0.0, 0.0))
-        flops, seconds = before.flops + count * p.flops, before.seconds + count * fastest[p]
-        merged[p.name] = TimedProduct(p.name, before.count + count, flops, seconds)
+        work, seconds = before.flops + count * p.flops, before.seconds + count * fastest[str(p)]
+        merged[p.name] = TimedProduct(p.name, before.number + count, work, seconds)
     return tuple(sorted(merged.values(), key=lambda t: -t.seconds))
 
 
@@ -141,7 +141,7 @@ def floor_table(prefix: int, found: Sequence[TimedProduct], step_s: float) -> Ta
         [
             {
                 "product": one.name,
-                "count": one.count,
+                "count": one.number,
                 "work": one.flops / 1e9,
                 "speed": one.flops / one.seconds / 1e9,
                 "time": 1e3 * one.seconds,
@@ -160,7 +160,7 @@ def floor_table(prefix: int, found: Sequence[TimedProduct], step_s: float) -> Ta
 
 
 def _together(name: str, found: Sequence[TimedProduct]) -> TimedProduct:
-    return TimedProduct(name, sum(t.count for t in found), sum(t.flops for t in found), sum(t.seconds for t in found))
+    return TimedProduct(name, sum(t.number for t in found), sum(t.flops for t in found), sum(t.seconds for t in found))
 
 
 def _repeated(product: Product) -> Any:

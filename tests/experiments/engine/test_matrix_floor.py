@@ -67,5 +67,5 @@ def test_a_table_ends_with_the_rest_and_the_sum():
 def test_single_products_take_time():
     square = jax.make_jaxpr(lambda x: x @ x)(jnp.ones((4, 4)))
     (one,) = time_products(square.jaxpr, 1, rounds=2)
-    assert (one.name, one.count, one.flops) == ("4 × 4 · 4 × 4", 1, 128.0)
+    assert (one.name, one.number, one.flops) == ("4 × 4 · 4 × 4", 1, 128.0)
     assert one.seconds > 0
