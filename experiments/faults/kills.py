@@ -30,7 +30,13 @@ POLL_S = 0.005  # time between two looks at a session's files; a step takes long
 PATIENCE_S = 300.0  # a session that adds nothing to its run for so long hangs
 
 START, BETWEEN, CHECKPOINT = "start-up", "between stages", "writing a checkpoint"
-STEPPING = {"sft": "SFT steps", "grpo": "GRPO steps", "blind": "blind SFT steps", "count": "steps"}
+STEPPING = {
+    "sft": "SFT steps",
+    "decoder": "decoder's SFT steps",
+    "grpo": "GRPO steps",
+    "blind": "blind SFT steps",
+    "count": "steps",
+}
 PHASES = (START, *STEPPING.values(), BETWEEN, CHECKPOINT)
 """Phases in which a kill can strike; between stages contacts are encoded, policies answer, the report is written."""
 

@@ -96,7 +96,7 @@ class KilledRuns:
 def run(config: FaultsConfig, context: Context) -> Results:
     """Kill, damage, feed nonsense, time."""
     study = SMALL_STUDY.configs()[config.study_scale]
-    steps = {"sft": study.sft.steps, "grpo": study.grpo_steps, "blind": study.blind.steps}
+    steps = {phase: getattr(study, phase).steps for phase in ("sft", "decoder", "blind")} | {"grpo": study.grpo_steps}
     grpo_options = ("--steps", str(config.grpo_steps))
     grpo = KillableTraining(name=SMALL_GRPO.name, options=grpo_options, steps={"grpo": config.grpo_steps})
     whole = KillableTraining(name=SMALL_STUDY.name, options=("--scale", config.study_scale), steps=steps)
@@ -190,10 +190,9 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     evidence = stages.gather_evidence(data, stages.probe_features(data, context), study.probe, context)
     sft_config = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
     params = stages.run_sft(policy, data, evidence, sft_config, context, seed=0, stage=sft)
-    features = stages.encode_rows(policy, params, data, data.parts["grpo"], context)
-    noise = stages.noise_bank(policy, params, data, seed=0)
-    label = data.label[data.parts["grpo"]]
-    contacts = stages.EncodedContacts(features=features, label=label, truth=label, noise=noise)
+    rows, noise = data.parts["grpo"], stages.noise_bank(policy, params, data, seed=0)
+    features, label = stages.encode_rows(policy, params, data, rows, context), data.label[rows]
+    contacts = stages.EncodedContacts(features=features, label=label, truth=label, noise=noise, evidence=evidence[rows])
     arm = stages.make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
     stages.run_grpo(policy, arm, contacts, params, context, seed=0, stage=grpo)
     blind_config = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)

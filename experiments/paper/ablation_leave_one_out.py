@@ -16,7 +16,6 @@ and are wrong (F2).  The other components matter less than seeds differ.
 """
 
 import dataclasses
-import functools
 
 from experiments.core.context import Context
 from experiments.core.results import Results
@@ -35,8 +34,8 @@ from experiments.paper.components import (
 from experiments.study.ablation import Ablation
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
-from experiments.study.stages import encode_rows, noise_bank, run_grpo, untrained
-from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy, grpo_contacts, make_study_arm
+from experiments.study.stages import encode_rows, run_grpo, untrained
+from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy, make_study_arm
 from touchr1_jax.training.evaluation import Evaluation
 
 STEPS = tuple(
@@ -55,12 +54,11 @@ def without_sft(trained: TrainedPolicy) -> Evaluation:
     """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
     policy, data, seed = trained.policy, trained.data, trained.seed
     params = untrained(policy, data, seed)
-    encode = functools.partial(encode_rows, policy, params, data, context=trained.context)
-    arm = make_study_arm(trained.config, policy, PUBLISHED, data.prior(), WITH_TACTILE_USE)
-    noise = noise_bank(policy, params, data, seed=seed)
-    contacts = grpo_contacts(data, encode(rows=data.parts["grpo"]), noise)
+    config = dataclasses.replace(trained.config, recipe="paper")  # without the anchor, which is SFT
+    arm = make_study_arm(config, policy, PUBLISHED, data.prior(), WITH_TACTILE_USE)
+    contacts = trained.contacts(params)
     tuned = run_grpo(policy, arm, contacts, params, trained.context, seed=seed, stage=f"grpo/{NO_SFT}/{seed}")
-    return trained.ask(tuned, encode(rows=data.parts["test"]))
+    return trained.ask(tuned, encode_rows(policy, params, data, data.parts["test"], trained.context))
 
 
 ABLATION = Ablation(

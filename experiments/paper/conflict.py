@@ -41,6 +41,7 @@ from experiments.paper.touch_gain import (
     touch_gain_table,
     touch_questions,
 )
+from experiments.study.controls import against_control, control_sentences, decision_table
 from experiments.study.estimates import RESAMPLES
 from experiments.study.examples import rollout_examples
 from experiments.study.paper_numbers import differences_table
@@ -62,7 +63,7 @@ GAP, GAIN = 40.0, 10.0
 
 DIFFERENCES = (
     ("conflict", "advertised, never measured", "deceptive pictures of generated objects"),
-    ("vision-only", "–", "the same policy, trained without touch for as many steps as SFT"),
+    ("vision-only", "–", "the same policy, trained without touch end to end alone"),
 )
 
 
@@ -98,14 +99,18 @@ def run(config: StudyConfig, context: Context) -> Results:
     gain, revised = gains[f"{FULL}, all"], {}
     if DECEPTIVE in contrasts[FULL]:
         revised = {name: revision_share(questions, levels[name], priors) for name in (FULL, BLIND)}
+    scored = score_study(study)
+    controlled = against_control(scored.arms, (FULL,))
     return study_results(
         study,
-        score_study(study),
-        verdict=verdict(contrasts[FULL], revised, gain),
+        scored,
+        comparisons=tuple(controlled),
+        verdict=(*verdict(contrasts[FULL], revised, gain), *control_sentences(controlled, (FULL,))),
         requirements=requirements(contrasts[FULL], gain),
         tables=(
             contrast_table(contrasts[FULL], contrasts[SFT]),
             touch_gain_table(gains),
+            *decision_table(study),
             differences_table((*presets.DIFFERENCES[:3], *DIFFERENCES)),
         ),
         pictures=(

@@ -31,11 +31,12 @@ from experiments.paper import presets
 from experiments.paper.components import FULL, run_full_model
 from experiments.study import paper_numbers as paper
 from experiments.study.baselines import baselines, level_answers
+from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, study_settings
-from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig
+from experiments.study.study import BLIND, CONTINUED, SFT, SMOKE, EvalVariant, Study, StudyConfig
 from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.training.evaluation import Evaluation
@@ -79,16 +80,17 @@ def run(config: MainConfig, context: Context) -> Results:
         for name, seeds in context.each("scoring", {**study.answers, **study.variants, **untrained}.items()):
             by_picture = bench.bench_answers(study.data, asks, study.answers[BLIND][: len(seeds)])
             rows[name] = bench.bench_row(asks, bench.bench_answers(study.data, asks, seeds), by_picture)
-    trained = {name: rows[name] for name in (SFT, FULL)}
+    trained = {name: rows[name] for name in study.policies}
     pictures, reliability = level_report(study)
-    comparisons = against_sft(trained, config.study.seeds)
+    controlled = against_control(trained, (FULL,))
+    comparisons = [*against(trained, FULL, SFT), *controlled, *against(rows, SFT, ENCODER_PROBE)]
     note = "policies that another study trained before cost nothing here"
     return Results(
         arms=trained,
         baselines={name: row for name, row in rows.items() if name not in trained},
         settings=study_settings(config.study),
         comparisons=tuple(comparisons),
-        verdict=verdict(rows, comparisons),
+        verdict=(*verdict(rows, comparisons), *control_sentences(controlled, (FULL,))),
         requirements=(at_most("minutes", context.elapsed_s / 60, 45.0, "min", note),),
         tables=(
             bench.comparison_table(
@@ -99,7 +101,9 @@ def run(config: MainConfig, context: Context) -> Results:
                 "intervals.",
             ),
             *bench.pooled_table(rows, SFT),
+            *decision_table(study),
             *reliability,
+            *seconds_table(study, context),
             bench.question_table(asks),
             paper.differences_table((*presets.DIFFERENCES[:4], *DIFFERENCES)),
         ),
@@ -143,11 +147,11 @@ def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
     return baselines(study) | answers
 
 
-def against_sft(rows: Mapping[str, Mapping[str, Estimate]], seeds: int) -> list[Comparison]:
-    """The full model against SFT, paired by seed; needs two seeds at least."""
-    a, b = rows[FULL], rows[SFT]
-    compared = [m for m in (*AVERAGED, "avg") if m in a and m in b] if seeds > 1 else []
-    return [compare_over_seeds(m, FULL, SFT, a[m], b[m]) for m in compared]
+def against(rows: Mapping[str, Mapping[str, Estimate]], one: str, other: str) -> list[Comparison]:
+    """One row against another in the columns of the table, paired by seed; needs two seeds at least."""
+    a, b = rows[one], rows[other]
+    compared = [m for m in (*AVERAGED, "avg") if m in a and m in b and len(a[m].per_seed) > 1]
+    return [compare_over_seeds(m, one, other, a[m], b[m]) for m in compared]
 
 
 def verdict(rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison]) -> tuple[str, ...]:
@@ -161,9 +165,11 @@ def verdict(rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Co
         f"{mean(best):.1f}."
     ]
     for c in comparisons:
-        if c.metric in ("avg", "omae", "csc"):
+        if c.metric in ("avg", "omae", "csc") and c.against != CONTINUED:
             chance = "0 lies outside" if c.low > 0 or c.high < 0 else "may be chance"
-            sentences.append(f"GRPO changes {c.metric} by {c.difference:+.3g} {bounds(c.low, c.high)} ({chance}).")
+            sentences.append(
+                f"{c.arm} against {c.against}: {c.metric} {c.difference:+.3g} {bounds(c.low, c.high)} ({chance})."
+            )
     if "avg" in rows[FULL]:
         ours, theirs = rows[FULL]["avg"].mean, paper.MAIN["Touch-R1-7B"][1]
         sentences.append(

@@ -27,7 +27,7 @@ from experiments.core.progress import in_megabytes
 from experiments.core.results import Table, named_table
 from experiments.study.dataset import Dataset
 from experiments.study.stages import encode_rows, untrained
-from experiments.study.study import BLIND, SFT, TrainedPolicy
+from experiments.study.study import BLIND, CONTINUED, SFT, TrainedPolicy
 from experiments.study.training import TrainingConfig
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
@@ -315,9 +315,11 @@ def written(source: Path, trained: TrainedPolicy) -> Evaluation:
 
 
 def merged_shares(arm: str, seeds: int, context: Context) -> dict[str, float]:
-    """Policy → share of its last stage's adapters that merging kept, the least of all seeds."""
-    shares = lambda stage: (context.load_stage(f"{KEPT}/{stage}/{seed}") for seed in range(seeds))
-    return {name: min(shares(stage)) for stage, name in {"sft": SFT, f"grpo/{arm}": arm, "blind": BLIND}.items()}
+    """Stage of training → share of its adapters that merging kept, the least of all seeds."""
+    stages = {"sft": SFT, f"decoder/{SFT}": f"{SFT}, decoder", f"decoder/{CONTINUED}": CONTINUED}
+    stages |= {f"grpo/{arm}": arm, "blind": BLIND}
+    shares = lambda stage: [context.load_stage(f"{KEPT}/{stage}/{seed}") for seed in range(seeds)]
+    return {name: min(shares(stage)) for stage, name in stages.items() if context.done(f"{KEPT}/{stage}/0")}
 
 
 def merged_table(kept: Mapping[str, float]) -> Table:

@@ -48,7 +48,7 @@ TRENDS = (*DRAWN, "mat_acc", "sfd", *sizes.CLAIMED)
 
 DIFFERENCES = (
     ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million"),
-    ("steps", "the same for all, not given", "the same for all, GRPO a third of the other experiments'"),
+    ("steps", "the same for all, not given", "the same for all"),
 )
 
 
@@ -56,7 +56,7 @@ DIFFERENCES = (
 class ScalingConfig:
     """The study, the sizes that replace its model, the bench's questions, and how often steps are timed."""
 
-    study: StudyConfig = StudyConfig(seeds=3, grpo_steps=300)
+    study: StudyConfig = StudyConfig(seeds=3)
     small: ModelConfig = sizes.SMALL
     large: ModelConfig = sizes.LARGE
     quota: Quota = Quota()

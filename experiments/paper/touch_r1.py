@@ -56,13 +56,14 @@ from experiments.paper.touch_gain import (
     study_touch_gain,
     touch_gain_table,
 )
+from experiments.study.controls import decision_table, seconds_table
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, score, score_study, study_results, study_settings
 from experiments.study.stages import StudySFT
-from experiments.study.study import BLIND, SFT, EvalVariant, check_arms, train_study
+from experiments.study.study import BLIND, CONTINUED, SFT, EvalVariant, check_arms, train_study
 from experiments.study.training import TrainingConfig, open_data, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
@@ -75,6 +76,7 @@ from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 
 ARM, ZERO, WRITTEN = "touch_r1", "zero_shot", "written"
@@ -98,12 +100,19 @@ GRPO = dataclasses.replace(
 
 
 def adapted_sft(
-    steps: int, *, micro_contacts: int, batch_size: int = 32, lora_rank: int = 16, lr_scale: float = 10.0
+    steps: int,
+    *,
+    micro_contacts: int,
+    batch_size: int = 32,
+    questions: int = 2,
+    lora_rank: int = 16,
+    lr_scale: float = 10.0,
 ) -> StudySFT:
     """SFT by adapters, by default at ten times the paper's learning rate, which is for whole weights."""
     return StudySFT(
         steps=steps,
         batch_size=batch_size,
+        questions=questions,
         micro_contacts=micro_contacts,
         lora_rank=lora_rank,
         remat=True,
@@ -135,13 +144,14 @@ class TouchR1Config(TrainingConfig):
     model: ReleasedModel = ReleasedModel()
     sft: StudySFT = adapted_sft(1_500, micro_contacts=4)
     blind: StudySFT = adapted_sft(1_500, micro_contacts=16)
+    decoder: SFTConfig = adapted_sft(1_000, batch_size=16, questions=4, micro_contacts=4)
     grpo: GRPOConfig = GRPO
     grpo_steps: int = 1_000
     grpo_lora_rank: int = 16
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        ranks = {f"{stage}.lora_rank": getattr(self, stage).lora_rank for stage in ("sft", "blind")}
+        ranks = {f"{stage}.lora_rank": getattr(self, stage).lora_rank for stage in ("sft", "blind", "decoder")}
         for field, rank in (ranks | {"grpo_lora_rank": self.grpo_lora_rank}).items():
             if not rank:
                 raise ValueError(f"{field} is 0: must be at least 1, released towers are frozen; raise it")
@@ -194,7 +204,9 @@ def run(config: TouchR1Config, context: Context) -> Results:
             touch_gain_table({f"{ARM}, all": gain}),
             released.merged_table(kept),
             released.memory_table(memory),
+            *decision_table(study),
             *tables,
+            *seconds_table(study, context),
         ),
         pictures=pictures,
         curves=CURVES,
@@ -250,7 +262,7 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
 def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.ndarray, seeds: int) -> list[Comparison]:
     """Each step of training against an earlier one or a baseline, over objects, and over seeds where there are two."""
     found = []
-    for a, b in ((ARM, SFT), (SFT, ZERO), (SFT, BLIND), (SFT, "constant")):
+    for a, b in ((ARM, SFT), (ARM, CONTINUED), (SFT, ZERO), (SFT, BLIND), (SFT, "constant")):
         for metric in COMPARED:
             if metric not in rows[a][0] or metric not in rows[b][0]:
                 continue
@@ -269,7 +281,8 @@ def verdict(
     acc = lambda name: rows[name]["acc"].mean
     sentences = [
         f"Of ordinal questions about unseen objects the model answers {acc(ZERO):.1f} % right as it was released and "
-        f"without touch, {acc(SFT):.1f} % after SFT, {acc(ARM):.1f} % after GRPO; trained without touch "
+        f"without touch, {acc(SFT):.1f} % after SFT, {acc(ARM):.1f} % after GRPO, {acc(CONTINUED):.1f} % after SFT for "
+        "as many seconds more; trained without touch "
         f"{acc(BLIND):.1f} %, a constant {acc('constant'):.1f} %."
     ]
     if gain is not None:
@@ -298,6 +311,7 @@ SMOKE = dataclasses.replace(
     ),
     sft=adapted_sft(8, batch_size=4, micro_contacts=2, lora_rank=4),
     blind=adapted_sft(8, batch_size=4, micro_contacts=4, lora_rank=4),
+    decoder=adapted_sft(4, batch_size=4, micro_contacts=4, lora_rank=4),
     grpo=dataclasses.replace(GRPO, prompts=2, group=4, micro_prompts=1, length=48),
     grpo_steps=4,
     grpo_lora_rank=4,
@@ -323,6 +337,7 @@ SMALL = dataclasses.replace(
     model=ReleasedModel(tactile=TactileViTConfig(sensors=0), frames=4, image_px=112, completion_tokens=36, view_px=32),
     sft=adapted_sft(1_000, batch_size=16, micro_contacts=2, lr_scale=100.0),
     blind=adapted_sft(1_000, batch_size=16, micro_contacts=16, lr_scale=100.0),
+    decoder=adapted_sft(300, batch_size=16, questions=4, micro_contacts=4, lr_scale=100.0),
     grpo=dataclasses.replace(GRPO, prompts=8, micro_prompts=4, length=36, lr_scale=200.0),
     grpo_steps=150,
 )

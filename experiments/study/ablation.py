@@ -9,6 +9,7 @@ from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
+from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
 from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
@@ -19,8 +20,16 @@ from experiments.study.training import GRPO_ATTRIBUTES
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
+from touchr1_jax.training.loop import HELD_OUT
 
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
+
+SFT_CURVES: Mapping[str, tuple[str, ...]] = {
+    "sft": ("loss", "token_accuracy"),
+    "decoder": ("loss", HELD_OUT),
+    "blind": ("loss",),
+}
+"""Of the phases of SFT the scalars that are drawn."""
 
 OWN_REWARD = "reward_trained"
 """An arm's reward under its own weights, on what GRPO asks about."""
@@ -49,7 +58,7 @@ class Ablation:
     @property
     def drawn(self) -> dict[str, tuple[str, ...]]:
         """Of each phase the scalars that are drawn."""
-        return {"sft": ("loss", "token_accuracy"), "blind": ("loss",), "grpo": self.curves}
+        return {**SFT_CURVES, "grpo": self.curves}
 
 
 def ablation_experiment(name: str, ablation: Ablation) -> Experiment[StudyConfig]:
@@ -73,7 +82,8 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
     """
     study = run_study(config, ablation.arms, context, ablation.algorithms, ablation.variants)
     scored = score_study(study)
-    comparisons = (*over_seeds(ablation, study, scored), *over_objects(study, scored))
+    controlled = against_control(scored.arms, study.arms)
+    comparisons = (*over_seeds(ablation, study, scored), *controlled, *over_objects(study, scored))
     shown = ablation.example or list(ablation.arms)[-1]
     pictures, tables = level_report(study)
     presets = {
@@ -90,8 +100,8 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
         scored,
         settings={**study_settings(config), **presets, **trained_on},
         comparisons=comparisons,
-        verdict=verdict(ablation, comparisons, scored.estimates),
-        tables=tables,
+        verdict=(*verdict(ablation, comparisons, scored.estimates), *control_sentences(controlled, study.arms)),
+        tables=(*decision_table(study), *tables, *seconds_table(study, context)),
         pictures=pictures,
         curves=ablation.drawn,
         examples=rollout_examples(study, shown, study.arms[shown]),

@@ -47,7 +47,7 @@ class LevelAnswers:
 def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     """Confusions of every policy, accuracy by agreement of its sensors, the reliability of levels, sampled answers."""
     objects = study.data.object_ids[study.data.parts["test"]]
-    rows = {name: _level_answers(study.answers[name], objects) for name in (SFT, *study.arms, BLIND)}
+    rows = {name: _level_answers(study.answers[name], objects) for name in (*study.policies, BLIND)}
     language = study.policy.language
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
     confusions = Picture(
@@ -57,7 +57,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
         content=confusion_chart(rows, words),
     )
     pictures, tables = sampled_report(study)
-    tables = (reliability_table({name: rows[name] for name in (SFT, *study.arms)}, words), *tables)
+    tables = (reliability_table({name: rows[name] for name in study.policies}, words), *tables)
     with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
     if not with_agreement:
         return (confusions, *pictures), tables

@@ -7,7 +7,7 @@ import numpy as np
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.core.text import interval
-from experiments.study.study import BLIND, SFT, Study
+from experiments.study.study import BLIND, Study
 from touchr1_jax.bench.sampled import Votes, calibration_error, majority, pass_at_k, reliability, samples_right
 from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.training.evaluation import Evaluation
@@ -19,7 +19,7 @@ RESAMPLES = 1_000
 def sampled_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     """Scores of sampled answers and a picture of their calibration; nothing where no answers were sampled."""
     objects = study.data.object_ids[study.data.parts["test"]]
-    rows = {name: study.answers[name] for name in (SFT, *study.arms, BLIND)}
+    rows = {name: study.answers[name] for name in (*study.policies, BLIND)}
     rows = {name: seeds for name, seeds in rows.items() if all(one.sampled is not None for one in seeds)}
     if not rows:
         return (), ()

@@ -48,7 +48,7 @@ def score_study(study: Study) -> Scored:
         name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
         for name, seeds in rows.items()
     }
-    arms = {name: estimates.pop(name) for name in (SFT, *study.arms)}
+    arms = {name: estimates.pop(name) for name in study.policies}
     return Scored(rows=rows, objects=objects, arms=arms, baselines=estimates)
 
 

@@ -24,10 +24,11 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.alarms import AlarmMonitor
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score, reward_weights
 from touchr1_jax.training import encoding
-from touchr1_jax.training.feeds import AnswerFeed, host_touch, touch_batch
+from touchr1_jax.training.evaluation import evaluate_policy
+from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
 from touchr1_jax.training.loop import SKIPPED, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
@@ -90,16 +91,17 @@ def _clips(data: Dataset, rows: np.ndarray, context: Context, title: str, **orde
 def gather_evidence(
     data: Dataset, probed: ProbeFeatures, config: ProbeConfig, context: Context
 ) -> Float[np.ndarray, "contact S A K"]:
-    """`sensor_evidence` of the SFT contacts; all others count as not recorded."""
-    sft = np.isin(np.arange(len(data.store)), data.parts["sft"])
+    """`sensor_evidence` of the training contacts, from probes of the SFT contacts; all others count as not recorded."""
+    sft, grpo = (np.isin(np.arange(len(data.store)), data.parts[part]) for part in ("sft", "grpo"))
     return sensor_evidence(
         probed.streams,
-        probed.present & sft[:, None],
+        probed.present & (sft | grpo)[:, None],
         data.label,
         data.object_ids,
         [LEVELS[name] for name in ATTRIBUTES],
         config,
         track=functools.partial(context.each, "evidence"),
+        read_only=grpo,
     )
 
 
@@ -220,19 +222,67 @@ def make_arm(
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedContacts:
-    """Contacts that GRPO asks about, encoded by one policy.
+    """Contacts that the decoder is trained on, by SFT or by GRPO, encoded by one policy.
 
     Attributes:
       features: their encoded touch.
-      label: their levels [n, A]; −1 where nothing may be asked.
-      truth: all their levels, −1 unknown, which rewards see.
+      label: their levels [n, A]; −1 where GRPO may not ask.
+      truth: all their levels, −1 unknown, which rewards and SFT see.
       noise: the encoder's noise bank.
+      evidence: [n, S, A, K] of the sensors' probes, from which verified answers are made.
+      full_share: share of the questions of GRPO that show all present sensors.
     """
 
     features: Features
     label: Int[np.ndarray, "n A"]
     truth: Int[np.ndarray, "n A"]
     noise: Float[Array, "K S N D"]
+    evidence: Float[np.ndarray, "n S A K"]
+    full_share: float = 0.75
+
+
+def run_decoder(
+    policy: TouchPolicy,
+    contacts: EncodedContacts,
+    validation: tuple[Features, np.ndarray],
+    config: SFTConfig,
+    params: Params,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+    share: bool = False,
+) -> Params:
+    """SFT of the decoder alone on encoded contacts, up to its best checkpoint; `share` as in `run_sft`.
+
+    Args:
+      policy, contacts, params, context, seed, stage: as in `run_grpo`.
+      validation: features and labels of contacts; the share of right answers about them chooses the checkpoint.
+      config: of this phase.
+    """
+
+    def held_out(found: Params) -> float:
+        asked = evaluate_policy(policy, found, *validation, alone=False)
+        n = np.arange(len(asked.contact))
+        level = np.asarray(asked.parsed.conclude)[n, asked.attribute]
+        return 100 * float(np.mean(level == asked.label[n, asked.attribute]))
+
+    def train() -> Params:
+        order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed}
+        order |= {"own": context.devices.local_rows(config.batch_size)}
+        clips = encoded_clips(contacts.features, np.arange(len(contacts.truth)), contacts.truth, **order)
+        feed = AnswerFeed(policy, clips, contacts.evidence, questions=config.questions, **order)
+        with stage_hooks(context, stage, config.steps, scored=True) as hooks:
+            options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": held_out}
+            return train_sft(policy, params, feed, config, hooks, **options)
+
+    if not share:
+        return train()
+    values = {"config": config, "model": policy.model, "seed": seed, "mesh": context.devices.shape}
+    inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
+    held = {**dataclasses.asdict(validation[0]), "label": validation[1]}
+    arrays = {**params, "input": inputs, "validation": held}
+    return cached("grpo", values, arrays, train, context, stage)
 
 
 def run_grpo(
@@ -252,6 +302,8 @@ def run_grpo(
     def train() -> Params:
         order: dict[str, Any] = {"batch_size": config.drawn, "seed": seed}
         order |= {"own": context.devices.local_rows(config.drawn), "truth": contacts.truth}
+        order |= {"full_share": contacts.full_share}
+        order |= {"evidence": None if left_out(config.algorithm.anchor) else contacts.evidence}
         feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
         with stage_hooks(context, stage, loop.steps, make_log=alarm_log) as hooks:
             return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, lora=lora, seed=seed)
@@ -261,7 +313,8 @@ def run_grpo(
     values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps, "lora": lora}
     values |= {"model": policy.model, "seed": seed, "mesh": context.devices.shape}
     inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
-    inputs |= {"label": contacts.label, "truth": contacts.truth}
+    inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
+    values |= {"full_share": contacts.full_share}
     return cached("grpo", values, {**params, "input": inputs}, train, context, stage)
 
 

@@ -28,10 +28,18 @@ from experiments.study.stages import (
     make_arm,
     noise_bank,
     probe_features,
+    run_decoder,
     run_grpo,
     run_sft,
 )
-from experiments.study.training import GRPO_ATTRIBUTES, TrainingConfig, open_data, require_derived, starting_model
+from experiments.study.training import (
+    DECODER,
+    GRPO_ATTRIBUTES,
+    TrainingConfig,
+    open_data,
+    require_derived,
+    starting_model,
+)
 from sensors_io.arrays import load_arrays
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
@@ -42,10 +50,16 @@ from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_pr
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
+from touchr1_jax.training.feeds import FULL_SHARE
 from touchr1_jax.training.train_grpo import check_rewards
 from touchr1_jax.types import Params, Parsed
 
-SFT, BLIND = "sft", "tactile_blind"
+SFT, CONTINUED, BLIND = "sft", "sft_continued", "tactile_blind"
+"""Policies of every study besides its arms: SFT, from which arms start, the control that continues SFT for as many
+seconds as an arm takes, and SFT without touch."""
+
+CONTINUED_ORDER = 1_000
+"""Added to the seed of the questions of the control, which would otherwise be those of the phase before it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,6 +80,7 @@ SMOKE = StudyConfig(
     scenes=SceneConfig(objects=60, sites=1),
     sft=StudySFT(steps=12, batch_size=8),
     blind=StudySFT(steps=12, batch_size=8, micro_contacts=8),
+    decoder=dataclasses.replace(DECODER, steps=6, batch_size=4, save_every=3),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
     grpo_steps=4,
 )
@@ -74,13 +89,28 @@ SMOKE = StudyConfig(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudySeed:
-    """One seed of a study."""
+    """One seed of a study; `evidence` [contact, S, A, K] is that of its verified answers."""
 
     config: TrainingConfig
     data: Dataset
     policy: TouchPolicy
+    evidence: np.ndarray
     context: Context
     seed: int
+
+    def contacts(self, params: Params) -> EncodedContacts:
+        """The contacts that a policy's decoder is trained on, encoded by it (see `training.Recipe`)."""
+        data, paper = self.data, self.config.recipe == "paper"
+        rows = data.parts["grpo"] if paper else np.concatenate([data.parts["sft"], data.parts["grpo"]])
+        truth = data.label[rows]
+        return EncodedContacts(
+            features=encode_rows(self.policy, params, data, rows, self.context),
+            label=np.where(np.isin(ATTRIBUTES, GRPO_ATTRIBUTES), truth, UNKNOWN) if paper else truth,
+            truth=truth,
+            noise=noise_bank(self.policy, params, data, seed=self.seed, contacts=self.config.noise_contacts),
+            evidence=self.evidence[rows],
+            **({} if paper else {"full_share": FULL_SHARE}),
+        )
 
     def ask(self, params: Params, features: Features, *, alone: bool = True, samples: int = 0) -> Evaluation:
         """Answers about encoded test contacts, asked under a progress bar; arguments of `evaluate_policy`."""
@@ -130,6 +160,11 @@ class Study:
     answers: Mapping[str, Sequence[Evaluation]]
     variants: Mapping[str, Sequence[Evaluation]] = dataclasses.field(default_factory=dict)
 
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """SFT, its control, and the arms."""
+        return (SFT, CONTINUED, *self.arms)
+
 
 def run_study(
     config: StudyConfig,
@@ -177,7 +212,7 @@ def check_arms(
             check_rewards(known, weights, TOUCH_LANGUAGE)
         except RewardError as error:
             raise RewardError(f"{error} (in the weights of arm {arm!r}, {dict(weights)})") from error
-    policies = (SFT, *arms)
+    policies = (SFT, CONTINUED, *arms)
     for name, variant in variants.items():
         if variant.of not in policies:
             raise ValueError(f"variant {name!r} is of {variant.of!r}: must be one of {', '.join(policies)}; correct it")
@@ -216,7 +251,7 @@ def train_study(
         arm: make_study_arm(config, policy, weights, prior, algorithms.get(arm, config.grpo.algorithm))
         for arm, weights in arms.items()
     }
-    answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, *arms, BLIND, *variants)}
+    answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, CONTINUED, *arms, BLIND, *variants)}
     study: dict[str, Any] = {"config": config, "data": data, "policy": policy, "context": context, "share": share}
     study |= {"tactile": tactile, "evidence": evidence, "arms": made, "variants": variants}
     for seed in context.each("seeds", range(config.seeds)):
@@ -240,15 +275,8 @@ def make_study_arm(
 ) -> GRPOArm:
     """An arm with a study's steps, adapters and further rewards."""
     weights = {**weights, **config.more_rewards}
-    grpo = dataclasses.replace(config.grpo, algorithm=algorithm)
+    grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm))
     return make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
-
-
-def grpo_contacts(data: Dataset, features: Features, noise: Array) -> EncodedContacts:
-    """The GRPO contacts, encoded; labels of attributes that GRPO does not ask about are hidden from questions."""
-    truth = data.labels("grpo")
-    label = np.where(np.isin(ATTRIBUTES, GRPO_ATTRIBUTES), truth, UNKNOWN)
-    return EncodedContacts(features=features, label=label, truth=truth, noise=noise)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -257,13 +285,12 @@ class _Seed(StudySeed):
 
     tactile: Params | None
     share: bool
-    evidence: np.ndarray
     arms: Mapping[str, GRPOArm]
     variants: Mapping[str, EvalVariant]
 
     def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
-        names = (SFT, *self.arms, BLIND, *self.variants)
+        names = (SFT, CONTINUED, *self.arms, BLIND, *self.variants)
         self.context.processes.write_once(lambda: self._drop_damaged(names))
         if not all(self._path(name).exists() for name in names):
             self._train()
@@ -271,17 +298,23 @@ class _Seed(StudySeed):
         return {name: load_answers(self._path(name)) for name in names}
 
     def _train(self) -> None:
-        """SFT, and every arm from there."""
-        data, policy, context = self.data, self.policy, self.context
-        params = self._sft(self.config.sft, f"sft/{self.seed}", tactile=self.tactile)
-        encode = functools.partial(encode_rows, policy, params, data, context=context)
-        test, train = encode(rows=data.parts["test"]), encode(rows=data.parts["grpo"])
-        noise = noise_bank(policy, params, data, seed=self.seed, contacts=self.config.noise_contacts)
-        contacts = grpo_contacts(data, train, noise)
-        self._evaluate_all(SFT, params, test, noise)
+        """SFT in its phases, its control, and every arm."""
+        data, policy, context, config, seed = self.data, self.policy, self.context, self.config, self.seed
+        params = self._sft(config.sft, f"sft/{seed}", tactile=self.tactile)
+        contacts = self.contacts(params)
+        test, val = (encode_rows(policy, params, data, data.parts[part], context) for part in ("test", "val"))
+        held_out = val, data.labels("val")
+        more_sft = functools.partial(run_decoder, policy, contacts, held_out, context=context, share=self.share)
+        if config.recipe == "touch":
+            params = more_sft(config.decoder, params, seed=seed, stage=f"decoder/{SFT}/{seed}")
+        self._evaluate_all(SFT, params, test, contacts.noise)
+        stage = f"decoder/{CONTINUED}/{seed}"
+        longer = more_sft(config.continued, params, seed=seed + CONTINUED_ORDER, stage=stage)
+        self._evaluate_all(CONTINUED, longer, test, contacts.noise)
         for name, arm in self.arms.items():
-            order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{name}/{self.seed}", "share": self.share}
-            self._evaluate_all(name, run_grpo(policy, arm, contacts, params, context, **order), test, noise)
+            order: dict[str, Any] = {"seed": seed, "stage": f"grpo/{name}/{seed}", "share": self.share}
+            tuned = run_grpo(policy, arm, contacts, params, context, **order)
+            self._evaluate_all(name, tuned, test, contacts.noise)
 
     def _blind(self) -> Evaluation:
         params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)

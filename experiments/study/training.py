@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from experiments.core.context import Context
 from experiments.study.dataset import Dataset, open_dataset
@@ -10,14 +10,16 @@ from experiments.study.sources import SourceConfig, prepare_records
 from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import Flag
+from sensors_io.schema import ATTRIBUTES, Flag
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
@@ -25,7 +27,25 @@ GRPO_SHARE = 0.35
 """Share of the training objects that SFT never sees."""
 
 GRPO_ATTRIBUTES = ORDINAL
-"""Attributes that GRPO asks about; the arms may differ in how they pay for the answers."""
+"""Attributes that GRPO asks about under recipe `paper`; the arms may differ in how they pay for the answers."""
+
+Recipe = Literal["touch", "paper"]
+"""Training after the end-to-end phase of SFT.
+
+`paper`: GRPO on contacts that SFT never saw, about hardness, roughness and protrusion, as published.
+`touch`: first SFT of the decoder alone on all training contacts, encoded once; then GRPO on the same contacts, about
+all attributes, half of the questions with a part of the sensors, anchored by the likelihood of the verified answers.
+"""
+
+DECODER = SFTConfig(
+    steps=600,
+    questions=len(ATTRIBUTES),
+    optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, warmup_steps=10),
+)
+"""The decoder's phase: 64 questions a step."""
+
+SFT_STEPS_PER_GRPO_STEP = 1.0
+"""Seconds of a step of GRPO over seconds of a step of the decoder's SFT, measured at the default sizes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,18 +65,33 @@ class TrainingConfig(SourceConfig):
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
     probe: ProbeConfig = ProbeConfig()
-    sft: StudySFT = StudySFT()
-    blind: StudySFT = StudySFT(micro_contacts=16)
+    sft: StudySFT = StudySFT(steps=300)
+    blind: StudySFT = StudySFT(steps=300, micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
+    recipe: Recipe = "touch"
+    """`paper` is the published recipe; `touch` adds the decoder's phase of SFT and anchors GRPO (see `Recipe`)."""
+    decoder: SFTConfig = DECODER
+    """The decoder's phase of SFT on encoded contacts; the control that continues SFT has its batches and rates too."""
+    anchor: float = 1.0
+    """Weight of the verified answers' likelihood in GRPO, under recipe `touch`."""
     grpo: GRPOConfig = GRPOConfig.paper()
     more_rewards: dict[str, float] = dataclasses.field(default_factory=dict)
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
-    grpo_steps: int = 900
-    grpo_save_every: int = 200
+    grpo_steps: int = 150
+    grpo_save_every: int = 150
     grpo_lora_rank: int = 0
     """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
     samples: int = 8
     """Sampled answers to each test question, for pass@k, maj@k and calibration; 0 asks for greedy answers only."""
+
+    @property
+    def continued(self) -> SFTConfig:
+        """SFT of the decoder for as many seconds as an arm of GRPO takes, by `SFT_STEPS_PER_GRPO_STEP`."""
+        return dataclasses.replace(self.decoder, steps=round(self.grpo_steps * SFT_STEPS_PER_GRPO_STEP))
+
+    def algorithm(self, preset: AnyAlgorithm) -> AnyAlgorithm:
+        """The algorithm of an arm: its preset, under recipe `touch` with the anchor."""
+        return dataclasses.replace(preset, anchor=self.anchor) if self.recipe == "touch" else preset
 
     @property
     def grpo_loop(self) -> LoopConfig:
@@ -71,7 +106,7 @@ class TrainingConfig(SourceConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
-        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples", "anchor")
         require_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(

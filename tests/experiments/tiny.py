@@ -17,6 +17,8 @@ from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig
+from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params, TouchBatch
 
 STUDY = StudyConfig(
@@ -26,6 +28,7 @@ STUDY = StudyConfig(
     probe=ProbeConfig(folds=2, iterations=4),
     sft=StudySFT(steps=3, batch_size=4),
     blind=StudySFT(steps=2, batch_size=4),
+    decoder=SFTConfig(steps=2, batch_size=2, questions=2, save_every=1, optimizer=OptimizerConfig(learning_rate=1e-3)),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,
     samples=0,

@@ -1,10 +1,34 @@
-"""Metrics of several sampled answers to each question: pass@k, majority votes, calibration."""
+"""Metrics of several sampled answers to each question: pass@k, majority votes, calibration, decision rules."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from touchr1_jax.bench.metrics import BOTTOM
+
+DecisionRule = Literal["argmax", "median", "expected"]
+"""Level that is answered from a distribution over levels: the likeliest, the median, or the rounded mean.
+
+They are best for accuracy, for the absolute error and for the squared error.
+"""
+
+
+def decide(share: np.ndarray, rule: DecisionRule) -> np.ndarray:
+    """Level, int [N], by a decision rule; `BOTTOM` where the distribution is zero throughout.
+
+    Args:
+      share: float [N, K], probability of each level, up to a factor.
+      rule: see `DecisionRule`; between two equally good levels the lower one.
+    """
+    total = share.sum(-1)
+    p = share / np.where(total > 0, total, 1.0)[:, None]
+    if rule == "argmax":
+        level = p.argmax(-1)
+    elif rule == "median":
+        level = (np.cumsum(p, -1) >= 0.5 - 1e-6).argmax(-1)
+    else:
+        level = np.ceil(p @ np.arange(p.shape[1]) - 0.5 - 1e-6).astype(int)
+    return np.where(total > 0, level, BOTTOM)
 
 
 class Votes(NamedTuple):

@@ -113,6 +113,8 @@ class Algorithm:
     """Largest grounding of a token, nat."""
     grounding_budget: float | None = None
     """Largest contribution of a prompt's grounding to the objective, in standard deviations of the reward."""
+    anchor: float = 0.0
+    """Weight of the likelihood of the verified answer to the same question, nat a token: the loss of SFT."""
     tactile_use: TactileUse = TactileUse.OFF
     tactile_weight: float = 0.3
     """Weight α of the tactile-use reward."""
@@ -138,7 +140,8 @@ class Algorithm:
             raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
-        for field in ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "tactile_weight"):
+        sizes = ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "anchor", "tactile_weight")
+        for field in sizes:
             if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
                 raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0; it is a size, not a sign")
         for field in ("importance_cap", "grounding_cap_nat", "grounding_budget", "entropy_floor_nat", "trust_nat"):

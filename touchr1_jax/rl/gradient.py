@@ -20,7 +20,7 @@ from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out, loss_beta, ratio_to_learner
-from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_terms
+from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_probs, token_terms
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
@@ -78,7 +78,8 @@ def grpo_gradient(
             old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
         rollout, w = micro.rollout, micro.weight
         a = micro.advantage if micro.token_advantage is None else micro.token_advantage
-        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest)
+        answer = None if left_out(algorithm.anchor) else answer_likelihood(fns, config, params, micro.batch)
+        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest, answer)
         return value, (parts | {"loss": value}, old)
 
     def add_micro_batch(grads: Params, micro: Experience) -> tuple[Params, tuple[dict[str, Array], Array]]:
@@ -120,6 +121,25 @@ def log_probs(
     return in_order(jax.lax.map(of_micro_batch, batches_of(config.micro_prompts, learn)))
 
 
+def answer_likelihood(fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch) -> Float[Array, "P"]:
+    """Mean log-probability of a token of each prompt's verified answer, nat; 0 where a question has none.
+
+    Raises:
+      ValueError: a batch without answers.
+    """
+    if batch.answer is None or batch.answer_mask is None:
+        raise ValueError("anchor is above 0, but the batch holds no verified answers; make it with evidence, or set 0")
+    states = jax.vmap(lambda b: group_states(fns, config, b, b.answer[None])(params, b.features)[0][0])(batch)
+    head = at_precision(config, params)
+
+    def log_prob(rows: Rows) -> Array:
+        return token_log_probs(jax.nn.log_softmax(fns.logits(head, rows["own"])), rows["token"])
+
+    rows = {"own": states.reshape(-1, states.shape[-1]), "token": batch.answer.reshape(-1)}
+    found = by_blocks(log_prob, rows, width=len(fns.banned), most=config.max_logits)
+    return masked.mean(found.reshape(batch.answer.shape), batch.answer_mask, -1)
+
+
 def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
     """Mean G of the prompts in which each stream was perturbed, and how many they were."""
     streams = experience.batch.features.stream_mask
@@ -149,7 +169,7 @@ def prompt_terms(
     The reference is not run at β = 0, nor the perturbed policy at γ = 0.
     """
     algorithm, batch, tokens = config.algorithm, experience.batch, experience.rollout.tokens
-    states = group_states(fns, config, experience)
+    states = group_states(fns, config, experience.batch, experience.rollout.tokens)
     own, prefix = states(params, batch.features)
     rows: Rows = {"own": own, "token": tokens}
     if not left_out(loss_beta(algorithm)):
@@ -180,10 +200,9 @@ def logit_terms(config: GRPOConfig, tokens: Int[Array, "*n"], logits: Mapping[st
 
 
 def group_states(
-    fns: PolicyFns, config: GRPOConfig, experience: Experience
+    fns: PolicyFns, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]
 ) -> Callable[..., tuple[Float[Array, "G T D"], PrefixCache]]:
     """The function (params, features, known, start) → hidden states of one prompt's completions and their prefix."""
-    batch, tokens = experience.batch, experience.rollout.tokens
     if config.remat:
         fns = dataclasses.replace(fns, module=fns.module.clone(remat=True))
 
@@ -205,7 +224,7 @@ def perturbed_states(
     Args:
       prefix: the prompt as the policy encodes it.
     """
-    states = group_states(fns, config, experience)
+    states = group_states(fns, config, experience.batch, experience.rollout.tokens)
     features = dataclasses.replace(experience.batch.features, touch=experience.masked_touch)
     known, own = _masked_branch(config, prefix), _masked_branch(config, params)
     starts = [int(row.min()) for row in fns.slots.touch]

@@ -35,6 +35,9 @@ class GRPOBatch:
     mask: Bool[Array, "P L"]
     target: Target
     ordered: Bool[Array, "P"] | None = None
+    answer: Int[Array, "P T"] | None = None
+    """Verified answers, whose likelihood an anchor raises; `None` where there is no anchor."""
+    answer_mask: Bool[Array, "P T"] | None = None
 
 
 class EncodedPrompts(NamedTuple):

@@ -151,6 +151,29 @@ def answer_text(
     return " ".join(f"<{tag}> {body} </{tag}>" for tag, body in zip(language.tags, bodies, strict=True))
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class LevelTokens:
+    """Where every level of a language is one token: those tokens, and the one that opens `conclude`.
+
+    `level` is int [A, K], −1 where an attribute has fewer levels.
+    """
+
+    opens: int
+    level: np.ndarray
+
+
+def level_tokens(language: Language, tokenizer: Tokenizer) -> LevelTokens | None:
+    """The tokens of the levels; `None` where the tokenizer splits a level or the tag."""
+    words = [[tokenizer.encode(level[0]) for level in attribute.levels] for attribute in language.attributes]
+    opens = tokenizer.encode(f"<{language.tags[2]}>")
+    if any(len(ids) != 1 for ids in [opens, *(ids for row in words for ids in row)]):
+        return None
+    level = np.full((len(words), max(map(len, words))), -1, np.int32)
+    for row, of_attribute in zip(level, words, strict=True):
+        row[: len(of_attribute)] = [ids[0] for ids in of_attribute]
+    return LevelTokens(opens=opens[0], level=level)
+
+
 def encode_answer(tokenizer: Tokenizer, text: str, length: int) -> tuple[np.ndarray, np.ndarray]:
     """An answer for training: ids, end token and padding, int32 [T], and the mask of ids with the end, bool [T].
 

@@ -177,6 +177,7 @@ class Checkpoints:
         Raises:
           CheckpointError: it is damaged, or holds another tree or other shapes.
         """
+        self._manager.wait_until_finished()
         step = self._manager.best_step() if self._scored else None
         return None if step is None else self._read(step, like)
 

@@ -15,6 +15,7 @@ from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rewards.base import GROUP, Decode
 from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, SampleConfig, make_answer, sample_group
+from touchr1_jax.text.template import level_tokens
 from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
 from touchr1_jax.types import Params, Parsed
 
@@ -33,6 +34,8 @@ class Evaluation:
       truth: level of every attribute, −1 unknown, which rewards see; `None` where only `label` was kept.
       alone: conclusions of the policy that is shown each stream alone; `None` where it was not asked so.
       sampled: conclusions of n answers sampled at temperature 1 with all streams; `None` where none was.
+      marginal: p(level | prompt), the mean over the sampled traces of p(level | trace) right after `conclude` opens,
+        normalised over levels; where the tokenizer splits levels it is the share of the samples that conclude one.
     """
 
     contact: Int[np.ndarray, "N"]
@@ -44,6 +47,7 @@ class Evaluation:
     alone: Int[np.ndarray, "N S A"] | None
     truth: Int[np.ndarray, "N A"] | None = None
     sampled: Int[np.ndarray, "N n A"] | None = None
+    marginal: Float[np.ndarray, "N K"] | None = None
 
 
 def evaluate_policy(
@@ -92,7 +96,7 @@ def evaluate_policy(
             done += real
             progress(done, len(rounds) * len(contact))
         found.append(jax.tree.map(lambda *x: np.concatenate(x), *blocks))
-    sampled = found.pop() if samples else None
+    sampled, marginal = found.pop() if samples else (None, None)
     together, *each_alone = found
     return Evaluation(
         contact=contact,
@@ -104,6 +108,7 @@ def evaluate_policy(
         alone=np.stack([x.parsed.conclude for x in each_alone], 1) if each_alone else None,
         truth=label[contact],
         sampled=sampled,
+        marginal=marginal,
     )
 
 
@@ -115,13 +120,29 @@ def answer_program(policy: TouchPolicy) -> Any:
 
 @functools.cache
 def sample_program(policy: TouchPolicy, samples: int) -> Any:
-    """Compiled sampler and parser, (params, questions, key) → conclusions [P, samples, A], made once."""
+    """Compiled sampler, (params, questions, key) → conclusions [P, samples, A] and marginal [P, K], made once."""
     fns, length = policy.fns, policy.model.completion_tokens
     draw = SampleConfig(group=samples, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id)
+    known = level_tokens(policy.language, policy.tokenizer)
+
+    def of_prompt(params: Params, batch: GRPOBatch, tokens: jax.Array, level: jax.Array) -> jax.Array:
+        a = jnp.argmax(batch.target.asked)
+        if known is None:
+            share = jax.nn.one_hot(level[:, a], max(policy.levels))
+        else:
+            at = jnp.argmax(tokens == known.opens, -1) + 1
+            states = fns.group_states(params, batch.features, batch.ids, batch.mask, tokens)[0]
+            chosen = jnp.take_along_axis(states, jnp.minimum(at, length - 1)[:, None, None], 1)[:, 0]
+            ids = jnp.asarray(known.level)[a]
+            p = jax.nn.softmax(jnp.where(ids >= 0, fns.logits(params, chosen)[:, ids], -jnp.inf))
+            share = jnp.where(((at > 1) & (at < length))[:, None], p, 0.0)
+        return jnp.mean(share, 0)
 
     @jax.jit
-    def sample(params: Params, batch: GRPOBatch, key: jax.Array) -> jax.Array:
-        return jax.vmap(jax.vmap(policy.parser))(sample_group(fns, params, batch, key, draw).tokens).conclude
+    def sample(params: Params, batch: GRPOBatch, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        tokens = sample_group(fns, params, batch, key, draw).tokens
+        level = jax.vmap(jax.vmap(policy.parser))(tokens).conclude
+        return level, jax.vmap(of_prompt, in_axes=(None, 0, 0, 0))(params, batch, tokens, level)
 
     return sample
 

@@ -10,14 +10,20 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any, Self
 
+import grain
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
+from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.text.template import answer_text, encode_answer
 from touchr1_jax.training.packing import PackedRows, Packing, existing_tokens, pack_rows
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.types import TouchBatch
+
+ONE_AT_A_TIME = grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)
+"""Reading options of a feed of row numbers: by default Grain shuffles 500 batches ahead, seconds of a core."""
 
 
 class Feed:
@@ -61,6 +67,43 @@ def touch_batch(clip: Mapping[str, Any]) -> TouchBatch:
     return jax.device_put(host_touch(clip))
 
 
+def take(features: Features, rows: np.ndarray) -> Features:
+    """Rows of encoded contacts, on the host as these are."""
+    return jax.tree.map(lambda x: x[rows], features)
+
+
+def encoded_clips(
+    features: Features,
+    contact: np.ndarray,
+    label: np.ndarray,
+    *,
+    batch_size: int,
+    seed: int,
+    own: np.ndarray | None = None,
+) -> grain.IterDataset:
+    """Encoded contacts in random order, again and again, in the place of the clips of an `AnswerFeed`.
+
+    Args:
+      features: of n contacts.
+      contact: [n], their numbers.
+      label: [n, A].
+      batch_size, seed, own: as in `AnswerFeed`.
+    """
+    own = np.arange(batch_size) if own is None else own
+
+    def gather(rows: np.ndarray) -> dict[str, Any]:
+        encoded = take(features, rows[own])
+        stream_mask = np.asarray(encoded.stream_mask)
+        return {"contact": contact[rows[own]], "label": label[rows[own]], "stream_mask": stream_mask, ENCODED: encoded}
+
+    order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
+    return order.map(gather).to_iter_dataset(ONE_AT_A_TIME)
+
+
+ENCODED = "encoded"
+"""Entry of a batch of clips that holds `Features` in the place of pictures."""
+
+
 def random_streams(present: np.ndarray, full_share: float, rng: np.random.Generator) -> np.ndarray:
     """Sensors whose touch a question shows: all present ones with probability `full_share`, else a random subset ≠ ∅.
 
@@ -91,7 +134,8 @@ class AnswerFeed(Feed):
 
     Args:
       policy: prompts and vocabulary.
-      clips: batches of clips, mappings with the arrays of `TouchBatch` and the number `contact` of each.
+      clips: batches of clips, mappings with the arrays of `TouchBatch` and the number `contact` of each, or
+        `encoded_clips`.
       evidence: [contact, S, A, K], out-of-fold log-probabilities of each sensor's probe.  `perceive` gives the level
         most likely to each sensor alone, `compare` the one most likely to the shown sensors together, `conclude` the
         label.
@@ -123,7 +167,7 @@ class AnswerFeed(Feed):
         self._policy, self._evidence, self._blind = policy, evidence, blind
         self._questions, self._packing, self._easy_steps = questions, packing, easy_steps
 
-    def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> SFTBatch:
+    def make(self, element: Mapping[str, Any], rng: np.random.Generator) -> SFTBatch:
         """Write the answers of one batch of clips; random numbers are drawn for the whole batch, not for `own`."""
         layout, (p, a), q = self._policy.layout, element["label"].shape, self._questions
         chosen = np.argsort(rng.random((self._batch_size, a)), 1)[self._own, :q]
@@ -134,7 +178,9 @@ class AnswerFeed(Feed):
         streams = np.zeros_like(present) if self._blind else random_streams(present, full_share, rng)
         streams = streams.reshape(self._batch_size, q, -1)[self._own]
         pairs = [
-            self._answer(element["contact"][i], chosen[i, j], element["label"][i], streams[i, j])
+            verified_answer(
+                self._policy, self._evidence[element["contact"][i]], chosen[i, j], element["label"][i], streams[i, j]
+            )
             for i in range(p)
             for j in range(q)
         ]
@@ -146,31 +192,45 @@ class AnswerFeed(Feed):
             "tokens": tokens,
             "token_mask": masks,
         }
-        touch = host_touch(element)
+        touch: TouchBatch | Features = element[ENCODED] if ENCODED in element else host_touch(element)
         return SFTBatch(touch=touch, rows=self._rows(touch, written), **written)
 
-    def _rows(self, touch: TouchBatch, written: dict[str, np.ndarray]) -> PackedRows | None:
+    def _rows(self, touch: TouchBatch | Features, written: dict[str, np.ndarray]) -> PackedRows | None:
         if self._packing is None:
             return None
+        if isinstance(touch, Features):
+            raise ValueError("packing is set, but the contacts are encoded: must be None for them; set pack to 0")
         fns, token_mask = self._policy.fns, written["token_mask"]
         exists = existing_tokens(fns.module, fns.slots, touch, written["mask"], written["streams"], token_mask)
         return pack_rows(exists, token_mask, self._packing)
 
-    def _answer(
-        self, contact: int, question: int, label: np.ndarray, streams: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        policy, asked = self._policy, self._policy.layout.asked[question]
-        length = policy.model.completion_tokens
-        if np.any(label[asked] < 0):  # not annotated: the question has no answer and no loss
-            return np.full(length, policy.tokenizer.pad_id, np.int32), np.zeros(length, bool)
-        log_prob = self._evidence[contact]
-        together = label if not streams.any() else log_prob[streams].sum(0).argmax(-1)
-        text = answer_text(
-            policy.language,
-            asked=asked,
-            streams=streams,
-            perceive=log_prob.argmax(-1),
-            compare=together,
-            conclude=label,
-        )
-        return encode_answer(policy.tokenizer, text, length)
+
+def verified_answer(
+    policy: TouchPolicy,
+    log_prob: Float[np.ndarray, "S A K"],
+    question: int | np.integer,
+    label: Int[np.ndarray, "A"],
+    streams: Bool[np.ndarray, "S"],
+) -> tuple[Int[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
+    """Tokens of the answer that SFT imitates, and which of them count: none where the label is unknown.
+
+    Args:
+      policy: prompts and vocabulary.
+      log_prob: each sensor's evidence about this contact.
+      question: its number in the layout.
+      label: of the contact.
+      streams: sensors that the question shows; without any, `compare` repeats the label.
+    """
+    asked, length = policy.layout.asked[question], policy.model.completion_tokens
+    if np.any(label[asked] < 0):
+        return np.full(length, policy.tokenizer.pad_id, np.int32), np.zeros(length, bool)
+    together = label if not streams.any() else log_prob[streams].sum(0).argmax(-1)
+    text = answer_text(
+        policy.language,
+        asked=asked,
+        streams=streams,
+        perceive=log_prob.argmax(-1),
+        compare=together,
+        conclude=label,
+    )
+    return encode_answer(policy.tokenizer, text, length)

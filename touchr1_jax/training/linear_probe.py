@@ -125,6 +125,7 @@ def sensor_evidence(
     levels: Sequence[int],
     config: ProbeConfig,
     track: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    read_only: Bool[np.ndarray, "n"] | None = None,
 ) -> Float[np.ndarray, "n S A K"]:
     """Out-of-fold log-probabilities of each sensor's own probe for every attribute.
 
@@ -139,15 +140,22 @@ def sensor_evidence(
       levels: K of each attribute.
       config: folds and fit.
       track: passes the (attribute, sensor) pairs through, for example under a progress bar.
+      read_only: rows of other groups that a probe of all the other rows reads and none is fitted on; none by default.
     """
     n, sensors = present.shape
+    read_only = np.zeros(n, bool) if read_only is None else read_only
     out = np.full((n, sensors, len(levels), max(levels)), -np.inf, np.float32)
     for a, s in track(itertools.product(range(len(levels)), range(sensors))):
         out[:, s, a, : levels[a]] = 0.0
-        known = np.flatnonzero(present[:, s] & (label[:, a] >= 0))
-        if len(np.unique(groups[known])) >= config.folds:
-            found = cross_fit(features[known, s], label[known, a], groups[known], levels[a], config)
-            out[known, s, a, : levels[a]] = found
+        known = np.flatnonzero(present[:, s] & (label[:, a] >= 0) & ~read_only)
+        if len(np.unique(groups[known])) < config.folds:
+            continue
+        out[known, s, a, : levels[a]] = cross_fit(features[known, s], label[known, a], groups[known], levels[a], config)
+        asked = np.flatnonzero(present[:, s] & read_only)
+        if len(asked):
+            x = np.concatenate([features[known, s], features[asked, s]])
+            fitted, y = np.arange(len(x)) < len(known), np.pad(label[known, a], (0, len(asked)), constant_values=-1)
+            out[asked, s, a, : levels[a]] = probe_log_probs(x, y, fitted[None], levels[a], config)[0, len(known) :]
     return out
 
 

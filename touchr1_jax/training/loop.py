@@ -7,7 +7,7 @@ state = fit(step, state, batches, LoopConfig(steps=100), hooks)
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -25,6 +25,10 @@ Log = Callable[[int, dict[str, float]], None]
 
 SKIPPED = "skipped"
 """Metric of a step that left its update out: how many did so far.  Other steps have none of this name."""
+
+
+HELD_OUT = "held_out"
+"""Metric of a step after which held-out data were scored: the score."""
 
 
 @runtime_checkable
@@ -165,7 +169,8 @@ def fit(
       batches: training data.
       config: number of steps, of steps between checkpoints, and of updates in a row that may be left out.
       hooks: log, checkpoints, stop signal.
-      held_out: score of a state on held-out data, taken whenever a checkpoint is due; the checkpoints keep the best.
+      held_out: score of a state on held-out data, taken whenever a checkpoint is due and logged as `HELD_OUT`; the
+        checkpoints keep the best.
 
     Raises:
       NonFiniteGradientError: more than `config.most_skipped` updates in a row were left out.
@@ -187,8 +192,8 @@ def fit(
         due = (t + 1) % config.save_every == 0 or t + 1 == config.steps
         leaving = hooks.stopping()
         if due or leaving:
-            lines.flush()
             score = held_out(state) if due and held_out is not None else None
+            lines.flush({} if score is None else {HELD_OUT: score})
             if hooks.checkpoints is not None:
                 hooks.checkpoints.save(t + 1, state, place, score)
         if t > start and hooks.times is not None:
@@ -232,12 +237,12 @@ class _LateLines:
         self.flush()
         self._pending = line
 
-    def flush(self) -> None:
-        """Log what is pending."""
+    def flush(self, further: Mapping[str, float] = {}) -> None:
+        """Log what is pending, with further values."""
         if self._pending is None:
             return
         (t, metrics, counts), self._pending = self._pending, None
-        values = fetch(metrics)
+        values = {**fetch(metrics), **further}
         if counts is None:
             self._log(t, values)
             return

@@ -5,17 +5,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import grain
-import jax
 import numpy as np
 from jaxtyping import Int
 
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rl.rollout import GRPOBatch
-from touchr1_jax.training.feeds import Feed, random_streams
-
-ONE_AT_A_TIME = grain.ReadOptions(num_threads=0, prefetch_buffer_size=0)
-"""Reading options of a feed of row numbers: by default Grain shuffles 500 batches ahead, seconds of a core."""
+from touchr1_jax.training.feeds import ONE_AT_A_TIME, Feed, random_streams, take, verified_answer
 
 
 class NoLabelsError(ValueError):
@@ -26,7 +22,8 @@ class QuestionFeed(Feed):
     """GRPO batches: encoded contacts in random order, each with the question for one attribute.
 
     Where several processes share a batch, each makes the rows `own` of it.  `truth` [n, A] are all levels that are
-    known, which rewards see; by default those of `label`, which may be asked about.
+    known, which rewards see; by default those of `label`, which may be asked about.  With `evidence` [n, S, A, K] of
+    the sensors' probes each question comes with its verified answer (`feeds.verified_answer`).
     """
 
     def __init__(
@@ -40,20 +37,29 @@ class QuestionFeed(Feed):
         full_share: float = 0.75,
         own: np.ndarray | None = None,
         truth: np.ndarray | None = None,
+        evidence: np.ndarray | None = None,
     ) -> None:
         contact, attribute = labelled_questions(label)
         order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
         super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
         self._policy, self._features, self._truth = policy, features, label if truth is None else truth
         self._contact, self._attribute, self._full_share = contact, attribute, full_share
-        self._own = np.arange(batch_size) if own is None else own
+        self._own, self._evidence = np.arange(batch_size) if own is None else own, evidence
 
     def make(self, element: np.ndarray, rng: np.random.Generator) -> GRPOBatch:
         """Gather the features of one batch of questions."""
         contact, attribute = self._contact[element], self._attribute[element]
         streams = random_streams(np.asarray(self._features.stream_mask)[contact], self._full_share, rng)
-        own = self._own
-        return question_batch(self._policy, self._features, self._truth, contact[own], attribute[own], streams[own])
+        contact, attribute, streams = contact[self._own], attribute[self._own], streams[self._own]
+        batch = question_batch(self._policy, self._features, self._truth, contact, attribute, streams)
+        if self._evidence is None:
+            return batch
+        of_rows = zip(self._evidence[contact], attribute, self._truth[contact], streams, strict=True)
+        pairs = [verified_answer(self._policy, *row) for row in of_rows]
+        answers: dict[str, Any] = dict(
+            zip(("answer", "answer_mask"), map(np.stack, zip(*pairs, strict=True)), strict=True)
+        )
+        return dataclasses.replace(batch, **answers)
 
 
 def labelled_questions(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.ndarray]:
@@ -88,11 +94,6 @@ def question_batch(
         target=policy.target(attribute, label[contact], streams),
         **asked,
     )
-
-
-def take(features: Features, rows: np.ndarray) -> Features:
-    """Rows of encoded contacts, on the host as these are."""
-    return jax.tree.map(lambda x: x[rows], features)
 
 
 def equal_blocks(total: int, size: int) -> Iterator[tuple[np.ndarray, int]]:

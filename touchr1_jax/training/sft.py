@@ -1,6 +1,7 @@
 """Stage 2, supervised fine-tuning: imitate verified answers, the loss on the answer's tokens alone.
 
-Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  The gradient is summed over
+Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  A batch of contacts that are
+encoded already trains the decoder alone, with the same loss.  The gradient is summed over
 micro-batches of contacts, and logits of a large vocabulary exist for some tokens at a time only.  Questions with their
 answers are padded to one length, or packed into rows (`packing`), which gives the same gradient.
 """
@@ -29,7 +30,8 @@ from touchr1_jax.types import Params, TouchBatch
 class SFTBatch:
     """P contacts with Q question–answer pairs each; `streams` says which sensors a question may feel."""
 
-    touch: TouchBatch
+    touch: TouchBatch | Features
+    """The contacts, or what the encoder made of them: then no gradient reaches the encoder."""
     ids: Int[Array, "P Q L"]
     mask: Bool[Array, "P Q L"]
     streams: Bool[Array, "P Q S"]
@@ -139,7 +141,7 @@ def sft_sums(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """−Σ log π(o_t | q, touch, o_<t) over the answer's tokens, and how many of them are predicted right."""
-    features = fns.encode(params, batch.touch, blind=blind)
+    features = encoded(fns, params, batch, blind=blind)
 
     def answer(features, ids, mask, streams, tokens):
         seen = dataclasses.replace(features, stream_mask=features.stream_mask & streams)
@@ -189,11 +191,16 @@ def row_scores(
     return _scored(fns, params, {"state": states, "token": following}, max_logits)
 
 
+def encoded(fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False) -> Features:
+    """The features of a batch's contacts; those that it carries are taken as they are."""
+    return batch.touch if isinstance(batch.touch, Features) else fns.encode(params, batch.touch, blind=blind)
+
+
 def encoded_group(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False
 ) -> tuple[Float[Array, "P n D"], Features]:
     """Tokens of each contact's streams and view, one after the other, and the features that they are of."""
-    features = fns.encode(params, batch.touch, blind=blind)
+    features = encoded(fns, params, batch, blind=blind)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1])
     return jnp.concatenate([touch, features.view.astype(touch.dtype)], 1), features
 

@@ -1,7 +1,12 @@
-"""Stage 2 from parameters to parameters: the settings of supervised fine-tuning, and the stage itself."""
+"""Stage 2 from parameters to parameters: the settings of supervised fine-tuning, and the stage itself.
+
+It has two phases, each a call of `train_sft`: end to end on clips, then the decoder alone on encoded contacts, which
+costs a fraction of a step and is what makes the answers say what the encoder sees.
+"""
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,13 +29,14 @@ from touchr1_jax.validation import above, at_least, within
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SFTConfig:
-    """Stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
+    """A phase of stage 2; the learning rate is the paper's 1e-5 times `lr_scale`."""
 
     steps: int = 450
     batch_size: int = 16
     questions: int = 2
     """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
+    """Steps between checkpoints, and between the points of which the best on validation objects is kept."""
     micro_contacts: int = 2
     """Contacts of a micro-batch of the gradient; two stay in cache, which on a CPU is a third faster than sixteen."""
     max_logits: int = MAX_LOGITS
@@ -88,6 +94,8 @@ def train_sft(
     *,
     seed: int = 0,
     blind: bool = False,
+    decoder_only: bool = False,
+    held_out: Callable[[Params], float] | None = None,
 ) -> Params:
     """Train a policy on verified answers; adapters are merged into the weights in the end.
 
@@ -99,10 +107,17 @@ def train_sft(
       hooks: log, checkpoints, devices.
       seed: of fresh adapters.
       blind: train without touch.
+      decoder_only: train the decoder alone, on batches of encoded contacts.
+      held_out: score of parameters on validation objects, higher is better, taken at every checkpoint and logged; the
+        parameters of the best checkpoint are returned.  Needs checkpoints that keep the best.
 
     Raises:
       SizeError: a policy with frozen towers, and no adapters.
+      ValueError: `held_out` without checkpoints.
     """
+    if held_out is not None and hooks.checkpoints is None:
+        raise ValueError("hooks.checkpoints is None: must keep the best where held_out is given; set it")
+    whole, params = params, {"decoder": params["decoder"]} if decoder_only else params
     lora = config.lora
     if policy.frozen and lora is None:
         raise SizeError(
@@ -117,9 +132,17 @@ def train_sft(
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
     constants = () if lora is None else (frozen,)
-    step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, *constants)
-    found = hooks.devices.gather(fit(step, state, batches, loop, hooks).params)
-    return found if lora is None else {**merge_adapters(frozen, found, lora, hooks), **found.towers}
+    devices = hooks.devices
+    step, state, batches = devices.shard(step, state, batches, config.batch_size, *constants)
+
+    def complete(state: SFTState, hooks: Hooks = SILENT) -> Params:
+        found = devices.gather(state.params)
+        return {**whole, **(found if lora is None else merge_adapters(frozen, found, lora, hooks) | found.towers)}
+
+    score = None if held_out is None else lambda state: held_out(complete(state))
+    state = fit(step, state, batches, loop, hooks, held_out=score)
+    best = hooks.checkpoints.best(state) if held_out is not None and hooks.checkpoints is not None else None
+    return complete(state if best is None else best.state, hooks)
 
 
 def fresh_adapters(frozen: Params, towers: Params, lora: LoraConfig, seed: int) -> Trainable:

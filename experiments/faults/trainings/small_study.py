@@ -15,6 +15,7 @@ from experiments.core.runner import Experiment
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import StudySFT
 from experiments.study.study import StudyConfig, run_study
+from experiments.study.training import DECODER
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -48,6 +49,7 @@ STUDY = StudyConfig(
     probe=ProbeConfig(folds=2, iterations=4),
     sft=StudySFT(steps=60, batch_size=4, save_every=3),
     blind=StudySFT(steps=30, batch_size=4, save_every=3, micro_contacts=4),
+    decoder=dataclasses.replace(DECODER, steps=30, batch_size=2, questions=2, save_every=3),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=60,
     grpo_save_every=3,
@@ -57,6 +59,7 @@ SHORT = dataclasses.replace(
     STUDY,
     sft=dataclasses.replace(STUDY.sft, steps=12),
     blind=dataclasses.replace(STUDY.blind, steps=6),
+    decoder=dataclasses.replace(STUDY.decoder, steps=6),
     grpo_steps=12,
 )
 

@@ -31,7 +31,9 @@ from touchr1_jax.rl.config import TactileUse
 
 PLAIN = (ablation_consistency, ablation_format, ablation_grounding)
 MODULES = (*PLAIN, ablation_cumulative, ablation_leave_one_out, ablation_ordinal, ablation_tactile_use)
-ARMS = ["sft", "zero_one", "ordinal", "debiased"]
+CONTROLS = ["sft", "sft_continued"]
+TRAINED = ["zero_one", "ordinal", "debiased"]
+ARMS = [*CONTROLS, *TRAINED]
 BASELINES = ["tactile_blind", "constant", "constant_joint", "constant_middle", "force_only"]
 
 
@@ -91,24 +93,28 @@ def test_comparisons_pair_arms_by_seed_and_baselines_by_object(directory):
             a, b = (both[c[side]][c["metric"]]["mean"] for side in ("arm", "against"))
             assert c["difference"] == pytest.approx(a - b, abs=1e-6)
     arms = {("ordinal", "zero_one"), ("debiased", "zero_one"), ("debiased", "ordinal")}
-    assert pairs["seeds"] == arms | {(arm, "sft") for arm in ARMS[1:]}
+    assert pairs["seeds"] == arms | {(arm, control) for arm in TRAINED for control in CONTROLS}
+    controlled = {c["metric"] for c in results["comparisons"] if c["against"] == "sft_continued"}
+    assert {"acc", "omae", "h_acc", "mat_acc", "csc"} <= controlled
     assert pairs["objects"] == {("sft", name) for name in BASELINES}
     own = [c for c in results["comparisons"] if c["metric"] == "reward_trained"]
-    assert [(c["arm"], c["against"]) for c in own] == [(arm, "sft") for arm in ARMS[1:]]
-    assert len(results["verdict"]) == 1 + len(arms) + len(ARMS[1:])
+    assert [(c["arm"], c["against"]) for c in own] == [(arm, "sft") for arm in TRAINED]
+    assert len(results["verdict"]) == 1 + len(arms) + 2 * len(TRAINED)
 
 
 def test_results_tell_data_and_the_time_of_every_stage(directory):
     results = read_json(directory / "results.json")
     assert results["data"]["source"] == "generated"
     assert results["data"]["test_objects"] == 5
-    stages = {f"{stage}/{seed}" for stage in ("sft", "blind", *(f"grpo/{arm}" for arm in ARMS[1:])) for seed in (0, 1)}
+    phases = ("sft", "blind", *(f"decoder/{name}" for name in CONTROLS), *(f"grpo/{arm}" for arm in TRAINED))
+    stages = {f"{phase}/{seed}" for phase in phases for seed in (0, 1)}
     asked = {f"ask/{name}/{seed}" for name in (*ARMS, "tactile_blind") for seed in (0, 1)}
     inside = {f"{what}/{stage}" for what in (STEPPING, WAITING) for stage in stages}
     assert set(results["timing"]) - inside == stages | asked | {"data", "total"}
     assert results["timing"]["total"] >= sum(results["timing"][s] for s in stages | asked)
     logged = [line["stage"] for line in read_metrics(directory)]
-    assert (logged.count("sft/0"), logged.count("grpo/ordinal/1")) == (3, 2)
+    assert (logged.count("sft/0"), logged.count("decoder/sft/0"), logged.count("grpo/ordinal/1")) == (3, 2, 2)
+    assert all("held_out" in line for line in read_metrics(directory) if line["stage"].startswith("decoder/"))
 
 
 def test_a_run_without_results_goes_on_from_the_answers(home, cache_dir, directory):
@@ -139,8 +145,8 @@ def test_damaged_answers_are_made_again(home, cache_dir, directory, capsys):
 def test_every_arm_of_tactile_use_is_trained_by_its_own_algorithm(tmp_path, cache_dir):
     directory = run_ablation(ablation_tactile_use, tmp_path, cache_dir, 1)
     results = read_json(directory / "results.json")
-    assert list(results["arms"]) == ["sft", "none", "literal", "recommended"]
-    assert results["settings"]["preset of literal"].startswith("paper with tactile_use=literal")
+    assert list(results["arms"]) == [*CONTROLS, "none", "literal", "recommended"]
+    assert results["settings"]["preset of literal"].startswith("paper with anchor=1.0, tactile_use=literal")
     lines = {line["stage"]: line for line in read_metrics(directory) if line["stage"].endswith("/0")}
     assert "touch_score" not in lines["grpo/none/0"]
     for arm in (TactileUse.LITERAL, TactileUse.RECOMMENDED):
@@ -151,7 +157,7 @@ def test_every_arm_of_tactile_use_is_trained_by_its_own_algorithm(tmp_path, cach
 @pytest.mark.parametrize("module", PLAIN)
 def test_every_ablation_runs(module, tmp_path, cache_dir):
     results = read_json(run_ablation(module, tmp_path, cache_dir, 1) / "results.json")
-    assert list(results["arms"]) == ["sft", *module.ABLATION.arms]
+    assert list(results["arms"]) == [*CONTROLS, *module.ABLATION.arms]
 
 
 STUDY = dataclasses.replace(tiny.STUDY, grpo_steps=1, share=False)
@@ -172,14 +178,14 @@ def run(tmp_path, cache_dir):
 @pytest.mark.slow
 def test_the_main_table_has_every_baseline(run):
     _, results = run(main_table, main_table.MainConfig(study=STUDY, quota=FEW))
-    assert list(results["arms"]) == ["sft", "full"]
+    assert list(results["arms"]) == [*CONTROLS, "full"]
     assert set(results["baselines"]) == {*main_table.TOUCHLESS, "encoder_probe", "nearest_fields"}
     for row in {**results["arms"], **results["baselines"]}.values():
         assert {"h_acc", "omae", "l2_em", "csc"} <= set(row)  # a single pair has no interval
     comparison, pooled, reliability, kinds, differences = (table["rows"] for table in results["tables"])
     assert comparison[-1][1:5] == [76.8, 68.4, 65.1, 74.6]
     assert [row[2] for row in kinds] == [8, 3, 2, 8]
-    assert [row[0] for row in pooled][:2] == ["sft", "full"]
+    assert [row[0] for row in pooled][:2] == [*CONTROLS, "full"]
     assert {row[0].split(":")[0] for row in reliability} == {"sft", "full"}
     assert len(differences) > 3
     assert results["requirements"][0]["met"]

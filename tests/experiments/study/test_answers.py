@@ -84,6 +84,16 @@ def test_sampled_answers_differ_from_each_other_and_repeat(ask):
     assert np.array_equal(one.tokens, ask(features, LABEL, alone=False).tokens)
 
 
+def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(policy, params, ask):
+    """Traces of the policy seldom conclude; those that do are scored one by one."""
+    features = tiny.features(3)
+    said = ask(features, LABEL, alone=False, samples=3)
+    assert said.marginal.shape == (12, 9)
+    assert np.all(said.marginal.sum(-1) < 1 + 1e-5)
+    levels = np.array([policy.levels[a] for a in said.attribute])
+    assert not said.marginal[np.arange(9) >= levels[:, None]].any()
+
+
 def felt_sum(decoder, batch):
     """In the place of a policy: its answer to everything is the sum of 2^s over the streams that it feels."""
     del decoder

@@ -96,7 +96,8 @@ def grpo(policy, params, data, tmp_path):
         features = tiny.features(2)
         features = dataclasses.replace(features, touch=features.touch + moved)
         noise, label = jnp.asarray(tiny.features(1, seed=1).touch), np.zeros((2, 4), np.int32)
-        contacts = EncodedContacts(features=features, label=label, truth=label, noise=noise)
+        evidence = np.zeros((2, *features.stream_mask.shape[1:], 4, 9), np.float32)
+        contacts = EncodedContacts(features=features, label=label, truth=label, noise=noise, evidence=evidence)
         loop = LoopConfig(steps=steps, save_every=1)
         arm = make_arm(policy, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
         order = {"seed": seed, "stage": "grpo/a/0", "share": True}

@@ -1,6 +1,7 @@
 """What the stages are fed: right answers, random questions, exact resumption."""
 
 import dataclasses
+import itertools
 import json
 import threading
 
@@ -16,9 +17,9 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
-from touchr1_jax.training.feeds import AnswerFeed, falling_share, random_streams
+from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams, take
 from touchr1_jax.training.packing import Packing
-from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch, take
+from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,19 @@ def answers(policy, data, evidence):
         order = {"batch_size": 3, "seed": 1} | {k: v for k, v in changes.items() if k in ("seed", "own")}
         clips = data.batches(data.parts["sft"], felt=not changes.get("blind"), **order)
         return AnswerFeed(policy, clips, evidence, **{"questions": 3, **order, **changes})
+
+    return feed
+
+
+@pytest.fixture
+def encoded(policy, data, evidence):
+    """The same contacts, encoded once."""
+    rows = data.parts["sft"]
+
+    def feed(**changes):
+        order = {"batch_size": 3, "seed": 1} | changes
+        clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], **order)
+        return AnswerFeed(policy, clips, evidence, questions=3, **order)
 
     return feed
 
@@ -164,6 +178,35 @@ def rows_of(rows):
         yield row[row >= 0], at
 
 
+def test_encoded_contacts_come_with_their_own_features_and_answers(policy, data, encoded, evidence):
+    rows, features = data.parts["sft"], tiny.features(len(data.parts["sft"]))
+    batch = next(encoded())
+    of_row = {features.touch[i].tobytes(): contact for i, contact in enumerate(rows)}
+    contacts = [of_row[np.asarray(touch).tobytes()] for touch in batch.touch.touch]
+    for i, a, streams, said in readings(policy, batch):
+        assert said.conclude[a] == data.label[contacts[i], a]
+        assert said.compare[a] == evidence[contacts[i]][streams, a].sum(0).argmax()
+
+
+def test_packed_rows_need_clips(policy, data, evidence):
+    rows = data.parts["sft"]
+    clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], batch_size=3, seed=1)
+    packing = Packing(width=128, contacts=1)
+    with pytest.raises(ValueError, match="packing is set"):
+        next(AnswerFeed(policy, clips, evidence, batch_size=3, questions=3, seed=1, packing=packing))
+
+
+def test_a_question_of_grpo_comes_with_its_verified_answer(policy, questions, data, evidence):
+    contact = data.parts["grpo"]
+    for batch in itertools.islice(questions(evidence=evidence[contact]), 3):
+        for i, ids in enumerate(batch.ids):
+            a = attribute_of(policy, ids)
+            said = read(policy.language, policy.tokenizer.decode(batch.answer[i][batch.answer_mask[i]][:-1]))
+            assert said.conclude[a] == batch.target.label[i, a]
+            assert [level[a] >= 0 for level in said.perceive] == batch.target.streams[i].tolist()
+    assert next(questions()).answer is None
+
+
 @pytest.mark.parametrize("kind", ["answers", "questions"])
 def test_one_seed_is_one_sequence_of_batches(request, kind):
     make = request.getfixturevalue(kind)
@@ -173,7 +216,7 @@ def test_one_seed_is_one_sequence_of_batches(request, kind):
     assert not equal(first[:1], first[1:2])
 
 
-@pytest.mark.parametrize("kind", ["answers", "questions", "packed", "easy"])
+@pytest.mark.parametrize("kind", ["answers", "encoded", "questions", "packed", "easy"])
 def test_a_state_resumes_exactly(request, kind):
     make = request.getfixturevalue(kind)
     feed = make()
@@ -187,7 +230,7 @@ def test_a_state_resumes_exactly(request, kind):
     assert equal(rest[:1], [leaves(next(feed))])
 
 
-@pytest.mark.parametrize("kind", ["answers", "questions", "packed"])
+@pytest.mark.parametrize("kind", ["answers", "encoded", "questions", "packed"])
 def test_processes_that_share_batches_make_them_together(request, kind):
     """What is drawn is drawn for the whole batch, so that it does not matter who makes which rows."""
     make = request.getfixturevalue(kind)

@@ -35,11 +35,11 @@ def probed(data):
 
 def test_evidence_of_recorded_touch_is_a_distribution_and_of_the_rest_nothing(data, probed, context):
     evidence = gather_evidence(data, probed, PROBE, context)
-    sft = np.isin(np.arange(len(data.store)), data.parts["sft"])
+    train = np.isin(np.arange(len(data.store)), np.concatenate([data.parts["sft"], data.parts["grpo"]]))
     for a, levels in enumerate(LEVELS.values()):
         assert (evidence[:, :, a, levels:] == -np.inf).all()
         for s in (0, 1):
-            recorded = sft & probed.present[:, s]
+            recorded = train & probed.present[:, s]
             known = evidence[:, s, a, :levels]
             np.testing.assert_allclose(np.exp(known[recorded]).sum(-1), 1, atol=1e-5)
             assert np.ptp(known[recorded], axis=-1).min() > 0

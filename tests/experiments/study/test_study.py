@@ -11,6 +11,7 @@ from experiments.study.baselines import baselines, constant_answers, joint_mode,
 from experiments.study.scores import PUBLISHED, score, score_study
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import (
+    CONTINUED,
     SFT,
     EvalVariant,
     Study,
@@ -75,7 +76,7 @@ def study(data, policy):
         probed=ProbeFeatures(streams=streams, present=np.ones((len(label), 4), bool), force=force.astype(np.float32)),
         prior=data.prior(),
         arms={},
-        answers={SFT: [answers_about(TEST)]},
+        answers={name: [answers_about(TEST)] for name in (SFT, CONTINUED)},
     )
 
 
@@ -147,7 +148,7 @@ def test_force_that_gives_hardness_away_is_found_out_where_it_is_measured(study)
 
 def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
     scored = score_study(study)
-    assert list(scored.arms) == list(scored.rows)[:1] == [SFT]
+    assert list(scored.arms) == list(scored.rows)[:2] == [SFT, CONTINUED]
     assert list(scored.baselines) == ["constant", "constant_joint", "constant_middle", "force_only"]
     assert list(scored.estimates) == [*scored.arms, *scored.baselines]
     assert len(scored.objects) == 19

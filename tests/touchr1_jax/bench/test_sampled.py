@@ -5,7 +5,16 @@ import itertools
 import numpy as np
 import pytest
 
-from touchr1_jax.bench.sampled import Bin, Votes, calibration_error, majority, pass_at_k, reliability, samples_right
+from touchr1_jax.bench.sampled import (
+    Bin,
+    Votes,
+    calibration_error,
+    decide,
+    majority,
+    pass_at_k,
+    reliability,
+    samples_right,
+)
 
 LABEL = np.array([[1, -1], [0, -1], [2, 1], [1, -1]])
 SAMPLED = np.array(
@@ -46,6 +55,24 @@ def test_pass_at_k_is_the_share_of_all_choices_of_k_that_hold_a_right_one(k):
 def test_more_than_there_are_samples_is_refused(k):
     with pytest.raises(ValueError, match=f"k is {k}: must be 1 … 4"):
         pass_at_k(samples_right(SAMPLED, LABEL), k)
+
+
+SHARES = np.array([[0.4, 0.3, 0.3], [0.5, 0.0, 0.5], [0.1, 0.2, 0.7], [0.45, 0.1, 0.45], [0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("rule", "level"), [("argmax", [0, 0, 2, 0, -1]), ("median", [1, 0, 2, 1, -1]), ("expected", [1, 1, 2, 1, -1])]
+)
+def test_a_rule_decides_by_hand_and_whatever_the_scale(rule, level):
+    assert decide(SHARES, rule).tolist() == decide(3 * SHARES, rule).tolist() == level
+
+
+@pytest.mark.parametrize(("rule", "power"), [("median", 1), ("expected", 2)])
+def test_a_rule_has_the_least_expected_error(rule, power):
+    share = np.random.default_rng(0).dirichlet(np.ones(4), 200)
+    error = (np.abs(np.arange(4)[:, None] - np.arange(4)) ** power) @ share.T  # [answer, N]
+    chosen = decide(share, rule)
+    np.testing.assert_allclose(error[chosen, np.arange(200)], error.min(0), atol=1e-9)
 
 
 def test_calibration_by_hand():

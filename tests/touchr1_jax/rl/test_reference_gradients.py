@@ -29,6 +29,7 @@ ALGORITHMS = {
     "importance of tokens": Paper(**LOUD, importance_cap=1.1),
     "importance of rollouts": Paper(**LOUD, importance_cap=1.1, importance_sequence=True),
     "KL in the reward": Paper(**LOUD, kl_in_reward=True),
+    "anchor": Paper(**LOUD, anchor=0.7),
 }
 SAMPLING = {
     "temperature": {"temperature": 0.7},
@@ -54,6 +55,7 @@ def problem(seed: int = 0) -> dict[str, np.ndarray]:
         "mask": np.arange(T) < rng.integers(1, T + 1, (P, G, 1)),
         "advantage": rng.normal(size=(P, G)),
         "weight": np.array([0.7, 0.3]),
+        "answer": rng.integers(0, V, (P, T)),
     }
 
 
@@ -66,7 +68,11 @@ def ours(config: GRPOConfig, fixed: dict[str, np.ndarray], *, first: bool):
         logits = {"own": own, "reference": x["reference"], "perturbed": perturbed}
         terms = logit_terms(config, tokens, logits)
         old = jax.lax.stop_gradient(terms.log_prob) if first else x["old"]
-        return grpo_loss(terms, old, x["sampler"], mask, x["advantage"], x["weight"], config)[0]
+        answer = jnp.asarray(fixed["answer"])[..., None]  # scored by the states of each prompt's first rollout
+        likelihood = jnp.take_along_axis(jax.nn.log_softmax(own[:, 0]), answer, -1)[..., 0].mean(-1)
+        anchor = likelihood if config.algorithm.anchor else None
+        arrays = (terms, old, x["sampler"], mask, x["advantage"], x["weight"])
+        return grpo_loss(*arrays, config, answer=anchor)[0]
 
     value, gradient = jax.jit(jax.value_and_grad(loss, (0, 1)))(x["own"], x["perturbed"])
     return float(value), np.stack(gradient)

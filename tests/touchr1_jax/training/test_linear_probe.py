@@ -8,7 +8,7 @@ import pytest
 import scipy.optimize
 import scipy.special
 
-from touchr1_jax.training.linear_probe import ProbeConfig, cross_fit, probe_log_probs, stream_features
+from touchr1_jax.training.linear_probe import ProbeConfig, cross_fit, probe_log_probs, sensor_evidence, stream_features
 
 CONFIG = ProbeConfig()
 K = 3
@@ -60,6 +60,20 @@ def test_unlabelled_rows_are_read_but_not_learned_from(problem):
     wrong = cross_fit(features + 100 * hidden[:, None], np.where(hidden, -1, labels), groups, K, CONFIG)
     np.testing.assert_allclose(wrong[~hidden], without[~hidden], atol=1e-6)
     assert np.isfinite(without).all()
+
+
+def test_rows_that_are_only_read_change_no_other_and_are_read_by_a_probe_of_all_others(problem):
+    features, labels, groups = problem[:3]
+    n, read_only = len(labels), np.arange(len(labels)) // 3 % 4 == 0
+    rows = features[:, None], np.ones((n, 1), bool), labels[:, None], groups, [3], CONFIG
+    found = sensor_evidence(*rows, read_only=read_only)[:, 0, 0]
+    kept = ~read_only
+    alone = sensor_evidence(
+        features[kept, None], np.ones((kept.sum(), 1), bool), labels[kept, None], groups[kept], [3], CONFIG
+    )
+    np.testing.assert_array_equal(found[kept], alone[:, 0, 0])
+    whole = probe_log_probs(features, np.where(kept, labels, -1), kept[None], 3, CONFIG)[0]
+    np.testing.assert_allclose(found[read_only], whole[read_only], atol=1e-4)
 
 
 def test_a_probe_beats_chance_out_of_fold(problem):

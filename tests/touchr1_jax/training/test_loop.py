@@ -8,7 +8,7 @@ import pytest
 
 from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
+from touchr1_jax.training.loop import HELD_OUT, SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
 
 STEPS = 10
 CONFIG = LoopConfig(steps=STEPS, save_every=3)
@@ -198,12 +198,13 @@ def test_a_request_to_stop_saves_where_it_is(whole, tmp_path):
 
 def test_the_best_held_out_state_is_kept(tmp_path):
     """Scores are taken where a checkpoint is due: after steps 3, 6, 9 and 10."""
-    scores = iter([1.0, 4.0, 2.0, 3.0])
+    scores, lines = iter([1.0, 4.0, 2.0, 3.0]), {}
     with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
         held_out = lambda state: next(scores)
-        fit(step, start(), feed(), CONFIG, Hooks(checkpoints=checkpoints), held_out=held_out)
+        fit(step, start(), feed(), CONFIG, Hooks(checkpoints=checkpoints, log=lines.__setitem__), held_out=held_out)
         assert int(checkpoints.best(start()).state.step) == 6
         assert int(checkpoints.restore(start()).state.step) == STEPS
+    assert {t: line[HELD_OUT] for t, line in lines.items() if HELD_OUT in line} == {2: 1.0, 5: 4.0, 8: 2.0, 9: 3.0}
 
 
 class Slow(Failing):

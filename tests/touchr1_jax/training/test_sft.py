@@ -48,6 +48,16 @@ def params():
     return {**tiny.params(), **tiny.shallow_params()}
 
 
+def test_encoded_contacts_train_the_decoder_as_the_contacts_do_and_nothing_else(params, batch):
+    features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
+    (value, right), whole = jax.jit(lambda p: sft_gradient(FNS, p, batch))(params)
+    again = jax.jit(lambda p: sft_gradient(FNS, p, batch.replace(touch=features)))
+    (encoded_value, encoded_right), grads = again({"decoder": params["decoder"]})
+    np.testing.assert_allclose((encoded_value, encoded_right), (value, right), rtol=1e-6)
+    for a, b in zip(jax.tree.leaves(grads["decoder"]), jax.tree.leaves(whole["decoder"]), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
 loss = jax.jit(lambda p, b: sft_loss(FNS, p, b))
 group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 

@@ -1,0 +1,148 @@
+"""What reinforcement must beat: SFT continued for as many seconds, and the decision rules that cost no training."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import get_args
+
+import numpy as np
+
+from experiments.core.context import Context
+from experiments.core.loops import STEPPING
+from experiments.core.results import Cell, Comparison, Estimate, Table, named_table
+from experiments.core.text import bounds, interval
+from experiments.study.estimates import compare_over_seeds
+from experiments.study.study import CONTINUED, Study
+from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
+from touchr1_jax.bench.sampled import DecisionRule, decide
+from touchr1_jax.bench.scoring import REPORTED
+from touchr1_jax.bench.statistics import clustered_bootstrap
+from touchr1_jax.training.evaluation import Evaluation
+
+RESAMPLES = 1_000
+"""Of each interval over objects."""
+
+MIDDLE = 1
+"""Middle one of three ordinal levels."""
+
+
+def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[str]) -> list[Comparison]:
+    """Every arm against the control that continues SFT, in every main metric, paired by seed.
+
+    Needs two seeds at least; without them there is no comparison.
+    """
+    control = rows[CONTINUED]
+    if any(len(estimate.per_seed) < 2 for estimate in control.values()):
+        return []
+    return [
+        compare_over_seeds(metric, arm, CONTINUED, rows[arm][metric], control[metric])
+        for arm in arms
+        for metric in control
+        if metric in rows[arm] and REPORTED[metric].better != "none" and not REPORTED[metric].secondary
+    ]
+
+
+def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) -> tuple[str, ...]:
+    """For each arm the metrics in which it is better or worse than SFT continued beyond chance over seeds."""
+    sentences = []
+    for arm in arms:
+        of_arm = [c for c in comparisons if c.arm == arm and c.against == CONTINUED and c.over == "seeds"]
+        if not of_arm:
+            continue
+        sure = [c for c in of_arm if c.low > 0 or c.high < 0]
+        gains = [c for c in sure if (c.difference > 0) == (REPORTED[c.metric].better == "higher")]
+        told = lambda found: ", ".join(f"{c.metric} {c.difference:+.3g} {bounds(c.low, c.high)}" for c in found)
+        losses = [c for c in sure if c not in gains]
+        sentences.append(
+            f"Against SFT continued for as many seconds, {arm} is better in {told(gains) or 'no metric'} and worse in "
+            f"{told(losses) or 'no metric'}, of {len(of_arm)} metrics, beyond chance over seeds."
+        )
+    return tuple(sentences)
+
+
+def seconds_table(study: Study, context: Context) -> tuple[Table, ...]:
+    """Seconds of training of every policy, mean over the seeds that this run trained; none where the cache had all."""
+    timing = context.timing()
+    phases = {name: f"grpo/{name}" for name in study.arms} | {CONTINUED: f"decoder/{CONTINUED}"}
+    phases = {"SFT, end to end": "sft", "SFT, decoder": "decoder/sft", **phases, "SFT without touch": "blind"}
+    rows: list[dict[str, Cell]] = []
+    for name, phase in phases.items():
+        seconds = [timing.get(f"{STEPPING}/{phase}/{seed}") for seed in range(study.config.seeds)]
+        trained = [s for s in seconds if s is not None]
+        if trained:
+            rows.append({"policy": name, "seconds": float(np.mean(trained)), "seeds": len(trained)})
+    if not rows:
+        return ()
+    note = f"{CONTINUED} has as many steps as take the seconds of an arm where the ratio of their steps was measured."
+    formats = {"seconds": ".1f", "seeds": "d"}
+    return (named_table("Seconds of training", rows, formats=formats, units={"seconds": "s"}, note=note),)
+
+
+def decision_table(study: Study) -> tuple[Table, ...]:
+    """Every policy's accuracy, error and middle answers, greedily and by each rule on its distribution over levels."""
+    objects = study.data.object_ids[study.data.parts["test"]]
+    rows: list[dict[str, Cell]] = []
+    for name in study.policies:
+        seeds = study.answers[name]
+        if all(one.marginal is not None for one in seeds):
+            rows += [{"policy and rule": f"{name}, {rule}", **_decided(seeds, objects, rule)} for rule in RULES]
+    if not rows:
+        return ()
+    columns = ("accuracy", "material", "middle", "middle, true")
+    return (
+        named_table(
+            "Decision rules",
+            rows,
+            formats=dict.fromkeys(columns[2:], ".1f"),
+            units={**dict.fromkeys(columns, "%"), "OMAE": "levels"},
+            meanings={
+                "accuracy": "hardness, roughness and protrusion; 95 % over objects, seeds pooled",
+                "OMAE": "mean distance in levels; 95 % over objects",
+                "middle": "ordinal answers that name the middle level",
+                "middle, true": "questions whose label it is",
+            },
+            note="Greedy decoding answers the likeliest token after the likeliest trace. The other rules decide from "
+            "p(level | prompt), the mean over sampled traces of p(level | trace), and cost no training.",
+        ),
+    )
+
+
+GREEDY = "greedy"
+RULES = (GREEDY, *get_args(DecisionRule))
+
+
+def decided_levels(answers: Evaluation, rule: str) -> np.ndarray:
+    """Level of the asked attribute, int [N], by `GREEDY` decoding or by a rule on the sampled traces.
+
+    Raises:
+      ValueError: a rule for answers without sampled traces.
+    """
+    if rule == GREEDY:
+        return np.asarray(answers.parsed.conclude)[np.arange(len(answers.contact)), answers.attribute]
+    if answers.marginal is None:
+        raise ValueError("answers.marginal is None: a decision rule needs sampled traces; sample some")
+    ordinal = np.isin(answers.attribute, [ATTRIBUTES.index(name) for name in ORDINAL])
+    chosen = next(r for r in get_args(DecisionRule) if r == rule)
+    return np.where(ordinal, decide(answers.marginal, chosen), decide(answers.marginal, "argmax"))
+
+
+def _decided(seeds: Sequence[Evaluation], objects: np.ndarray, rule: str) -> dict[str, Cell]:
+    """Cells of one policy's row; levels without an order are answered by the likeliest."""
+    level = np.concatenate([decided_levels(one, rule) for one in seeds])
+    label = np.concatenate([one.label[np.arange(len(one.label)), one.attribute] for one in seeds])
+    attribute = np.concatenate([one.attribute for one in seeds])
+    of = np.concatenate([objects[one.contact] for one in seeds])
+    ordinal = np.isin(attribute, [ATTRIBUTES.index(name) for name in ORDINAL])
+    right, distance = 100.0 * (level == label), np.where(level == BOTTOM, 2 * MIDDLE, np.abs(level - label))
+
+    def span(x: np.ndarray, rows: np.ndarray, spec: str) -> str | None:
+        if len(np.unique(of[rows])) < 2:
+            return None
+        return interval(clustered_bootstrap(x[rows].astype(float), of[rows], resamples=RESAMPLES), spec)
+
+    return {
+        "accuracy": span(right, ordinal, ".1f"),
+        "OMAE": span(distance, ordinal, ".3f"),
+        "material": span(right, ~ordinal, ".1f"),
+        "middle": 100 * float(np.mean(level[ordinal] == MIDDLE)),
+        "middle, true": 100 * float(np.mean(label[ordinal] == MIDDLE)),
+    }
