@@ -1,4 +1,4 @@
-"""What reinforcement must beat: SFT continued for as many seconds, and the decision rules that cost no training."""
+"""Controls of reinforcement: SFT continued for as many seconds, and decision rules that cost no training."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import get_args

@@ -80,7 +80,8 @@ def grpo_gradient(
         a = micro.advantage if micro.token_advantage is None else micro.token_advantage
         answer = None if left_out(algorithm.anchor) else answer_likelihood(fns, config, params, micro.batch)
         value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest, answer)
-        return value, (parts | {"loss": value}, old)
+        parts |= {"loss": value} if answer is None else {"loss": value, "answer_likelihood": answer}
+        return value, (parts, old)
 
     def add_micro_batch(grads: Params, micro: Experience) -> tuple[Params, tuple[dict[str, Array], Array]]:
         more, found = jax.grad(loss, has_aux=True)(params, micro)

@@ -41,14 +41,13 @@ def grpo_loss(
     longest: int | Float[Array, ""] | None = None,
     answer: Float[Array, "P"] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
-    """Loss −J of a micro-batch of groups; the losses of all micro-batches of a step add up to that of the step.
+    """Loss −J of a micro-batch of groups, which adds up to that of the step over all of them.
 
         J   = Σ_p w_p ⟨c_t S_t⟩ + 1/N Σ_p [ min(γ ⟨G_t⟩, budget) − β ⟨KL_t⟩ + η min(⟨H_t⟩, floor) + λ L_p ]
         S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
         c_t = min(π_old(o_t) / π_sampler(o_t), cap)                       (`importance` has another)
 
     ⟨·⟩ is the mean over the tokens of a prompt's group: `algorithm.average` for S and KL, per rollout for G and H.
-    L is the mean log-likelihood of a token of the prompt's verified answer, λ = `anchor`.
     Source: Touch-R1 (arXiv 2605.27154, eq. 5), where N = P, w = 1/N, c = 1, η = λ = 0 and nothing bounds G.
 
     Args:
@@ -60,7 +59,7 @@ def grpo_loss(
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
       longest: `divisor` of the whole batch; by default that of these rollouts.
-      answer: L of each prompt; `None` where λ is 0.
+      answer: L, the mean log-likelihood of a token of each verified answer; `None` where λ = `anchor` is 0.
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
@@ -74,13 +73,10 @@ def grpo_loss(
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
-
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
-    gain = jnp.sum(weight * policy) + jnp.sum(grounded - loss_beta(algorithm) * kl + explored) / config.prompts
-    if answer is not None:
-        gain += algorithm.anchor * jnp.sum(answer) / config.prompts
-
+    further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
+    gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
     gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, {
@@ -93,7 +89,6 @@ def grpo_loss(
         "clip_share": per_rollout(clipped.astype(jnp.float32)),
         "sampler_gap": per_rollout(gap),
         "sampler_gap_peak": peak(gap),
-        **({} if answer is None else {"answer_likelihood": answer}),
     }
 
 
