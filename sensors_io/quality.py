@@ -146,6 +146,27 @@ def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:
     return result
 
 
+def oddities(sequence: Sequence, config: QualityConfig | None = None) -> tuple[str, ...]:
+    """Why a legal sequence teaches nothing, or little, about touch; empty for an ordinary one."""
+    config = config or QualityConfig()
+    found = {
+        "one frame": len(sequence) == 1,
+        "times that run backwards": bool((np.diff(sequence.host_time_ns) < 0).any()),
+        "every frame flagged": bool(sequence.flags.all()),
+    }
+    if sequence.frames is not None:
+        least, most = int(sequence.frames.min()), int(sequence.frames.max())
+        colour = {0: "black", 255: "white"}.get(most, "of one grey")
+        found["pictures of one pixel"] = sequence.frames.shape[1] * sequence.frames.shape[2] == 1
+        found[f"all pictures {colour}"] = least == most
+        found["no change between pictures"] = (
+            len(sequence) > 1 and least < most and bool((sequence.frames == sequence.frames[:1]).all())
+        )
+    if sequence.depth_mm is not None:
+        found["no contact in any frame"] = bool(untouched(sequence.depth_mm, sequence.valid, config).all())
+    return tuple(name for name, holds in found.items() if holds)
+
+
 def without(flags: np.ndarray, *filters: Flag) -> np.ndarray:
     """Flags uint32 [N] with the bits of some filters taken back."""
     bits = np.uint32(sum(filters))

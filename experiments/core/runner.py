@@ -21,15 +21,17 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import tyro
 from rich.console import Console
 
-from experiments.core import runs, watchers
+from experiments.core import numerics, runs, watchers
 from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import left_out_tables
+from experiments.core.memory import require_memory
 from experiments.core.report import write_report
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from sensors_io.errors import UserError
+from touchr1_jax.distributed.companions import DifferentProcessesError, watched
 from touchr1_jax.distributed.processes import (
     Accelerators,
     Launch,
@@ -62,6 +64,7 @@ KNOWN_ERRORS = (
     NoLabelsError,
     DamagedFileError,
     ProcessesNotFoundError,
+    DifferentProcessesError,
     MachineError,
     RewardError,
     SizeError,
@@ -194,26 +197,30 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
 
 def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
     stopping, directory = Stopping(), None
+    fate = lambda: f"Everything so far is in {directory}. To continue: {runs.continuing(typed)}"
     try:
+        numerics.require_supported()
+        require_memory({})
         processes = join_processes(command.launch)
-        require_accelerators(command.scale, experiment.needs.get(command.scale))
-        chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
-        directory = Path(chosen)
-        lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
-        with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
-            if processes.writes:
-                runs.point_latest(directory)
-                _announce(directory, resumed)
-            _compute(experiment, command, directory, about, stopping, processes)
+        common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
+        common |= {"versions": runs.versions(), "settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
+        with watched(processes.count, processes.index, common, fate):
+            require_accelerators(command.scale, experiment.needs.get(command.scale))
+            chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
+            directory = Path(chosen)
+            lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
+            with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
+                if processes.writes:
+                    runs.point_latest(directory)
+                    _announce(directory, resumed)
+                _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
         print_error(f"{type(error).__name__}: {error}")
         if directory is not None:
-            print_lines(f"Everything so far is in {directory}. To continue: {runs.continuing(typed)}")
+            print_lines(fate())
         return 1
     except Stopped as stopped:
-        print_lines(
-            f"\nStopped by {stopped}. Everything so far is in {directory}. To continue: {runs.continuing(typed)}"
-        )
+        print_lines(f"\nStopped by {stopped}. {fate()}")
         return 128 + stopped.number
     return 0
 
@@ -224,17 +231,26 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     home = command.runs_dir / experiment.name
     unfinished = None if command.fresh else runs.newest(home, config, finished=False)
     if unfinished is not None:
+        numerics.require_same(runs.read_description(unfinished).get("settings"), unfinished)
         return str(unfinished), True
-    return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed))), False
+    here: dict[str, Any] = {"settings": numerics.settings(), "devices": numerics.machine()}
+    return str(runs.create(home, runs.describe(experiment.name, command.scale, config, typed, **here))), False
 
 
 def _announce(directory: Path, resumed: bool) -> None:
     """Print whether the run is new, the path of its page, and a note if the code has changed since it began."""
     print_lines(f"continuing {directory} (--fresh starts a new run)" if resumed else f"new run {directory}")
     print_lines(f"to watch: {directory / 'report.html'}")
-    began, now = runs.Revision(**runs.read_description(directory)["git"]), runs.revision()
-    if resumed and began != now:
+    if not resumed:
+        return
+    description = runs.read_description(directory)
+    began, now = runs.Revision(**description["git"]), runs.revision()
+    if began != now:
         print_lines(f"note: this run began at {began}, the code is now at {now}")
+    for field, here in (("versions", runs.versions()), ("machine", numerics.machine())):
+        before = {name: description.get(field, {}).get(name, value) for name, value in here.items()}
+        for change in numerics.changed(before, here):
+            print_lines(f"note: since this run began, {change}")
 
 
 def _compute(

@@ -10,6 +10,8 @@ import contextlib
 import dataclasses
 import datetime
 import fcntl
+import functools
+import hashlib
 import importlib.metadata
 import os
 import platform
@@ -67,6 +69,16 @@ def _git(root: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
+@functools.cache
+def code_digest(root: Path = ROOT) -> str:
+    """Sixteen digits of the hash of all source files, which also counts what no commit holds."""
+    sum_ = hashlib.sha256()
+    for folder in ("touchr1_jax", "sensors_io", "experiments"):
+        for path in sorted((root / folder).rglob("*.py")):
+            sum_.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return sum_.hexdigest()[:16]
+
+
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that decide what a run computes."""
     found = {"python": platform.python_version()} | dict.fromkeys(PACKAGES, "not installed")
@@ -89,15 +101,23 @@ def create(home: Path, description: dict[str, Any]) -> Path:
     raise RuntimeError(f"{home / stamp} and 98 more were made within this second; wait for the next second")
 
 
-def describe(name: str, scale: str, config: Any, command: str) -> dict[str, Any]:
-    """The content of `config.json`: the resolved configuration and everything needed to run it again."""
+def describe(
+    name: str, scale: str, config: Any, command: str, *, settings: Mapping[str, Any], devices: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The content of `config.json`: the resolved configuration and everything needed to run it again.
+
+    Args:
+      name, scale, config, command: of the experiment.
+      settings, devices: those of `numerics`.
+    """
     return {
         "experiment": name,
         "scale": scale,
         "config": config,
         "git": dataclasses.asdict(revision()),
         "versions": versions(),
-        "machine": {"system": platform.system(), "machine": platform.machine(), "cpus": os.cpu_count()},
+        "settings": settings,
+        "machine": {"system": platform.system(), "machine": platform.machine(), "cpus": os.cpu_count(), **devices},
         "command": command,
     }
 

@@ -1,15 +1,18 @@
-"""Every file of an unfinished run, damaged in four ways: the run ends the same or names the damage."""
+"""Files of an unfinished run, damaged in four ways and by single bits: the run ends the same or names the damage."""
 
 import contextlib
 import dataclasses
+import functools
 import io
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from experiments.core.context import Context
 from experiments.faults.digests import differences, digests
-from experiments.faults.fixtures import cut, emptied, flipped, newest_checkpoints, run_counting, run_directory
+from experiments.faults.fixtures import cut, emptied, flip_bit, flipped, newest_checkpoints, run_counting, run_directory
 
 DAMAGES: Mapping[str, Callable[[Path], None]] = {
     "a byte flipped": flipped,
@@ -17,6 +20,8 @@ DAMAGES: Mapping[str, Callable[[Path], None]] = {
     "emptied": emptied,
     "removed": Path.unlink,
 }
+
+BIT = "a random bit flipped"
 
 SAME, OLDER, NAMED, WRONG = "same end", "same end from an older checkpoint", "named error", "WRONG"
 OUTCOMES = (SAME, OLDER, NAMED, WRONG)
@@ -35,24 +40,35 @@ class Damage:
     message: str
 
 
-def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
-    """Damage each file in a copy of an unfinished run, continue it, and compare its end with an undamaged copy's."""
+def damage_each(
+    unfinished: Path, scratch: Path, context: Context, most: int | None = None, flips: int = 0
+) -> Iterator[Damage]:
+    """Damage a file in a copy of an unfinished run, continue it, and compare its end with an undamaged copy's.
+
+    Args:
+      unfinished: the folder of the run.
+      scratch: an empty folder.
+      context: for progress.
+      most: number of files that are damaged in every way; `None` for all.
+      flips: number of single bits that are flipped besides, each a random one of a random file.
+    """
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
     _continued(whole)
     wanted = digests(run_directory(whole))
     files = [path for path in sorted(newest_checkpoints(unfinished)[0].rglob("*")) if path.is_file()]
     files += [run_directory(unfinished) / name for name in RUN_FILES]
-    every = [
-        (i, path, damage)
-        for i, path in enumerate(files[:most])
-        for damage in DAMAGES
-        if path.stat().st_size or damage == "removed"
-    ]
-    for i, path, damage in context.each("damaging files", every, still=True):  # the run's own output is captured
-        folder = scratch / f"{i}-{damage.replace(' ', '-')}"
+    full, rng = [path for path in files if path.stat().st_size], np.random.default_rng(0)
+    every = [(path, how) for path in files[:most] for how in DAMAGES.items() if path in full or how[0] == "removed"]
+    for _ in range(flips):
+        path = full[rng.integers(len(full))]
+        bit = int(rng.integers(8 * path.stat().st_size))
+        every.append((path, (BIT, functools.partial(flip_bit, bit=bit))))
+    # the run's own output is captured
+    for i, (path, (damage, apply)) in context.each("damaging files", enumerate(every), still=True):
+        folder = scratch / str(i)
         shutil.copytree(unfinished, folder, symlinks=True)
-        DAMAGES[damage](folder / path.relative_to(unfinished))
+        apply(folder / path.relative_to(unfinished))
         code, output = _continued(folder)
         message = next((s for s in output.splitlines() if "Error" in s or "is kept as damaged" in s), "")
         outcome = _outcome(folder, code, output, wanted)

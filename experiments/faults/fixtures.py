@@ -74,6 +74,13 @@ def flipped(path: Path) -> None:
     path.write_bytes(content)
 
 
+def flip_bit(path: Path, bit: int) -> None:
+    """Flip one bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(content)
+
+
 def cut(path: Path) -> None:
     """Leave the first half of a file."""
     content = path.read_bytes()

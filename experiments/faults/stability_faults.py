@@ -34,6 +34,8 @@ from experiments.faults.bad_inputs import cases, provoke
 from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import unfinished_run
+from experiments.faults.flipped_bits import RAW, READINGS, Flip, flip_bits
+from experiments.faults.flipped_bits import WRONG as WRONG_READING
 from experiments.faults.kills import (
     PHASES,
     START,
@@ -80,6 +82,10 @@ class FaultsConfig:
     study: KillConfig = KillConfig(kills=10, startup_share=0.2)
     study_scale: str = "default"
     damaged_files: int | None = None
+    flips: int = 1000
+    """Bits flipped in the files of a finished study and its cache, of which each is read."""
+    resumed_flips: int = 60
+    """Bits flipped in the files of an unfinished run, which then goes on."""
     bad_inputs: int | None = None
     waiting: WaitingConfig = WaitingConfig()
 
@@ -105,13 +111,20 @@ def run(config: FaultsConfig, context: Context) -> Results:
         "study": kill_training("study", whole, config.study, context),
     }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
-        damage = damage_files(config.damaged_files, context, Path(scratch))
+        damage = damage_files(config, context, Path(scratch))
+        flips = flip_files(config.flips, context, Path(scratch))
         inputs = try_inputs(config.bad_inputs, context, Path(scratch))
     waited = waits(config.waiting, context)
     return Results(
-        verdict=verdict(killed, damage, inputs, waited),
-        requirements=requirements(killed, damage, inputs, waited),
-        tables=(kill_table(killed), damage_table(damage), input_table(inputs), waiting_table(waited)),
+        verdict=verdict(killed, damage, flips, inputs, waited),
+        requirements=requirements(killed, damage, flips, inputs, waited),
+        tables=(
+            kill_table(killed),
+            damage_table(damage),
+            flip_table(flips),
+            input_table(inputs),
+            waiting_table(waited),
+        ),
         pictures=(kill_picture({name: each.kills for name, each in killed.items()}),),
         settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(inputs)},
     )
@@ -154,14 +167,24 @@ def _strike(
         return campaign.run_killed(number, kills, undisturbed, before=before, keep=keep)
 
 
-def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
+def flip_files(count: int, context: Context, scratch: Path) -> list[Flip]:
+    """Every flipped bit of the study that nobody killed, and of its cache."""
+    if not context.done("flips"):
+        whole = context.directory / "killed" / SMALL_STUDY.name / UNDISTURBED
+        context.save_stage("flips", list(flip_bits(whole, scratch, context, count)))
+    return [Flip(**one) for one in context.load_stage("flips")]
+
+
+def damage_files(config: FaultsConfig, context: Context, scratch: Path) -> list[Damage]:
     """Every damaged file and the end of its run."""
     if not context.done("damage"):
         unfinished, damaged = scratch / "unfinished", scratch / "damaged"
         unfinished.mkdir()
         damaged.mkdir()
         unfinished_run(unfinished)
-        context.save_stage("damage", list(damage_each(unfinished, damaged, context, most)))
+        context.save_stage(
+            "damage", list(damage_each(unfinished, damaged, context, config.damaged_files, config.resumed_flips))
+        )
     return [Damage(**one) for one in context.load_stage("damage")]
 
 
@@ -204,7 +227,11 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
 
 
 def requirements(
-    killed: Mapping[str, KilledRuns], damage: Sequence[Damage], inputs: Sequence[InputRow], waited: Waits
+    killed: Mapping[str, KilledRuns],
+    damage: Sequence[Damage],
+    flips: Sequence[Flip],
+    inputs: Sequence[InputRow],
+    waited: Waits,
 ) -> tuple[Requirement, ...]:
     """Kills survived, wrong ends, inputs that are answered, waits."""
     at_start = max(sum(k.phase == START for k in each.kills) / len(each.kills) for each in killed.values())
@@ -215,6 +242,8 @@ def requirements(
         at_most("files that differ after them", sum(len(k.differs) for k in killed.values()), 0),
         at_most("share of kills at start-up", at_start, 0.5, note="of the training with the larger share"),
         at_most("damaged files with a wrong end", sum(one.outcome == WRONG for one in damage), 0),
+        at_most("flipped bits that read as something else", sum(one.reading == WRONG_READING for one in flips), 0),
+        at_most("flipped bits that end in a raw error", sum(one.reading == RAW for one in flips), 0),
         at_least("kinds of bad input answered", answered, 25),
         at_most("kinds of bad input not answered", len(inputs) - answered, 0),
         *(
@@ -225,15 +254,21 @@ def requirements(
 
 
 def verdict(
-    killed: Mapping[str, KilledRuns], damage: Sequence[Damage], inputs: Sequence[InputRow], waited: Waits
+    killed: Mapping[str, KilledRuns],
+    damage: Sequence[Damage],
+    flips: Sequence[Flip],
+    inputs: Sequence[InputRow],
+    waited: Waits,
 ) -> tuple[str, ...]:
     """Kills and differences of each training, ends with damaged files, answered inputs, the longest wait."""
     kills = "; ".join(f"the {name}, {len(k.kills)} times, {len(k.differs)} differences" for name, k in killed.items())
     ends = ", ".join(f"{sum(one.outcome == outcome for one in damage)} {outcome}" for outcome in OUTCOMES)
+    readings = ", ".join(f"{sum(one.reading == name for one in flips)} {name}" for name in READINGS)
     worst = max(wait_s / steps_s for steps_s, wait_s in waited.values())
     return (
         f"Killed by kill -9: {kills}.",
         f"Of {len(damage)} damaged files: {ends}.",
+        f"Of {len(flips)} flipped bits: {readings}.",
         f"Of {len(inputs)} kinds of bad input {sum(not row['faults'] for row in inputs)} are answered with error, "
         f"place and way out.  At most {worst:.2%} of a training step waits for data.",
     )
@@ -264,6 +299,19 @@ def damage_table(damage: Sequence[Damage]) -> Table:
         "Damaged files of a run that goes on",
         [{"damage": kind, **count(same), "said": same[0].message[:CELL]} for kind, same in by_kind.items()],
         note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
+    )
+
+
+def flip_table(flips: Sequence[Flip]) -> Table:
+    """What reading gave, by kind of file."""
+    by_kind: dict[str, list[Flip]] = {}
+    for one in sorted(flips, key=lambda flip: flip.file):
+        by_kind.setdefault(one.file, []).append(one)
+    count = lambda same: {name: sum(one.reading == name for one in same) for name in READINGS}
+    return named_table(
+        "Flipped bits of a study and its cache",
+        [{"file": name, **count(same)} for name, same in by_kind.items()],
+        note="One random bit of a random file at a time; the file is read as a session reads it.",
     )
 
 
@@ -315,8 +363,8 @@ def kill_picture(kills: Mapping[str, Sequence[Kill]]) -> Picture:
 
 DEFAULT = FaultsConfig()
 SMOKE = FaultsConfig(
-    grpo=KillConfig(kills=3), grpo_steps=20, study=KillConfig(kills=1), study_scale="short", damaged_files=2,
-    bad_inputs=30, waiting=WaitingConfig(steps=3),
+    grpo=KillConfig(kills=3), grpo_steps=20, study=KillConfig(kills=1), study_scale="short",
+    damaged_files=2, flips=100, resumed_flips=2, bad_inputs=30, waiting=WaitingConfig(steps=3),
 )  # fmt: skip
 
 EXPERIMENT = Experiment(name="stability_faults", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

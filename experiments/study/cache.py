@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
+from experiments.core import numerics
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context, read_metrics
 from experiments.core.runs import ROOT, versions
@@ -79,9 +79,9 @@ def cached(
 
 
 def fingerprint(values: Mapping[str, Any], arrays: Mapping[str, Any], source: str) -> str:
-    """Sixteen digits of the hash of configurations, arrays, package versions, device, compilation, and source."""
+    """Sixteen digits of the hash of configurations, arrays, package versions, settings, machine and source."""
     sum_ = hashlib.sha256()
-    machine = {"device": jax.default_backend(), "quickly": jax.config.values["jax_disable_most_optimizations"]}
+    machine = {**numerics.machine(), "settings": numerics.settings()}
     about = {**jsonable(values), **machine, "versions": versions(), "source": source}
     sum_.update(json.dumps(about, sort_keys=True).encode())
     for name, x in sorted(_flat(arrays).items()):
@@ -113,15 +113,24 @@ def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def _found(path: Path, context: Context, stage: str) -> Params:
+def read_policy(path: Path) -> tuple[Params, list[dict[str, Any]]]:
+    """Parameters of a policy in the cache, and the lines that its training logged.
+
+    Raises:
+      ValueError, KeyError: the file is damaged.
+    """
     arrays = load_arrays(path)
     lines = json.loads(arrays.pop(_LINES).tobytes())
-    params = {name: jnp.asarray(x) for name, x in arrays.items()}
+    return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in arrays.items()}, sep="/"), lines
+
+
+def _found(path: Path, context: Context, stage: str) -> Params:
+    params, lines = read_policy(path)
     if _logged(context, stage) != lines:  # a resumed run has them already, and its log must not be reordered
         context.rewind(stage, 0)
         for line in lines:
             context.log(stage, **line)
-    return traverse_util.unflatten_dict(params, sep="/")
+    return params
 
 
 def _logged(context: Context, stage: str) -> list[dict[str, Any]]:

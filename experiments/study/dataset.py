@@ -1,6 +1,7 @@
 """The data of an experiment: contacts on disk, split by object into the parts that the stages use."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +69,16 @@ class Dataset:
         }
 
 
-def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[str, np.ndarray]:
+def split_parts(
+    store: RecordStore, grpo_share: float, seed: int = 0, left_out: Sequence[int] = ()
+) -> dict[str, np.ndarray]:
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
+
+    Args:
+      store: the records.
+      grpo_share: of the training objects.
+      seed: of the draw.
+      left_out: contacts that are in no part.
 
     Raises:
       DataError: a part without a contact.
@@ -80,6 +89,7 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     kept = np.isin(ids, np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))])
     val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
     parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
+    parts = {name: rows[~np.isin(rows, left_out)] for name, rows in parts.items()}
     for name, rows in parts.items():
         if not len(rows):
             raise DataError(
@@ -89,8 +99,18 @@ def split_parts(store: RecordStore, grpo_share: float, seed: int = 0) -> dict[st
     return parts
 
 
-def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: float = 0.0, threads: int = 1) -> Dataset:
-    """Open records and split them; `memory_gib` of their clips stay in memory once so many threads have read them."""
+def open_dataset(
+    path: Path,
+    clip: ClipConfig,
+    grpo_share: float,
+    memory_gib: float = 0.0,
+    threads: int = 1,
+    left_out: Sequence[int] = (),
+) -> Dataset:
+    """Open records and split them without the contacts that are left out.
+
+    `memory_gib` of their clips stay in memory once so many threads have read them.
+    """
     store = RecordStore(path)
     clip = dataclasses.replace(clip, sensors=store.meta.sensors)
     cards = [store.objects[key.object_id] for key in store.contacts]
@@ -98,7 +118,7 @@ def open_dataset(path: Path, clip: ClipConfig, grpo_share: float, memory_gib: fl
         store=store,
         clip=clip,
         memory=ClipMemory(clip, round(memory_gib * 2**30)),
-        parts=split_parts(store, grpo_share),
+        parts=split_parts(store, grpo_share, left_out=left_out),
         label=np.stack([card.label_row() for card in cards]),
         object_ids=np.array([card.object_id for card in cards]),
         visual_lies=np.array([bool(card.visual_lies) for card in cards]),

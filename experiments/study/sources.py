@@ -11,9 +11,14 @@ from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
+from sensors_io.quality import oddities
+from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
+
+MOST_NAMED = 3
+"""Odd contacts that a line names."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -28,6 +33,8 @@ class SourceConfig:
     """Generated scenes, PhysiCLeAR's videos, or a folder of records."""
     data_dir: Path | None = None
     """Folder of the videos or records."""
+    drop_odd: bool = False
+    """Leave out contacts that teach nothing about touch, such as those of black pictures; they are listed anyway."""
     scenes: SceneConfig = SceneConfig()
     physiclear: PhysiclearConfig = PhysiclearConfig()
 
@@ -50,6 +57,31 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))
     return path
+
+
+def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[int, ...]:
+    """Contacts of recordings of which a sequence teaches nothing about touch, listed by reason; none of generated ones.
+
+    Args:
+      config: of the experiment; `drop_odd` decides what the list says.
+      path: directory of the records.
+      context: the run.
+    """
+    if config.data == "generated":
+        return ()
+    store, reasons = RecordStore(path), dict[str, dict[int, str]]()
+    for i in context.each("looking for odd contacts", range(len(store))):
+        for sequence in store.contact(i).values():
+            for reason in oddities(sequence):
+                reasons.setdefault(reason, {})[i] = sequence.name
+    what = "are left out" if config.drop_odd else "are trained on (--drop-odd leaves them out)"
+    for reason, named in sorted(reasons.items()):
+        names = ", ".join([*named.values()][:MOST_NAMED]) + (" …" if len(named) > MOST_NAMED else "")
+        context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {names}")
+    untouched = sorted(store.objects.keys() - {key.object_id for key in store.contacts})
+    if untouched:
+        context.print(f"without any contact: {len(untouched)} of {len(store.objects)} objects, such as {untouched[0]}")
+    return tuple(sorted({i for rows in reasons.values() for i in rows}))
 
 
 def _make(context: Context, title: str, make: Callable[[ProgressCallback], object]) -> None:

@@ -5,13 +5,15 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from experiments.core.context import Context
+from experiments.core.memory import require_memory
 from experiments.study.dataset import Dataset, open_dataset
-from experiments.study.sources import SourceConfig, prepare_records
+from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.distributed.processes import GIB
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
@@ -136,8 +138,11 @@ def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset
         view_px=view_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
     )
+    context.print(require_memory({"clips at most": round(config.clip_memory_gib * GIB)}))
     path = prepare_records(config, context)
-    return open_dataset(path, clip, GRPO_SHARE, config.clip_memory_gib, config.read_threads)
+    odd = odd_contacts(config, path, context)
+    left_out = odd if config.drop_odd else ()
+    return open_dataset(path, clip, GRPO_SHARE, config.clip_memory_gib, config.read_threads, left_out)
 
 
 M = TypeVar("M", bound=TouchConfig)

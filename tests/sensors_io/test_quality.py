@@ -49,6 +49,30 @@ def test_untouched_frames_are_judged_where_depth_is_valid() -> None:
     assert not quality.untouched(depth, None, CONFIG).any()
 
 
+def test_odd_but_legal_sequences_are_named() -> None:
+    pictures = np.arange(3 * 4 * 4 * 3, dtype=np.uint8).reshape(3, 4, 4, 3)
+    key = ContactKey(object_id="a", site=0, motion="press", trial=0)
+    time, flags = np.arange(3) * 10, np.zeros(3, np.uint32)
+    whole = Sequence(
+        key=key, sensor="xense", frames=pictures, host_time_ns=time, phase=np.ones(3, np.uint8), flags=flags
+    )
+    cases = {
+        (): {},
+        ("all pictures black",): {"frames": np.zeros_like(pictures)},
+        ("all pictures white",): {"frames": np.full_like(pictures, 255)},
+        ("all pictures of one grey",): {"frames": np.full_like(pictures, 7)},
+        ("no change between pictures",): {"frames": np.repeat(pictures[:1], 3, 0)},
+        ("pictures of one pixel",): {"frames": pictures[:, :1, :1]},
+        ("times that run backwards",): {"host_time_ns": time[::-1].copy()},
+        ("every frame flagged",): {"flags": flags + 4},
+        ("no contact in any frame",): {"depth_mm": np.zeros((3, 4, 4), np.float32)},
+    }
+    for expected, changes in cases.items():
+        assert quality.oddities(dataclasses.replace(whole, **changes)) == expected
+    one = {name: getattr(whole, name)[:1] for name in ("frames", "host_time_ns", "phase", "flags")}
+    assert quality.oddities(dataclasses.replace(whole, **one)) == ("one frame",)
+
+
 def test_marks_can_be_taken_back() -> None:
     flags = np.array([0, int(Flag.TIME_GAP)], np.uint32)
     both = quality.marked(flags, {Flag.SATURATED: np.array([True, True])})

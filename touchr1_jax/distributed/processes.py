@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from touchr1_jax.distributed.companions import coordination_apart
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.placement import DeviceMesh
 from touchr1_jax.training.loop import SingleDevice
@@ -133,8 +134,9 @@ def join_processes(launch: Launch) -> ProcessGroup:
     if not launch.distributed:
         return SINGLE_PROCESS
     try:
-        jax.distributed.initialize(launch.coordinator, launch.processes, launch.process)
-    except ValueError as error:
+        with coordination_apart():
+            jax.distributed.initialize(launch.coordinator, launch.processes, launch.process)
+    except (ValueError, jax.errors.JaxRuntimeError) as error:
         raise ProcessesNotFoundError(
             f"--distributed finds no other processes ({error}): start them with srun, mpirun or as an indexed "
             "Kubernetes job, or give --coordinator HOST:PORT --processes N --process I in each"

@@ -183,7 +183,7 @@ class Checkpoints:
 
     def _read(self, step: int, like: Any) -> Restored:
         where = self._directory / str(step)
-        changed = _changed_files(where)
+        changed = changed_files(where)
         if changed:
             raise DamagedCheckpointError(f"{where}: the checksum of {', '.join(changed)} does not hold")
         try:
@@ -281,8 +281,8 @@ def _file_checksums(where: Path) -> dict[str, int]:
     return {path.relative_to(where).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
 
 
-def _changed_files(where: Path) -> list[str]:
-    """Files that are not what was saved; of a checkpoint of earlier versions, which has no checksums, none."""
+def changed_files(where: Path) -> list[str]:
+    """Files of a checkpoint that are not what was saved; of one of earlier versions, which has no checksums, none."""
     path = where / CHECKSUMS
     if not path.is_file():
         return []

@@ -5,9 +5,10 @@ import dataclasses
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.faults import stability_faults
+from experiments.faults import flipped_bits, stability_faults
 from experiments.faults.damaged_files import OLDER, OUTCOMES, SAME, WRONG, Damage, damage_each
 from experiments.faults.fixtures import unfinished_run
+from experiments.faults.flipped_bits import FOUND, RAW, Flip
 from experiments.faults.kills import START, STEPPING, Kill
 from experiments.faults.stability_faults import GRPO, KilledRuns, WaitingConfig, damage_table, kill_table, requirements
 from tests.experiments import tiny
@@ -18,12 +19,13 @@ STRUCK = Kill(phase=STEPPING["sft"], after_s=2.0, done=0.5, torn=True)
 AT_START = dataclasses.replace(STRUCK, phase=START, torn=False)
 KILLED = KilledRuns(kills=(STRUCK,) * 150 + (AT_START,) * 50, runs=1, differs=())
 DAMAGE = Damage(file="config.json", damage="removed", outcome=SAME, message="")
+FLIP = Flip(file="a/config.json", bit=3, reading=FOUND)
 ANSWERED = [{"input": f"{i}", "kind": "run", "exit code": 1, "answer": "Error", "faults": ""} for i in range(25)]
 
 
-def unmet(killed=KILLED, damage=(DAMAGE,), inputs=ANSWERED):
+def unmet(killed=KILLED, damage=(DAMAGE,), inputs=ANSWERED, flips=(FLIP,)):
     """Names of the requirements that are not met, where 0.1 s of 10 s are waited."""
-    found = requirements({GRPO: killed}, list(damage), list(inputs), {"sft/0": (10.0, 0.1)})
+    found = requirements({GRPO: killed}, list(damage), list(flips), list(inputs), {"sft/0": (10.0, 0.1)})
     return {r.name for r in found if not r.met}
 
 
@@ -35,6 +37,10 @@ def test_every_fault_breaks_its_requirement():
     differs = dataclasses.replace(KILLED, differs=("run 0: metrics.jsonl",))
     assert unmet(killed=differs) == {"files that differ after them"}
     assert unmet(damage=[DAMAGE, dataclasses.replace(DAMAGE, outcome=WRONG)]) == {"damaged files with a wrong end"}
+    assert unmet(flips=[FLIP, dataclasses.replace(FLIP, reading=flipped_bits.WRONG)]) == {
+        "flipped bits that read as something else"
+    }
+    assert unmet(flips=[FLIP, dataclasses.replace(FLIP, reading=RAW)]) == {"flipped bits that end in a raw error"}
     silent = {**ANSWERED[0], "faults": "the exit code is 0"}
     assert unmet(inputs=[*ANSWERED, silent]) == {"kinds of bad input not answered"}
 

@@ -3,13 +3,16 @@
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.study import sources
-from experiments.study.sources import SourceConfig, prepare_records
+from experiments.study.dataset import split_parts
+from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
+from sensors_io.records import RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 
@@ -82,3 +85,25 @@ def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, con
     ]
     assert all(path.parent == context.cache_dir and path.name.startswith("physiclear-") for path in paths)
     assert "importing videos" in console.file.getvalue()
+
+
+def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_request(data, tmp_path, context):
+    """The fourth contact is black for one sensor; one object was never touched."""
+    store, black = data.store, 3
+    with RecordWriter(tmp_path / "odd", meta=store.meta) as writer:
+        for card in store.objects.values():
+            writer.write_object(card)
+        writer.write_object(dataclasses.replace(store.objects[store.contacts[0].object_id], object_id="untouched"))
+        for i in range(len(store)):
+            sequences = list(store.contact(i).values())
+            if i == black:
+                sequences[0] = dataclasses.replace(sequences[0], frames=np.zeros_like(sequences[0].frames))
+            writer.write_contact(sequences)
+    config = SourceConfig(data="records", data_dir=tmp_path / "odd")
+    assert odd_contacts(config, tmp_path / "odd", context) == (black,)
+    printed = context.console.file.getvalue()
+    assert f"all pictures black: 1 of {len(store)} contacts are trained on (--drop-odd leaves them out)" in printed
+    assert f"without any contact: 1 of {len(store.objects) + 1} objects, such as untouched" in printed
+    parts = split_parts(store, 0.35, left_out=(black,))
+    assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {black}
+    assert odd_contacts(GENERATED, store.path, context) == ()

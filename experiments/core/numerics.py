@@ -1,0 +1,77 @@
+"""What the bits of a result depend on besides configuration and code: settings of JAX and XLA, device, processor.
+
+Cores, threads and thread pools change no bit.  The number of devices does; the cache of policies counts the mesh.
+"""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from experiments.core.errors import ConfigurationError
+from touchr1_jax.training.compilation import FLAGS, processor
+
+SETTINGS = (
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_disable_most_optimizations",
+    "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable",
+)
+"""Settings of JAX that change results."""
+
+UNSUPPORTED = {
+    "jax_enable_x64": "it makes 64-bit numbers of what this code stores in 32 bits",
+    "jax_disable_jit": "training steps give their buffers away, which only compiled programs can do",
+}
+"""Settings of JAX that no experiment runs with, and the reason."""
+
+HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
+"""Flags of XLA that change no result."""
+
+
+def require_supported() -> None:
+    """Refuse settings that no experiment runs with.
+
+    Raises:
+      ConfigurationError: one of them is on.
+    """
+    for name, why in UNSUPPORTED.items():
+        if jax.config.values[name]:
+            raise ConfigurationError(f"{name} is True: must be False, since {why}; unset {name.upper()}")
+
+
+def settings() -> dict[str, Any]:
+    """The settings of JAX and the flags of XLA that change results."""
+    flags = sorted(flag for flag in os.environ.get(FLAGS, "").split() if not flag.startswith(HARMLESS))
+    return {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
+
+
+def require_same(before: Mapping[str, Any] | None, where: object) -> None:
+    """Refuse to continue a run under other settings than those that it began with.
+
+    Args:
+      before: the settings in its `config.json`; `None` for a run of an earlier version, which recorded none.
+      where: its directory.
+
+    Raises:
+      ConfigurationError: they differ.
+    """
+    found = () if before is None else changed(before, settings())
+    if found:
+        raise ConfigurationError(
+            f"{where} cannot be continued to the same bits: {'; '.join(found)}; set them as they were, or start a new "
+            "run with --fresh"
+        )
+
+
+def machine() -> dict[str, str]:
+    """The kinds of device and of processor."""
+    return {"device": jax.default_backend(), "processor": processor()}
+
+
+def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, ...]:
+    """What differs between two mappings, each as "NAME was A and is B"."""
+    names = sorted(before.keys() | now.keys())
+    return tuple(f"{n} was {before.get(n)!r} and is {now.get(n)!r}" for n in names if before.get(n) != now.get(n))

@@ -1,0 +1,145 @@
+"""Single bits flipped at random in the files of a run and of its cache: each is found where its file is read, or
+changes nothing.
+
+A file is read as a session reads it, by the function that does; whole sessions with a flipped bit are in
+`damaged_files`.
+"""
+
+import dataclasses
+import hashlib
+import re
+import shutil
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.core.artifacts import DamagedFileError, read_json
+from experiments.core.context import Context, MetricLog, read_metrics
+from experiments.core.runs import read_description
+from experiments.faults.fixtures import flip_bit
+from experiments.study.cache import read_policy
+from experiments.study.study import load_answers
+from sensors_io.errors import UserError
+from sensors_io.records import RecordStore
+from touchr1_jax.training.checkpoint import CheckpointError, DamagedCheckpointError, changed_files
+
+FOUND, SAME, WRONG, RAW, UNREAD = "found", "read the same", "WRONG", "RAW ERROR", "never read back"
+READINGS = (FOUND, SAME, UNREAD, WRONG, RAW)
+"""What reading a file with a flipped bit may give: an error that names it, what was written, other content, an error
+that nobody handles; or nothing ever reads the file."""
+
+NAMED = (DamagedFileError, CheckpointError, UserError)
+"""Errors that a session answers by an older checkpoint, by doing the work again, or by their message."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Flip:
+    """One flipped bit: the kind of its file, its place, and what reading gave."""
+
+    file: str
+    bit: int
+    reading: str
+
+
+def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int = 0) -> Iterator[Flip]:
+    """Flip one bit at a time in a copy of a folder: a random bit of a random file.
+
+    Args:
+      root: a run, its cache and its compiled programs.
+      scratch: an empty folder for the copy.
+      context: for progress.
+      count: number of flips.
+      seed: of the choice.
+    """
+    copy = shutil.copytree(root, scratch / "flipped", symlinks=True)
+    files = [p for p in sorted(copy.rglob("*")) if p.is_file() and not p.is_symlink() and p.stat().st_size]
+    rng = np.random.default_rng(seed)
+    for _ in context.each("flipping bits", range(count), still=True):
+        path = files[rng.integers(len(files))]
+        content = path.read_bytes()
+        bit = int(rng.integers(8 * len(content)))
+        yield Flip(file=kind(path.relative_to(copy)), bit=bit, reading=_reading(path, content, bit))
+
+
+def _reading(path: Path, content: bytes, bit: int) -> str:
+    """What reading gives after a flip, which is then taken back."""
+    read = next((read for pattern, read in READERS if re.search(pattern, path.as_posix())), None)
+    if read is None:
+        return UNREAD
+    before = read(path)
+    flip_bit(path, bit)
+    try:
+        return SAME if read(path) == before else WRONG
+    except NAMED:
+        return FOUND
+    except Exception:  # counted as what it is: nothing handles it
+        return RAW
+    finally:
+        path.write_bytes(content)
+
+
+def kind(path: Path) -> str:
+    """A path without the names that differ from run to run."""
+    return re.sub(r"\d{8}-\d{6}|[0-9a-f]{16,}|(?<=[-/])\d+(?=[/.\-])", "…", path.as_posix())
+
+
+def digest(tree: Any) -> str:
+    """SHA-256 of arrays and JSON values."""
+    sum_ = hashlib.sha256()
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        sum_.update(jax.tree_util.keystr(path).encode())
+        sum_.update(leaf.tobytes() if isinstance(leaf, np.ndarray | jax.Array) else repr(leaf).encode())
+    return sum_.hexdigest()
+
+
+def _checkpoint(path: Path) -> str:
+    """The file itself, if the checkpoint that it belongs to counts as whole."""
+    (folder,) = (parent for parent in path.parents if parent.name.isdigit() and (parent / "data").is_dir())
+    changed = changed_files(folder)
+    if changed:
+        raise DamagedCheckpointError(f"{folder}: {changed}")
+    return digest(path.read_bytes())
+
+
+def _log(path: Path) -> str:
+    MetricLog(path).close()  # as a session that continues the run
+    return digest(read_metrics(path.parent))
+
+
+def _answers(path: Path) -> str:
+    answers = load_answers(path)
+    return digest(
+        {f.name: getattr(answers, f.name) for f in dataclasses.fields(answers)} | {"parsed": vars(answers.parsed)}
+    )
+
+
+def _records(path: Path) -> str:
+    store = RecordStore(path.parent)
+    contacts = [{name: vars(s) for name, s in store.contact(i).items()} for i in range(len(store))]
+    cards = {name: vars(card) for name, card in store.objects.items()}
+    return digest([dataclasses.asdict(store.meta), store.complete, cards, contacts])
+
+
+def _program(path: Path) -> str:
+    try:
+        return digest(zlib.decompress(path.read_bytes()))
+    except zlib.error as error:  # JAX then warns, and compiles again
+        raise DamagedFileError(str(error)) from error
+
+
+READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
+    (r"/_CHECKPOINT_METADATA$", lambda path: ""),  # times, on which no state depends
+    (r"/checkpoints/.*/\d+/", _checkpoint),
+    (r"/metrics\.jsonl$", _log),
+    (r"/answers/[^/]*\.npz$", _answers),
+    (r"/(sft|grpo)/[^/]*\.npz$", lambda path: digest(read_policy(path))),
+    (r"/scenes-[^/]*/[^/]*\.(json|arrayrecord)$", _records),
+    (r"/config\.json$", lambda path: digest(read_description(path.parent))),
+    (r"\.json$", lambda path: digest(read_json(path))),
+    (r"-cache$", _program),
+)
+"""Pattern of a path and what reads it; the first that fits counts."""

@@ -1,0 +1,65 @@
+"""Settings that change bits are recorded, compared when a run continues, or refused."""
+
+import jax
+import pytest
+
+from experiments.core import numerics
+from experiments.core.artifacts import read_json
+from experiments.core.errors import ConfigurationError
+from experiments.core.runner import main
+from touchr1_jax.training.compilation import FLAGS
+
+FAKES = "tests.experiments.fakes"
+
+
+@pytest.mark.parametrize(
+    ("flags", "kept"),
+    [
+        ("--xla_cpu_enable_fast_math=true --xla_cpu_max_isa=SSE4_2", 2),
+        ("--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0", 2),
+        ("--xla_force_host_platform_device_count=8 --xla_dump_to=/tmp/x", 0),
+    ],
+)
+def test_flags_that_change_results_are_settings(monkeypatch, flags, kept):
+    monkeypatch.setenv(FLAGS, "")
+    before = numerics.settings()
+    monkeypatch.setenv(FLAGS, flags)
+    assert len(numerics.settings()[FLAGS]) == kept
+    assert bool(numerics.changed(before, numerics.settings())) == bool(kept)
+    numerics.require_same(None, "a run of an earlier version")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("jax_default_matmul_precision", "float32"),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_threefry_partitionable", None),
+    ],
+)
+def test_a_run_is_not_continued_under_other_settings(tmp_path, capsys, name, value):
+    order = ["coin", "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "data"), "--scale", "smoke"]
+    assert main(order, package=FAKES) == 0
+    (tmp_path / "coin" / "latest" / "results.json").unlink()
+    assert read_json(tmp_path / "coin" / "latest" / "config.json")["settings"] == numerics.settings()
+    before = jax.config.values[name]
+    jax.config.update(name, not before if value is None else value)
+    try:
+        assert main(order, package=FAKES) == 1
+    finally:
+        jax.config.update(name, before)
+    assert f"{name} was" in capsys.readouterr().err
+    assert main(order, package=FAKES) == 0
+
+
+@pytest.mark.parametrize("name", ["jax_enable_x64", "jax_disable_jit"])
+def test_settings_that_no_experiment_runs_with_are_refused(tmp_path, capsys, name):
+    jax.config.update(name, True)
+    try:
+        with pytest.raises(ConfigurationError, match=f"unset {name.upper()}"):
+            numerics.require_supported()
+        assert main(["coin", "--runs-dir", str(tmp_path)], package=FAKES) == 1
+    finally:
+        jax.config.update(name, False)
+    assert f"{name} is True: must be False" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
