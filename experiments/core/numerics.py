@@ -72,6 +72,6 @@ def machine() -> dict[str, str]:
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, ...]:
-    """What differs between two mappings, each as "NAME was A and is B"."""
+    """Differences between two mappings, each as "NAME was A and is B"."""
     names = sorted(before.keys() | now.keys())
     return tuple(f"{n} was {before.get(n)!r} and is {now.get(n)!r}" for n in names if before.get(n) != now.get(n))

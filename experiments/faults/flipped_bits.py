@@ -66,7 +66,7 @@ def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int
 
 
 def _reading(path: Path, content: bytes, bit: int) -> str:
-    """What reading gives after a flip, which is then taken back."""
+    """Read a file with a flipped bit, which is then taken back."""
     read = next((read for pattern, read in READERS if re.search(pattern, path.as_posix())), None)
     if read is None:
         return UNREAD

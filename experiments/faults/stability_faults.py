@@ -303,7 +303,7 @@ def damage_table(damage: Sequence[Damage]) -> Table:
 
 
 def flip_table(flips: Sequence[Flip]) -> Table:
-    """What reading gave, by kind of file."""
+    """Readings by kind of file."""
     by_kind: dict[str, list[Flip]] = {}
     for one in sorted(flips, key=lambda flip: flip.file):
         by_kind.setdefault(one.file, []).append(one)

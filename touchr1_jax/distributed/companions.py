@@ -154,7 +154,7 @@ def watched(count: int, index: int, about: Mapping[str, Any], fate: Callable[[],
 
 
 def different(here: Any, there: Any, name: str = "") -> list[str]:
-    """What differs between two values in JSON's types, each as "NAME is A here and B there"."""
+    """Differences between two values in JSON's types, each as "NAME is A here and B there"."""
     if isinstance(here, Mapping) and isinstance(there, Mapping):
         keys = sorted(here.keys() | there.keys())
         return [line for k in keys for line in different(here.get(k), there.get(k), f"{name}.{k}".lstrip("."))]
