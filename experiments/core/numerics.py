@@ -1,4 +1,4 @@
-"""What the bits of a result depend on besides configuration and code: settings of JAX and XLA, device, processor.
+"""Settings that the bits of a result depend on besides configuration and code: JAX, XLA, device, processor.
 
 Cores, threads and thread pools change no bit.  The number of devices does; the cache of policies counts the mesh.
 """
