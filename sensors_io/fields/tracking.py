@@ -34,6 +34,7 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)  # the affin
 _BACK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 5, 0.03)
 _PIECES = 3  # that are tried as the one that is right
 _RINGS = 12  # that grow around a piece at most
+_NEARLY_ALL = 0.9  # share of the most points that any start leaves whole
 _SAMPLED_PX = 4  # of which exposure is told: every so many along both axes
 _LIGHT_OF_CONTACT = 0.1  # relative change of the median that a contact's own shading may make
 
@@ -135,7 +136,7 @@ class Tracker:
         points, found = self._forth(picture, self._last)
         reseeded = gap or self._failed(points, found)
         if reseeded:
-            points, found = self._recovered(picture, points, found)
+            points, found = self._recovered(picture, points, found, gap)
         points, found = self._gated(picture, points, found)
         self._last = self._completed(points, found)
         return Tracked(points_px=self._last, found=found, reseeded=reseeded)
@@ -187,9 +188,14 @@ class Tracker:
             np.mean(~found) > self._config.reseed_share or self._neighbours.torn(moved, found, self._config.strain)
         )
 
-    def _recovered(self, picture: np.ndarray, points: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _recovered(
+        self, picture: np.ndarray, points: np.ndarray, found: np.ndarray, gap: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The start that leaves most points whole, of those grown from every large piece of two fields: the present
         one and that of dense flow.
+
+        A regular lattice moved by a whole pitch looks the same.  Unless frames are missing, a start near the last
+        picture therefore comes first if it leaves nearly as many points whole.
         """
         flow = self._flow.calc(self._reference, picture, None)  # type: ignore[call-overload]
         at_points = cv2.remap(flow, self._start[:, :1], self._start[:, 1:], cv2.INTER_LINEAR)[:, 0]
@@ -197,7 +203,14 @@ class Tracker:
         grown = [g for field in fields for g in self._grown(picture, *field)]
         if not grown:
             return points, found
-        return max(grown, key=lambda g: (g[1].sum(), -self.spline.bending(g[0] - self._start, g[1])))
+        most = max(found.sum() for _, found in grown)
+        near = [g for g in grown if not gap and self._is_near(*g) and g[1].sum() >= _NEARLY_ALL * most]
+        return max(near or grown, key=lambda g: (g[1].sum(), -self.spline.bending(g[0] - self._start, g[1])))
+
+    def _is_near(self, points: np.ndarray, found: np.ndarray) -> bool:
+        """True if the points moved by less than half a pitch since the last picture, by their median."""
+        step = np.hypot(*(points - self._last)[found].T)
+        return bool(np.median(step) < self.spline.pitch_px / 2)
 
     def _grown(
         self, picture: np.ndarray, points: np.ndarray, found: np.ndarray
