@@ -7,9 +7,9 @@ Three arms of GRPO start from the same SFT checkpoint of each seed and see the s
 differ in the reward alone.  `zero_one` pays 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
 published consistency term.  `debiased` subtracts from the ordinal credit what a constant answer would earn, so that no
 level is favoured, and pays for consistency only where the answer is right.  All pay −0.1 for an answer that cannot be
-parsed.
+parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).
 
-Cost: 17 to 25 minutes on two cores with five seeds; `--scale smoke` under two.
+Cost: about 20 minutes on two cores with five seeds; `--scale smoke` under two.
 
 Expected: ordinal credit pays the middle level for being near everything (answering the middle beats answering low as
 soon as p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`; a lower ordinal

@@ -4,16 +4,18 @@
 
 The bench's questions (see `dataset_card`) about the test objects of a study: properties of a touch, several at once,
 comparisons and orders, single sensors, and objects that look like others.  Answered by the full model (published
-rewards and grounding), by SFT alone, and by baselines: constants, the measured force, the picture alone by a probe and
-by a policy that was trained without touch, the nearest training contacts by their fields, a linear probe on the encoder
-of SFT, and the same probe when every contact has another object's touch.  Policies and baselines answer about one touch
-at a time; comparisons follow from these answers (see `experiments.paper.bench_scores`).
+rewards and grounding), by SFT alone, by SFT continued for as many seconds as GRPO takes, and by baselines: constants,
+the measured force, the picture alone by a probe and by a policy that was trained without touch, the nearest training
+contacts by their fields, a linear probe on the encoder of SFT, and the same probe when every contact has another
+object's touch.  Policies and baselines answer about one touch at a time; comparisons follow from these answers (see
+`experiments.paper.bench_scores`).
 
-Cost: some 36 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
+Cost: some 30 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
-Expected: touch is worth thirty points over every baseline without it; a linear probe on its own encoder does as well.
-Baselines without touch stay near chance in comparisons.  A constant already has an average of about 28.
+Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT reads as much as a
+linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch
+stay near chance in comparisons.  A constant already has an average of about 28.
 """
 
 import dataclasses

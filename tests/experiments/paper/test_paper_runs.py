@@ -182,11 +182,14 @@ def test_the_main_table_has_every_baseline(run):
     assert set(results["baselines"]) == {*main_table.TOUCHLESS, "encoder_probe", "nearest_fields"}
     for row in {**results["arms"], **results["baselines"]}.values():
         assert {"h_acc", "omae", "l2_em", "csc"} <= set(row)  # a single pair has no interval
-    comparison, pooled, reliability, kinds, differences = (table["rows"] for table in results["tables"])
+    comparison, pooled, reliability, seconds, kinds, differences = (table["rows"] for table in results["tables"])
     assert comparison[-1][1:5] == [76.8, 68.4, 65.1, 74.6]
     assert [row[2] for row in kinds] == [8, 3, 2, 8]
-    assert [row[0] for row in pooled][:2] == [*CONTROLS, "full"]
-    assert {row[0].split(":")[0] for row in reliability} == {"sft", "full"}
+    assert [row[0] for row in pooled][:3] == [*CONTROLS, "full"]
+    assert {row[0].split(":")[0] for row in reliability} == {*CONTROLS, "full"}
+    assert {row[0] for row in seconds} >= {"sft_continued", "full"}
+    compared = {(c["arm"], c["against"]) for c in results["comparisons"]}
+    assert compared == {("full", "sft"), ("full", "sft_continued"), ("sft", "encoder_probe")}
     assert len(differences) > 3
     assert results["requirements"][0]["met"]
 
@@ -195,15 +198,15 @@ def test_the_main_table_has_every_baseline(run):
 def test_the_ladder_has_every_arm_and_the_papers_rows(run):
     directory, results = run(ablation_cumulative, STUDY)
     names = [c.added.name for c in COMPONENTS]
-    assert list(results["arms"]) == names
+    assert list(results["arms"]) == [*CONTROLS, *names[1:]]
     assert "untrained" in results["baselines"]
-    ladder, effects, attributes, pooled, reliability, _ = (table["rows"] for table in results["tables"])
+    ladder, effects, attributes, pooled, reliability, *_ = (table["rows"] for table in results["tables"])
     assert [row[0] for row in ladder] == [BASE, *names] == [row[0] for row in attributes]
     assert ladder[3][3] == 0.31
     assert len(effects) == 3 * len(names)
     assert {row[7] for row in effects} <= {"reproduced", "opposite", "undecided", "not in the paper"}
-    assert [row[0] for row in pooled] == names
-    assert len(reliability) == 9 * len(names)
+    assert [row[0] for row in pooled] == [*CONTROLS, *names[1:]]
+    assert len(reliability) == 9 * (len(names) + 1)
     assert len(results["requirements"]) == 3
     assert (directory / "plots" / "changes.svg").exists()
 
@@ -212,17 +215,18 @@ def test_the_ladder_has_every_arm_and_the_papers_rows(run):
 def test_every_component_is_left_out(run):
     _, results = run(ablation_leave_one_out, STUDY)
     names = [c.omitted.name for c in COMPONENTS]
-    assert set(results["arms"]) == {"sft", "full", *names}
+    assert set(results["arms"]) == {*CONTROLS, "full", *names}
     assert len(results["tables"][0]["rows"]) == 3 * len(names)
 
 
 @pytest.mark.slow
 def test_conflict_evaluates_with_and_without_touch(run):
     directory, results = run(conflict, STUDY)
-    contrasts, gains, _ = (table["rows"] for table in results["tables"])
+    contrasts, gains, *_ = (table["rows"] for table in results["tables"])
     assert contrasts[0][0] == "all questions"
     assert gains[0][0] == "full, all"
     assert results["requirements"][-1]["name"] == "least gain from touch, all questions"
+    assert {(c["arm"], c["against"]) for c in results["comparisons"]} == {("full", "sft_continued")}
     assert len(list((directory / "answers").glob("*-under-*.npz"))) == 2 * 2 * 4
 
 

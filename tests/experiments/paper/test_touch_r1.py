@@ -16,7 +16,7 @@ from experiments.core.results import Estimate
 from experiments.core.runner import main
 from experiments.paper.touch_r1 import ARM, DEFAULT, DRAWN, SMALL, SMOKE, TAUGHT, WRITTEN, ZERO, verdict
 from experiments.study.stages import StudySFT
-from experiments.study.study import BLIND, SFT
+from experiments.study.study import BLIND, CONTINUED, SFT
 from tests.experiments.shrunk import only_run
 from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.load import Load
@@ -61,7 +61,7 @@ def test_a_folder_without_weights_is_named_before_data_are_made(tmp_path, capsys
 @pytest.mark.parametrize(("config", "first"), [(SMOKE, DRAWN), (SMALL, TAUGHT)])
 def test_a_verdict_says_what_its_figures_are_of(config, first):
     half = Estimate(mean=50.0, ci95=(40.0, 60.0), per_seed=(50.0,))
-    rows = {name: {"acc": half} for name in (ZERO, SFT, ARM, BLIND, "constant")}
+    rows = {name: {"acc": half} for name in (ZERO, SFT, CONTINUED, ARM, BLIND, "constant")}
     assert verdict(config, rows, None)[0] == first
     assert DRAWN not in (said := verdict(dataclasses.replace(config, weights=Path("released")), rows, None))
     assert TAUGHT not in said
@@ -83,7 +83,7 @@ def whole(tmp_path_factory):
 def test_the_smoke_run_trains_scores_and_writes(whole):
     directory = only_run(whole / "runs", "touch_r1")
     results = read_json(directory / "results.json")
-    assert list(results["arms"]) == ["sft", ARM]
+    assert list(results["arms"]) == ["sft", "sft_continued", ARM]
     assert list(results["baselines"])[:2] == [ZERO, "tactile_blind"]
     assert {"acc", "omae", "csc", "mat_acc", "parse_rate", "reward"} <= set(results["arms"][ARM])
     assert "csc" not in results["baselines"][ZERO]
@@ -91,19 +91,19 @@ def test_the_smoke_run_trains_scores_and_writes(whole):
     same, kept = results["requirements"]
     assert same["measured"] == 0
     assert -0.1 < kept["measured"] < 1.1
-    assert len(results["tables"]) == 4
-    stages = ("sft/0", f"grpo/{ARM}/0", "blind/0")
+    assert {"Decision rules", "Seconds of training"} <= {table["title"] for table in results["tables"]}
+    stages = ("sft/0", "decoder/sft/0", "decoder/sft_continued/0", f"grpo/{ARM}/0", "blind/0")
     assert {f"{what}/{stage}" for what in (STEPPING, WAITING) for stage in stages} <= set(results["timing"])
     assert results["settings"]["weights"] == "tiny, bfloat16"
     assert Load(directory=directory / "weights" / "0").run() == 0
     assert (directory / "report.html").exists()
     said = [f"{ARM}-under-{control}" for control in CONTROLS]
     names = {path.stem for path in (directory / "answers").glob("*.npz")}
-    assert names == {f"{name}-0" for name in ("sft", ARM, "tactile_blind", ZERO, WRITTEN, *said)}
+    assert names == {f"{name}-0" for name in ("sft", "sft_continued", ARM, "tactile_blind", ZERO, WRITTEN, *said)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("where", [("sft/0", 5), (f"grpo/{ARM}/0", 2)])
+@pytest.mark.parametrize("where", [("sft/0", 5), ("decoder/sft/0", 2), (f"grpo/{ARM}/0", 2)])
 def test_a_stopped_run_ends_in_the_same_bits(whole, tmp_path, monkeypatch, where):
     log = Context.log
 

@@ -10,11 +10,15 @@ from rich.console import Console
 from experiments.core.context import Context, read_metrics
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import ProbeFeatures, StudySFT, gather_evidence, make_arm, run_sft
+from experiments.study.study import StudySeed, make_study_arm
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.feeds import AnswerFeed, encoded_clips
 from touchr1_jax.training.linear_probe import ProbeConfig
-from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.loop import Hooks, LoopConfig
+from touchr1_jax.training.train_sft import train_sft
 
 PROBE = ProbeConfig(folds=2, iterations=4)
 CONFIG = StudySFT(steps=3, batch_size=4)
@@ -108,6 +112,49 @@ def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest_also_from_
 def test_a_curriculum_is_a_share_of_the_steps(train, padded):
     """Here of all of them: it learns from other questions."""
     assert train(curriculum=1.0)[1][0] != padded[1][0]
+
+
+def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(policy, data, params, tmp_path):
+    """Scores fall after the first of two checkpoints; adapters are merged before a policy is scored."""
+    rows = data.parts["sft"]
+    evidence = np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
+    for rank in (0, 2):
+        config = dataclasses.replace(tiny.STUDY.decoder, steps=2, save_every=1, lora_rank=rank)
+        order, scores, scored = {"batch_size": config.batch_size, "seed": 0}, iter([2.0, 1.0]), []
+        clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], **order)
+        feed = AnswerFeed(policy, clips, evidence, questions=config.questions, **order)
+
+        def held_out(found, scores=scores, scored=scored):
+            scored.append(jax.tree.map(np.asarray, found))
+            return next(scores)
+
+        with Checkpoints(tmp_path / str(rank), better="higher") as checkpoints:
+            hooks = Hooks(checkpoints=checkpoints)
+            found = train_sft(policy, params, feed, config, hooks, decoder_only=True, held_out=held_out)
+        jax.tree.map(np.testing.assert_array_equal, found, scored[0])
+        for name in set(params) - {"decoder"}:
+            jax.tree.map(np.testing.assert_array_equal, found[name], params[name])
+        moved = [tree["decoder"]["layers_0"]["q_proj"]["kernel"] for tree in (params, *scored)]
+        assert np.any(moved[0] != moved[1])
+        assert np.any(moved[1] != moved[2])
+
+
+def test_the_best_point_needs_checkpoints(policy, params):
+    with pytest.raises(ValueError, match=r"hooks\.checkpoints is None"):
+        train_sft(policy, params, iter(()), CONFIG, held_out=lambda found: 0.0)
+
+
+@pytest.mark.parametrize(("recipe", "anchor", "parts"), [("touch", 1.0, ("sft", "grpo")), ("paper", 0.0, ("grpo",))])
+def test_one_word_chooses_the_recipe(policy, data, params, context, recipe, anchor, parts):
+    config = dataclasses.replace(tiny.STUDY, recipe=recipe)
+    evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
+    seed = StudySeed(config=config, data=data, policy=policy, evidence=evidence, context=context, seed=0)
+    contacts = seed.contacts(params)
+    rows = np.concatenate([data.parts[part] for part in parts])
+    np.testing.assert_array_equal(contacts.truth, data.label[rows])
+    assert (contacts.label[:, 3] == -1).all() == (recipe == "paper")
+    arm = make_study_arm(config, policy, PUBLISHED, data.prior(), config.grpo.algorithm)
+    assert arm.config.algorithm.anchor == anchor
 
 
 @pytest.mark.parametrize(
