@@ -70,9 +70,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             f"{len(items):,} questions about {len(shown)} objects that no training contact shows pass all "
             f"{len(checks)} checks; the rules removed {len(found.removed)}.",
             f"Of {len(sound)} items with a planted error each rule finds at least {least:.1f} %.",
-            f"In {100 * share_at_odds(items):.0f} % of the questions the sensors' numbers, each read by its "
-            "thresholds, do not give the answer: these questions stay, or the bench would hold only what a threshold "
-            "can answer.",
+            f"In {100 * share_at_odds(items):.0f} % of them a threshold on each number does not give the answer.",
         ),
         requirements=(
             at_least("questions", len(items), config.quota.total, note="of the quota"),

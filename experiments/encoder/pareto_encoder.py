@@ -27,15 +27,16 @@ from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
-from experiments.encoder.held_out import (
+from experiments.encoder.pretrain import (
     StageOneDataConfig,
+    clip_of,
     held_out_contacts,
     open_touch,
     points,
+    pretrain,
     probe_encoder,
     training_rows,
 )
-from experiments.encoder.pretrain import PretrainConfig, clip_of, pretrain
 from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
 from experiments.study.dataset import Dataset
@@ -44,6 +45,7 @@ from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.pretraining import PretrainConfig
 from touchr1_jax.types import Params, TouchBatch
 
 SEED = 0

@@ -1,4 +1,7 @@
-"""Stage 1 as a stage of a run: pretraining with held-out skill and probes on the way, and the resulting encoder."""
+"""Stage 1 as a stage of a run: its recordings, pretraining, and measurements on held-out contacts on the way.
+
+The scenes differ from those of the later stages, and are split by object.
+"""
 
 import dataclasses
 import functools
@@ -6,50 +9,134 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
-from experiments.encoder.held_out import HeldOutContacts, assess
+from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
-from touchr1_jax.models.predictor import PredictorConfig
-from touchr1_jax.models.pretrained import PretrainedEncoder
-from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.training.dynamics import (
-    DynamicsConfig,
-    DynamicsState,
-    DynamicsStep,
-    Guards,
-    make_dynamics_step,
-    start_dynamics,
-)
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import ATTRIBUTES, Flag
+from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+from touchr1_jax.training import pretraining
+from touchr1_jax.training.dynamics import DynamicsConfig, DynamicsState, encode_each, read_frames, steps_of
 from touchr1_jax.training.feeds import Feed, host_touch, touch_batch
-from touchr1_jax.training.latent_probes import collapse_alarms
+from touchr1_jax.training.latent_probes import collapse_alarms, contact_features, probe_right
+from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
-from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
-from touchr1_jax.types import TouchBatch
+from touchr1_jax.training.pretraining import Encode, EncoderAssessment, PretrainConfig, dynamics_program
+from touchr1_jax.types import Params, TouchBatch
+
+BATCH = 32
+"""Contacts that are encoded at once."""
+
+RESAMPLES = 2000
+"""Resamples of each interval: the error of its ends is about a tenth of its width."""
+
+STAGE_ONE_SEED = 1
+"""Seed of the scenes of stage 1: its objects differ from those of seed 0, on which later stages train and test."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PretrainConfig:
-    """Stage 1; the learning rate is the paper's 1e-5 times `lr_scale`, `encoder.sensors` is set by the data."""
+class StageOneDataConfig(SourceConfig):
+    """The recordings, and the largest number of labelled contacts to fit the probes on."""
 
-    encoder: TactileViTConfig = TactileViTConfig(sensors=0, causal=True)
-    predictor: PredictorConfig = PredictorConfig()
-    frames: int = 4
-    frames_kept: int | None = None
-    """Number of these frames that are read, the most salient ones; all by default."""
-    image_px: int = 112
-    steps: int = 450
-    batch_size: int = 32
-    probe_every: int = 150
-    """Steps between held-out measurements, and between checkpoints."""
-    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
+    scenes: SceneConfig = SceneConfig(objects=2400, sites=1, seed=STAGE_ONE_SEED)
+    probe_fit: int = 1680
+    probe: ProbeConfig = ProbeConfig()
 
-    def dynamics(self, sensors: int) -> DynamicsConfig:
-        """The networks for this number of streams."""
-        encoder = dataclasses.replace(self.encoder, sensors=sensors)
-        return DynamicsConfig(encoder=encoder, predictor=self.predictor, frames_kept=self.frames_kept)
+
+def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
+    """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
+    clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
+    return open_dataset(prepare_records(config, context), clip, grpo_share=0.5)
+
+
+def training_rows(data: Dataset) -> np.ndarray:
+    """Contacts of all training objects, ascending; all are used, since no later stage shares these scenes."""
+    return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HeldOutContacts:
+    """Contacts to measure on: probes are fitted on `fit_rows`, everything is measured on `read_rows`.
+
+    `label` int32 [contact, A] is of the whole store.
+    """
+
+    store: Contacts
+    clip: ClipConfig
+    fit_rows: np.ndarray
+    read_rows: np.ndarray
+    label: np.ndarray
+    probe: ProbeConfig
+
+    @property
+    def rows(self) -> np.ndarray:
+        """All contacts, those to fit on first, [fit + read]."""
+        return np.concatenate([self.fit_rows, self.read_rows])
+
+    @property
+    def fitted(self) -> np.ndarray:
+        """True for the rows to fit on, bool [fit + read]."""
+        return np.arange(len(self.rows)) < len(self.fit_rows)
+
+    def probe_right(self, latent: np.ndarray, exists: np.ndarray) -> np.ndarray:
+        """True where a linear probe on the latents of all contacts is right, bool [read, 3]."""
+        label = self.label[self.rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
+        return probe_right(np.asarray(contact_features(latent, exists)), label, self.fitted, self.probe)
+
+    def encode(self, encode: Encode, context: Context) -> dict[str, np.ndarray]:
+        """Results of all rows on the host, in their order; every call has the same number of contacts."""
+        rows, parts = self.rows, []
+        padded = rows[np.minimum(np.arange(-(-len(rows) // BATCH) * BATCH), len(rows) - 1)]
+        order: dict[str, Any] = {"batch_size": BATCH, "seed": 0, "shuffle": False, "repeat": False}
+        with context.progress("encoding", len(padded)) as advance:
+            for element in clip_batches(self.store, padded, self.clip, **order):
+                parts.append(jax.device_get(encode(touch_batch(element))))
+                advance(BATCH)
+        return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
+
+
+def held_out_contacts(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
+    """Contacts of a part ("val" for choosing, "test" for reporting) to measure on, and training contacts to fit on.
+
+    `fit` is another number of contacts to fit on than the configured one.
+    """
+    return HeldOutContacts(
+        store=data.store,
+        clip=data.clip,
+        fit_rows=training_rows(data)[: config.probe_fit if fit is None else fit],
+        read_rows=data.parts[part],
+        label=data.label,
+        probe=config.probe,
+    )
+
+
+def assess(
+    networks: DynamicsConfig, state: DynamicsState, held_out: HeldOutContacts, context: Context
+) -> EncoderAssessment:
+    """Measure the averaged encoder and the predictor on held-out contacts."""
+    encode_all = lambda encode: held_out.encode(encode, context)
+    return pretraining.assess(networks, state, encode_all, held_out.fitted, held_out.probe_right)
+
+
+def probe_encoder(networks: DynamicsConfig, encoder: Params, held_out: HeldOutContacts, context: Context) -> np.ndarray:
+    """True where the probes on an encoder alone are right, bool [read, 3]."""
+
+    def encode(batch: TouchBatch) -> dict[str, Any]:
+        batch = read_frames(networks, batch)
+        exists = steps_of(batch, networks.encoder.frames_per_step).exists
+        return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
+
+    return held_out.probe_right(**held_out.encode(jax.jit(encode), context))
+
+
+def points(values: np.ndarray, objects: np.ndarray) -> Interval:
+    """Mean in points of values [n] or [n, A] of n contacts, with an interval over objects [n]."""
+    clusters = np.repeat(objects, values[0].size)
+    return clustered_bootstrap(100.0 * values.astype(float).ravel(), clusters, resamples=RESAMPLES)
 
 
 class ClipFeed(Feed):
@@ -104,32 +191,10 @@ def pretrain(
     return state
 
 
-def encoder_of(
-    config: PretrainConfig, state: DynamicsState, sensors: tuple[str, ...], **notes: Any
-) -> PretrainedEncoder:
-    """The averaged encoder, from which other studies start."""
-    encoder = dataclasses.replace(config.encoder, sensors=len(sensors))
-    return PretrainedEncoder(config=encoder, sensors=sensors, params=jax.device_get(state.target), notes=notes)
-
-
 def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: ClipConfig, seed: int) -> DynamicsState:
-    """The state before training; its target is an untrained encoder."""
-    networks = config.dynamics(len(clip.sensors))
-    optimizer, _ = dynamics_program(networks, config.optimizer, config.steps)
+    """The state before training on some contacts."""
     one = next(iter(clip_batches(store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
-    start = jax.jit(lambda key, batch: start_dynamics(networks, optimizer, key, batch))
-    # committed to the device, as a restored state is: otherwise the step would be compiled twice
-    state: DynamicsState = jax.device_put(start(jax.random.key(seed), touch_batch(one)), jax.devices()[0])
-    return state
-
-
-@functools.cache
-def dynamics_program(
-    networks: DynamicsConfig, optimizer: OptimizerConfig, steps: int
-) -> tuple[optax.GradientTransformation, DynamicsStep]:
-    """Optimizer and compiled step with all guards against collapse, made once for all seeds."""
-    made = make_optimizer(optimizer, steps)
-    return made, make_dynamics_step(networks, made, Guards())
+    return pretraining.untrained(config, touch_batch(one), seed)
 
 
 def _measure(

@@ -5,17 +5,15 @@
 
 Stage 1: a causal tactile encoder and a predictor learn the dynamics of presses by four sensors, on objects that no
 later stage uses.  Measured on objects that neither training nor probes have used: the skill of the predicted latents
-over copying the last one, and linear probes for hardness, roughness and protrusion, compared with the same probes on
-the untrained encoder.  The averaged encoder is written to the run as `encoder.npz`.
+over copying the last one, and linear probes compared with those on the untrained encoder.  The averaged encoder is
+written to the run as `encoder.npz`.
 
 Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
 
-Expected: a skill near .5, since most of the changes up to the next level of force are predictable.  The skill over each
-step's mean latent, which knows the force but not the object, says more: .4.  A random encoder is hard to beat: it
-computes the energies of its filters by design, and probes read seven labels in ten from them, as from fixed statistics
-of the pictures; the same network trained with the labels of 1,200 contacts gains two points.  Prediction first improves
-hardness, which is dynamics, and makes texture and shape, which are not, worse throughout: at the end three points are
-lost.
+Expected: a skill near .5 over copying, .4 over each step's mean latent, which knows the force but not the object.  A
+random encoder is hard to beat: it computes the energies of its filters by design, and probes read seven labels in ten
+from them.  Prediction first improves hardness, which is dynamics, and makes texture and shape worse throughout: at the
+end three points are lost.
 """
 
 import dataclasses
@@ -30,19 +28,21 @@ from experiments.core.context import Context, read_metrics
 from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.held_out import (
-    EncoderAssessment,
+from experiments.encoder.pretrain import (
     StageOneDataConfig,
     assess,
+    clip_of,
     held_out_contacts,
     open_touch,
     points,
-    skill,
+    pretrain,
     training_rows,
+    untrained,
 )
-from experiments.encoder.pretrain import PretrainConfig, clip_of, encoder_of, pretrain, untrained
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.bench.statistics import skill
+from touchr1_jax.training.pretraining import EncoderAssessment, PretrainConfig, encoder_of
 
 SEED = 0
 LEAST_SKILL, LEAST_LEAD = 0.2, 15.0  # over copy-last; points over the random encoder

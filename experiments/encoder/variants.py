@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-from experiments.encoder.pretrain import PretrainConfig
 from sensors_io.pipeline import Contacts
 from sensors_io.schema import ContactKey, ObjectCard, Sequence
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.training.pretraining import PretrainConfig
 
 FRAMES, IMAGE_PX = 8, 112
 REFERENCE = "256 tokens"

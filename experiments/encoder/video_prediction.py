@@ -30,13 +30,12 @@ from experiments.core.pictures import image_grid
 from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.held_out import StageOneDataConfig, open_touch, skill, training_rows
-from experiments.encoder.pretrain import ClipFeed
+from experiments.encoder.pretrain import ClipFeed, StageOneDataConfig, open_touch, training_rows
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.image_similarity import check_weights, lpips, ssim
-from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.bench.statistics import Interval, skill
 from touchr1_jax.models.frame_decoder import FrameDecoderConfig
 from touchr1_jax.models.predictor import layer_norm
 from touchr1_jax.models.pretrained import PretrainedEncoder, load_encoder

@@ -29,7 +29,7 @@ from experiments.core.context import Context
 from experiments.core.loops import STEPPING, WAITING
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.pretrain import PretrainConfig, pretrain
+from experiments.encoder.pretrain import pretrain
 from experiments.faults.bad_inputs import cases, provoke
 from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
 from experiments.faults.digests import differences, digests
@@ -54,6 +54,7 @@ from experiments.study.study import StudyConfig, open_study_data
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.pretraining import PretrainConfig
 
 MOST_WAITING = 0.02  # share of a step that may wait for data
 KILLS = 200  # kills that training must survive

@@ -2,23 +2,20 @@
 
     python -m experiments identifiability [--scale smoke]
 
-Generated objects are pressed once, 0.3 to 5 N in four frames, by all four sensors.  A linear probe on fixed features of
-a sensor's pictures, fields and force predicts hardness, roughness and protrusion of unseen objects, at several
-multiples of the sensors' noise; it is compared with probes that know the true shape alone, or the measured force alone.
-The accuracy of such a probe is a lower bound of the information in touch.  Then the probe is trained at other tiers of
-the contact ladder, on the same presses with the same noise, and tested on the exact ones.  Friction and elasticity,
-which a press does not show, are predicted from a slide and from a press that is released, both from the protocol.
-Intervals are over objects.
+All four sensors press generated objects once, 0.3 to 5 N in four frames.  A linear probe on fixed features of pictures,
+fields and force predicts hardness, roughness and protrusion of unseen objects at several multiples of the sensors'
+noise, next to probes that know the true shape or the force alone; its accuracy is a lower bound of the information in
+touch.  Then the probe is trained at other tiers of the contact ladder, on the same presses with the same noise, and
+tested on the exact ones.  Friction and elasticity are predicted from a slide and from a press that is released.
 
 Cost: about seven minutes on two cores (`smoke` two minutes on one).
 
-Expected: hardness is predicted far better by touch than by shape or force alone, which stay near guessing; roughness by
-the camera of the GelSight Mini alone; protrusion by all sensors, less well than by its shape.  The generator's grid of
-64² costs a probe less than a point, 24² several, a bed of springs ten.
+Expected: touch predicts hardness far better than shape or force alone, which stay near guessing; roughness by the
+camera of the GelSight Mini alone; protrusion by all sensors.  The generator's grid of 64² costs a probe less than a
+point, 24² several, a bed of springs ten.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from collections.abc import Sequence as Seq
 
 import numpy as np
@@ -189,34 +186,19 @@ def _requirements(config: IdentifiabilityConfig, studied: StudyPredictions) -> t
 
 
 def _verdict(config: IdentifiabilityConfig, studied: StudyPredictions) -> tuple[str, ...]:
-    own, last, hardness = studied.own, len(studied.noise) - 1, STATIC[0]
-    accuracy = studied.accuracy
-    fused = {name: accuracy[name, FUSED, own].mean for name in STATIC}
-    fall = {
-        name: float(
-            np.mean([studied.accuracy[name, s, own].mean - studied.accuracy[name, s, last].mean for s in SENSORS])
-        )
-        for name in STATIC
-    }
-    moved = {key: one.mean for key, one in studied.moved_accuracy.items()}
+    hardness, moved = STATIC[0], studied.moved_accuracy
+    fused = ", ".join(f"{name} {studied.accuracy[name, FUSED, studied.own].mean:.0f} %" for name in STATIC)
     used = [t.name for t in config.solved if t.grid >= config.coarsest_used]
-    tier, name = max(((t, n) for t in used for n in STATIC), key=lambda key: studied.lost[key].mean)
+    lost = max(studied.lost[tier, name].mean for tier in used for name in STATIC)
     return (
-        f"Right answers of all four sensors together about unseen objects: {_listed(fused, '%')}. For {hardness}, true "
-        f"shape alone gives {studied.blind_accuracy[hardness, SHAPE].mean:.0f} %, force alone "
-        f"{studied.blind_accuracy[hardness, FORCE].mean:.0f} %, guessing {CHANCE:.0f} %.",
-        f"Noise ×{studied.noise[last]:g} instead of ×1 costs a sensor {_listed(fall, 'points')}.",
-        "Trained at a tier in use and tested on exact records, a probe loses at most "
-        f"{studied.lost[tier, name].mean:.1f} points ({name}, {tier}); trained on springs, "
+        f"Right answers of all four sensors together about unseen objects: {fused}; guessing {CHANCE:.0f} %. For "
+        f"{hardness}, true shape alone gives {studied.blind_accuracy[hardness, SHAPE].mean:.0f} %, force alone "
+        f"{studied.blind_accuracy[hardness, FORCE].mean:.0f} %.",
+        f"A tier in use costs a probe at most {lost:.1f} points, springs cost "
         f"{studied.lost[studied.springs, hardness].mean:.0f} of {hardness}.",
-        f"Touch without force predicts friction from a slide in {moved['friction', 'slide_x']:.0f} % and from a press "
-        f"in {moved['friction', 'press']:.0f} %, elasticity from a press that is released in "
-        f"{moved['elasticity', 'hold']:.0f} % and from one that is not in {moved['elasticity', 'press']:.0f} %.",
+        f"A slide gives friction in {moved['friction', 'slide_x'].mean:.0f} %, a press that is released elasticity in "
+        f"{moved['elasticity', 'hold'].mean:.0f} %.",
     )
-
-
-def _listed(named: Mapping[str, float], unit: str) -> str:
-    return ", ".join(f"{name} {value:.0f} {unit}" for name, value in named.items())
 
 
 DEFAULT = IdentifiabilityConfig()

@@ -17,14 +17,15 @@ from experiments.core.timing import median_ms
 from experiments.mechanics import tangential_scenes as scenes
 from experiments.mechanics.tangential_methods import dragged
 from sensors_io.scenes import history, tangential
-from sensors_io.scenes.hertz import Hertz, half_space_spectrum
+from sensors_io.scenes.hertz import Hertz
+from sensors_io.scenes.mindlin import FrictionalSphere, half_space
 from sensors_io.scenes.sensors import BODY, SensorModel
 from sensors_io.scenes.traction import Compliance, make_coupling, rigid_field
 
 SIDE_MM, TIGHT = 16.0, 1e-4
-SHEAR_MODULUS_MPA, FRICTION = 0.15, 0.5
-SPHERE = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS_MPA, force_n=2.0)
-"""On a half-space of ν = 0, which is as compliant along as across a wave: both closed forms are then exact."""
+SPHERE = FrictionalSphere(
+    normal=Hertz(radius_mm=8.0, plane_modulus_mpa=0.3, force_n=2.0), shear_modulus_mpa=0.15, friction=0.5
+)
 
 PULL_SHARES = (0.3, 0.6, 0.9)
 STICK_RATIOS = (0.8, 0.5, 0.2)
@@ -56,39 +57,29 @@ def closed_forms(grid: int, context: Context) -> dict[str, float]:
 def cattaneo_mindlin(grid: int, context: Context) -> dict[str, float]:
     """Deviation of the solver from Cattaneo (1938) and Mindlin (1949): the worst over three forces, relative.
 
-        δ = 3μF/(8Ga) [1 − (1 − Q/μF)^⅔],   c = a (1 − Q/μF)^⅓,   τ = μ [p_a(r) − (c/a) p_c(r)]
-
     `slide` is the rigid slide that carries Q, `force` the Q that this slide takes, `traction` the L₂ error of τ.
     """
     x, spacing, limit, compliance = _sphere(grid)
-    radius, most, a = np.hypot(x[None], x[:, None]), FRICTION * SPHERE.force_n, SPHERE.contact_radius_mm
-    still = jnp.zeros((grid, grid), jnp.complex64)
+    radius, still = np.hypot(x[None], x[:, None]), jnp.zeros((grid, grid), jnp.complex64)
     off: dict[str, list[float]] = {"slide": [], "force": [], "traction": []}
     for share in context.each("Cattaneo and Mindlin", PULL_SHARES):
-        slide = 3 * most / (8 * SHEAR_MODULUS_MPA * a) * (1 - (1 - share) ** (2 / 3))
-        stick = a * (1 - share) ** (1 / 3)
-        inner = SPHERE.peak_pressure_mpa * stick / a * np.sqrt(np.maximum(1 - (radius / stick) ** 2, 0))
-        true = FRICTION * (SPHERE.pressure_mpa(radius) - inner)
-        pull = jnp.asarray([share * most, 0.0], jnp.float32)
+        slide, true, force = SPHERE.slide_mm(share), SPHERE.pulled_mpa(share, radius), share * SPHERE.most_n
+        pull = jnp.asarray([force, 0.0], jnp.float32)
         pulled = tangential.solve_force(limit, pull, still, compliance, spacing, TIGHT)
         slid = tangential.solve(limit, still + slide, compliance, None, TIGHT)
         off["slide"].append(abs(complex(pulled.slide_mm) / slide - 1))
-        off["force"].append(abs(complex(jnp.sum(slid.traction_mpa)) * spacing**2 / (share * most) - 1))
+        off["force"].append(abs(complex(jnp.sum(slid.traction_mpa)) * spacing**2 / force - 1))
         off["traction"].append(float(np.linalg.norm(pulled.traction_mpa - true) / np.linalg.norm(true)))
     return {name: max(values) for name, values in off.items()}
 
 
 def lubkin(grid: int, context: Context) -> float:
-    """Deviation of the torque of a twisted sphere from Lubkin (1951): the worst over three twists, relative.
-
-    A stack of twisted punches of radius t (Reissner & Sagoci 1944: torque 16/3 G t³ each) makes τ = μp outside the
-    stick radius c:  θ(c) = 3μF/(4πGa²) [K(k) − E(k)],  k² = 1 − c²/a²;  the torque is ∫ 16/3 G t³ dθ(t).
-    """
+    """Deviation of the torque of a twisted sphere from Lubkin (1951): the worst over three twists, relative."""
     x, spacing, limit, compliance = _sphere(grid)
     axis, still = jnp.asarray(x, jnp.float32), jnp.zeros(2, jnp.float32)
     off = []
     for ratio in context.each("Lubkin", STICK_RATIOS):
-        twist, torque = _lubkin(ratio)
+        twist, torque = SPHERE.twist(ratio)
         solved = tangential.solve(limit, rigid_field(axis, still, twist, still), compliance, None, TIGHT)
         t = np.asarray(solved.traction_mpa, np.complex128)
         off.append(abs(float(np.sum(x[None] * t.imag - x[:, None] * t.real)) * spacing**2 / torque - 1))
@@ -150,7 +141,7 @@ def decision_table(promises: Sequence[PromiseCheck]) -> Table:
 def closed_form_table(errors: Mapping[str, float], grid: int) -> Table:
     """Deviations from all closed forms."""
     return named_table(
-        f"Closed forms at {grid}², {SPHERE.contact_radius_mm / SIDE_MM * grid:.1f} pixels a contact radius",
+        f"Closed forms at {grid}², {SPHERE.normal.contact_radius_mm / SIDE_MM * grid:.1f} pixels a contact radius",
         [{"figure": name, "worst error": 100 * value} for name, value in errors.items()],
         formats={"worst error": ".2f"},
         units={"worst error": "%"},
@@ -159,25 +150,11 @@ def closed_form_table(errors: Mapping[str, float], grid: int) -> Table:
 
 
 def _sphere(grid: int) -> tuple[np.ndarray, float, jnp.ndarray, Compliance]:
-    """Pixel centres, pixel size, μp of the sphere, which carries its force exactly, and the half-space."""
+    """Pixel centres, pixel size, μp of the sphere, and the half-space."""
     spacing = SIDE_MM / grid
     x = (np.arange(grid) + 0.5) * spacing - SIDE_MM / 2
-    p = SPHERE.pressure_mpa(np.hypot(x[None], x[:, None]))
-    limit = FRICTION * p * SPHERE.force_n / (p.sum() * spacing**2)
-    half = half_space_spectrum(grid, spacing, 2 * SHEAR_MODULUS_MPA)
-    mirrored = np.roll(half[::-1], 1, 0)[:, grid - 1 : 0 : -1]
-    even = jnp.asarray(np.concatenate([half, mirrored], 1), jnp.float32)
-    return x, spacing, jnp.asarray(limit, jnp.float32), Compliance(even=even, odd=jnp.zeros_like(even, jnp.complex64))
-
-
-def _lubkin(stick_ratio: float) -> tuple[float, float]:
-    """Twist and torque of the sphere when it sticks within `stick_ratio` of its contact radius."""
-    a, angle = SPHERE.contact_radius_mm, np.linspace(0, np.pi / 2, 4001)
-    ratio = np.linspace(stick_ratio, 1, 400)
-    root = np.sqrt(1 - (1 - ratio[:, None] ** 2) * np.sin(angle) ** 2)
-    scale = 3 * FRICTION * SPHERE.force_n / (4 * np.pi * SHEAR_MODULUS_MPA * a**2)
-    twist = scale * np.trapezoid(1 / root - root, angle, axis=1)
-    return float(twist[0]), float(np.trapezoid(16 / 3 * SHEAR_MODULUS_MPA * (ratio * a) ** 3, -twist))
+    limit = SPHERE.limit_mpa(np.hypot(x[None], x[:, None]), spacing)
+    return x, spacing, jnp.asarray(limit, jnp.float32), half_space(grid, spacing, 2 * SPHERE.shear_modulus_mpa)
 
 
 # Coupling ------------------------------------------------------------------------------------------------------------
@@ -252,19 +229,6 @@ def coupling_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             "not converged": "frames, with coupling",
         },
         note="Of sensors with markers, means over bodies of every kind.  Coupled presses pay for friction in full.",
-    )
-
-
-def coupling_verdict(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Effect and cost of coupling in a sentence."""
-    press, moved = ([row for row in rows if (row["time without"] is None) is still] for still in (True, False))
-    mean = lambda rows: float(np.mean([row["markers"] / 100 for row in rows]))
-    return (
-        f"Coupling changes the markers' sideways displacement by {mean(press):.0%} in a press and {mean(moved):.0%} "
-        f"in a motion, at most {max(row['by'] / row['noise'] for row in rows):.1f} of a node's noise; it adds "
-        f"{float(np.mean([row['time with'] for row in press])):.1f} ms per frame to a press, which needs no friction "
-        "without it, and makes the friction of a motion cost "
-        f"{float(np.mean([row['time with'] / row['time without'] for row in moved])):.1f} times as much."
     )
 
 

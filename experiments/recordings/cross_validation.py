@@ -12,14 +12,14 @@ from jaxtyping import Int
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
-from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.fine_tuning import ReinforceConfig
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_answers
 from experiments.recordings.level_probes import SCENES
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose
+from touchr1_jax.training.description_tuning import ReinforceConfig
 from touchr1_jax.training.kernel_probe import object_weights, standardise
 
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the training objects, that the probes learn from

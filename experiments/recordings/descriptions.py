@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.recordings.description_policy import LANGUAGE
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.importers.keep import ImportSourceError, Skip
@@ -23,6 +22,7 @@ from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.schema import ATTRIBUTES
 from sensors_io.schema import LEVELS as SCENE_LEVELS
 from sensors_io.touches import describe, families, read_touch, touch_of_scene
+from touchr1_jax.models.description_policy import LANGUAGE
 
 VERSION = 1  # raised when a description changes, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists

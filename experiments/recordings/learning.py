@@ -15,9 +15,12 @@ from jaxtyping import Float, Int
 
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
-from experiments.recordings.description_policy import COMBINATIONS, LEVELS, PolicyShape, description_policy
+from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.fine_tuning import (
+from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos
+from sensors_io.importers.keep import ImportSourceError
+from touchr1_jax.models.description_policy import COMBINATIONS, LEVELS, PolicyShape, description_policy
+from touchr1_jax.training.description_tuning import (
     READING,
     Lesson,
     ReinforceConfig,
@@ -27,8 +30,6 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos
-from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.training.kernel_probe import object_weights, standardise
 from touchr1_jax.types import Params
 
@@ -90,11 +91,10 @@ def learn(
         components, _ = principal_components(read, config.components)
         lessons = [_lesson(read.crossed(own), components, training.label, weight) for own in seeds]
         readers = [_reader(config, 1000 + m, context) for m in range(config.members)]
-    members = tune(policy, config.tune, readers, lessons, seeds, context, stage)
-    trained = [
-        reinforce(policy, config.reinforce, params, lesson, own, context, f"grpo/{stage}/{own}")
-        for params, lesson, own in zip(members, lessons, seeds, strict=True)
-    ]
+    trained = _tuned(config, config.tune, readers, lessons, seeds, context, stage)
+    for m, own in enumerate(seeds if config.reinforce.steps else ()):
+        with stage_hooks(context, f"grpo/{stage}/{own}", config.reinforce.steps) as hooks:
+            trained[m] = reinforce(policy, config.reinforce, trained[m], lessons[m], own, hooks)
     params = jax.tree.map(lambda *x: np.stack(x), *jax.device_get(trained))
     return TrainedEnsemble(config=config, params=params, training=training, auxiliary=auxiliary)
 
@@ -104,7 +104,23 @@ def _reader(config: LearnConfig, seed: int, context: Context) -> Params:
     shape, families, components = config.shape, len(config.evidence.families), config.components
     policy, lesson = description_policy(shape), reading_lesson(families, components, READINGS, seed)
     params, stage = policy.fresh(jax.random.key(seed), config.inputs), f"reading/{families}-{components}/{seed}"
-    return tune(policy, config.reading, [params], [lesson], [seed], context, stage)[0]
+    return _tuned(config, config.reading, [params], [lesson], [seed], context, stage)[0]
+
+
+def _tuned(
+    config: LearnConfig,
+    tuning: TuneConfig,
+    members: list[Params],
+    lessons: list[Lesson],
+    seeds: list[int],
+    context: Context,
+    stage: str,
+) -> list[Params]:
+    """The members after a stage of supervised training; 0 steps leave them as they are."""
+    if not tuning.steps:
+        return members
+    with stage_hooks(context, stage, tuning.steps) as hooks:
+        return tune(description_policy(config.shape), tuning, members, lessons, seeds, hooks)
 
 
 def answer_log_probs(trained: TrainedEnsemble, videos: DescribedVideos) -> Float[np.ndarray, "n 27"]:

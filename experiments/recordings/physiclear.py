@@ -31,7 +31,7 @@ from experiments.core.look import PALETTE
 from experiments.core.pictures import heatmaps
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.core.text import bounds
+from experiments.core.text import interval
 from experiments.recordings.cross_validation import (
     CrossValidation,
     agreement,
@@ -42,7 +42,6 @@ from experiments.recordings.cross_validation import (
     objects_for,
     score_table,
 )
-from experiments.recordings.description_policy import LANGUAGE, choose, description_policy
 from experiments.recordings.descriptions import (
     AuxiliaryData,
     DescribedVideos,
@@ -54,6 +53,7 @@ from experiments.recordings.learning import LearnConfig, answer_log_probs, ident
 from experiments.study.levels import confusion_map
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.models.description_policy import LANGUAGE, choose, description_policy
 
 NAMES = ("hardness", "roughness", "bumps")
 """PhysiCLeAR's names of the attributes, in the order of the answers: it calls protrusion bumps."""
@@ -218,19 +218,15 @@ def verdict(
     main: Mapping[str, Interval], curve: Mapping[int, Mapping[str, Interval]], videos: DescribedVideos
 ) -> tuple[str, ...]:
     """The scores on unseen objects, and the number of objects that the goals would need."""
-    some, many = min(curve), max(curve)
-    right, mean, needed = main["all right"], main["mean"], dict[str, str]()
+    needed = []
     for name in ("all right", "mean"):
         found = objects_for({n: 100 - at[name].mean for n, at in curve.items()}, 100 - GOALS[name])
-        needed[name] = f"{found:.0f}" if math.isfinite(found) else "more than any number"
+        needed.append(f"{f'{found:.0f}' if math.isfinite(found) else 'no number'} for {GOALS[name]:.0f} % ({name})")
+    scores = ", ".join(f"{name} {interval(main[name], '.1f')} %" for name in ("all right", "mean"))
     return (
         f"Of {len(videos.names)} videos of {len(np.unique(videos.objects))} objects that it never touched, the policy "
-        f"answers {right.mean:.1f} % right in all three {bounds(right.low, right.high, '.1f')} and {mean.mean:.1f} % "
-        f"of the levels {bounds(mean.low, mean.high, '.1f')}, {main['OMAE'].mean:.2f} levels off on average.",
-        f"From {some} to {many} objects learned from, the levels answered right by the probes rise from "
-        f"{curve[some]['mean'].mean:.0f} to {curve[many]['mean'].mean:.0f} %; by the power law through that curve, "
-        f"{GOALS['mean']:.0f} % takes {needed['mean']} of them, {GOALS['all right']:.0f} % all right "
-        f"{needed['all right']}.",
+        f"answers right: {scores}; {main['OMAE'].mean:.2f} levels off on average.",
+        f"Objects to learn from, by the power law through the probes' curve: {', '.join(needed)}.",
     )
 
 

@@ -139,8 +139,14 @@ def run(config: StorageConfig, context: Context) -> Results:
     rates = feed_rates(config.feed, store, config.rounds, context)
     best = fastest_small(rows, NEED_FPS)
     filters = {kind: chosen_filters(context.each(f"filters, {kind}", group)) for kind, group in clips.items()}
+    sizes = [f"{_bytes(g, OWN) / _bytes(g, 'raw'):.2f} ({kind})" for kind, g in rows.items()]
     return Results(
-        verdict=_verdict(rows, best, parts, rates),
+        verdict=(
+            f"Of the codecs that read {NEED_FPS:,.0f} frames/s the rule chooses {best.name}; records use {OWN}, which "
+            f"takes {', '.join(sizes)} of the bytes of raw frames.",
+            f"A clip of 8 frames of 4 sensors costs {sum(list(parts.values())[:3]):.1f} ms of one core; the feed gives "
+            f"{rates[0, 'as recorded']:.0f} clips/s without reading processes.",
+        ),
         requirements=_requirements(rows, best),
         tables=(*(_codec_table(kind, r) for kind, r in rows.items()), *_other_tables(filters, parts, rates)),
         pictures=tuple(_picture(n, *row) for n, row in context.each("drawing", enumerate(rows.items()))),
@@ -260,27 +266,6 @@ def _requirements(rows: Rows, best: Codec) -> tuple[Requirement, ...]:
         at_most("kinds of clips that the records' codec changes", inexact, 0),
         at_most("its bytes against those of the rule's choice", excess, 1.02, note=f"the rule chooses {best.name}"),
         at_most(f"its bytes against {PLAIN}, worst kind", against, 1.0),
-    )
-
-
-def _verdict(
-    rows: Rows, best: Codec, parts: Mapping[str, float], rates: Mapping[tuple[int, str], float]
-) -> tuple[str, ...]:
-    share = lambda group, name: _bytes(group, name) / _bytes(group, "raw")
-    sizes = ", ".join(f"{kind} {share(g, OWN):.2f} ({PLAIN} {share(g, PLAIN):.2f})" for kind, g in rows.items())
-    lossy = sorted({row.codec.name for group in rows.values() for row in group if not row.exact})
-    slowest = max(list(parts)[:3], key=lambda part: parts[part])
-    own = min(_of(group, OWN).read_fps for kind, group in rows.items() if kind in (GENERATED, IMPORTED))
-    return (
-        f"Of the codecs that read {NEED_FPS:,.0f} frames/s the rule chooses {best.name}; records use {OWN}, which "
-        f"reads {own:,.0f}.",
-        f"Its bytes as a share of the raw frames: {sizes}.",
-        f"Not lossless through OpenCV, and left out: {', '.join(lossy)}."
-        if lossy
-        else "Every codec gave every bit back.",
-        f"A clip of 8 frames of 4 sensors costs {sum(list(parts.values())[:3]):.1f} ms of one core, most of it to "
-        f"{slowest}; the feed gives {rates[0, 'as recorded']:.0f} clips/s without reading processes, "
-        f"{rates[0, 'all of these']:.0f} with every augmentation.",
     )
 
 

@@ -100,8 +100,13 @@ def run(config: RealismConfig, context: Context) -> Results:
     shadows = realism_fit.shadow_gain(study, context)
     clean, stored = (realism_fit.clean(study, optics) for optics in (study.fitted, photometric.MINI))
     drift = float(np.sqrt(np.mean((clean - stored) ** 2)))
+    (before, *_), (after, right, error) = rows["lamps by eye"], rows["fitted, with grain"]
     return Results(
-        verdict=_verdict(rows, shadows),
+        verdict=(
+            f"Fitted optics bring pictures from {before.pixel:.1f} to {after.pixel:.1f} grey levels of real ones; "
+            f"a classifier assigns {right:.0f} ± {error:.0f} % of the patches to the right set, 50 % would be chance.",
+            f"Cast shadows would explain {100 * shadows['explained']:.1f} % of the residual of the fit.",
+        ),
         requirements=(
             at_most(
                 "stored constants against this fit, rms over held-out presses",
@@ -195,20 +200,6 @@ def _side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictu
         caption="One column per press: the recording, the same touch by lamps set by eye, and by the fitted optics.",
         content=image_grid(rows),
         kind="png",
-    )
-
-
-def _verdict(
-    rows: Mapping[str, tuple[PictureDistances, float, float]], shadows: Mapping[str, float]
-) -> tuple[str, ...]:
-    (before, right_before, _), (after, right_after, error) = rows["lamps by eye"], rows["fitted, with grain"]
-    return (
-        f"Fitted optics bring generated presses from {before.pixel:.1f} to {after.pixel:.1f} grey levels of the real "
-        f"ones, and the spectrum from {before.spectrum_db:.1f} to {after.spectrum_db:.1f} dB.",
-        f"A classifier assigns {right_after:.0f} ± {error:.0f} % of the patches to the right set, {right_before:.0f} % "
-        "with lamps by eye; 50 % would be chance.",
-        f"Cast shadows would explain {100 * shadows['explained']:.1f} % of the residual of the fit: "
-        f"{shadows['left_levels']:.2f} levels with them, {shadows['residual_levels']:.2f} without.",
     )
 
 

@@ -112,7 +112,8 @@ def run(config: ThroughputConfig, context: Context) -> Results:
     to_write = config.scenes(config.written_contacts, config.image_px)
     write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills, config.seed)
     found = context.once("written/0", write)
-    written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": ResumedSet(**found["kept"])})
+    kept = ResumedSet(**found["kept"])
+    written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": kept})
     scenes = config.scenes(config.feed_contacts, config.image_px)
     parts = {
         name: throughput_rates.part_costs(scenes, SENSORS.index(name), config.stage_objects)
@@ -131,8 +132,13 @@ def run(config: ThroughputConfig, context: Context) -> Results:
         NamedRate(f"feed {config.large_px}²", large, LARGE_RATE),
         NamedRate(f"written {config.image_px}²", written.rate, PAPER_RECORDS / WRITTEN_HOURS / 3600, written.bytes),
     )
+    lost = kept.missing + kept.repeated + kept.damaged + kept.differing
     return Results(
-        verdict=_verdict(feed, large, written),
+        verdict=(
+            f"A feed makes {feed.per_second:.0f} records/s ({feed.cpu_ms:.2f} ms of one core each), "
+            f"{large.per_second:.0f} with the large pictures.",
+            f"{lost} contacts are missing, repeated, damaged or different after {written.kills} kills of their writer.",
+        ),
         requirements=_requirements(feed, large, written, max(leaks[-1][name] for name in ORDINAL)),
         tables=(_rate_table(rates), _part_table(config, parts), floor, left_out_table(paper), _leak_table(leaks)),
         pictures=(_picture(config, rates, parts),),
@@ -220,19 +226,6 @@ def left_out_table(config: SceneConfig) -> Table:
 
 
 # Report --------------------------------------------------------------------------------------------------------------
-
-
-def _verdict(feed: RecordRate, large: RecordRate, written: WrittenSet) -> tuple[str, ...]:
-    hours, write_hours = (PAPER_RECORDS / rate.per_second / 3600 for rate in (feed, written.rate))
-    kept, size = written.kept, PAPER_RECORDS * written.bytes / 1e9
-    lost = kept.missing + kept.repeated + kept.damaged + kept.differing
-    return (
-        f"A feed makes {feed.per_second:.0f} records/s ({feed.cpu_ms:.2f} ms of one core each), "
-        f"{large.per_second:.0f} with the large pictures ({large.cpu_ms:.2f} ms): 1.32 million in {hours:.2f} h.",
-        f"Written, they take {write_hours:.2f} h and {size:.1f} GB, {written.bytes / 1e3:.1f} kB each.",
-        f"Kills at random moments: {written.kills}; the writer left {kept.records:,} records; {lost} contacts are "
-        "missing, repeated, damaged, or differ from those of an undisturbed writer.",
-    )
 
 
 def _requirements(feed: RecordRate, large: RecordRate, written: WrittenSet, leak: float) -> tuple[Requirement, ...]:

@@ -326,3 +326,24 @@ def _check_values(values: np.ndarray, clusters: np.ndarray, strata: np.ndarray) 
     if not np.all(np.isfinite(values)):
         first = int(np.argmin(np.isfinite(values)))
         raise ValueError(f"values[{first}] is {values[first]}: values must be finite; leave undefined ones out")
+
+
+def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resamples: int = 2000) -> Interval:
+    """1 − Σ error / Σ reference over n contacts, with an interval over objects.
+
+    Args:
+      error, reference: [n] of the same contacts, reference > 0 in sum.
+      objects: [n].
+
+    Raises:
+      ValueError: a reference without error, for which no skill is defined.
+    """
+    if not reference.sum() > 0:
+        raise ValueError(f"reference sums to {reference.sum()}: must be > 0, or no skill is defined; choose another")
+    names, group = np.unique(objects, return_inverse=True)
+    sums = np.zeros((len(names), 2))
+    np.add.at(sums, group, np.stack([error, reference], 1).astype(float))
+    weights = np.random.default_rng(0).multinomial(len(names), np.full(len(names), 1 / len(names)), resamples)
+    drawn = weights @ sums
+    low, high = np.quantile(1 - drawn[:, 0] / drawn[:, 1], (0.025, 0.975))
+    return Interval(mean=float(1 - error.sum() / reference.sum()), low=float(low), high=float(high))

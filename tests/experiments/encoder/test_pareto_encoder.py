@@ -7,9 +7,8 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import pareto_encoder
-from experiments.encoder.held_out import StageOneDataConfig
 from experiments.encoder.pareto_encoder import MeasuredVariant, choose, loss, part_table
-from experiments.encoder.pretrain import PretrainConfig
+from experiments.encoder.pretrain import StageOneDataConfig
 from experiments.encoder.speed import CompiledProgram
 from experiments.encoder.variants import REFERENCE, STUDIED, FieldsOnly, variants
 from sensors_io.pipeline import make_clip
@@ -17,6 +16,7 @@ from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.training.linear_probe import ProbeConfig
+from touchr1_jax.training.pretraining import PretrainConfig
 
 VARIANTS = {v.name: v for v in variants(PretrainConfig(frames=8))}
 

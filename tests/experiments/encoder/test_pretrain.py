@@ -11,8 +11,7 @@ from rich.console import Console
 from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain_encoder
-from experiments.encoder.held_out import StageOneDataConfig, held_out_contacts
-from experiments.encoder.pretrain import PretrainConfig, pretrain
+from experiments.encoder.pretrain import StageOneDataConfig, held_out_contacts, points, pretrain
 from experiments.study.stages import run_sft
 from experiments.study.training import starting_model
 from tests.experiments import tiny
@@ -21,6 +20,7 @@ from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import build_policy
 from touchr1_jax.training.linear_probe import ProbeConfig
+from touchr1_jax.training.pretraining import PretrainConfig
 
 PRETRAIN = PretrainConfig(
     encoder=dataclasses.replace(tiny.MODEL.tactile, causal=True),
@@ -105,3 +105,8 @@ def test_a_study_starts_from_it(directory, data, context):
     params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", tactile=tactile)
     jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
     assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)
+
+
+def test_points_pool_attributes_by_object():
+    found = points(np.array([[True, False], [True, True], [False, False]]), np.array([0, 0, 1]))
+    assert (found.mean, found.low, found.high) == (50, 0, 75)

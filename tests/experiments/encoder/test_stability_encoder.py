@@ -7,7 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import stability_encoder
-from experiments.encoder.held_out import StageOneDataConfig
+from experiments.encoder.pretrain import StageOneDataConfig
 from experiments.encoder.stability_encoder import ARMS, CollapseOutcome
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.encoder import video_prediction
-from experiments.encoder.held_out import StageOneDataConfig
+from experiments.encoder.pretrain import StageOneDataConfig
 from experiments.encoder.video_prediction import (
     COPY,
     MEAN,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.recordings.cross_validation import agreement, constants, deal_folds, objects_for, scores, vote
-from experiments.recordings.description_policy import COMBINATIONS, choose, utility
+from touchr1_jax.models.description_policy import COMBINATIONS, choose, utility
 from touchr1_jax.training.kernel_probe import object_weights
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)

@@ -3,14 +3,22 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.core.context import Context, read_metrics
-from experiments.recordings.description_policy import COMBINATIONS, LENGTH, PolicyShape, choose, description_policy
+from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.fine_tuning import (
+from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
+from experiments.recordings.level_probes import LevelProbeConfig, sense
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.touches import families
+from touchr1_jax.models.description_policy import COMBINATIONS, LENGTH, PolicyShape, choose, description_policy
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.training.description_tuning import (
     Lesson,
     ReinforceConfig,
     TuneConfig,
@@ -20,12 +28,6 @@ from experiments.recordings.fine_tuning import (
     reinforce,
     tune,
 )
-from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
-from experiments.recordings.level_probes import LevelProbeConfig, sense
-from sensors_io.importers.keep import ImportSourceError
-from sensors_io.touches import families
-from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 
 SHAPE = PolicyShape(
@@ -101,7 +103,8 @@ def test_training_resumes_from_its_checkpoint(tmp_path):
     runs = []
     for _ in range(2):
         context = run_context(tmp_path)
-        runs.append(tune(policy, config, [params] * 2, [lesson] * 2, [0, 1], context, "fold/0"))
+        with stage_hooks(context, "fold/0", config.steps) as hooks:
+            runs.append(tune(policy, config, [params] * 2, [lesson] * 2, [0, 1], hooks))
         context.close()
     jax.tree.map(np.testing.assert_array_equal, *runs)
     first, second = (jax.tree.leaves(member) for member in runs[0])
@@ -116,7 +119,7 @@ def test_every_answer_fits_and_parses():
     np.testing.assert_array_equal(parsed.conclude, COMBINATIONS)
     assert (np.asarray(parsed.perceive)[:, 0] == COMBINATIONS[5]).all()
     assert bool(parsed.formatted.all())
-    np.testing.assert_array_equal(number(COMBINATIONS), np.arange(27))
+    np.testing.assert_array_equal(number(jnp.asarray(COMBINATIONS)), np.arange(27))
 
 
 def test_conclusions_from_made_up_evidence_are_as_frequent_as_their_probability():
@@ -140,7 +143,7 @@ def test_scene_probes_keep_the_order_of_the_law():
 
 
 def test_disturbed_inputs_keep_their_mean():
-    y = np.asarray(disturb(jax.random.key(0), np.ones((4000, 2), np.float32), TuneConfig(drop=0.5, noise=0.1)))
+    y = np.asarray(disturb(jax.random.key(0), jnp.ones((4000, 2)), TuneConfig(drop=0.5, noise=0.1)))
     assert abs(y.mean() - 1) < 0.05
     assert abs((y == 0).mean() - 0.5) < 0.03
 
@@ -149,11 +152,12 @@ def test_disturbed_inputs_keep_their_mean():
 def test_grpo_moves_the_decoder_alone(trained, tmp_path):
     videos, learned = trained
     params = jax.tree.map(lambda x: x[0], learned.params)
-    x = np.zeros((len(videos.names), CONFIG.inputs), np.float32)
-    lesson = Lesson(x=x, percept=videos.label, label=videos.label, weight=np.ones(len(x), np.float32))
+    x, label = jnp.zeros((len(videos.names), CONFIG.inputs)), jnp.asarray(videos.label)
+    lesson = Lesson(x=x, percept=label, label=label, weight=jnp.ones(len(x)))
     grpo = dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=4, group=4, length=LENGTH, lr_scale=300.0)
     config, context = ReinforceConfig(steps=2, grpo=grpo), run_context(tmp_path)
-    tuned = reinforce(description_policy(SHAPE), config, params, lesson, 0, context, "grpo/0")
+    with stage_hooks(context, "grpo/0", config.steps) as hooks:
+        tuned = reinforce(description_policy(SHAPE), config, params, lesson, 0, hooks)
     context.close()
     assert all(np.isfinite(line["reward"]) for line in read_metrics(tmp_path))
     jax.tree.map(np.testing.assert_array_equal, tuned["encoder"], params["encoder"])

@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sensors_io.layer import Layer, depth_response, wave_numbers
-from sensors_io.scenes import optics, traction
-from sensors_io.scenes.hertz import half_space_spectrum
+from sensors_io.scenes import optics
 
 
 def deformed(
@@ -33,13 +32,6 @@ def light(
 def off(found: np.ndarray, true: np.ndarray) -> float:
     """Distance of a field from the true one, over the length of that."""
     return float(np.linalg.norm(found - true) / np.linalg.norm(true))
-
-
-def half_space(points: int, spacing: float, modulus_mpa: float) -> traction.Compliance:
-    """Of ν = 0: the tangential compliance is isotropic, and equals the normal one."""
-    half = half_space_spectrum(points, spacing, modulus_mpa)
-    even = np.concatenate([half, np.roll(half[::-1], 1, 0)[:, points - 1 : 0 : -1]], 1)
-    return traction.Compliance(even=jnp.asarray(even, jnp.float32), odd=jnp.zeros(even.shape, jnp.complex64))
 
 
 def directions(points: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:

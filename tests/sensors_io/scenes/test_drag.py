@@ -10,8 +10,8 @@ import pytest
 from sensors_io.layer import Layer
 from sensors_io.scenes import drag, tangential, traction
 from sensors_io.scenes.hertz import Hertz
+from sensors_io.scenes.mindlin import half_space
 from sensors_io.scenes.motions import plan
-from tests.sensors_io.scenes.references import half_space
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N

@@ -11,7 +11,8 @@ import pytest
 from sensors_io.layer import Layer, normal_compliance, wave_numbers
 from sensors_io.scenes import contact, partial_slip, tangential, traction
 from sensors_io.scenes.hertz import Hertz
-from tests.sensors_io.scenes.references import half_space, off
+from sensors_io.scenes.mindlin import half_space
+from tests.sensors_io.scenes.references import off
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N

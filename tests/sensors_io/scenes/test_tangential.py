@@ -11,7 +11,8 @@ import pytest
 from sensors_io.layer import Layer
 from sensors_io.scenes import tangential, traction
 from sensors_io.scenes.hertz import Hertz
-from tests.sensors_io.scenes.references import half_space, off, shear_tensor
+from sensors_io.scenes.mindlin import FrictionalSphere, half_space
+from tests.sensors_io.scenes.references import off, shear_tensor
 
 N, WINDOW_MM = 48, 16.0
 SPACING = WINDOW_MM / N
@@ -19,9 +20,12 @@ X = (np.arange(N) + 0.5) * SPACING - WINDOW_MM / 2
 RADIUS = np.hypot(X[None], X[:, None])
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 SHEAR_MODULUS, FRICTION = 0.15, 0.5
-SPHERE = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=2.0)
-A_MM = SPHERE.contact_radius_mm
-"""On a half-space of ν = 0, whose tangential compliance 1/(μq) is isotropic: Cattaneo's solution is then exact."""
+SPHERE = FrictionalSphere(
+    normal=Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=2.0),
+    shear_modulus_mpa=SHEAR_MODULUS,
+    friction=FRICTION,
+)
+A_MM = SPHERE.normal.contact_radius_mm
 STILL = jnp.zeros((N, N), jnp.complex64)
 SHEAR_DISPLACEMENT = jax.jit(traction.shear_displacement)
 
@@ -38,8 +42,7 @@ def _layer() -> traction.Compliance:
 
 def _limit() -> np.ndarray:
     """μp of the sphere, which carries the force exactly."""
-    p = SPHERE.pressure_mpa(RADIUS)
-    return FRICTION * p * SPHERE.force_n / (p.sum() * SPACING**2)
+    return SPHERE.limit_mpa(RADIUS, SPACING)
 
 
 def _slide(limit: np.ndarray, target: np.ndarray | complex, compliance: traction.Compliance, **kwargs):
@@ -67,15 +70,12 @@ def _rough_pressure(seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
 def test_cattaneo_and_mindlin(share: float) -> None:
-    most = FRICTION * SPHERE.force_n
+    most = SPHERE.most_n
     solved = _pull(_limit(), (share * most, 0.0), _half_space())
-    stick = A_MM * (1 - share) ** (1 / 3)
-    slide = 3 * most * 2 / (16 * SHEAR_MODULUS * A_MM) * (1 - (1 - share) ** (2 / 3))
-    inner = np.sqrt(np.maximum(1 - (RADIUS / stick) ** 2, 0)) * SPHERE.peak_pressure_mpa * stick / A_MM
     assert solved.converged
-    assert complex(solved.slide_mm) == pytest.approx(slide, rel=0.01)
-    assert solved.stick_share == pytest.approx((stick / A_MM) ** 2, abs=0.06)
-    assert off(solved.traction_mpa, FRICTION * (SPHERE.pressure_mpa(RADIUS) - inner)) < 0.06
+    assert complex(solved.slide_mm) == pytest.approx(SPHERE.slide_mm(share), rel=0.01)
+    assert solved.stick_share == pytest.approx((SPHERE.stick_radius_mm(share) / A_MM) ** 2, abs=0.06)
+    assert off(solved.traction_mpa, SPHERE.pulled_mpa(share, RADIUS)) < 0.06
     assert _force(solved) == pytest.approx(share * most, rel=1e-5)
 
 
@@ -86,23 +86,10 @@ def test_prescribed_slide_and_prescribed_force_agree() -> None:
     assert off(slid.traction_mpa, pulled.traction_mpa) < 0.02
 
 
-def _lubkin(stick_ratio: float) -> tuple[float, float]:
-    """Twist and torque of a sphere that sticks within r < c = stick_ratio a.
-
-    A stack of twisted punches of radius t (Reissner & Sagoci: torque 16/3 G t³ each) makes τ = μp outside c by Abel's
-    transform: θ(c) = 3μF/(4πGa²) [K(k) − E(k)], k² = 1 − c²/a², and the torque ∫ 16/3 G t³ dθ(t) (Lubkin 1951).
-    """
-    angle, ratio = np.linspace(0, np.pi / 2, 4001), np.linspace(stick_ratio, 1, 400)
-    root = np.sqrt(1 - (1 - ratio[:, None] ** 2) * np.sin(angle) ** 2)
-    scale = 3 * FRICTION * SPHERE.force_n / (4 * np.pi * SHEAR_MODULUS * A_MM**2)
-    theta = scale * np.trapezoid(1 / root - root, angle, axis=1)
-    return float(theta[0]), float(np.trapezoid(16 / 3 * SHEAR_MODULUS * (ratio * A_MM) ** 3, -theta))
-
-
 @pytest.mark.parametrize("stick_ratio", [0.8, 0.5, 0.2, 0.0])
 def test_lubkin_twist(stick_ratio: float) -> None:
     """Down to the whole contact slipping, at a torque of 3π/16 μFa."""
-    twist, torque = _lubkin(stick_ratio) if stick_ratio else (100.0, 3 * np.pi / 16 * FRICTION * SPHERE.force_n * A_MM)
+    twist, torque = SPHERE.twist(stick_ratio) if stick_ratio else (100.0, 3 * np.pi / 16 * SPHERE.most_n * A_MM)
     solved = _slide(_limit(), 1j * twist * (X[None] + 1j * X[:, None]), _half_space(), tolerance=1e-4)
     x = jnp.asarray(X, jnp.float32)
     force, moment = jax.jit(traction.resultant)(jnp.zeros((N, N)), solved.traction_mpa, x, SPACING)

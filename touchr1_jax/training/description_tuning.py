@@ -1,4 +1,4 @@
-"""Supervised fine-tuning of an ensemble of policies, and GRPO after it."""
+"""Supervised fine-tuning of an ensemble of policies that read descriptions of touch, and GRPO after it."""
 
 import dataclasses
 import functools
@@ -13,15 +13,13 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from experiments.core.context import Context
-from experiments.core.loops import run_loop, stage_hooks
-from experiments.recordings.description_policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS, DescriptionPolicy
 from touchr1_jax import masked
+from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LENGTH, LEVELS, DescriptionPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
-from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.loop import Hooks, LoopConfig, fit
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.questions import ONE_AT_A_TIME
 from touchr1_jax.training.sft import SFTState
@@ -117,15 +115,9 @@ def tune(
     members: Sequence[Params],
     lessons: Sequence[Lesson],
     seeds: Sequence[int],
-    context: Context,
-    stage: str,
+    hooks: Hooks,
 ) -> list[Params]:
-    """Train the members of an ensemble on verified answers, each on its lesson; 0 steps leave them as they are.
-
-    The context keeps checkpoints and the loss, the mean over the members, under the name of the stage.
-    """
-    if not config.steps:
-        return list(members)
+    """Train the members of an ensemble on verified answers, each on its lesson; the loss is the mean over them."""
     optimizer, advance = _tune_program(policy, config)
     first = tuple(SFTState(params=p, opt_state=optimizer.init(p), step=jnp.zeros((), jnp.int32)) for p in members)
     keys = [jax.random.split(jax.random.key(seed), config.steps) for seed in seeds]
@@ -135,7 +127,7 @@ def tune(
         return tuple(state for state, _ in moved), {"loss": jnp.mean(jnp.stack([loss for _, loss in moved]))}
 
     numbers = iter(grain.MapDataset.range(config.steps).to_iter_dataset(ONE_AT_A_TIME))
-    trained = run_loop(step, first, numbers, LoopConfig(steps=config.steps), context, stage)
+    trained = fit(step, first, numbers, LoopConfig(steps=config.steps), hooks)
     return [state.params for state in trained]
 
 
@@ -181,29 +173,25 @@ def reinforce(
     params: Params,
     lesson: Lesson,
     seed: int,
-    context: Context,
-    stage: str,
+    hooks: Hooks,
 ) -> Params:
-    """GRPO of one member's decoder; the encoder stays as it is, and so does the decoder with 0 steps."""
-    if not config.steps:
-        return params
+    """GRPO of one member's decoder; the encoder stays as it is."""
     rng = np.random.default_rng(seed)
     noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
     weight = np.asarray(lesson.weight, np.float64)
     drawn = [rng.choice(len(weight), config.grpo.drawn, p=weight / weight.sum()) for _ in range(config.steps)]
     batches = grain.MapDataset.source(drawn).map(functools.partial(_questions, policy, params, lesson))
-    with stage_hooks(context, stage, config.steps) as hooks:
-        return train_grpo(
-            policy,
-            params,
-            iter(batches.to_iter_dataset(ONE_AT_A_TIME)),
-            _score(policy, config.grpo.algorithm),
-            config.grpo,
-            LoopConfig(steps=config.steps),
-            hooks,
-            noise=policy.features(params, noise).touch,
-            seed=seed,
-        )
+    return train_grpo(
+        policy,
+        params,
+        iter(batches.to_iter_dataset(ONE_AT_A_TIME)),
+        _score(policy, config.grpo.algorithm),
+        config.grpo,
+        LoopConfig(steps=config.steps),
+        hooks,
+        noise=policy.features(params, noise).touch,
+        seed=seed,
+    )
 
 
 @functools.cache

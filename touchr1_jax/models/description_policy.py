@@ -22,7 +22,6 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.language import HARDNESS, PROTRUSION, ROUGHNESS, SENSORS, Language
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import answer_text, build_layout, encode_answer, prompt_words
@@ -95,7 +94,7 @@ class DescriptionPolicy(TouchPolicy):
         """Log-probability of every token of answers about one touch."""
         ids, mask = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0])
         logits = self.fns.group_logits(params, self.features(params, x), ids, mask, tokens)
-        return token_log_probs(jax.nn.log_softmax(logits), tokens)
+        return jnp.take_along_axis(jax.nn.log_softmax(logits), tokens[..., None], -1)[..., 0]
 
     @functools.cached_property
     def slots(self) -> np.ndarray:
