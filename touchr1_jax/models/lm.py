@@ -129,11 +129,18 @@ class DecoderLayer(nn.Module):
         return self.finish(x[-1:], attend(q[-1:], [KeySource(cache.k, cache.v, mask)])), cache
 
     def over_completion(
-        self, x: Float[Array, "*g T D"], rotation: Rotation, past: LayerCache, mask: Bool[Array, "L"]
+        self,
+        x: Float[Array, "*g T D"],
+        rotation: Rotation,
+        past: LayerCache,
+        mask: Bool[Array, "L"],
+        exists: Bool[Array, "T"] | None = None,
     ) -> Float[Array, "*g T D"]:
-        """All tokens of a completion, or of a group of them, under the prompt whose keys are `past`."""
+        """All tokens of a completion, or of a group of them, under the prompt whose keys are `past`; by default all
+        tokens exist."""
         q, own = self.project(x, rotation)
         causal = jnp.tri(x.shape[-2], dtype=bool)
+        causal = causal if exists is None else causal & exists
         return self.finish(x, attend(q, [KeySource(past.k, past.v, mask), KeySource(own.k, own.v, causal)]))
 
     def over_row(self, x: Float[Array, "W D"], rotation: Rotation, segments: Segments) -> Float[Array, "W D"]:
@@ -237,6 +244,15 @@ class Decoder(nn.Module):
             x = layer.over_completion(x, rotation, past, prefix.mask)
         return x
 
+    def extend_embedded(
+        self, x: Float[Array, "T D"], exists: Bool[Array, "T"], prefix: PrefixCache
+    ) -> Float[Array, "T D"]:
+        """As `extend`, for embedded tokens of one sequence; those that do not exist advance no position."""
+        rotation = self._rotation(_text_positions(prefix.next_position, exists))
+        for layer, past in zip(self.layers, prefix.layers, strict=True):
+            x = layer.over_completion(x, rotation, past, prefix.mask, exists)
+        return x
+
     def packed_states(
         self,
         x: Float[Array, "W D"],
@@ -271,6 +287,40 @@ class Decoder(nn.Module):
             x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(cache.k, cache.v, seen)]))
             written.append(cache)
         return x[0], tuple(written)
+
+    def advance(
+        self,
+        x: Float[Array, "n D"],
+        exists: Bool[Array, "n"],
+        t: Int[Array, ""],
+        prefix: PrefixCache,
+        caches: tuple[LayerCache, ...],
+        seen: Bool[Array, "T"],
+    ) -> tuple[Float[Array, "n D"], tuple[LayerCache, ...], Bool[Array, "T"]]:
+        """Append n embedded tokens at row t of the caches; those that do not exist are never attended to.
+
+        Args:
+          x: embedded tokens.
+          exists: which of them exist.
+          t: row of the first one.
+          prefix: encoded prompt.
+          caches: keys and values of the rows before t.
+          seen: rows before t that exist.
+
+        Returns:
+          The hidden states of the tokens, the caches, and all rows that exist.
+        """
+        n, rows = x.shape[0], seen.shape[0]
+        rotation = self._rotation(_text_positions(prefix.next_position + jnp.sum(seen), exists))
+        seen = _write_row(seen[:, None], exists[:, None], t)[:, 0]
+        mask = seen & (jnp.arange(rows) <= t + jnp.arange(n)[:, None])
+        written = []
+        for layer, past, cache in zip(self.layers, prefix.layers, caches, strict=True):
+            q, own = layer.project(x, rotation)
+            cache = LayerCache(_write_row(cache.k, own.k, t), _write_row(cache.v, own.v, t))
+            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(cache.k, cache.v, mask)]))
+            written.append(cache)
+        return x, tuple(written), seen
 
     def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
         c = self.config
@@ -322,6 +372,11 @@ def _joined(before: LayerCache | None, own: LayerCache) -> LayerCache:
     return LayerCache(jnp.concatenate([before.k, own.k], 1), jnp.concatenate([before.v, own.v], 1))
 
 
+def _text_positions(first: Int[Array, ""], exists: Bool[Array, "n"]) -> Int[Array, "3 n"]:
+    """(time, row, column) of tokens that follow one another; those that do not exist advance nothing."""
+    return jnp.broadcast_to(first + jnp.cumsum(exists) - 1, (3, len(exists)))
+
+
 def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, ""]:
     """The position that follows a prompt."""
     return jnp.max(jnp.where(mask, positions, -1)) + 1
@@ -329,7 +384,7 @@ def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, "
 
 @custom_vmap
 def _write_row(cache: Array, row: Array, t: Array) -> Array:
-    """cache[:, t] = row[:, 0]; stays a slice update in place under `vmap`, where jax's own rule makes a scatter."""
+    """Rows from t on replaced; stays a slice update in place under `vmap`, where jax's own rule makes a scatter."""
     return jax.lax.dynamic_update_slice_in_dim(cache, row, t, axis=cache.ndim - 2)
 
 

@@ -97,7 +97,10 @@ class Policy(nn.Module):
     def encode_streams(self, frames, force_n, frame_index, frame_mask, sensor) -> Float[Array, "*n N D"]:
         """Tactile tokens of any batch of streams, at the decoder's width; arguments as in `TactileViT`."""
         x = self.tactile(frames, force_n, frame_index, frame_mask, sensor)
-        x = x.reshape(*x.shape[:-3], -1, x.shape[-1])
+        return self.project(x.reshape(*x.shape[:-3], -1, x.shape[-1]))
+
+    def project(self, x: Float[Array, "*n W"]) -> Float[Array, "*n D"]:
+        """Tokens of the tactile encoder, or of another one, at the decoder's width."""
         return self.tactile_out(nn.gelu(self.tactile_in(self.tactile_norm(x))))
 
     def encode(self, batch: TouchBatch) -> Features:
@@ -173,6 +176,30 @@ class Policy(nn.Module):
         first = jnp.broadcast_to(first, (*tokens.shape[:-1], 1, *first.shape))
         return jnp.concatenate([first, self.decoder.extend(tokens[..., :-1], prefix)], -2)
 
+    def explored_states(
+        self,
+        tokens: Int[Array, "T"],
+        exists: Bool[Array, "T"],
+        touch: Float[Array, "B N W"],
+        observed: Bool[Array, "B N"],
+        first: Float[Array, "D"],
+        prefix: PrefixCache,
+    ) -> Float[Array, "T D"]:
+        """Hidden states that predict each token of B + 1 turns, after each of which but the last stands an observation.
+
+        Each token is predicted from the last row before it that exists, the first from the prompt.
+        """
+        turns, width = len(touch) + 1, len(tokens) // (len(touch) + 1)
+        text = self.decoder.embed(tokens).reshape(turns, width, -1)
+        seen = self.project(touch).astype(text.dtype)
+        with_last = lambda x: jnp.pad(x, [(0, 1)] + [(0, 0)] * (x.ndim - 1))
+        in_rows = lambda x, y: jnp.concatenate([x, with_last(y)], 1).reshape(-1, *x.shape[2:])
+        there = in_rows(exists.reshape(turns, width), observed)
+        hidden = self.decoder.extend_embedded(in_rows(text, seen), there, prefix)
+        latest = jax.lax.cummax(jnp.where(there, 1 + jnp.arange(len(there)), 0))
+        before = jnp.append(0, latest[:-1]).reshape(turns, -1)[:, :width]
+        return jnp.concatenate([first[None], hidden])[before.reshape(-1)]
+
     def packed_states(self, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
         """Hidden states at the places of a row that ask for them; `features` as in `Row`."""
         x = self.decoder.embed(row.ids)
@@ -183,6 +210,14 @@ class Policy(nn.Module):
     def logits(self, states: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts."""
         return self.decoder.logits(states, banned)
+
+    def embed(self, tokens: Int[Array, "*n"]) -> Float[Array, "*n D"]:
+        """Embedded words."""
+        return self.decoder.embed(tokens)
+
+    def advance(self, x, exists, t, prefix: PrefixCache, caches: tuple[LayerCache, ...], seen):
+        """Append embedded tokens to a trajectory; see `Decoder.advance`."""
+        return self.decoder.advance(x, exists, t, prefix, caches, seen)
 
     def decode(self, token, t, prefix: PrefixCache, caches: tuple[LayerCache, ...], banned: Bool[Array, "V"]):
         """Logits of completion token t + 1 after token t, and the grown caches."""

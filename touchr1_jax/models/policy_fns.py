@@ -69,6 +69,11 @@ class PolicyFns:
         stream = np.isin(self.slots.stream_text, np.arange(len(self.slots.touch)))
         return int(min([*np.flatnonzero(stream), *self.slots.touch.ravel(), len(stream)]))
 
+    @property
+    def touch_starts(self) -> tuple[int, ...]:
+        """First prompt token that a change of each stream's touch can change."""
+        return tuple(int(row.min()) for row in self.slots.touch)
+
     def prefill(
         self,
         params: Params,

@@ -309,9 +309,10 @@ RULES: tuple[AlarmRule, ...] = (
 
 
 class AlarmMonitor:
-    """Checks the metrics of a run by all rules; it keeps the last `WINDOW` steps and the first `START`."""
+    """Checks the metrics of a run by some rules; it keeps the last `WINDOW` steps and the first `START`."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: tuple[AlarmRule, ...] = RULES) -> None:
+        self._rules = rules
         self._first: list[Metrics] = []
         self._last: collections.deque[Metrics] = collections.deque(maxlen=WINDOW)
         self._left_out: collections.deque[bool] = collections.deque(maxlen=WINDOW)
@@ -325,14 +326,14 @@ class AlarmMonitor:
         """
         self._left_out.append(left_out)
         at_once = {**metrics, LEFT_OUT: sum(self._left_out) / WINDOW}
-        found = [rule.alarm(at_once, at_once) for rule in RULES if rule.at_once]
+        found = [rule.alarm(at_once, at_once) for rule in self._rules if rule.at_once]
         if not left_out:
             self._last.append(metrics)
             if len(self._first) < START:
                 self._first.append(metrics)
             if len(self._last) == WINDOW:
                 now, start = _mean(self._last), _mean(self._first)
-                found += [rule.alarm(now, start) for rule in RULES if not rule.at_once]
+                found += [rule.alarm(now, start) for rule in self._rules if not rule.at_once]
         return [alarm for alarm in found if alarm is not None]
 
 

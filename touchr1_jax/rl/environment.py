@@ -9,7 +9,7 @@ members of `Environment` can take its place.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,7 @@ class Outcome(NamedTuple):
     harm: Float[Array, ""]
 
 
+@runtime_checkable
 class Environment(Protocol):
     """Interface of an environment; a pytree of arrays with these members.
 
@@ -112,6 +113,30 @@ class TouchBank:
         return state, outcome
 
 
+def check_bank(bank: TouchBank, *, least: int = 2) -> None:
+    """Find the objects and the choices of a bank that leave nothing to choose.
+
+    Args:
+      bank: contacts.
+      least: fewest contacts of an object; 1 accepts objects with a single one.
+
+    Raises:
+      EnvironmentCheckError: no object, a choice that no object has, or an object with fewer contacts.
+    """
+    available = np.asarray(bank.available)
+    if not available.shape[0]:
+        raise EnvironmentCheckError("the bank has no object: must have at least 1; add some")
+    missing = [words for i, words in enumerate(bank.actions) if not available[:, i].any()]
+    if missing:
+        raise EnvironmentCheckError(f"choices {missing} are available for no object; leave them out of the bank")
+    few = np.flatnonzero(available.sum(1) < least)
+    if len(few):
+        raise EnvironmentCheckError(
+            f"{len(few)} objects, the first of them {few[:5].tolist()}, have fewer than {least} contacts: there is "
+            "nothing to choose; leave them out of the bank"
+        )
+
+
 class EnvironmentCheckError(ValueError):
     """An environment from which nothing can be learned, or that the step cannot run."""
 
@@ -127,7 +152,7 @@ def check_environment(environment: Environment, cases: Any, *, budget: int) -> O
     Raises:
       EnvironmentCheckError: a budget below 1, fewer than two actions, repeated words, a number of kinds other than that
         of the actions, functions that cannot be traced, a state that changes its shape, outcomes of wrong shapes or
-        types, a number that is not finite, negative seconds or harm, an action that observes nothing in any case.
+        types, a number that is not finite, negative seconds or harm.
     """
     actions = environment.actions
     if budget < 1:
@@ -196,7 +221,3 @@ def _check_outcomes(actions: tuple[str, ...], outcome: Outcome) -> None:
                 f"outcome.{field} of {actions[action]!r} in case {case} is {value[wrong][0]}: must be finite"
                 f"{'' if field == 'tokens' else ' and ≥ 0'}; correct the data"
             )
-    observed = np.any(outcome.exists, axis=(0, 2))
-    silent = [words for i, words in enumerate(actions) if not observed[i]]
-    if silent:
-        raise EnvironmentCheckError(f"actions {silent} observe nothing in any case: leave them out, or check the data")

@@ -186,7 +186,7 @@ def prompt_terms(
 
     if config.remat:
         of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
-    rows = {name: x.reshape(-1, *x.shape[2:]) for name, x in rows.items()}
+    rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
     return jax.tree.map(lambda x: x.reshape(tokens.shape), found)
 
@@ -202,8 +202,9 @@ def logit_terms(config: GRPOConfig, tokens: Int[Array, "*n"], logits: Mapping[st
 
 def group_states(
     fns: PolicyFns, config: GRPOConfig, batch: GRPOBatch, tokens: Int[Array, "G T"]
-) -> Callable[..., tuple[Float[Array, "G T D"], PrefixCache]]:
-    """The function (params, features, known, start) → hidden states of one prompt's completions and their prefix."""
+) -> Callable[..., tuple[Any, PrefixCache]]:
+    """The function (params, features, known, start) → states of one prompt's completions, as `fns.logits` takes them,
+    and their prefix."""
     if config.remat:
         fns = dataclasses.replace(fns, module=fns.module.clone(remat=True))
 
@@ -216,7 +217,7 @@ def group_states(
 
 def perturbed_states(
     fns: PolicyFns, config: GRPOConfig, params: Params, experience: Experience, prefix: PrefixCache
-) -> Float[Array, "G T D"]:
+) -> Any:
     """Hidden states of the completions under perturbed touch.
 
     Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
@@ -228,9 +229,9 @@ def perturbed_states(
     states = group_states(fns, config, experience.batch, experience.rollout.tokens)
     features = dataclasses.replace(experience.batch.features, touch=experience.masked_touch)
     known, own = _masked_branch(config, prefix), _masked_branch(config, params)
-    starts = [int(row.min()) for row in fns.slots.touch]
+    starts = fns.touch_starts
 
-    def again(start: int, p: Params) -> Array:
+    def again(start: int, p: Params) -> Any:
         return states(p, features, known, start)[0]
 
     if config.micro_prompts > 1:

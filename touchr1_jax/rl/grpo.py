@@ -12,7 +12,7 @@ the device between the first line and the metrics.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -150,22 +150,26 @@ def make_grpo_step(
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.bfloat16:
         fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16))
-    engine = _Engine(fns, score, optimizer, config, constraint, gather)
+    return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather), config)
+
+
+def compile_step(engine: "GRPOEngine", config: GRPOConfig) -> Callable[..., tuple[GRPOState, dict[str, Array]]]:
+    """The jitted step of an engine; the state's buffers are donated."""
     return jax.jit(engine.step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Engine:
+class GRPOEngine:
     """The parts of a step, in the order in which it takes them."""
 
-    fns: PolicyFns
-    score: ScoreFn
+    fns: Any
+    score: Callable[..., Any]
     optimizer: optax.GradientTransformation
     config: GRPOConfig
     constraint: Constraint | None
     gather: Callable[[Params], Params]
 
-    def step(self, state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs) -> tuple[GRPOState, dict[str, Array]]:
+    def step(self, state: GRPOState, batch: Any, frozen: Any) -> tuple[GRPOState, dict[str, Array]]:
         """Rollouts, rewards, advantages, update."""
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
@@ -174,14 +178,14 @@ class _Engine:
             lag = f"stale is {self.config.algorithm.stale}, but the state holds {len(state.behind)} older parameters"
             raise ValueError(f"{lag}; make it with `start_state`")
         sampler = state.behind[0] if state.behind else state.params
-        group, metrics = self.rollouts(sampler, batch, frozen.noise, sample_key, control_key)
+        group, metrics = self.rollouts(sampler, batch, frozen, sample_key, control_key)
         if self.config.algorithm.candidates > 1:
             metrics |= {f"drawn_{name}": value for name, value in self.group_metrics(group).items()}
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         reference = frozen.reference if state.reference is None else state.reference
         group = self.penalised(group, reference) if self.config.algorithm.kl_in_reward else group
-        learn = self.experience(group, frozen.noise, mask_key)
+        learn = self.experience(group, self.perturbed(group.batch, frozen, mask_key))
         if not ratio_to_learner(self.config.algorithm):  # by the learner's pass: the sampler's own may round otherwise
             learn = learn._replace(old=log_probs(self.fns, self.config, sampler, group.batch, learn.rollout))
         params, opt_state, parts = update_policy(
@@ -193,7 +197,7 @@ class _Engine:
         return self.refreshed(after), metrics
 
     def rollouts(
-        self, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, control_key: Array
+        self, params: Params, batch: Any, frozen: Any, key: Array, control_key: Array
     ) -> tuple[Group, dict[str, Array]]:
         """A group of answers to every prompt, parsed and rewarded; with R_tu also answers under every control."""
         algorithm = self.config.algorithm
@@ -212,7 +216,7 @@ class _Engine:
 
         bonus, metrics = jnp.zeros_like(reward), dict[str, Array]()
         if algorithm.tactile_use is not TactileUse.OFF:
-            bonus, metrics = tactile_use.tactile_bonus(algorithm, parsed, batch, noise, answer, control_key)
+            bonus, metrics = tactile_use.tactile_bonus(algorithm, parsed, batch, frozen.noise, answer, control_key)
         if algorithm.tactile_use is TactileUse.LITERAL:
             terms = {**terms, tactile_use.TERM: algorithm.tactile_weight * bonus}
             reward = reward + terms[tactile_use.TERM]
@@ -246,8 +250,12 @@ class _Engine:
         term = -self.config.algorithm.beta * masked.total(rollout.log_prob - log_ref, rollout.mask, -1)
         return group._replace(reward=group.reward + term, terms={**group.terms, "kl": term})
 
-    def experience(self, group: Group, noise: Float[Array, "K S N D"], key: Array) -> Experience:
-        """Advantages and weights of the groups, and the perturbed touch of the grounding term."""
+    def perturbed(self, batch: Any, frozen: Any, key: Array) -> tuple[Array, Int[Array, "P"]]:
+        """Touch of which one stream of each prompt is noise, for the grounding term, and which stream."""
+        return mask_one_stream(batch.features, frozen.noise, key)
+
+    def experience(self, group: Group, perturbed: tuple[Array, Int[Array, "P"]]) -> Experience:
+        """Advantages and weights of the groups, with the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
         kept = functools.partial(of_kept_groups, algorithm, finite=group.finite)
         advantage, by_token = kept(advantages(algorithm, group.reward, group.terms)), None
@@ -265,7 +273,7 @@ class _Engine:
             weight = prompt_weights(~no_signal)
         if algorithm.average is Average.BATCH:
             weight = over_tokens(weight, rollout.mask)
-        masked_touch, stream = mask_one_stream(batch.features, noise, key)
+        masked_touch, stream = perturbed
         return Experience(
             batch=batch,
             masked_touch=masked_touch,

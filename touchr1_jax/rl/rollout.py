@@ -152,7 +152,7 @@ def sample(
 
     def body(loop: _Loop) -> _Loop:
         logits = tempered(loop.logits, config.temperature)
-        token = _draw(_allowed(logits, loop, config), jax.random.fold_in(key, loop.t), config)
+        token = draw_token(_allowed(logits, loop, config), jax.random.fold_in(key, loop.t), config)
         log_prob = drawn_log_probs(jax.nn.log_softmax(logits), token, config.top_p, config.min_p)
         token = jnp.where(loop.alive, token, config.pad_id)
         logits, caches = step(token, loop.t, prefix, loop.caches)
@@ -177,13 +177,13 @@ def sample(
         log_prob=jnp.zeros((t_max, p, g)),
         mask=jnp.zeros((t_max, p, g), bool),
     )
-    end = jax.lax.while_loop(lambda s: (s.t < t_max) & _any_alive(s.alive), body, start)
+    end = jax.lax.while_loop(lambda s: (s.t < t_max) & any_alive(s.alive), body, start)
     by_rollout = lambda x: jnp.moveaxis(x, 0, -1)
     return Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
 
 
 @custom_vmap
-def _any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
+def any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
     """True while any rollout continues.
 
     Under `vmap` one condition serves all runs: a condition per run would batch the token index too, and with it every
@@ -192,19 +192,17 @@ def _any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
     return jnp.any(alive)
 
 
-@_any_alive.def_vmap
-def _any_alive_anywhere(size: int, batched: list[bool], alive: Array) -> tuple[Array, bool]:
+@any_alive.def_vmap
+def any_alive_anywhere(size: int, batched: list[bool], alive: Array) -> tuple[Array, bool]:
     del size, batched
-    return _any_alive(alive), False
+    return any_alive(alive), False
 
 
 def _allowed(logits: Float[Array, "P G V"], loop: _Loop, config: SampleConfig) -> Float[Array, "P G V"]:
-    """The logits, those of tokens that the constraint forbids or the nucleus does not hold at −∞."""
-    if config.constraint is not None:
-        logits = jnp.where(config.constraint.allowed(loop.state, config.length - loop.t), logits, -jnp.inf)
-    if not truncates(config.top_p, config.min_p):
+    """The logits, those of tokens that the constraint forbids at −∞."""
+    if config.constraint is None:
         return logits
-    return jnp.where(nucleus(jax.nn.log_softmax(logits), config.top_p, config.min_p), logits, -jnp.inf)
+    return jnp.where(config.constraint.allowed(loop.state, config.length - loop.t), logits, -jnp.inf)
 
 
 def tempered(logits: Float[Array, "*n V"], temperature: float) -> Float[Array, "*n V"]:
@@ -245,8 +243,10 @@ def drawn_log_probs(
     return drawn - jax.nn.logsumexp(jnp.where(kept, log_p, -jnp.inf), -1)
 
 
-def _draw(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) -> Int[Array, "P G"]:
-    """The most likely token, or one drawn from the softmax of the logits."""
+def draw_token(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) -> Int[Array, "P G"]:
+    """The most likely token, or one drawn from the softmax of the logits, in the nucleus if there is one."""
+    if truncates(config.top_p, config.min_p):
+        logits = jnp.where(nucleus(jax.nn.log_softmax(logits), config.top_p, config.min_p), logits, -jnp.inf)
     if config.greedy:
         return jnp.argmax(logits, -1).astype(jnp.int32)
     if config.inverse:

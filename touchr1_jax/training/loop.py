@@ -203,6 +203,14 @@ def fit(
     return state
 
 
+def peek(batches: Batches) -> Any:
+    """The next batch, which is made again when it is asked for."""
+    place = batches.get_state()
+    first = next(batches)
+    batches.set_state(place)
+    return first
+
+
 def resume(state: Any, batches: Batches, checkpoints: Checkpoints | None) -> tuple[int, Any]:
     """Step and state of the newest intact checkpoint, to which the batches are set; 0 and `state` without one."""
     restored = None if checkpoints is None else checkpoints.restore(state)

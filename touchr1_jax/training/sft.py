@@ -28,10 +28,13 @@ from touchr1_jax.types import Params, TouchBatch
 
 @struct.dataclass
 class SFTBatch:
-    """P contacts with Q question–answer pairs each; `streams` says which sensors a question may feel."""
+    """P contacts with Q question–answer pairs each; `streams` says which sensors a question may feel.
 
-    touch: TouchBatch | Features
-    """The contacts, or what the encoder made of them: then no gradient reaches the encoder."""
+    `touch` is a `TouchBatch`, or what the encoder made of it: then no gradient reaches the encoder.  Of trajectories it
+    is their `Explored` observations, with Q = 1.
+    """
+
+    touch: Any
     ids: Int[Array, "P Q L"]
     mask: Bool[Array, "P Q L"]
     streams: Bool[Array, "P Q S"]
@@ -191,9 +194,9 @@ def row_scores(
     return _scored(fns, params, {"state": states, "token": following}, max_logits)
 
 
-def encoded(fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False) -> Features:
+def encoded(fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False) -> Any:
     """The features of a batch's contacts; those that it carries are taken as they are."""
-    return batch.touch if isinstance(batch.touch, Features) else fns.encode(params, batch.touch, blind=blind)
+    return fns.encode(params, batch.touch, blind=blind) if isinstance(batch.touch, TouchBatch) else batch.touch
 
 
 def encoded_group(

@@ -23,7 +23,7 @@ from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
-from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.train_sft import fresh_adapters, merge_adapters
 from touchr1_jax.types import Params, Parsed, Target
@@ -145,18 +145,10 @@ def check_whole_batch(
     program, key = influence_program(fns, config.length), jax.random.key(seed)
     frozen = FrozenInputs(reference=(), noise=noise)
     check, placed, rows = hooks.devices.shard(program, decoder, batches, config.drawn, frozen, key)
-    check_streams(*jax.device_get(check(placed, _peek(rows))[1]))
+    check_streams(*jax.device_get(check(placed, peek(rows))[1]))
 
 
 @functools.cache
 def influence_program(fns: PolicyFns, length: int) -> Any:
     """Compiled `stream_influence`, made once for all rewards and seeds; its parameters come back as they are."""
     return jax.jit(lambda p, batch, frozen, key: (p, stream_influence(fns, p, batch, frozen.noise, key, length)))
-
-
-def _peek(batches: Batches) -> Any:
-    """The next batch, which is made again when it is asked for."""
-    place = batches.get_state()
-    first = next(batches)
-    batches.set_state(place)
-    return first

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array
 
+from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
@@ -86,7 +87,7 @@ class SFTConfig:
 
 
 def train_sft(
-    policy: TouchPolicy,
+    policy: TouchPolicy | ActivePolicy,
     params: Params,
     batches: Batches,
     config: SFTConfig,

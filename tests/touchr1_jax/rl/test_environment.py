@@ -15,6 +15,7 @@ from touchr1_jax.rl.environment import (
     TouchBank,
     TouchCase,
     TouchChoice,
+    check_bank,
     check_environment,
 )
 
@@ -81,7 +82,6 @@ BAD = {
     "occur twice": ({"choices": (CHOICES[0], CHOICES[0])}, 1),
     "outcome.tokens": ({"tokens": np.full((2, 2, 3, 4), np.nan, np.float32)}, 1),
     "outcome.seconds": ({"seconds": np.full((2, 2), -1, np.float32)}, 1),
-    "observe nothing": ({"available": np.array([[True, False], [True, False]])}, 1),
 }
 
 
@@ -90,6 +90,25 @@ def test_the_check_names_the_fault(names):
     changes, budget = BAD[names]
     with pytest.raises(EnvironmentCheckError, match=names):
         check_environment(make_bank(**changes), cases(0, 1), budget=budget)
+
+
+NOTHING_TO_CHOOSE = {
+    "no object has": np.array([[True, False], [True, False]]),
+    "1 objects": np.array([[True, True], [True, False]]),
+    "2 objects": np.array([[True, False], [False, True]]),
+}
+
+
+@pytest.mark.parametrize("available", NOTHING_TO_CHOOSE.values(), ids=NOTHING_TO_CHOOSE)
+def test_banks_without_a_choice_are_refused(available):
+    with pytest.raises(EnvironmentCheckError):
+        check_bank(make_bank(available=available))
+
+
+def test_objects_with_one_contact_may_be_accepted():
+    check_bank(make_bank(), least=1)
+    with pytest.raises(EnvironmentCheckError, match=r"\[1\]"):
+        check_bank(make_bank())
 
 
 class Count(NamedTuple):

@@ -1,0 +1,63 @@
+"""The reward of a trajectory by hand, and what is found wrong with a reward before training."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.touchr1_jax.explored import BANK, POLICY
+from touchr1_jax.rewards import RewardError
+from touchr1_jax.rl.environment import check_environment
+from touchr1_jax.rl.touch_reward import Prices, Spent, check_touch_reward, check_touching_pays, priced_answer
+from touchr1_jax.training.exploration import touch_batch_of
+from touchr1_jax.types import Parsed
+
+FREE = Prices(jnp.float32(0), jnp.float32(0))
+EVERY = touch_batch_of(POLICY, BANK, np.repeat(np.arange(4), 2), np.tile([0, 1], 4))
+
+
+@pytest.fixture(scope="module")
+def outcome():
+    return check_environment(BANK, EVERY.case, budget=1)
+
+
+def parsed(level: int) -> Parsed:
+    answer, some = jnp.full(2, level), jnp.array(level >= 0)
+    return Parsed(
+        perceive=answer[None], compare=answer, conclude=answer, formatted=some, truncated=~some, length=jnp.array(0)
+    )
+
+
+@pytest.mark.parametrize(("level", "answer"), [(2, 1.0), (0, 0.0), (-1, -0.1)])
+def test_hand_values(level, answer):
+    target = POLICY.target(np.array([1]), np.array([[0, 2]]))
+    one = type(target)(**{name: jnp.asarray(x[0]) for name, x in vars(target).items()})
+    spent = Spent(jnp.float32(3), jnp.float32(2), jnp.int32(1))
+    terms = priced_answer(parsed(level), one, spent, Prices(jnp.float32(0.1), jnp.float32(0.25)))
+    assert {name: float(x) for name, x in terms.items()} == pytest.approx(
+        {"answer": answer, "seconds": -0.3, "harm": -0.5}
+    )
+
+
+def test_the_published_reward_is_finite_and_pays(outcome):
+    check_touch_reward(priced_answer, FREE, EVERY.target, outcome)
+    check_touching_pays(priced_answer, FREE, EVERY.target, outcome)
+
+
+FAULTS = {
+    "'bad' of the reward is nan": lambda p, t, s, c: {"bad": jnp.where(p.formatted, 1.0, jnp.nan)},
+    "'bad' of the reward is inf": lambda p, t, s, c: {"bad": 1 / (1 - s.actions)},
+    "float scalar": lambda p, t, s, c: {"bad": p.conclude},
+    "dictionary": lambda p, t, s, c: s.seconds,
+}
+
+
+@pytest.mark.parametrize("names", FAULTS)
+def test_a_reward_that_is_no_number_is_named(outcome, names):
+    with pytest.raises(RewardError, match=names):
+        check_touch_reward(FAULTS[names], FREE, EVERY.target, outcome)
+
+
+@pytest.mark.parametrize("prices", [Prices(jnp.float32(1), jnp.float32(0)), Prices(jnp.float32(2), jnp.float32(9))])
+def test_prices_at_which_touching_never_pays_are_named(outcome, prices):
+    with pytest.raises(RewardError, match="never pays"):
+        check_touching_pays(priced_answer, prices, EVERY.target, outcome)

@@ -1,0 +1,82 @@
+"""Alarms of policies that explore: known failures of learning which touch to make, each with its cure.
+
+The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
+"""
+
+from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics
+
+SHARED = ("F3", "F7", "F8", "F9", "F10", "F15")
+"""Codes of the rules of `alarms` that hold for trajectories too."""
+
+
+def untouched_share(now: Metrics, start: Metrics) -> float | None:
+    """Share of trajectories without an action."""
+    del start
+    return now["no_action_share"]
+
+
+def single_share(now: Metrics, start: Metrics) -> float | None:
+    """Share of trajectories with one action where several are allowed, while answers get no better."""
+    several = now["budget"] > 1 and now["accuracy"] <= start["accuracy"]
+    return now["one_action_share"] if several else None
+
+
+def full_share(now: Metrics, start: Metrics) -> float | None:
+    """Share of trajectories with as many actions as are allowed, where they are several and have a price."""
+    del start
+    return now["all_actions_share"] if now["budget"] > 1 and now.get("reward_seconds", 0.0) < 0 else None
+
+
+def first_kind(now: Metrics, start: Metrics) -> float | None:
+    """Share of the most frequent kind of first action, where there are several questions and kinds."""
+    del start
+    differ = now["questions"] > 1 and now["kinds"] > 1 and now["no_action_share"] < 0.5
+    return now["first_kind_peak"] if differ else None
+
+
+def silent_actions(now: Metrics, start: Metrics) -> float | None:
+    """Share of the actions that observe nothing."""
+    del start
+    return now["silent_share"]
+
+
+ACTIVE_RULES: tuple[AlarmRule, ...] = (
+    *(rule for rule in RULES if rule.code in SHARED),
+    AlarmRule(
+        code="A1",
+        meaning="the policy never touches: lower the prices, or start from a policy that touches at random",
+        bound=0.95,
+        reason="one group of eight trajectories in three then has no touch at all to compare with",
+        check=untouched_share,
+    ),
+    AlarmRule(
+        code="A2",
+        meaning="the policy always touches once and gets no better: add an entropy bonus, or warm up on longer "
+        "trajectories",
+        bound=0.98,
+        reason="a group of eight then compares numbers of touches in one case of seven",
+        check=single_share,
+    ),
+    AlarmRule(
+        code="A3",
+        meaning="the policy makes every touch that is allowed: raise the price of a second",
+        bound=0.98,
+        reason="a group of eight then compares numbers of touches in one case of seven",
+        check=full_share,
+    ),
+    AlarmRule(
+        code="A4",
+        meaning="the policy starts with one kind of touch for all questions: add an entropy bonus, or lower the "
+        "learning rate",
+        bound=0.95,
+        reason="one group of eight in three then tries another kind first",
+        check=first_kind,
+    ),
+    AlarmRule(
+        code="A5",
+        meaning="most touches observe nothing: leave the choices out that are not available",
+        bound=0.5,
+        reason="half of the price is then paid for nothing",
+        check=silent_actions,
+    ),
+)
