@@ -45,18 +45,24 @@ def update_policy(
         config = dataclasses.replace(config, algorithm=alone, prompts=config.prompts // number)
         old = log_probs(fns, config, params, learn.batch, learn.rollout) if ratio_to_learner(algorithm) else learn.old
         learn = learn._replace(old=old, weight=number * learn.weight)
-    minibatches = learn if number == 1 else batches_of(config.prompts, learn)
+    before = None  # what a trust region is measured from, where that is not what ratios are to
+    if algorithm.trust_nat is not None and not ratio_to_learner(algorithm):
+        before = log_probs(fns, config, params, learn.batch, learn.rollout)
+    whole = (learn, before)
+    minibatches = whole if number == 1 else batches_of(config.prompts, whole)
 
     def once(carry: tuple[Params, optax.OptState, Array], place: Any):
         params, opt_state, old = carry
         first, which = place
-        part = learn._replace(old=old) if number == 1 else jax.tree.map(lambda x: x[which], minibatches)
+        part, origin = minibatches if number == 1 else jax.tree.map(lambda x: x[which], minibatches)
+        part = part._replace(old=old) if number == 1 else part
         grads, parts, old = bucketed_gradient(fns, config, params, reference, part, first, longest)
         norm = optax.tree.norm(grads)
         moved, opt_state = finite_update(optimizer, grads, norm, opt_state, params)
         parts = parts | {"grad_norm": norm}
         if (trust := algorithm.trust_nat) is not None:
-            moved, size = within_trust(fns, config, params, moved, part._replace(old=old), trust)
+            part = part._replace(old=old if origin is None else origin)
+            moved, size = within_trust(fns, config, params, moved, part, trust)
             parts |= size
         return (moved, opt_state, old if number == 1 else learn.old), parts
 

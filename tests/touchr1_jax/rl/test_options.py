@@ -193,6 +193,17 @@ def test_parts_of_several_updates_are_those_of_the_first(learn):
     close(two, one, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("minibatches", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_trust_region_does_not_count_the_lag_of_the_sampler(learn, minibatches):
+    """The learner is far from the parameters that sampled, the update is short."""
+    algorithm = dataclasses.replace(CONFIG.algorithm, stale=1, trust_nat=1e-3, minibatches=minibatches)
+    optimizer = optax.sgd(1e-6)
+    config = dataclasses.replace(CONFIG, algorithm=algorithm)
+    parts = jax.jit(lambda: update_policy(FNS, optimizer, config, START, optimizer.init(START), START, learn)[2])()
+    assert parts["update_kl"] < 1e-6
+    assert parts["update_scale"] == 1
+
+
 def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
     """At a small rate two halves move twice as far as the whole; at a large one the second is off policy.
 
