@@ -34,6 +34,7 @@ from experiments.paper.component_effects import (
 from experiments.paper.components import BASE, BASE_ROW, COMPONENTS, published_steps, reinforced
 from experiments.study import paper_numbers as paper
 from experiments.study.ablation import Ablation
+from experiments.study.controls import control_sentences
 from experiments.study.stages import encode_rows, untrained
 from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy
 from touchr1_jax.training.evaluation import Evaluation
@@ -90,7 +91,7 @@ def run(config: StudyConfig, context: Context) -> Results:
     return dataclasses.replace(
         results,
         baselines={**results.baselines, UNTRAINED: found.reported(UNTRAINED)},
-        verdict=verdict(found),
+        verdict=(*verdict(found), *control_sentences(results.comparisons, WEIGHTS)),
         requirements=requirements(found),
         tables=(
             ladder_table(found.estimates),

@@ -32,6 +32,7 @@ from experiments.paper.components import (
     reinforced,
 )
 from experiments.study.ablation import Ablation
+from experiments.study.controls import control_sentences
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
 from experiments.study.stages import encode_rows, run_grpo, untrained
@@ -85,7 +86,7 @@ def run(config: StudyConfig, context: Context) -> Results:
     return dataclasses.replace(
         results,
         arms={**results.arms, NO_SFT: found.reported(NO_SFT)},
-        verdict=verdict(found),
+        verdict=(*verdict(found), *control_sentences(results.comparisons, WEIGHTS)),
         tables=(effects, *pooled_table(results.arms, FULL), *further, differences_table(presets.DIFFERENCES)),
     )
 

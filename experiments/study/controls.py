@@ -8,18 +8,14 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Table, named_table
-from experiments.core.text import bounds, interval
-from experiments.study.estimates import compare_over_seeds
+from experiments.core.text import bounds
+from experiments.study.estimates import compare_over_seeds, object_interval
 from experiments.study.study import CONTINUED, Study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
 from touchr1_jax.bench.sampled import DecisionRule, decide
 from touchr1_jax.bench.scoring import REPORTED
-from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.training.evaluation import Evaluation
-
-RESAMPLES = 1_000
-"""Of each interval over objects."""
 
 MIDDLE = 1
 """Middle one of three ordinal levels."""
@@ -133,16 +129,10 @@ def _decided(seeds: Sequence[Evaluation], objects: np.ndarray, rule: str) -> dic
     of = np.concatenate([objects[one.contact] for one in seeds])
     ordinal = np.isin(attribute, [ATTRIBUTES.index(name) for name in ORDINAL])
     right, distance = 100.0 * (level == label), np.where(level == BOTTOM, 2 * MIDDLE, np.abs(level - label))
-
-    def span(x: np.ndarray, rows: np.ndarray, spec: str) -> str | None:
-        if len(np.unique(of[rows])) < 2:
-            return None
-        return interval(clustered_bootstrap(x[rows].astype(float), of[rows], resamples=RESAMPLES), spec)
-
     return {
-        "accuracy": span(right, ordinal, ".1f"),
-        "OMAE": span(distance, ordinal, ".3f"),
-        "material": span(right, ~ordinal, ".1f"),
+        "accuracy": object_interval(right[ordinal], of[ordinal]),
+        "OMAE": object_interval(distance[ordinal], of[ordinal], ".3f"),
+        "material": object_interval(right[~ordinal], of[~ordinal]),
         "middle": 100 * float(np.mean(level[ordinal] == MIDDLE)),
         "middle, true": 100 * float(np.mean(label[ordinal] == MIDDLE)),
     }

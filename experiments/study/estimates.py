@@ -7,12 +7,23 @@ import numpy as np
 
 from experiments.core.errors import require
 from experiments.core.results import Comparison, Estimate
+from experiments.core.text import interval
 from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.scoring import REPORTED
 
 RESAMPLES = 2_000
 """Of each interval over objects: its ends are then good to a tenth of its width."""
+
+
+def object_interval(values: np.ndarray, objects: np.ndarray, spec: str = ".1f") -> str | None:
+    """A table's cell: mean of values [n] and its interval over their objects [n]; nothing with fewer than two objects.
+
+    A thousand resamples give the ends to a tenth of the interval's width.
+    """
+    if len(np.unique(objects)) < 2:
+        return None
+    return interval(statistics.clustered_bootstrap(values.astype(float), objects, resamples=RESAMPLES // 2), spec)
 
 
 def pooled(seeds: Sequence[Scores]) -> Scores:

@@ -9,7 +9,7 @@ from experiments.core.charts import Panel, draw, estimates
 from experiments.core.look import PALETTE
 from experiments.core.pictures import Heatmap, heatmaps
 from experiments.core.results import Cell, Picture, Table, named_table
-from experiments.core.text import interval
+from experiments.study.estimates import object_interval
 from experiments.study.sampled import sampled_report
 from experiments.study.study import BLIND, SFT, Study
 from sensors_io.schema import ATTRIBUTES
@@ -121,8 +121,8 @@ def reliability_table(rows: Mapping[str, LevelAnswers], words: Words) -> Table:
                 {
                     "policy and level": f"{name}: {attribute} {level}",
                     "answered": 100 * float(np.mean(answer == k)),
-                    "right when answered": _share(label == k, answer == k, objects),
-                    "found where true": _share(answer == k, label == k, objects),
+                    "right when answered": object_interval(100.0 * (label == k)[answer == k], objects[answer == k]),
+                    "found where true": object_interval(100.0 * (answer == k)[label == k], objects[label == k]),
                 }
                 for k, level in enumerate(levels)
             ]
@@ -174,10 +174,3 @@ def accuracy_by_agreement(answers: LevelAnswers) -> tuple[list[int], list[Interv
             intervals.append(clustered_bootstrap(100.0 * right[at], objects[at], resamples=RESAMPLES))
             weight.append(float(np.mean(at)))
     return counts, intervals, np.array(weight)
-
-
-def _share(hit: np.ndarray, of: np.ndarray, objects: np.ndarray) -> str | None:
-    """Per cent of `hit` among `of`, with its interval; nothing where fewer than two objects are left."""
-    if len(np.unique(objects[of])) < 2:
-        return None
-    return interval(clustered_bootstrap(100.0 * hit[of], objects[of], resamples=RESAMPLES), ".1f")

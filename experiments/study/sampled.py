@@ -6,14 +6,10 @@ import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.results import Cell, Picture, Table, named_table
-from experiments.core.text import interval
+from experiments.study.estimates import object_interval
 from experiments.study.study import BLIND, Study
 from touchr1_jax.bench.sampled import Votes, calibration_error, majority, pass_at_k, reliability, samples_right
-from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.training.evaluation import Evaluation
-
-RESAMPLES = 1_000
-"""Of each interval over objects."""
 
 
 def sampled_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
@@ -53,8 +49,7 @@ def sampled_table(rows: Mapping[str, Sequence[Evaluation]], objects: np.ndarray)
             f"pass@{k}": pass_at_k(right, k),
             f"maj@{k}": votes.right,
         }
-        percent = {title: clustered_bootstrap(100.0 * x, of, resamples=RESAMPLES) for title, x in shown.items()}
-        cells = {title: interval(found, ".1f") for title, found in percent.items()}
+        cells = {title: object_interval(100.0 * x, of) for title, x in shown.items()}
         lines.append({"policy": name, **cells, "ECE": 100 * calibration_error(votes)})
     titles = [title for title in lines[0] if title != "policy"]
     return named_table(
