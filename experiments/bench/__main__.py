@@ -12,7 +12,6 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from experiments.bench import card
 from experiments.bench.contacts import measure_split, read_source
 from experiments.core.artifacts import write_json
 from experiments.core.text import number
@@ -23,6 +22,7 @@ from touchr1_jax.bench.items import ItemError, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
 from touchr1_jax.bench.people import annotate, audit
 from touchr1_jax.bench.people.sheets import SheetError
+from touchr1_jax.bench.questions import card
 from touchr1_jax.bench.questions.answers import average_line, metric_rows, parsed_share, read_answers
 from touchr1_jax.bench.questions.contacts import ContactError
 from touchr1_jax.bench.questions.draw import Quota, QuotaError

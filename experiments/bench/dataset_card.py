@@ -19,18 +19,18 @@ import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 
-from experiments.bench import card
 from experiments.bench.contacts import read_source
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
+from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.items import KINDS, Item, write_items
+from touchr1_jax.bench.questions import card
 from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.bench.questions.generate import BenchSource, generate, share_at_odds
 from touchr1_jax.bench.questions.rules import FilteredItems, count_found_errors
@@ -76,7 +76,7 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             at_least("questions", len(items), config.quota.total, note="of the quota"),
             at_least("made twice, the same bytes", again == found, 1),
             at_least("planted faults caught, the worst rule", least, 100, "%"),
-            *checks,
+            *(at_most(c.name, c.measured, c.bound, c.unit, c.note) for c in checks),
         ),
         tables=(
             _question_table(items),

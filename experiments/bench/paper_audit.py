@@ -53,11 +53,8 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
     count = {name: sum(c.verdict == name for c in wrong) for name in ("contradiction", "unsupported", "not given")}
     return Results(
         verdict=(
-            f"{len(wrong)} statements do not hold: {count['contradiction']} are contradicted by the paper's own "
-            f"numbers, {count['unsupported']} are not supported by them, for {count['not given']} the paper lacks what "
-            "is needed to decide.",
-            f"{len(right)} others are confirmed to the rounding: gains over other models, VTV150K's averages, the size "
-            "of the data set.",
+            f"{len(wrong)} statements do not hold: {count['contradiction']} are contradicted, {count['unsupported']} "
+            f"not supported, {count['not given']} left open; {len(right)} others are confirmed to the rounding.",
         ),
         requirements=(
             at_most("known inconsistencies that do not show", unseen, 0),

@@ -311,9 +311,8 @@ def report(
     return Results(
         verdict=(
             *(
-                f"{s} frames ahead, the error of touch alone is {skills[TOUCH, s].mean:.0%} below that of copying the "
-                f"last frame {bounds(skills[TOUCH, s].low, skills[TOUCH, s].high, '.2f')}, that of the mean frame "
-                f"{skills[MEAN, s].mean:.0%}."
+                f"{s} frames ahead, touch alone has a skill of {interval(skills[TOUCH, s], '.2f')} over copying the "
+                f"last frame, the mean frame one of {skills[MEAN, s].mean:.2f}."
                 for s in config.skips
             ),
             f"The picture of the object reduces the error {longest} frames ahead by {vision.mean:.1%} "

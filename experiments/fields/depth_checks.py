@@ -10,7 +10,9 @@ from experiments.core.context import Context
 from experiments.core.results import Cell, Column, Table, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.depth_methods import INTEGRATORS, Integrator, calibrated, depth_by
-from experiments.fields.published import (
+from experiments.fields.sections import ReportPart
+from sensors_io import quality
+from sensors_io.calibration.published import (
     FOLDERS,
     ball_presses,
     feelanyforce_rows,
@@ -19,8 +21,6 @@ from experiments.fields.published import (
     known_truth,
     read_folder,
 )
-from experiments.fields.sections import ReportPart
-from sensors_io import quality
 from sensors_io.fields.contact import ContactConfig, changed_contacts, steepest_change
 from sensors_io.fields.depth import DepthReader
 from sensors_io.fields.poisson import dirichlet, neumann
@@ -115,8 +115,7 @@ def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list
         "known to about 50 µm.",
     )
     return [
-        f"At known press depth the mean rmse is {rmse:.0f} µm, {shape_only:.1f} µm with the offset removed "
-        f"({fixed[0]:.0f} and {fixed[1]:.0f} µm with a fixed border).",
+        f"At known press depth the mean rmse is {rmse:.0f} µm, {fixed[0]:.0f} µm with a fixed border.",
         at_most("known press depth, mean rmse", rmse, MOST_UM, "µm"),
         at_most("known press depth, offset removed", shape_only, MOST_SHAPE_UM, "µm"),
         table,
@@ -168,8 +167,7 @@ def contact_section(root: pathlib.Path, seed: int) -> list[ReportPart]:
     )
     return [
         f"{rejected} of {len(frames)} pictures without contact are rejected, {real} of "
-        f"{sum(map(len, presses.values()))} real contacts; {int((flagged & empty).sum())} of {int(empty.sum())} "
-        "empty rows are flagged.",
+        f"{sum(map(len, presses.values()))} real contacts.",
         at_most("pictures without contact that pass", len(frames) - rejected, 0.0),
         at_most("real contacts that are rejected, by colour or by depth", real, 0.0),
         at_most("rows flagged wrongly or not", int(np.count_nonzero(flagged != empty)), 0.0),

@@ -10,8 +10,8 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.results import at_most, named_table
-from experiments.fields.published import load, reduced
 from experiments.fields.sections import ReportPart
+from sensors_io.calibration.published import load, reduced
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern, examine
 from sensors_io.importers.keep import Keep

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import map_coordinates, spline_filter
 
-from experiments.fields.published import load
+from sensors_io.calibration.published import load
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.scenes import optics
 from sensors_io.scenes.sensors import DMTAC_X, XENSE, SensorModel

@@ -117,10 +117,8 @@ def drift_section(
     own, alone, peer = (medians[name] for name in (MAIN, UNSMOOTHED, FRAME_TO_FRAME))
     pooled = lambda cycles: float(np.nanmedian(np.concatenate([errors[MAIN][cycles] for errors in drift.values()])))
     return [
-        f"After 1, {PUBLISHED} and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f}, {own[1]:.4f} "
-        f"and {own[2]:.4f} px, without smoothing by {alone[0]:.4f}, {alone[1]:.4f} and {alone[2]:.4f} px. This is "
-        f"not drift but the noise of a pair of pictures, whose lower bound for a single marker is {bound:.4f} px. "
-        f"Tracked from frame to frame they are off by {peer[0]:.3f}, {peer[1]:.3f} and {peer[2]:.3f} px.",
+        f"After 1 and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f} and {own[2]:.4f} px (lower bound "
+        f"of a single marker's noise {bound:.4f} px); from frame to frame by {peer[0]:.3f} and {peer[2]:.3f} px.",
         at_most(
             f"off after 900 pictures, as published ({first}, one picture at rest)",
             own[1],

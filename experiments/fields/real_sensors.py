@@ -26,9 +26,9 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.look import LOOK, PALETTE, png
 from experiments.core.results import Cell, Picture, Results, named_table
 from experiments.core.runner import Experiment
-from experiments.fields.published import FOLDERS, RecordingFolder, read_folder
 from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
 from sensors_io.calibration.presses import BallPresses
+from sensors_io.calibration.published import FOLDERS, RecordingFolder, read_folder
 from sensors_io.fields.extract import Extractor
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.schema import Flag

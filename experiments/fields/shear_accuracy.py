@@ -148,9 +148,7 @@ def shear_section(data_dir: pathlib.Path | None, context: Context) -> list[Repor
     )
     return [
         *(
-            f"{sensor}: shear by the layer's compliance is off by {_mean(by[MAIN]):.1f} µm "
-            f"({_mean(by[WITH_GRADIENT]):.1f} µm with the gradient part of the motion), by {_mean(by[SUBTRACTED]):.1f} "
-            f"µm if the deformation's noise is left in, by Helmholtz–Hodge {_mean(by[BASELINE]):.1f} µm."
+            f"{sensor}: shear is off by {_mean(by[MAIN]):.1f} µm, by Helmholtz–Hodge {_mean(by[BASELINE]):.1f} µm."
             for sensor, by in errors.items()
         ),
         at_most("shear error over Helmholtz–Hodge's, worst sensor", ratio, 1.0),

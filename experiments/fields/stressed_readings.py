@@ -15,7 +15,14 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.fields.depth_methods import calibrated, depth_by, published_poisson, table_map
-from experiments.fields.generated_presses import (
+from experiments.fields.generated_slides import Slide, cached_slides, pressing
+from experiments.fields.known_motion import NOISE_GREY as GEL_NOISE_GREY
+from experiments.fields.known_motion import GelCamera, GelMotion, MarkerGel, grey
+from experiments.fields.shear_accuracy import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, shear_methods
+from experiments.fields.stress import StressedField, StressOutcome
+from experiments.fields.trackers import FOLLOWERS
+from sensors_io.calibration.circles import find_circles
+from sensors_io.calibration.generated_presses import (
     AXIS_MM,
     NOISE_GREY,
     WINDOW_MM,
@@ -24,13 +31,6 @@ from experiments.fields.generated_presses import (
     generated_presses,
     to_bytes,
 )
-from experiments.fields.generated_slides import Slide, cached_slides, pressing
-from experiments.fields.known_motion import NOISE_GREY as GEL_NOISE_GREY
-from experiments.fields.known_motion import GelCamera, GelMotion, MarkerGel, grey
-from experiments.fields.shear_accuracy import BASELINE, MAIN, SUBTRACTED, WITH_GRADIENT, shear_methods
-from experiments.fields.stress import StressedField, StressOutcome
-from experiments.fields.trackers import FOLLOWERS
-from sensors_io.calibration.circles import find_circles
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.fields.extract import Extractor
 from sensors_io.fields.poisson import dirichlet

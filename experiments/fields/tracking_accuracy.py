@@ -122,8 +122,7 @@ def marker_section(gels: Sequence[MarkerGel], context: Context) -> list[ReportPa
         (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
     )
     return [
-        f"The affine fit anchored to the picture at rest is off by {median:.3f} px in the median and {high:.3f} px "
-        f"at the 95th percentile of the markers, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
+        f"Markers are off by {median:.3f} px in the median, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
         at_most("marker error, median", median, 0.04, "px"),
         at_most("marker error, 95th percentile", high, 0.11, "px"),
         at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
@@ -173,9 +172,8 @@ def dense_section(rounds: int, gels: Sequence[MarkerGel], context: Context) -> l
         caption="Mean distance from the truth; bars reach to the 95th percentile.",
         content=speed_against_error(points, "error, px", None, legend=False),
     )
-    sentence = f"Between the markers the mean error of the thin-plate spline is {error:.3f} px; it takes"
     return [
-        f"{sentence} {spline_ms:.2f} ms.",
+        f"Between the markers the mean error of the spline is {error:.3f} px; it takes {spline_ms:.2f} ms.",
         at_most("dense field, mean error", error, 0.05, "px"),
         at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
         table,

@@ -5,10 +5,10 @@ import pytest
 
 from experiments.fields.depth_checks import analytic_surfaces, scale_error
 from experiments.fields.depth_methods import INTEGRATORS, MAPS
-from experiments.fields.generated_presses import AXIS_MM, WINDOW_MM, fitted_optics, generated_presses, near_lamps
-from experiments.fields.published import known_truth
 from experiments.fields.stressed_readings import depth_outcome, stressed_press
 from sensors_io.calibration.circles import find_circles
+from sensors_io.calibration.generated_presses import AXIS_MM, WINDOW_MM, fitted_optics, generated_presses, near_lamps
+from sensors_io.calibration.published import known_truth
 from sensors_io.schema import Flag
 
 

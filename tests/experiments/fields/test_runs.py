@@ -9,7 +9,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.fields import pareto_fields, real_sensors, stability_fields
-from experiments.fields.published import FOLDERS, read_folder
+from sensors_io.calibration.published import FOLDERS, read_folder
 from tests.experiments.shrunk import run_shrunk
 
 CLIPS = pathlib.Path(__file__).parents[2] / "data" / "gelslam"

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from experiments.bench import card
 from touchr1_jax.bench.items import Item
+from touchr1_jax.bench.questions import card
 
 
 def failing(items, source, **changes) -> list[str]:

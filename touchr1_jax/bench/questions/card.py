@@ -8,7 +8,6 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 
-from experiments.core.results import Requirement, at_most
 from touchr1_jax.bench.items import Ask, Item
 from touchr1_jax.bench.questions.contacts import MeasuredContact, SplitContacts
 from touchr1_jax.bench.questions.wording import answer_choices, read_answer
@@ -31,11 +30,27 @@ Asked = Sequence[tuple[Ask, int]]
 """Questions of a cell and their answers."""
 
 
+@dataclasses.dataclass(frozen=True)
+class CardCheck:
+    """A figure that must not exceed its bound."""
+
+    name: str
+    measured: float
+    bound: float
+    unit: str = ""
+    note: str = ""
+
+    @property
+    def met(self) -> bool:
+        """True if it does not."""
+        return self.measured <= self.bound
+
+
 class CardError(ValueError):
     """Items that do not pass the card; the message names every check that failed."""
 
 
-def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[Requirement, ...]:
+def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) -> tuple[CardCheck, ...]:
     """Every check of the card: figures that must not exceed their bounds."""
     shown = {touch for item in items for touch in item.ask.touches}
     objects, known = {touch.object for touch in shown}, {contact.fingerprint for contact in train.contacts}
@@ -52,15 +67,15 @@ def checks(items: Sequence[Item], bench: SplitContacts, train: SplitContacts) ->
     )
     unseen, cells = len(bench.objects() - objects) / len(bench.objects()), answer_cells(items)
     return (
-        *(at_most(name, count, 0.0, note=meaning) for name, count, meaning in counts),
-        at_most("objects never shown", 100.0 * unseen, 100.0 * (1 - LEAST_OBJECTS), "%", "of the split"),
+        *(CardCheck(name, count, 0.0, note=meaning) for name, count, meaning in counts),
+        CardCheck("objects never shown", 100.0 * unseen, 100.0 * (1 - LEAST_OBJECTS), "%", "of the split"),
         _worst("commonest answer over equal shares", cells, _commonest, BALANCE),
         _worst("training mode over chance", cells, lambda c, s: _mode(c, s, train.contacts), CONSTANT),
         _worst("best answer to each wording over chance", cells, _by_wording, WORDING),
     )
 
 
-def require(results: Sequence[Requirement]) -> None:
+def require(results: Sequence[CardCheck]) -> None:
     """Raise unless all checks passed.
 
     Raises:
@@ -104,7 +119,7 @@ def answer_cells(items: Sequence[Item]) -> Mapping[AnswerCell, Asked]:
 
 def _worst(
     name: str, cells: Mapping[AnswerCell, Asked], right: Callable[[AnswerCell, Asked], int | None], bound: float
-) -> Requirement:
+) -> CardCheck:
     """The cell whose shortcut is furthest above equal shares of the levels that occur, in points."""
     judged = {}
     for cell, rows in cells.items():
@@ -112,9 +127,9 @@ def _worst(
             count, occurring = right(cell, rows), len({level for _, level in rows})
             judged[cell] = 0.0 if count is None else 100.0 * (count / len(rows) - 1 / occurring)
     if not judged:
-        return at_most(name, 0.0, bound, "points", "nothing to judge")
+        return CardCheck(name, 0.0, bound, "points", "nothing to judge")
     worst = max(judged, key=lambda cell: judged[cell])
-    return at_most(name, judged[worst], bound, "points", f"the worst is {' '.join(worst)}")
+    return CardCheck(name, judged[worst], bound, "points", f"the worst is {' '.join(worst)}")
 
 
 def _commonest(cell: AnswerCell, rows: Asked) -> int:
