@@ -14,13 +14,20 @@ from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.study.dataset import Dataset, open_dataset
 from experiments.study.sources import SourceConfig, prepare_records
-from sensors_io.pipeline import ClipConfig, Contacts, clip_batches
+from sensors_io.pipeline import ClipConfig, ClipMemory, Contacts, clip_batches
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.training import pretraining
-from touchr1_jax.training.dynamics import DynamicsConfig, DynamicsState, encode_each, read_frames, steps_of
+from touchr1_jax.training.dynamics import (
+    DynamicsConfig,
+    DynamicsState,
+    MeasuredTouch,
+    encode_each,
+    read_frames,
+    steps_of,
+)
 from touchr1_jax.training.feeds import Feed, host_touch, touch_batch
 from touchr1_jax.training.latent_probes import collapse_alarms, contact_features, probe_right
 from touchr1_jax.training.linear_probe import ProbeConfig
@@ -47,10 +54,12 @@ class StageOneDataConfig(SourceConfig):
     probe: ProbeConfig = ProbeConfig()
 
 
-def open_touch(config: StageOneDataConfig, frames: int, image_px: int, context: Context) -> Dataset:
+def open_touch(
+    config: StageOneDataConfig, frames: int, image_px: int, context: Context, *, memory_gib: float = 0.0
+) -> Dataset:
     """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
     clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
-    return open_dataset(prepare_records(config, context), clip, grpo_share=0.5)
+    return open_dataset(prepare_records(config, context), clip, 0.5, memory_gib)
 
 
 def training_rows(data: Dataset) -> np.ndarray:
@@ -139,16 +148,71 @@ def points(values: np.ndarray, objects: np.ndarray) -> Interval:
     return clustered_bootstrap(100.0 * values.astype(float).ravel(), clusters, resamples=RESAMPLES)
 
 
+DEPTH_MEASURES = 3
+"""Numbers that `depth_measures` gives of a frame."""
+
+
+def depth_measures(depth_mm: np.ndarray) -> np.ndarray:
+    """Greatest depth, root mean square depth, and that of its change from node to node, float32 [N, 3], of depth
+    [N, h, w], mm: how far, how widely and how unevenly a gel is pressed in."""
+    depth = depth_mm.astype(float)
+    across, down = np.diff(depth, axis=2)[:, :-1], np.diff(depth, axis=1)[:, :, :-1]
+    rms = lambda x: np.sqrt(np.mean(x, axis=(1, 2)))
+    return np.stack([depth.max((1, 2)), rms(depth**2), rms(across**2 + down**2)], 1).astype(np.float32)
+
+
+class ClipDepth:
+    """Measures of the depth of the frames of clips, read from the store once per contact.
+
+    Frames of a sequence without depth have NaN.
+    """
+
+    def __init__(self, store: Contacts, sensors: tuple[str, ...]) -> None:
+        self._store, self._sensors = store, sensors
+        self._known: dict[int, dict[str, np.ndarray]] = {}
+
+    def __call__(self, contact: np.ndarray, frame_index: np.ndarray) -> np.ndarray:
+        """Measures of the chosen frames of contacts [P], float32 [P, S, F, 3]; `frame_index` is [P, S, F]."""
+        found = np.full((*frame_index.shape, DEPTH_MEASURES), np.nan, np.float32)
+        for p, i in enumerate(contact):
+            of_contact = self._measures(int(i))
+            for s, sensor in enumerate(self._sensors):
+                if sensor in of_contact:
+                    found[p, s] = of_contact[sensor][frame_index[p, s]]
+        return found
+
+    def _measures(self, i: int) -> dict[str, np.ndarray]:
+        if i not in self._known:
+            contact = self._store.contact(i, fields=True)
+            self._known[i] = {s: depth_measures(x.depth_mm) for s, x in contact.items() if x.depth_mm is not None}
+        return self._known[i]
+
+
 class ClipFeed(Feed):
-    """Clips in random order, without end."""
+    """Clips in random order, without end; with `depth` they come with measures of it, and `memory` keeps them."""
 
-    def __init__(self, store: Contacts, rows: np.ndarray, clip: ClipConfig, *, batch_size: int, seed: int) -> None:
-        super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed), seed)
+    def __init__(
+        self,
+        store: Contacts,
+        rows: np.ndarray,
+        clip: ClipConfig,
+        *,
+        batch_size: int,
+        seed: int,
+        depth: ClipDepth | None = None,
+        memory: ClipMemory | None = None,
+    ) -> None:
+        super().__init__(clip_batches(store, rows, clip, batch_size=batch_size, seed=seed, memory=memory), seed)
+        self._depth = depth
 
-    def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch:
+    def make(self, element: dict[str, np.ndarray], rng: np.random.Generator) -> TouchBatch | MeasuredTouch:
         """The clips unchanged."""
         del rng
-        return host_touch(element)
+        touch = host_touch(element)
+        if self._depth is None:
+            return touch
+        depth: Any = self._depth(element["contact"], element["frame_index"])
+        return MeasuredTouch(touch=touch, depth_mm=depth)
 
 
 def clip_of(config: PretrainConfig, clip: ClipConfig) -> ClipConfig:
@@ -166,6 +230,7 @@ def pretrain(
     stage: str,
     seed: int,
     held_out: HeldOutContacts | None = None,
+    memory: ClipMemory | None = None,
 ) -> DynamicsState:
     """Train encoder and predictor on some contacts, without their labels; a stopped stage resumes.
 
@@ -176,9 +241,19 @@ def pretrain(
       context, stage: the run, and the name of the stage, `PHASE/SEED`.
       seed: of parameters and order.
       held_out: contacts to measure on every `probe_every` steps; nothing is measured by default.
+      memory: keeps the clips.
+
+    Raises:
+      ValueError: contacts to measure on, for another objective than `dynamics`.
     """
+    if held_out is not None and config.objective != "dynamics":
+        raise ValueError(
+            f"objective is {config.objective!r}: must be 'dynamics' where held-out predictions are measured; "
+            "`stage_one` compares the others"
+        )
     clip = clip_of(config, clip)
-    feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed)
+    depth = ClipDepth(store, clip.sensors) if config.objective == "physics" else None
+    feed = ClipFeed(store, rows, clip, batch_size=config.batch_size, seed=seed, depth=depth, memory=memory)
     networks = config.dynamics(len(clip.sensors))
     _, step = dynamics_program(networks, config.optimizer, config.steps)
     state = untrained(config, store, rows, clip, seed)
@@ -194,7 +269,11 @@ def pretrain(
 def untrained(config: PretrainConfig, store: Contacts, rows: np.ndarray, clip: ClipConfig, seed: int) -> DynamicsState:
     """The state before training on some contacts."""
     one = next(iter(clip_batches(store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
-    return pretraining.untrained(config, touch_batch(one), seed)
+    batch: TouchBatch | MeasuredTouch = touch_batch(one)
+    if config.objective == "physics":
+        depth: Any = np.zeros((*one["frame_index"].shape, DEPTH_MEASURES), np.float32)
+        batch = MeasuredTouch(touch=touch_batch(one), depth_mm=depth)
+    return pretraining.untrained(config, batch, seed)
 
 
 def _measure(

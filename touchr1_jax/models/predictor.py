@@ -75,6 +75,17 @@ class LatentPredictor(nn.Module):
         return last + x.reshape(p, t, s, n, d).swapaxes(1, 2)
 
 
+class Head(nn.Module):
+    """Two dense layers with a gelu between them, from latents to `out` numbers."""
+
+    width: int
+    out: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n out"]:
+        return nn.Dense(self.out, name="out")(nn.gelu(nn.Dense(self.width, name="in")(x)))
+
+
 def layer_norm(x: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
     """(x − mean)/√(var + 1e-6) over the last axis, without scale and shift."""
     centred = x - x.mean(-1, keepdims=True)

@@ -23,7 +23,7 @@ from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.text.constraint import Constraint, compile_constraint
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.parser import Parser, compile_parser
-from touchr1_jax.text.template import PromptLayout, build_layout, prompt_words
+from touchr1_jax.text.template import LevelTokens, PromptLayout, build_layout, level_tokens, prompt_words
 from touchr1_jax.text.tokenizer import Tokenizer, word_level
 from touchr1_jax.types import Params, Target, TouchBatch
 
@@ -92,6 +92,21 @@ class TouchPolicy:
     def constraint(self) -> Constraint:
         """Grammar of formatted answers, for constrained sampling."""
         return compile_constraint(self.language, self.tokenizer)
+
+    @functools.cached_property
+    def level_tokens(self) -> LevelTokens:
+        """Token of each level, for an enumerated conclusion.
+
+        Raises:
+          ValueError: a vocabulary that splits a level or a tag.
+        """
+        found = level_tokens(self.language, self.tokenizer)
+        if found is None:
+            raise ValueError(
+                "enumerated is set, but this vocabulary writes a level or a tag in several tokens: each must be one "
+                "token to be enumerated; leave enumerated None"
+            )
+        return found
 
     def init(self, seed: int, batch: TouchBatch) -> Params:
         """Fresh parameters for the shapes of a batch."""

@@ -48,6 +48,14 @@ class Advantage(enum.Enum):
     PER_REWARD = "per-reward"
 
 
+class Norm(enum.Enum):
+    """What expected rewards are divided by where the conclusion is enumerated (see `enumerated`)."""
+
+    NONE = "none"
+    STD = "std"
+    MEAN = "mean"
+
+
 class TactileUse(enum.Enum):
     """Form of R_tu, the reward for answers that controls without touch do not reach (see `tactile_use`)."""
 
@@ -78,6 +86,8 @@ class Algorithm:
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
     best_of: int = 1
     """Rewards count by the best of k rollouts, pass@k or max@k (see `best_of`); 1 counts each by itself."""
+    enumerated: Norm | None = None
+    """Enumerate the level that concludes an answer, rewards over this norm; `None` samples it (see `enumerated`)."""
     segment_credit: bool = False
     """Credit a token only with rewards that are not settled before its segment (`advantages.segment_advantages`)."""
     stable_rewards: bool = False
@@ -136,6 +146,8 @@ class Algorithm:
             count = getattr(self, field)
             if count is not None and count < 1:
                 raise ValueError(f"{field} is {count}: must be at least 1; raise it")
+        if self.enumerated is not None:
+            refuse_with_enumeration(self)
         if self.stale < 0:
             raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
         if not 0 < self.reference_share <= 1:
@@ -148,6 +160,21 @@ class Algorithm:
             bound = getattr(self, field)
             if bound is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
+
+
+def refuse_with_enumeration(algorithm: Algorithm) -> None:
+    """Refuse options that need the reward of a sampled conclusion, which enumeration replaces.
+
+    Raises:
+      ValueError: it names the option.
+    """
+    needed = {"best_of": 1, "segment_credit": False, "kl_in_reward": False, "tactile_use": TactileUse.OFF}
+    for field, value in needed.items():
+        if getattr(algorithm, field) != value:
+            raise ValueError(
+                f"{field} is {getattr(algorithm, field)}: must be {value} where enumerated is "
+                f"{algorithm.enumerated}, because it needs the reward of a sampled conclusion; change either"
+            )
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:

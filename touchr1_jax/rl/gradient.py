@@ -20,6 +20,7 @@ from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out, loss_beta, ratio_to_learner
+from touchr1_jax.rl.enumerated import LevelRewards
 from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_probs, token_terms
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
@@ -40,6 +41,8 @@ class Experience(NamedTuple):
     weight: Float[Array, "P"]
     token_advantage: Float[Array, "P G T"] | None = None
     """Advantage of each token, in the place of the rollout's, where segments are credited apart."""
+    levels: LevelRewards | None = None
+    """Rewards of every conclusion, which the loss reads in the place of `advantage` where it is enumerated."""
 
 
 def grpo_gradient(
@@ -79,7 +82,8 @@ def grpo_gradient(
         rollout, w = micro.rollout, micro.weight
         a = micro.advantage if micro.token_advantage is None else micro.token_advantage
         answer = None if left_out(algorithm.anchor) else answer_likelihood(fns, config, params, micro.batch)
-        value, parts = grpo_loss(terms, old, rollout.log_prob, rollout.mask, a, w, config, longest, answer)
+        rollouts = old, rollout.log_prob, rollout.mask, a, w
+        value, parts = grpo_loss(terms, *rollouts, config, longest, answer, micro.levels)
         parts |= {"loss": value} if answer is None else {"loss": value, "answer_likelihood": answer}
         return value, (parts, old)
 
@@ -188,7 +192,20 @@ def prompt_terms(
         of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
-    return jax.tree.map(lambda x: x.reshape(tokens.shape), found)
+    terms = jax.tree.map(lambda x: x.reshape(tokens.shape), found)
+    if experience.levels is None:
+        return terms
+    return terms._replace(level_log_prob=level_log_probs(fns, config, heads["own"], own, experience.levels))
+
+
+def level_log_probs(
+    fns: PolicyFns, config: GRPOConfig, params: Params, states: Float[Array, "G T D"], levels: LevelRewards
+) -> Float[Array, "G K"]:
+    """log π of each level where each completion of one prompt concludes; −∞ past the last level."""
+    at = jnp.minimum(levels.at, states.shape[1] - 1)
+    here = jnp.take_along_axis(states, at[:, None, None], 1)[:, 0]
+    log_p = jax.nn.log_softmax(tempered(fns.logits(params, here), config.temperature))
+    return jnp.where(levels.ids >= 0, log_p[:, levels.ids], -jnp.inf)
 
 
 def logit_terms(config: GRPOConfig, tokens: Int[Array, "*n"], logits: Mapping[str, Float[Array, "*n V"]]) -> TokenTerms:

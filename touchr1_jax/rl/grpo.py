@@ -26,6 +26,7 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rewards.base import GROUP
 from touchr1_jax.rl import tactile_use
 from touchr1_jax.rl.advantages import (
+    SPREAD_FLOOR,
     added_after,
     advantages,
     dynamic_sampling_rows,
@@ -36,6 +37,7 @@ from touchr1_jax.rl.advantages import (
 )
 from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision, ratio_to_learner
 from touchr1_jax.rl.counterfactual import mask_one_stream
+from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.metrics import advantage_metrics, answer_metrics, reward_metrics, rollout_metrics, touch_metrics
@@ -43,6 +45,7 @@ from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, samp
 from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
+from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.types import Params, Parsed, Rollout
 
 LEAN = {"xla_cpu_use_fusion_emitters": False}
@@ -92,6 +95,8 @@ class Group(NamedTuple):
     terms: dict[str, Float[Array, "D G"]]
     finite: Bool[Array, "D"]
     bonus: Float[Array, "D G"]
+    levels: LevelRewards | None = None
+    """Rewards of every conclusion, where it is enumerated."""
 
 
 def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
@@ -121,6 +126,7 @@ def make_grpo_step(
     constraint: Constraint | None = None,
     *,
     gather: Callable[[Params], Params] = lambda params: params,
+    levels: LevelTokens | None = None,
 ) -> Callable[[GRPOState, GRPOBatch, FrozenInputs], tuple[GRPOState, dict[str, Array]]]:
     """Build the jitted step, (state, batch, frozen) → (state, metrics); the state's buffers are donated.
 
@@ -132,9 +138,11 @@ def make_grpo_step(
       constraint: which completions may be sampled; `None` leaves them free.
       gather: all-gathers sharded weights, once before the sampling loop, which reads all of them for every token (see
         `distributed.placement.gather_params`); by default they are read as they are.
+      levels: token of each level, for an algorithm that enumerates conclusions.
 
     Raises:
-      ValueError: an algorithm that samples constrained, without a constraint; one that credits segments, with a score
+      ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without
+        the tokens of the levels; one that credits segments, with a score
         that `make_score` did not make; lean compilation where jax has none.
     """
     if config.lean_compilation and not compiles_leanly():
@@ -148,9 +156,11 @@ def make_grpo_step(
         )
     if config.algorithm.constrained and constraint is None:
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
+    if config.algorithm.enumerated is not None and levels is None:
+        raise ValueError("enumerated is set, but there are no tokens of levels; make them with `level_tokens`")
     if config.bfloat16:
         fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16))
-    return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather), config)
+    return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather, levels), config)
 
 
 def compile_step(engine: "GRPOEngine", config: GRPOConfig) -> Callable[..., tuple[GRPOState, dict[str, Array]]]:
@@ -168,6 +178,7 @@ class GRPOEngine:
     config: GRPOConfig
     constraint: Constraint | None
     gather: Callable[[Params], Params]
+    levels: LevelTokens | None
 
     def step(self, state: GRPOState, batch: Any, frozen: Any) -> tuple[GRPOState, dict[str, Array]]:
         """Rollouts, rewards, advantages, update."""
@@ -220,7 +231,12 @@ class GRPOEngine:
         if algorithm.tactile_use is TactileUse.LITERAL:
             terms = {**terms, tactile_use.TERM: algorithm.tactile_weight * bonus}
             reward = reward + terms[tactile_use.TERM]
-        return Group(batch, rollout, parsed, reward, terms, finite, bonus), metrics | left_out
+        levels = None
+        if algorithm.enumerated is not None and self.levels is not None:
+            reward_of = lambda tokens, target: score(tokens, target)[0]
+            levels = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward)
+            levels = levels._replace(reward=jnp.where(finite[:, None, None], levels.reward, 0.0))
+        return Group(batch, rollout, parsed, reward, terms, finite, bonus, levels), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:
         """Settings of the sampler for so many completions of a prompt."""
@@ -238,6 +254,8 @@ class GRPOEngine:
 
     def no_signal(self, group: Group) -> Bool[Array, "D"]:
         """Groups without a gradient: the reward is constant, and the bonus where it is added to the advantage."""
+        if group.levels is not None:
+            return all_equal(group.levels, SPREAD_FLOOR) | ~group.finite
         equal = no_signal(self.config.algorithm, group.reward, group.terms)
         if self.config.algorithm.tactile_use is TactileUse.RECOMMENDED:
             equal &= zero_variance(group.bonus)
@@ -283,6 +301,7 @@ class GRPOEngine:
             advantage=advantage,
             token_advantage=by_token,
             weight=weight,
+            levels=group.levels,
         )
 
     def refreshed(self, state: GRPOState) -> GRPOState:

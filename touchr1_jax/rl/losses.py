@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, KLEstimator, Surrogate, left_out, loss_beta
+from touchr1_jax.rl.enumerated import ExactTerms, LevelRewards, before_level, conclude_exactly, exact_terms
 
 LOG_RATIO_CLAMP = 20.0
 """Bound of a log-ratio before `exp`: e^20 is far past any meaning and far from float32 overflow."""
@@ -28,6 +29,8 @@ class TokenTerms(NamedTuple):
     """KL(π(· | touch) ‖ π(· | one stream replaced by noise)), nat, at most `grounding_cap_nat`."""
     entropy: Float[Array, "*n"]
     """Entropy of π, nat."""
+    level_log_prob: Float[Array, "*g K"] | None = None
+    """log π of each level at the place where a rollout concludes, −∞ past the last one; only where it is enumerated."""
 
 
 def grpo_loss(
@@ -40,6 +43,7 @@ def grpo_loss(
     config: GRPOConfig,
     longest: int | Float[Array, ""] | None = None,
     answer: Float[Array, "P"] | None = None,
+    levels: LevelRewards | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
     """Loss −J of a micro-batch of groups, which adds up to that of the step over all of them.
 
@@ -60,6 +64,7 @@ def grpo_loss(
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
       longest: `divisor` of the whole batch; by default that of these rollouts.
       answer: L, the mean log-likelihood of a token of each verified answer; `None` where λ = `anchor` is 0.
+      levels: rewards of every conclusion, where it is enumerated: they replace `advantage` (see `enumerated`).
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
@@ -67,9 +72,7 @@ def grpo_loss(
     """
     algorithm = config.algorithm
     longest = divisor(config, mask) if longest is None else longest
-    objective, clipped = surrogate(algorithm, terms.log_prob, old, mask, advantage)
-    if algorithm.importance_cap is not None:
-        objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
+    objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
@@ -79,7 +82,7 @@ def grpo_loss(
     gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
     gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
-    return -gain, {
+    return -gain, expected | {
         "surrogate": policy,
         "kl": kl,
         "kl_peak": peak(terms.reference_kl),
@@ -90,6 +93,45 @@ def grpo_loss(
         "sampler_gap": per_rollout(gap),
         "sampler_gap_peak": peak(gap),
     }
+
+
+def policy_objective(
+    algorithm: Algorithm,
+    terms: TokenTerms,
+    old: Float[Array, "P G T"],
+    sampler: Float[Array, "P G T"],
+    mask: Bool[Array, "P G T"],
+    advantage: Float[Array, "P G *t"],
+    levels: LevelRewards | None,
+) -> tuple[Float[Array, "P G T"], Bool[Array, "P G T"], dict[str, Float[Array, "P"]]]:
+    """c_t S_t of every token, where the clip cut its gradient off, and each prompt's mean E where it is enumerated.
+
+    Arguments are those of `grpo_loss`.
+    """
+    exact = None if levels is None else exact_levels(algorithm, terms, levels)
+    trace = mask if levels is None else before_level(mask, levels.at)
+    a = advantage if exact is None else exact.advantage
+    objective, clipped = surrogate(algorithm, terms.log_prob, old, trace, a)
+    if algorithm.importance_cap is not None:
+        objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
+    if levels is None or exact is None:
+        return objective, clipped, {}
+    expected = {"expected_reward": jnp.mean(exact.expected, -1)}
+    return conclude_exactly(objective, exact.objective, levels.at), clipped, expected
+
+
+def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) -> ExactTerms:
+    """`enumerated.exact_terms` of groups of rollouts.
+
+    Raises:
+      ValueError: an algorithm that does not enumerate, or terms without the probabilities of the levels.
+    """
+    if algorithm.enumerated is None or terms.level_log_prob is None:
+        raise ValueError("levels are given, but enumerated is None or terms lack level_log_prob; pass both or neither")
+    states, epsilon = levels.at < terms.log_prob.shape[-1], algorithm.epsilon
+    return exact_terms(
+        algorithm.enumerated, terms.level_log_prob, levels.reward, states, levels.sampled, epsilon=epsilon
+    )
 
 
 def importance(

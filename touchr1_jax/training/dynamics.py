@@ -10,11 +10,14 @@ they would be satisfied by telling sensors and forces apart, which is no news.
 Sources: Assran et al. 2023 (I-JEPA) for the objective; Bardes et al. 2022 (VICReg, §4.1) for the two terms, here with
 std = √(var + 1e-4); Grill et al. 2020 (BYOL) for the moving average.  Departures: the predictor is told time and force
 of the step that it predicts, and other sensors take part in the prediction.
+
+`DynamicsConfig.objective` selects one of three other objectives (see `objectives`), each with a head in the place of
+the predictor: contrast between sensors, prediction of hidden patches, force and depth.
 """
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, assert_never
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +26,20 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.models.predictor import LN_FLOOR, LatentPredictor, PredictorConfig, layer_norm
+from touchr1_jax.models.predictor import LN_FLOOR, Head, LatentPredictor, PredictorConfig, layer_norm
 from touchr1_jax.models.salience import fewer_frames
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
+from touchr1_jax.training.objectives import (
+    Objective,
+    contrast_loss,
+    hidden_loss,
+    hide_patches,
+    measured_loss,
+    measured_targets,
+    random_patches,
+)
 from touchr1_jax.types import Params, TouchBatch
+from touchr1_jax.validation import at_least, within
 
 SPREAD_FLOOR = 1e-4
 """Added to a variance under the root, whose gradient is then finite; VICReg's."""
@@ -62,10 +75,28 @@ class DynamicsConfig:
     encoder: TactileViTConfig
     predictor: PredictorConfig = PredictorConfig()
     frames_kept: int | None = None
+    objective: Objective = "dynamics"
+    hidden_share: float = 0.5
+    """Share of the patches that are hidden, for the objective `masked`."""
+    embedding: int = 64
+    """Width of the embedding that the objective `contrast` compares."""
 
     def __post_init__(self) -> None:
-        if not self.encoder.causal:
+        if self.objective == "dynamics" and not self.encoder.causal:
             raise ValueError("encoder.causal is False: a step that sees the next one predicts it by copying; set it")
+        kept = {"frames_kept": self.frames_kept, "encoder.patches_kept": self.encoder.patches_kept}
+        if self.objective in ("masked", "physics") and any(value is not None for value in kept.values()):
+            raise ValueError(f"{kept}: must be None for objective {self.objective!r}, which reads all; leave them out")
+        within(self, 0, 1, "hidden_share")
+        at_least(self, 1, "embedding")
+
+
+@struct.dataclass
+class MeasuredTouch:
+    """Contacts with measures of the depth of each frame, mm; NaN where it was not measured."""
+
+    touch: TouchBatch
+    depth_mm: Float[Array, "P S F q"]
 
 
 @struct.dataclass
@@ -222,25 +253,120 @@ def random_shown(key: Array, present: Bool[Array, "P S"], full_share: float) -> 
     return present & (full | one | jax.random.bernoulli(keep_key, 0.5, present.shape))
 
 
+def head_of(config: DynamicsConfig, quantities: int = 0) -> Head:
+    """The head of an objective other than `dynamics`; `quantities` are those of `physics`."""
+    out = {"contrast": config.embedding, "masked": config.encoder.width, "physics": quantities}[config.objective]
+    return Head(width=2 * config.encoder.width, out=out)
+
+
+def contrast_terms(config: DynamicsConfig, params: Params, batch: TouchBatch) -> Float[Array, ""]:
+    """`contrast_loss` of each stream's mean latent; force and time, which alone identify a contact, are not shown."""
+    batch = read_frames(config, batch)
+    order = jnp.broadcast_to(jnp.arange(batch.frame_index.shape[-1]), batch.frame_index.shape)
+    latent = encode_batch(
+        config.encoder, params["encoder"], dataclasses.replace(without_force(batch), frame_index=order)
+    )
+    exists = steps_of(batch, config.encoder.frames_per_step).exists
+    mean = masked.mean(latent, exists[..., None, None], (2, 3))
+    embedding: Any = head_of(config).apply({"params": params["predictor"]}, mean)
+    return contrast_loss(embedding, exists.any(-1))
+
+
+def masked_terms(
+    config: DynamicsConfig, params: Params, target: Params, batch: TouchBatch, key: Array
+) -> Float[Array, ""]:
+    """`hidden_loss` of hidden patches, and of all pooled tokens, against the averaged encoder that sees everything."""
+    frames, index = batch.frames, batch.frame_index
+    cell = config.encoder.stem_px * config.encoder.patch_cells
+    grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
+    hidden = random_patches(key, (*index.shape[:2], grid), config.hidden_share)
+    encode = lambda p, x: TactileViT(config.encoder).apply({"params": p}, *_streams(x), method=TactileViT.encode)
+    seen: Any = encode(params["encoder"], dataclasses.replace(batch, frames=hide_patches(frames, hidden)))
+    goal: Any = encode(target, batch)
+
+    def head(latent: Array) -> Array:
+        found: Any = head_of(config).apply({"params": params["predictor"]}, latent)
+        return found
+
+    exists = steps_of(batch, config.encoder.frames_per_step).exists[..., None]
+    patches = hidden_loss(head(seen.patches), layer_norm(goal.patches), exists & hidden[:, :, None])
+    pooled = hidden_loss(head(seen.pooled), layer_norm(goal.pooled), jnp.broadcast_to(exists, seen.pooled.shape[:-1]))
+    return patches + pooled
+
+
+def physics_terms(config: DynamicsConfig, params: Params, batch: MeasuredTouch) -> Float[Array, ""]:
+    """`measured_loss` of force and depth at the last frame of each step, estimated without force as input."""
+    touch, per_step = batch.touch, config.encoder.frames_per_step
+    steps = steps_of(touch, per_step)
+    depth_mm = batch.depth_mm[:, :, per_step - 1 :: per_step]
+    measured, known = measured_targets(steps.force_n, depth_mm)
+    latent = encode_batch(config.encoder, params["encoder"], without_force(touch))
+    head = head_of(config, measured.shape[-1])
+    found: Any = head.apply({"params": params["predictor"]}, latent.reshape(*latent.shape[:3], -1))
+    return measured_loss(found, measured, known & steps.exists[..., None])
+
+
+def without_force(batch: TouchBatch) -> TouchBatch:
+    """The contacts with unknown forces."""
+    return dataclasses.replace(batch, force_n=jnp.zeros_like(batch.force_n))
+
+
+def stage_one_loss(
+    config: DynamicsConfig,
+    params: Params,
+    target: Params,
+    batch: TouchBatch | MeasuredTouch,
+    key: Array,
+    guards: Guards,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Loss and metrics of the configured objective; arguments as in `dynamics_loss`, `key` draws what is hidden.
+
+    Raises:
+      ValueError: the objective `physics` without measured depth.
+    """
+    touch = batch.touch if isinstance(batch, MeasuredTouch) else batch
+    match config.objective:
+        case "dynamics":
+            shown = random_shown(key, touch.stream_mask, FULL_SHARE)
+            return dynamics_loss(config, params, target, touch, shown, guards)
+        case "contrast":
+            value = contrast_terms(config, params, touch)
+        case "masked":
+            value = masked_terms(config, params, target, touch, key)
+        case "physics":
+            if not isinstance(batch, MeasuredTouch):
+                raise ValueError("batch has no depth_mm: the objective physics needs it; pass a MeasuredTouch")
+            value = physics_terms(config, params, batch)
+        case _:
+            assert_never(config.objective)
+    return value, {config.objective: value}
+
+
 def start_dynamics(
-    config: DynamicsConfig, optimizer: optax.GradientTransformation, key: Array, batch: TouchBatch
+    config: DynamicsConfig, optimizer: optax.GradientTransformation, key: Array, batch: TouchBatch | MeasuredTouch
 ) -> DynamicsState:
     """Fresh state from one key and the shapes of a batch."""
     encoder_key, predictor_key, key = jax.random.split(key, 3)
+    batch, depth = (batch.touch, batch.depth_mm) if isinstance(batch, MeasuredTouch) else (batch, None)
     one = read_frames(config, jax.tree.map(lambda x: x[:1], batch))
     sensors = jnp.arange(batch.frames.shape[1])[None]
     streams = (one.frames, one.force_n, one.frame_index, one.frame_mask, sensors)
     encoder = TactileViT(config.encoder).init(encoder_key, *streams)["params"]
     latent, steps = encode_batch(config.encoder, encoder, one), steps_of(one, config.encoder.frames_per_step)
-    asked = (latent[:, :, :-1], steps.exists[:, :, :-1], steps.index[:, :, 1:], steps.force_n[:, :, 1:])
-    predictor = LatentPredictor(config.predictor, batch.frames.shape[1]).init(predictor_key, *asked)["params"]
+    if config.objective == "dynamics":
+        asked = (latent[:, :, :-1], steps.exists[:, :, :-1], steps.index[:, :, 1:], steps.force_n[:, :, 1:])
+        predictor = LatentPredictor(config.predictor, batch.frames.shape[1]).init(predictor_key, *asked)["params"]
+    else:
+        quantities = 0 if depth is None else 4 + depth.shape[-1]
+        joined = latent.reshape(*latent.shape[:3], -1) if config.objective == "physics" else latent
+        predictor = head_of(config, quantities).init(predictor_key, joined)["params"]
     params = {"encoder": encoder, "predictor": predictor}
     target = jax.tree.map(jnp.copy, encoder)  # the step gives its buffers away: the two must not share any
     zero = jnp.zeros((), jnp.int32)
     return DynamicsState(params=params, target=target, opt_state=optimizer.init(params), step=zero, key=key)
 
 
-DynamicsStep = Callable[[DynamicsState, TouchBatch], tuple[DynamicsState, dict[str, Array]]]
+DynamicsStep = Callable[[DynamicsState, TouchBatch | MeasuredTouch], tuple[DynamicsState, dict[str, Array]]]
 
 
 def dynamics_update(
@@ -248,11 +374,11 @@ def dynamics_update(
     optimizer: optax.GradientTransformation,
     guards: Guards,
     state: DynamicsState,
-    batch: TouchBatch,
+    batch: TouchBatch | MeasuredTouch,
 ) -> tuple[DynamicsState, dict[str, Array]]:
     """One step of gradient descent, then f̄ ← ema · f̄ + (1 − ema) · f; pure, for `jit` and `vmap`."""
-    shown = random_shown(jax.random.fold_in(state.key, state.step), batch.stream_mask, FULL_SHARE)
-    loss = lambda p: dynamics_loss(config, p, state.target, batch, shown, guards)
+    key = jax.random.fold_in(state.key, state.step)
+    loss = lambda p: stage_one_loss(config, p, state.target, batch, key, guards)
     (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)

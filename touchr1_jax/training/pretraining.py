@@ -25,6 +25,7 @@ from touchr1_jax.training.dynamics import (
     DynamicsState,
     DynamicsStep,
     Guards,
+    MeasuredTouch,
     encode_each,
     make_dynamics_step,
     predict_next,
@@ -35,6 +36,7 @@ from touchr1_jax.training.dynamics import (
     steps_of,
 )
 from touchr1_jax.training.latent_probes import rank_me, told_apart
+from touchr1_jax.training.objectives import Objective
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params, TouchBatch
 
@@ -57,6 +59,8 @@ class PretrainConfig:
     frames_kept: int | None = None
     """Number of these frames that are read, the most salient ones; all by default."""
     image_px: int = 112
+    objective: Objective = "dynamics"
+    """Task that is learned without labels (see `objectives.Objective`)."""
     steps: int = 450
     batch_size: int = 32
     probe_every: int = 150
@@ -66,12 +70,15 @@ class PretrainConfig:
     def dynamics(self, sensors: int) -> DynamicsConfig:
         """The networks for this number of streams."""
         encoder = dataclasses.replace(self.encoder, sensors=sensors)
-        return DynamicsConfig(encoder=encoder, predictor=self.predictor, frames_kept=self.frames_kept)
+        return DynamicsConfig(
+            encoder=encoder, predictor=self.predictor, frames_kept=self.frames_kept, objective=self.objective
+        )
 
 
-def untrained(config: PretrainConfig, batch: TouchBatch, seed: int) -> DynamicsState:
+def untrained(config: PretrainConfig, batch: TouchBatch | MeasuredTouch, seed: int) -> DynamicsState:
     """The state before training, for contacts like those of a batch; its target is an untrained encoder."""
-    networks = config.dynamics(batch.stream_mask.shape[1])
+    touch = batch.touch if isinstance(batch, MeasuredTouch) else batch
+    networks = config.dynamics(touch.stream_mask.shape[1])
     optimizer, _ = dynamics_program(networks, config.optimizer, config.steps)
     start = jax.jit(lambda key, batch: start_dynamics(networks, optimizer, key, batch))
     # committed to the device, as a restored state is: otherwise the step would be compiled twice

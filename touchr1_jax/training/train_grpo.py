@@ -23,6 +23,7 @@ from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
+from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.train_sft import fresh_adapters, merge_adapters
@@ -62,7 +63,9 @@ def train_grpo(
       ValueError: a first batch without touch, a stream whose touch does not reach the policy.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
-    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, lora, hooks.devices.gather_params)
+    levels = None if config.algorithm.enumerated is None else policy.level_tokens
+    gather = hooks.devices.gather_params
+    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, lora, gather, levels)
     decoder = {"decoder": params["decoder"]}
     check_whole_batch(policy.fns, decoder, batches, config, hooks, noise, seed)
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
@@ -108,12 +111,14 @@ def grpo_program(
     constraint: Constraint | None = None,
     lora: LoraConfig | None = None,
     gather: Callable[[Params], Params] = lambda params: params,
+    levels: LevelTokens | None = None,
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds; with adapters the frozen decoder is the last argument."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates * config.algorithm.minibatches
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    plain = make_grpo_step(fns, score, optimizer, config, constraint, gather=gather)
+    make = functools.partial(make_grpo_step, gather=gather, levels=levels)
+    plain = make(fns, score, optimizer, config, constraint)
     if lora is None:
         return optimizer, plain
     # a jitted step inside another takes no options of the compiler: the outer one gets them
@@ -123,7 +128,7 @@ def grpo_program(
         state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params
     ) -> tuple[GRPOState, dict[str, Array]]:
         adapted = adapt(fns, base, lora)
-        return make_grpo_step(adapted, score, optimizer, inner, constraint, gather=gather)(state, batch, frozen)
+        return make(adapted, score, optimizer, inner, constraint)(state, batch, frozen)
 
     return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
 

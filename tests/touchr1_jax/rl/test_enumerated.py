@@ -1,0 +1,214 @@
+"""Enumerated conclusions: values by hand, the gradient against a float64 one, and whole steps."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from tests.touchr1_jax import tiny
+from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy
+from touchr1_jax.rewards import make_rewards, uniform_prior
+from touchr1_jax.rl.config import Average, Cispo, Dapo, GRPOConfig, Gspo, Norm, Paper, Rloo, TactileUse
+from touchr1_jax.rl.enumerated import (
+    LevelRewards,
+    all_equal,
+    before_level,
+    conclude_exactly,
+    conclusion_place,
+    exact_terms,
+    level_rewards,
+)
+from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.losses import TokenTerms, grpo_loss
+from touchr1_jax.rl.scoring import make_score
+from touchr1_jax.text.constraint import compile_constraint
+from touchr1_jax.text.parser import compile_parser
+from touchr1_jax.text.template import level_tokens
+
+PARSER = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
+LEVELS = level_tokens(tiny.LANGUAGE, tiny.TOKENIZER)
+PROBABILITY = jnp.array([[0.5, 0.25], [0.0, 0.5]])  # of two levels after two traces; the rest is other words
+REWARD = jnp.array([[1.0, 0.0], [1.0, 0.4]])
+
+
+def terms(norm: Norm, states=(True, True), sampled=(0.0, 0.0)):
+    return exact_terms(norm, jnp.log(PROBABILITY), REWARD, jnp.array(states), jnp.array(sampled), epsilon=0.0)
+
+
+@pytest.mark.parametrize(
+    ("norm", "n"),
+    [
+        (Norm.NONE, 1.0),
+        # Ē = .35: (.5 · .65² + .25 · .35² + .25 · .35² + .5 · .05² + .5 · .35²) / 2
+        (Norm.STD, np.sqrt((0.5 * 0.65**2 + 0.5 * 0.35**2 + 0.5 * 0.05**2 + 0.5 * 0.35**2) / 2)),
+        (Norm.MEAN, 0.35),
+    ],
+)
+def test_expected_rewards_and_advantages_by_hand(norm, n):
+    found = terms(norm)
+    np.testing.assert_allclose(found.expected, [0.5, 0.2], rtol=1e-6)
+    np.testing.assert_allclose(found.advantage, np.array([0.3, -0.3]) / n, rtol=1e-5)
+    np.testing.assert_allclose(found.objective, np.array([0.5, 0.2]) / n, rtol=1e-5)
+
+
+def test_a_trace_without_conclusion_keeps_its_sampled_reward():
+    found = terms(Norm.NONE, states=(True, False), sampled=(9.0, 0.1))
+    np.testing.assert_allclose(found.expected, [0.5, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(found.advantage, [0.4, -0.4], rtol=1e-6)
+    spread = np.sqrt(((0.5 * 0.7**2 + 0.5 * 0.3**2) + 0.2**2) / 2)
+    np.testing.assert_allclose(
+        terms(Norm.STD, states=(True, False), sampled=(9.0, 0.1)).advantage, [0.4 / spread, -0.4 / spread], rtol=1e-5
+    )
+
+
+def test_a_group_of_one_has_no_advantage_and_a_tiny_mean_is_bounded():
+    one = exact_terms(Norm.MEAN, jnp.log(jnp.array([[0.01]])), jnp.array([[1.0]]), jnp.array([True]), jnp.zeros(1))
+    np.testing.assert_allclose(one.advantage, [0.0])
+    np.testing.assert_allclose(one.objective, [0.5], rtol=1e-6)  # .01 / .02
+
+
+def test_the_level_takes_the_place_of_its_token_and_what_follows_counts_nothing():
+    objective = jnp.arange(1.0, 9.0).reshape(2, 4)
+    found = conclude_exactly(objective, jnp.array([0.5, 0.7]), jnp.array([2, 4]))
+    np.testing.assert_allclose(found, [[1, 2, 0.5, 0], [5, 6, 7, 8]])
+    mask = jnp.array([[True, True, True, True], [True, True, False, False]])
+    expected = [[True, True, False, False], [True, True, False, False]]
+    np.testing.assert_array_equal(before_level(mask, jnp.array([2, 4])), expected)
+
+
+TRACE = np.array([0.3, -0.5])  # logits of two traces
+LEVEL = np.array([[0.2, -0.1, 0.6], [-0.4, 0.9, 0.0]])  # logits of three levels after each
+EARNS = np.array([[1.0, 0.4, 0.0], [0.0, 1.0, 0.3]])
+
+
+def softmax(x: np.ndarray) -> np.ndarray:
+    return np.exp(x) / np.exp(x).sum(-1, keepdims=True)
+
+
+def true_gradient() -> tuple[np.ndarray, np.ndarray]:
+    """Central differences of Σ_trace π(trace) Σ_k p_k r_k, float64."""
+    flat = np.concatenate([TRACE, LEVEL.ravel()])
+    value = lambda x: softmax(x[:2]) @ (softmax(x[2:].reshape(2, 3)) * EARNS).sum(-1)
+    h = 1e-6 * np.eye(len(flat))
+    slope = np.array([(value(flat + e) - value(flat - e)) / 2e-6 for e in h])
+    return slope[:2], slope[2:].reshape(2, 3)
+
+
+ALGORITHMS = (
+    Rloo(enumerated=Norm.NONE),
+    Dapo(enumerated=Norm.NONE, average=Average.LENGTH),
+    Cispo(enumerated=Norm.NONE, average=Average.LENGTH),
+)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda a: type(a).__name__)
+def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm):
+    """A policy of two traces, one token each, and three levels; every group of two traces by its probability."""
+    config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=2, algorithm=algorithm)
+
+    def loss(trace_logits, level_logits, pair):
+        log_trace, log_level = jax.nn.log_softmax(trace_logits), jax.nn.log_softmax(level_logits)
+        drawn = jnp.array(pair)
+        log_prob = jnp.stack([log_trace[drawn], log_level[drawn, 0]], -1)[None]
+        nothing = jnp.zeros_like(log_prob)
+        found = TokenTerms(log_prob, nothing, nothing, nothing, log_level[drawn][None])
+        earns, at = jnp.asarray(EARNS)[drawn][None], jnp.ones((1, 2), int)
+        levels = LevelRewards(ids=jnp.arange(3)[None], at=at, reward=earns, sampled=nothing[..., 0])
+        old = jax.lax.stop_gradient(log_prob)
+        mask, a, w = jnp.ones(old.shape, bool), jnp.full((1, 2), jnp.nan), jnp.ones(1)
+        return grpo_loss(found, old, old, mask, a, w, config, levels=levels)[0]
+
+    grad = jax.grad(loss, argnums=(0, 1))
+    total = [np.zeros(2), np.zeros((2, 3))]
+    for pair in itertools.product(range(2), repeat=2):
+        chance = np.prod(softmax(TRACE)[list(pair)])
+        for sum_, g in zip(total, grad(jnp.asarray(TRACE), jnp.asarray(LEVEL), pair), strict=True):
+            sum_ -= config.length * chance * np.asarray(g, float)
+    for found, exact in zip(total, true_gradient(), strict=True):
+        np.testing.assert_allclose(found, exact, atol=2e-6)
+
+
+def test_the_conclusion_begins_after_its_only_tag():
+    tokens = jnp.array([[5, 7, 1, 2], [5, 1, 2, 7], [5, 1, 2, 3], [7, 1, 7, 2]])
+    np.testing.assert_array_equal(conclusion_place(tokens, 7), [2, 4, 4, 4])
+
+
+def test_levels_of_several_tokens_are_refused():
+    by_letter = dataclasses.replace(tiny.TOKENIZER, encoder=lambda text: [ord(c) for c in text])
+    policy = TouchPolicy(
+        model=TouchConfig(), language=tiny.LANGUAGE, tokenizer=by_letter, layout=tiny.LAYOUT, fns=FNS, parser=PARSER
+    )
+    with pytest.raises(ValueError, match="several tokens"):
+        assert policy.level_tokens
+
+
+@pytest.fixture(scope="module")
+def rewards():
+    """Of an answer that concludes "firm" and one that is cut off, for a question about hardness and one of all."""
+    text = "<perceive> xense soft </perceive> <compare> hard </compare> <conclude> firm </conclude>"
+    ids = [*tiny.TOKENIZER.encode(text), tiny.TOKENIZER.end_ids[0]]
+    tokens = jnp.asarray([ids, [*ids[:6], *[tiny.TOKENIZER.pad_id] * (len(ids) - 6)]])
+    target = tiny.target(np.zeros(2, int), np.array([2, 2]))
+    target = target.replace(asked=target.asked.at[1].set(True))
+    worth = make_score(PARSER, make_rewards(uniform_prior((3, 3, 3, 9))), {"accuracy": 1.0})
+    each = jax.vmap(jax.vmap(worth, in_axes=(0, None), axis_name="group"))
+    reward_of = lambda tokens, target: each(tokens, target)[0]
+    both = jnp.stack([tokens, tokens])
+    return level_rewards(reward_of, LEVELS, both, target, jnp.full((2, 2), 0.25))
+
+
+def test_rewards_of_every_conclusion_by_hand(rewards):
+    """Label "hard": ordinal credit 0, .4, 1; the levels that hardness lacks earn 0, and a cut answer states none."""
+    np.testing.assert_allclose(rewards.reward[0, 0], [0, 0.4, 1, *[0] * 6], atol=1e-6)
+    assert rewards.at[0, 0] == 8
+    length = 11
+    assert rewards.at[0, 1] == length
+    np.testing.assert_array_equal(rewards.at[1], [length, length])  # a question about everything is not enumerated
+    assert list(rewards.ids[0]) == list(LEVELS.level[0])
+
+
+def test_prompts_whose_levels_all_earn_the_same_teach_nothing():
+    reward = jnp.array([[[1.0, 0.0]], [[0.5, 0.5]], [[0.5, 9.0]]])
+    ids = jnp.array([[1, 2], [1, 2], [1, -1]])
+    levels = LevelRewards(ids=ids, at=jnp.zeros((3, 1), int), reward=reward, sampled=jnp.zeros((3, 1)))
+    np.testing.assert_array_equal(all_equal(levels, 1e-5), [False, True, True])
+
+
+@pytest.mark.parametrize(
+    "change", [{"best_of": 2}, {"segment_credit": True}, {"kl_in_reward": True}, {"tactile_use": TactileUse.LITERAL}]
+)
+def test_options_that_need_a_sampled_conclusion_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        Paper(enumerated=Norm.STD, **change)
+
+
+def test_a_step_needs_the_tokens_of_the_levels():
+    config = GRPOConfig(prompts=P, micro_prompts=P, algorithm=Rloo(enumerated=Norm.NONE))
+    with pytest.raises(ValueError, match="enumerated is set"):
+        make_grpo_step(FNS, score, optax.sgd(0.1), config)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", [Rloo, Gspo])
+def test_a_step_on_the_policy_raises_the_expected_reward(preset):
+    """Constrained rollouts conclude, so that no prompt is degenerate although all samples may earn the same."""
+    constraint = compile_constraint(tiny.LANGUAGE, tiny.TOKENIZER)
+    algorithm = preset(enumerated=Norm.MEAN, constrained=True)
+    config = GRPOConfig(prompts=P, group=2, length=14, micro_prompts=P, algorithm=algorithm)
+    worth = make_score(PARSER, make_rewards(uniform_prior((3, 3, 3, 9))), {"accuracy": 1.0})
+    optimizer = optax.adam(3e-3)
+    step = make_grpo_step(FNS, worth, optimizer, config, constraint, levels=LEVELS)
+    state = start_state(tiny.shallow_params(0, loud=0.2), optimizer, jax.random.key(0), config)
+    found = []
+    for _ in range(30):
+        state, metrics = step(state, tiny.question_batch(1, P), FROZEN)
+        found.append(jax.device_get(metrics))
+    assert all(np.isfinite(v) for m in found for v in m.values())
+    early, late = (np.mean([m["expected_reward"] for m in part]) for part in (found[:5], found[-5:]))
+    assert late > early + 0.02
+    assert found[0]["degenerate_share"] == 0
