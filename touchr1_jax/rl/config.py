@@ -49,7 +49,7 @@ class Advantage(enum.Enum):
 
 
 class Norm(enum.Enum):
-    """What expected rewards are divided by where the conclusion is enumerated (see `enumerated`)."""
+    """Divisor of expected rewards where the conclusion is enumerated (see `enumerated`)."""
 
     NONE = "none"
     STD = "std"
@@ -146,8 +146,11 @@ class Algorithm:
             count = getattr(self, field)
             if count is not None and count < 1:
                 raise ValueError(f"{field} is {count}: must be at least 1; raise it")
-        if self.enumerated is not None:
-            refuse_with_enumeration(self)
+        sampled = {"best_of": 1, "segment_credit": False, "kl_in_reward": False, "tactile_use": TactileUse.OFF}
+        for field, value in (sampled if self.enumerated is not None else {}).items():
+            if getattr(self, field) != value:
+                needs = f"must be {value} where enumerated is set, because it needs a sampled conclusion; change either"
+                raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
         if self.stale < 0:
             raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
         if not 0 < self.reference_share <= 1:
@@ -160,21 +163,6 @@ class Algorithm:
             bound = getattr(self, field)
             if bound is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
-
-
-def refuse_with_enumeration(algorithm: Algorithm) -> None:
-    """Refuse options that need the reward of a sampled conclusion, which enumeration replaces.
-
-    Raises:
-      ValueError: it names the option.
-    """
-    needed = {"best_of": 1, "segment_credit": False, "kl_in_reward": False, "tactile_use": TactileUse.OFF}
-    for field, value in needed.items():
-        if getattr(algorithm, field) != value:
-            raise ValueError(
-                f"{field} is {getattr(algorithm, field)}: must be {value} where enumerated is "
-                f"{algorithm.enumerated}, because it needs the reward of a sampled conclusion; change either"
-            )
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:

@@ -29,7 +29,7 @@ MEAN_FLOOR = 0.02
 
 
 class LevelRewards(NamedTuple):
-    """What the completions of P prompts earn for every level that they could conclude with.
+    """Rewards of the completions of P prompts for every level that they could conclude with.
 
     Attributes:
       ids: token of each level of the asked attribute, −1 past the last one.

@@ -27,7 +27,7 @@ from touchr1_jax.types import Params, TouchBatch
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FineTuned:
-    """What is fine-tuned: an encoder, and levels of the first attributes of a label."""
+    """Shape of the encoder that is fine-tuned, and levels of the first attributes of a label."""
 
     encoder: TactileViTConfig
     levels: tuple[int, ...] = (3, 3, 3)
