@@ -60,7 +60,8 @@ def make_active_step(
     """
     check_active_config(fns, config, budget)
     fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16)) if config.bfloat16 else fns
-    return compile_step(ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, budget), config)
+    engine = ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, None, budget)
+    return compile_step(engine, config)
 
 
 def check_active_config(fns: ActiveFns, config: GRPOConfig, budget: int) -> None:
@@ -81,6 +82,8 @@ def check_active_config(fns: ActiveFns, config: GRPOConfig, budget: int) -> None
             f"constrained is {algorithm.constrained}, but the policy's functions are constrained={fns.constrained}; "
             "choose the functions that fit"
         )
+    if algorithm.enumerated is not None:
+        raise ValueError(f"enumerated is {algorithm.enumerated}: must be None for trajectories; leave it out")
     if algorithm.tactile_use is not TactileUse.OFF:
         raise ValueError(
             f"tactile_use is {algorithm.tactile_use}: must be OFF for trajectories, whose touch has a price instead"
