@@ -26,7 +26,7 @@ import numpy as np
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.core.results import Picture, Results
+from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain
 from experiments.paper.label_curves import (
@@ -69,11 +69,12 @@ from experiments.study.study import (
     save_answers,
 )
 from experiments.study.training import DECODER, starting_model
-from sensors_io.schema import ATTRIBUTES, SENSORS
+from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model
+from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.feeds import FULL_SHARE
@@ -165,8 +166,8 @@ class LabelledSet:
         held_out = val, data.labels("val")
         longer = run_decoder(self.policy, known, held_out, config.decoder, start, self.context, stage=stage, **order)
         self._keep("two_phases", longer, test)
-        agreed = self._pseudo(known, free, self._agreed(longer, free))
-        measured = self._pseudo(known, free, self.measured[data.parts["grpo"]])
+        agreed = self._implied("agreement", known, free, self._agreed(longer, free))
+        measured = self._implied("physics", known, free, self.measured[data.parts["grpo"]])
         of_method: dict[Method, EncodedContacts] = {"grpo": known, "agreement": agreed, "physics": measured}
         for method, contacts in of_method.items():
             self._keep(method, self._reinforced(method, contacts, longer), test)
@@ -187,14 +188,13 @@ class LabelledSet:
         ask_all = np.zeros_like(free.label)  # a label of 0 has every question asked; nothing else reads it
         return agreed_levels(evaluate_policy(self.policy, params, free.features, ask_all), free.label)
 
-    def _pseudo(self, known: EncodedContacts, free: EncodedContacts, level: np.ndarray) -> EncodedContacts:
+    def _implied(
+        self, method: Method, known: EncodedContacts, free: EncodedContacts, level: np.ndarray
+    ) -> EncodedContacts:
         """Both kinds of contacts, those without labels with the levels that a label-free reward pays."""
-        right = level == self.data.label[self.data.parts["grpo"]]
-        asked = level >= 0
-        self.context.print(
-            f"{self.name}, seed {self.seed}: {asked.sum()} levels without labels, right in "
-            f"{100 * right[asked].mean() if asked.any() else float('nan'):.0f} %"
-        )
+        right, asked = level == self.data.label[self.data.parts["grpo"]], level >= 0
+        found = [100 * float(asked.mean()), 100 * float(right[asked].mean()) if asked.any() else None]
+        self.context.save_stage(f"implied/{method}-{self.name}/{self.seed}", found)
         if not asked.any():
             return known
         label = np.concatenate([known.label, level])
@@ -206,7 +206,7 @@ class LabelledSet:
     def _reinforced(self, method: str, contacts: EncodedContacts, start: Params) -> Params:
         config = self.config
         grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(config.grpo.algorithm))
-        arm = arm_of(self.policy, self.data.prior().tobytes(), grpo, config.grpo_loop)
+        arm = arm_of(self.policy, grpo, config.grpo_loop)
         order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{method}-{self.name}/{self.seed}", "share": True}
         return run_grpo(self.policy, arm, contacts, start, self.context, **order)
 
@@ -220,10 +220,9 @@ class LabelledSet:
 
 
 @functools.cache
-def arm_of(policy: TouchPolicy, prior: bytes, grpo: GRPOConfig, loop: LoopConfig) -> GRPOArm:
-    """The arm of all sets with one prior, so that its step is compiled once."""
-    table = np.frombuffer(prior, np.float32).reshape(len(ATTRIBUTES), -1)
-    return make_arm(policy, REWARDS, table, grpo, loop)
+def arm_of(policy: TouchPolicy, grpo: GRPOConfig, loop: LoopConfig) -> GRPOArm:
+    """The arm of all sets, so that its step is compiled once; its rewards need no shares of labels."""
+    return make_arm(policy, REWARDS, uniform_prior(policy.levels), grpo, loop)
 
 
 def run(config: FewLabelsConfig, context: Context) -> Results:
@@ -239,11 +238,10 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
     for seed in context.each("seeds", range(config.seeds)):
         order = np.random.default_rng((seed, 31)).permutation(train)
         for count in context.each("labels", config.labelled):
-            parts = {"sft": order[:count], "grpo": order[count : count + config.unlabelled]}
-            if not len(parts["grpo"]):
-                parts["grpo"] = parts["sft"]  # everything is labelled: label-free rewards ask about the same contacts
-            few = dataclasses.replace(data, parts={**data.parts, **parts})
+            few = with_parts(data, order[:count], order[count : count + config.unlabelled])
             evidence = gather_evidence(few, probed, config.probe, context)
+            if not len(few.parts["grpo"]):  # everything is labelled: label-free rewards ask about the same contacts
+                few = with_parts(data, order[:count], order[: config.unlabelled])
             for encoder, start in ((RANDOM, None), (PRETRAINED, tactile)):
                 name = f"{min(count, len(train))}-{encoder}"
                 made: dict[str, Any] = {"config": config, "context": context, "data": few, "policy": policy}
@@ -254,7 +252,13 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
     scored = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     objects = data.object_ids[data.parts["test"]][next(iter(answers.values()))[0].contact]
     counts = [min(count, len(train)) for count in config.labelled]
-    return report(config, data, scored, objects, list(dict.fromkeys(counts)))
+    counts = list(dict.fromkeys(counts))
+    return report(config, data, scored, objects, counts, implied_table(config, context, counts))
+
+
+def with_parts(data: Dataset, labelled: np.ndarray, unlabelled: np.ndarray) -> Dataset:
+    """The data with other contacts in the parts that are trained on."""
+    return dataclasses.replace(data, parts={**data.parts, "sft": labelled, "grpo": unlabelled})
 
 
 def pretrained_encoder(config: FewLabelsConfig, data: Dataset, rows: np.ndarray, context: Context) -> Path:
@@ -267,12 +271,33 @@ def pretrained_encoder(config: FewLabelsConfig, data: Dataset, rows: np.ndarray,
     return path
 
 
+def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[int]) -> Table:
+    """How many levels each label-free reward pays, and how many of them are right, means over seeds."""
+    lines: list[dict[str, Cell]] = []
+    for method in ("agreement", "physics"):
+        for name in (f"{count}-{encoder}" for encoder in (RANDOM, PRETRAINED) for count in counts):
+            found = [context.load_stage(f"implied/{method}-{name}/{seed}") for seed in range(config.seeds)]
+            right = [x for _, x in found if x is not None]
+            share = float(np.mean([x for x, _ in found]))
+            lines.append(
+                {"set": f"{method}-{name}", "implied": share, "right": float(np.mean(right)) if right else None}
+            )
+    return named_table(
+        "Levels without labels",
+        lines,
+        formats={"implied": ".0f", "right": ".0f"},
+        units={"implied": "%", "right": "%"},
+        meanings={"implied": "of four properties of the contacts without labels", "right": "of the implied levels"},
+    )
+
+
 def report(
     config: FewLabelsConfig,
     data: Dataset,
     scored: Mapping[str, Sequence[Mapping[str, Scores]]],
     objects: np.ndarray,
     counts: Sequence[int],
+    implied: Table,
 ) -> Results:
     """Learning curves, their differences, and where each method pays."""
     rows = {
@@ -285,7 +310,7 @@ def report(
         verdict=verdict(comparisons, counts),
         arms=rows,
         comparisons=tuple(comparisons),
-        tables=(curve_table(rows, comparisons, counts),),
+        tables=(curve_table(rows, comparisons, counts), implied),
         pictures=(
             Picture(
                 name="few_labels",
