@@ -31,8 +31,16 @@ from experiments.core.loops import run_loop
 from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.held_out import StageOneDataConfig, open_touch, points, training_rows
-from experiments.encoder.pretrain import ClipFeed, PretrainConfig, clip_of, encoder_of, pretrain, untrained
+from experiments.encoder.pretrain import (
+    ClipFeed,
+    StageOneDataConfig,
+    clip_of,
+    open_touch,
+    points,
+    pretrain,
+    training_rows,
+    untrained,
+)
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
@@ -46,6 +54,7 @@ from touchr1_jax.training.fine_tuning import start_fine_tuning as start
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.objectives import Objective
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.training.pretraining import PretrainConfig, encoder_of
 from touchr1_jax.types import Params
 
 RANDOM = "random"

@@ -28,7 +28,7 @@ from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.pretrain import PretrainConfig, encoder_of, pretrain
+from experiments.encoder.pretrain import pretrain
 from experiments.paper.label_curves import (
     METHODS,
     PRETRAINED,
@@ -79,6 +79,7 @@ from touchr1_jax.rl.config import GRPOConfig, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.feeds import FULL_SHARE
 from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.pretraining import PretrainConfig, encoder_of
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
