@@ -149,7 +149,7 @@ def fine_tuned_right(
     count: int,
     seed: int,
 ) -> list[Any]:
-    """Whether fine-tuned encoders are right, [steps, val + test contact, attribute], from the run where it is there."""
+    """Correctness of fine-tuned encoders, [steps, val + test contact, attribute], from the run where it is there."""
 
     def compute() -> list[Any]:
         rows = labelled_rows(data, count, seed)
@@ -179,7 +179,7 @@ def read_rows(config: StageOneConfig, data: Dataset, part: str) -> np.ndarray:
 
 
 def is_right(config: StageOneConfig, data: Dataset, read: Callable[..., Any], params: Params) -> np.ndarray:
-    """Whether the likeliest level is right, bool [val + test contact, attribute]."""
+    """Correctness of the likeliest level, bool [val + test contact, attribute]."""
     rows = np.concatenate([read_rows(config, data, part) for part in ("val", "test")])
     padded = rows[np.minimum(np.arange(-(-len(rows) // READ_BATCH) * READ_BATCH), len(rows) - 1)]
     order: dict[str, Any] = {"batch_size": READ_BATCH, "seed": 0, "shuffle": False, "repeat": False}

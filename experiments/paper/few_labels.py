@@ -273,7 +273,7 @@ def pretrained_encoder(config: FewLabelsConfig, data: Dataset, rows: np.ndarray,
 
 
 def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[int]) -> Table:
-    """How many levels each label-free reward pays, and how many of them are right, means over seeds."""
+    """Share of levels that each label-free reward pays, and of those that are right, means over seeds."""
     lines: list[dict[str, Cell]] = []
     for method in ("agreement", "physics"):
         for name in (f"{count}-{encoder}" for encoder in (RANDOM, PRETRAINED) for count in counts):

@@ -286,7 +286,7 @@ def sure(comparisons: Sequence[Comparison], arm: str, metric: str) -> int:
 
 
 def verdict(comparisons: Sequence[Comparison], arms: Sequence[str]) -> tuple[str, ...]:
-    """How many arms beat the control, how many lose to it, and the answer to the paper's claim."""
+    """Numbers of arms that beat the control and that lose to it, and the answer to the paper's claim."""
     better = [arm for arm in arms if sure(comparisons, arm, "acc") > 0 or sure(comparisons, arm, "omae") > 0]
     worse = [arm for arm in arms if any(sure(comparisons, arm, metric) < 0 for metric in COMPARED)]
     clean = [arm for arm in better if arm not in worse]
