@@ -4,6 +4,7 @@ import lzma
 import math
 import os
 import pathlib
+import struct
 import tokenize
 import zipfile
 import zlib
@@ -17,6 +18,9 @@ _BROKEN = (
     *MALFORMED, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError,
 )  # fmt: skip
 """Errors that damaged bytes raise in NumPy and zipfile."""
+
+_LONGEST_END = 2**16 + 22
+"""Bytes of the end of a zip archive with the longest comment; it states the number of entries."""
 
 
 class ArraysError(UserError, ValueError):
@@ -37,6 +41,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             with path.open("rb") as file:
                 return {path.stem: _array(file, path.stat().st_size)}
         with zipfile.ZipFile(path) as archive:
+            _require_all(archive, path)
             found = {}
             for member in archive.infolist():
                 with archive.open(member) as file:
@@ -44,6 +49,16 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             return found
     except _BROKEN as error:
         raise ArraysError(f"{path} cannot be read as arrays ({error}); copy it again from its source") from error
+
+
+def _require_all(archive: zipfile.ZipFile, path: pathlib.Path) -> None:
+    """Refuse an archive of which some entries are hidden, as by a flipped bit in the length of a comment."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _LONGEST_END))
+        end = file.read()
+    (stated,) = struct.unpack_from("<H", end, end.rfind(b"PK\5\6") + 10)
+    if stated not in (len(archive.infolist()), 0xFFFF):  # more than 2¹⁶ are counted elsewhere
+        raise ValueError(f"it states {stated} entries and shows {len(archive.infolist())}")
 
 
 def _array(file: IO[bytes], size: int) -> np.ndarray:

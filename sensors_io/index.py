@@ -8,11 +8,11 @@ import dataclasses
 import json
 import os
 import pathlib
-import zlib
 from collections.abc import Mapping
 from typing import Any, Self
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
+from sensors_io.json_files import seal, unseal
 from sensors_io.schema import ContactKey
 from sensors_io.shards import Shard
 
@@ -22,7 +22,6 @@ READABLE = (1, 2)
 """Versions whose records this code reads; 1 stored camera frames as they are, 2 stores differences."""
 
 INDEX = "index.json"
-_CHECKSUM = "crc32"  # of the text before it
 
 
 class MissingIndexError(RecordsError):
@@ -82,12 +81,9 @@ class Index:
         try:
             text = path.read_text()
             tree = json.loads(text)
-            found = (tree["format"], tree["version"])
+            found = (tree["format"], tree["version"])  # first: another version may have another checksum
             if found in [(FORMAT, version) for version in READABLE]:
-                stated = tree.get(_CHECKSUM)  # an index of an earlier version of this code has none
-                if stated is not None and stated != zlib.crc32(text.rpartition(f',"{_CHECKSUM}"')[0].encode()):
-                    raise ValueError("its checksum does not hold")
-                return cls._from_tree(tree)
+                return cls._from_tree(unseal(text))
         except OSError as error:
             raise RecordsError(
                 f"{path} cannot be read ({error}); make it readable, or copy it again from its source"
@@ -129,9 +125,8 @@ class Index:
             "frames": self.frames,
         }
         temporary = root / f".{INDEX}.tmp"
-        body = json.dumps(tree, separators=(",", ":"), allow_nan=False).removesuffix("}")
         with temporary.open("w") as file:
-            file.write(f'{body},"{_CHECKSUM}":{zlib.crc32(body.encode())}}}')
+            file.write(seal(json.dumps(tree, separators=(",", ":"), allow_nan=False)))
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(root / INDEX)

@@ -1,10 +1,21 @@
-"""Small JSON files that are whole or not there."""
+"""Small JSON files that are whole or not there, and the checksum of a JSON object.
+
+A *sealed* object ends with the CRC-32 of the text before it, since a flipped bit on a disk raises no error of its own.
+Objects without this key, such as those of earlier versions, are read as well.
+"""
 
 import json
 import os
 import pathlib
+import re
+import zlib
 from collections.abc import Mapping
 from typing import Any
+
+CHECKSUM = "crc32"
+"""Last key of a sealed object."""
+
+_VALUE = re.compile(r": ?([0-9]{1,10})\s*\}")  # of the last key, if it is a whole number
 
 
 def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
@@ -12,7 +23,42 @@ def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
     with temporary.open("w") as file:
-        json.dump(tree, file, indent=1, allow_nan=False)
+        file.write(seal(json.dumps(tree, indent=1, allow_nan=False)))
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
+
+
+def read_json(path: pathlib.Path) -> Any:
+    """The value of a JSON file, without its checksum.
+
+    Raises:
+      OSError, ValueError: it cannot be read, or its checksum does not hold.
+    """
+    return unseal(path.read_text())
+
+
+def seal(text: str) -> str:
+    """Add the checksum to the text of a JSON object, as its last key."""
+    body = text.removesuffix("}").rstrip()
+    comma, space, end = "" if body == "{" else ",", "\n  " if "\n" in text else " ", "\n}" if "\n" in text else "}"
+    return f'{body}{comma}{space}"{CHECKSUM}": {zlib.crc32(body.encode())}{end}'
+
+
+def unseal(text: str) -> Any:
+    """The value of a JSON text, without its checksum.
+
+    Raises:
+      ValueError: it is no JSON, or its checksum does not hold.
+    """
+    value, text = json.loads(text), text.rstrip()
+    end = text.rfind('"')
+    start, stated = text.rfind('"', 0, max(end, 0)), _VALUE.fullmatch(text, end + 1)
+    if start < 0 or stated is None or not isinstance(value, dict):
+        return value
+    name = text[start + 1 : end]
+    if int(stated[1]) == zlib.crc32(text[:start].rstrip().removesuffix(",").encode()):  # whatever became of its name
+        del value[name]
+    elif name == CHECKSUM:
+        raise ValueError("its checksum does not hold")
+    return value

@@ -1,13 +1,12 @@
 """Delay of each sensor's timestamps, measured once and subtracted from every recording."""
 
 import dataclasses
-import json
 import pathlib
 from collections.abc import Mapping
 from typing import Self
 
 from sensors_io.errors import UserError
-from sensors_io.json_files import write_json
+from sensors_io.json_files import read_json, write_json
 
 
 class OffsetsError(UserError, ValueError):
@@ -62,7 +61,7 @@ class Offsets:
           OffsetsError: a field is missing or of another kind.
         """
         try:
-            tree = json.loads(path.read_text())
+            tree = read_json(path)
             sensors = {str(name): Offset(**offset) for name, offset in tree["sensors"].items()}
             late_s = [float(offset.late_s) for offset in sensors.values()]
             if any(abs(late) > LARGEST_S for late in late_s):

@@ -6,7 +6,6 @@ A pose is a stretch of `hold_s` in which no component of the force spreads by mo
 
 import collections
 import dataclasses
-import json
 import pathlib
 from typing import Self
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S
 from sensors_io.force import ForceError, GravityModel, fit_gravity, gravity_directions
-from sensors_io.json_files import write_json
+from sensors_io.json_files import read_json, write_json
 
 _LEAST_READINGS = 8  # in a stretch: fewer tell no spread
 
@@ -112,7 +111,7 @@ class ForceZero:
           ForceError: a field is missing or is no number.
         """
         try:
-            tree = json.loads(path.read_text())
+            tree = read_json(path)
             tree = {name: np.array(v, np.float64) if isinstance(v, list) else v for name, v in tree.items()}
             down = tree.pop("down").reshape(3)
             model = GravityModel(**tree)

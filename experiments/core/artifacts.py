@@ -9,18 +9,13 @@ import enum
 import json
 import math
 import os
-import re
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-CHECKSUM = "crc32"
-"""Last key of a sealed JSON object."""
-
-_SEAL = re.compile(r'\s*,?\s*"([^"]*)": ([0-9]+)\s*\}\s*\Z')  # the last key of an object, if it holds a whole number
+from sensors_io.json_files import seal, unseal
 
 
 class DamagedFileError(ValueError):
@@ -97,29 +92,6 @@ def write_json(path: Path, value: Any) -> None:
 def write_sealed(path: Path, value: Any) -> None:
     """Publish a dataclass or a mapping as indented JSON with its checksum, atomically."""
     write_text(path, seal(json.dumps(jsonable(value), indent=2, ensure_ascii=False)) + "\n")
-
-
-def seal(text: str) -> str:
-    """Add the checksum to the text of a JSON object, as its last key."""
-    body = text.removesuffix("}").rstrip()
-    comma, space, end = "" if body == "{" else ",", "\n  " if "\n" in text else " ", "\n}" if "\n" in text else "}"
-    return f'{body}{comma}{space}"{CHECKSUM}": {zlib.crc32(body.encode())}{end}'
-
-
-def unseal(text: str) -> Any:
-    """The value of a JSON text, without its checksum.
-
-    Raises:
-      ValueError: it is no JSON, or its checksum does not hold.
-    """
-    value, last = json.loads(text), _SEAL.search(text)
-    if last is None or not isinstance(value, dict):
-        return value
-    if int(last[2]) == zlib.crc32(text[: last.start()].encode()):  # whatever became of its name
-        del value[last[1]]
-    elif last[1] == CHECKSUM:
-        raise ValueError("its checksum does not hold")
-    return value
 
 
 def read_json(path: Path) -> Any:

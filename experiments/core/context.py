@@ -16,18 +16,16 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from experiments.core.artifacts import (
-    CHECKSUM,
     DamagedFileError,
     UnwrittenError,
     jsonable,
     read_json,
-    seal,
-    unseal,
     write_sealed,
     write_text,
 )
 from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, show_progress
 from experiments.core.stopping import Stopping
+from sensors_io.json_files import CHECKSUM, seal, unseal
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 
 T = TypeVar("T")

@@ -33,6 +33,7 @@ from experiments.core.text import bounds, interval
 from experiments.encoder.pretrain import ClipFeed, StageOneDataConfig, open_touch, training_rows
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
+from sensors_io.arrays import load_arrays
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.image_similarity import check_weights, lpips, ssim
 from touchr1_jax.bench.statistics import Interval, skill
@@ -196,8 +197,7 @@ class FrameMetrics:
 
 def read_lpips(path: Path) -> dict[str, np.ndarray]:
     """The weights of LPIPS, whose shapes must be the published ones."""
-    with np.load(path) as file:
-        weights = dict(file)
+    weights = load_arrays(path)
     check_weights(weights)
     return weights
 

@@ -46,7 +46,7 @@ class Flip:
 
 
 def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int = 0) -> Iterator[Flip]:
-    """Flip one bit at a time in a copy of a folder: a random bit of a random file.
+    """Flip one bit at a time in a copy of a folder: a random bit of a random file of a random kind.
 
     Args:
       root: a run, its cache and its compiled programs.
@@ -56,13 +56,17 @@ def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int
       seed: of the choice.
     """
     copy = shutil.copytree(root, scratch / "flipped", symlinks=True)
-    files = [p for p in sorted(copy.rglob("*")) if p.is_file() and not p.is_symlink() and p.stat().st_size]
-    rng = np.random.default_rng(seed)
+    kinds: dict[str, list[Path]] = {}
+    for path in sorted(copy.rglob("*")):
+        if path.is_file() and not path.is_symlink() and path.stat().st_size:
+            kinds.setdefault(kind(path.relative_to(copy)), []).append(path)
+    rng, names = np.random.default_rng(seed), sorted(kinds)
     for _ in context.each("flipping bits", range(count), still=True):
-        path = files[rng.integers(len(files))]
+        name = names[rng.integers(len(names))]
+        path = kinds[name][rng.integers(len(kinds[name]))]
         content = path.read_bytes()
         bit = int(rng.integers(8 * len(content)))
-        yield Flip(file=kind(path.relative_to(copy)), bit=bit, reading=_reading(path, content, bit))
+        yield Flip(file=name, bit=bit, reading=_reading(path, content, bit))
 
 
 def _reading(path: Path, content: bytes, bit: int) -> str:
@@ -84,7 +88,7 @@ def _reading(path: Path, content: bytes, bit: int) -> str:
 
 def kind(path: Path) -> str:
     """A path without the names that differ from run to run."""
-    return re.sub(r"\d{8}-\d{6}|[0-9a-f]{16,}|(?<=[-/])\d+(?=[/.\-])", "…", path.as_posix())
+    return re.sub(r"(?<=/compiled/).*(?=-)|\d{8}-\d{6}|[0-9a-f]{16,}|(?<=[-/])\d+(?=[/.\-])", "…", path.as_posix())
 
 
 def digest(tree: Any) -> str:
@@ -132,7 +136,7 @@ def _program(path: Path) -> str:
 
 
 READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
-    (r"/_CHECKPOINT_METADATA$", lambda path: ""),  # times, on which no state depends
+    (r"/(_CHECKPOINT_METADATA|commit_success\.txt)$", lambda path: ""),  # times, and a mark that is only looked for
     (r"/checkpoints/.*/\d+/", _checkpoint),
     (r"/metrics\.jsonl$", _log),
     (r"/answers/[^/]*\.npz$", _answers),

@@ -312,7 +312,7 @@ def flip_table(flips: Sequence[Flip]) -> Table:
     return named_table(
         "Flipped bits of a study and its cache",
         [{"file": name, **count(same)} for name, same in by_kind.items()],
-        note="One random bit of a random file at a time; the file is read as a session reads it.",
+        note="One random bit of a random file of a random kind; the file is read as a session reads it.",
     )
 
 

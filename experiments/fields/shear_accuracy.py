@@ -17,6 +17,7 @@ from experiments.core.results import Cell, Picture, Table, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.generated_slides import NODES, Slide, cached_slides, make_slides, node_grid, pressing
 from experiments.fields.sections import ReportPart
+from sensors_io.arrays import load_arrays
 from sensors_io.clock import NS_PER_S
 from sensors_io.fields import total_force
 from sensors_io.fields.compliance import total_force as total_traction
@@ -269,10 +270,10 @@ class ForceRecording(NamedTuple):
 
 
 def _load(path: pathlib.Path) -> ForceRecording:
-    with np.load(path) as file:
-        force = file["3D_ResultantForce"].reshape(-1, 3)
-        time_ns = np.rint(file["sendTimestamp"].ravel() * NS_PER_S).astype(np.int64)
-        return ForceRecording(path.stem, file["3D_Displacements"], force, time_ns)
+    file = load_arrays(path)
+    force = file["3D_ResultantForce"].reshape(-1, 3)
+    time_ns = np.rint(file["sendTimestamp"].ravel() * NS_PER_S).astype(np.int64)
+    return ForceRecording(path.stem, file["3D_Displacements"], force, time_ns)
 
 
 def _lag_s(one: ForceRecording) -> float | None:

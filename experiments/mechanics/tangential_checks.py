@@ -16,6 +16,7 @@ from experiments.core.results import Cell, Table, named_table
 from experiments.core.timing import median_ms
 from experiments.mechanics import tangential_scenes as scenes
 from experiments.mechanics.tangential_methods import dragged
+from sensors_io.arrays import load_arrays
 from sensors_io.scenes import history, tangential
 from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.mindlin import FrictionalSphere, half_space
@@ -255,10 +256,10 @@ def loop_table(data_dir: Path) -> Table:
     """
     path = data_dir / RECORDING
     require(path.is_file(), "data_dir", data_dir, f"must hold {RECORDING}", "give the folder of the recordings")
-    with np.load(path) as recording:
-        force = -recording["3D_ResultantForce"].reshape(-1, 3)[:, 2]
-        depth = -recording["3D_Displacements"][..., 2].mean(1)
-        time = recording["sendTimestamp"].ravel() - recording["sendTimestamp"].ravel()[0]
+    recording = load_arrays(path)
+    force = -recording["3D_ResultantForce"].reshape(-1, 3)[:, 2]
+    depth = -recording["3D_Displacements"][..., 2].mean(1)
+    time = recording["sendTimestamp"].ravel() - recording["sendTimestamp"].ravel()[0]
     heading = {lag: f"force read {1000 * lag:.0f} ms later" for lag in LAGS_S}
     rows: list[dict[str, Cell]] = []
     for press in _presses(force):

@@ -29,6 +29,7 @@ from experiments.study.dataset import Dataset
 from experiments.study.stages import encode_rows, untrained
 from experiments.study.study import BLIND, CONTINUED, SFT, TrainedPolicy
 from experiments.study.training import TrainingConfig
+from sensors_io.arrays import load_arrays
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
@@ -290,8 +291,8 @@ def read_policy(
             f"{directory} holds no {TOUCH_FILE}: must be a folder that `touch_r1` wrote; correct it"
         )
     released = load_params(directory, read_config(directory), dtype, progress=progress)
-    with np.load(directory / TOUCH_FILE) as file:
-        touch = traverse_util.unflatten_dict({name: jnp.asarray(file[name]) for name in file.files}, sep="/")
+    arrays = load_arrays(directory / TOUCH_FILE)
+    touch = traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in arrays.items()}, sep="/")
     return {**touch, "vision": {"tower": released["vision"]}, "decoder": released["decoder"]}
 
 

@@ -18,6 +18,7 @@ from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos
+from sensors_io.arrays import load_arrays
 from sensors_io.importers.keep import ImportSourceError
 from touchr1_jax.models.description_policy import COMBINATIONS, LEVELS, PolicyShape, description_policy
 from touchr1_jax.training.description_tuning import (
@@ -189,10 +190,10 @@ def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
     """
     if not path.is_file():
         raise ImportSourceError(f"policy is {path}: no such file; train one, or name a run's policy.npz")
-    with np.load(path) as file:
-        if str(file["identity"]) != identity(config):
-            raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
-        found = traverse_util.unflatten_dict(dict(file), sep="/")
+    arrays = load_arrays(path)
+    if str(arrays["identity"]) != identity(config):
+        raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
+    found = traverse_util.unflatten_dict(arrays, sep="/")
     return TrainedEnsemble(
         config=config,
         params=found["params"],

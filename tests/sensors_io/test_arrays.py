@@ -1,5 +1,6 @@
 """Arrays of files from outside: equal to NumPy's, or refused."""
 
+import contextlib
 import io
 
 import numpy as np
@@ -47,3 +48,18 @@ def test_no_flip_of_a_byte_raises_anything_else(tmp_path):
             load_arrays(tmp_path / "a.npz")
         except ArraysError:
             continue
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_every_flipped_bit_of_an_archive_is_named_or_harmless(tmp_path, save):
+    """A flipped bit in the list of its entries may hide some of them."""
+    path, arrays = tmp_path / "x.npz", {"a": np.arange(3), "b": np.eye(2), "c": np.zeros(1)}
+    save(path, **arrays)
+    whole = path.read_bytes()
+    end = 8 * whole.index(b"PK\1\2")
+    for bit in [*range(0, end, 9), *range(end, 8 * len(whole))]:
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        with contextlib.suppress(ArraysError):
+            np.testing.assert_equal(load_arrays(path), arrays)

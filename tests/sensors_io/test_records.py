@@ -258,7 +258,7 @@ def test_every_flipped_bit_of_the_index_is_found(tmp_path):
     fakes.write(tmp_path, 1)
     path = tmp_path / "index.json"
     whole = path.read_bytes()
-    end = whole.index(b',"crc32"')
+    end = whole.index(b', "crc32"')
     for i in range(end):
         for bit in (0, 4, 7):
             path.write_bytes(whole[:i] + bytes([whole[i] ^ (1 << bit)]) + whole[i + 1 :])

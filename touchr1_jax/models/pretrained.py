@@ -3,7 +3,9 @@
 import dataclasses
 import io
 import json
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,13 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params
 
 _ABOUT = "about"  # entry of the file that holds its JSON; parameters are named by their path, joined by "/"
+
+
+_BROKEN = (
+    OSError, ValueError, TypeError, LookupError, AttributeError, RuntimeError, EOFError, SyntaxError,
+    zipfile.BadZipFile, zlib.error, tokenize.TokenError,
+)  # fmt: skip
+"""Errors that damaged bytes raise in NumPy and zipfile."""
 
 
 class EncoderError(WeightsError):
@@ -61,13 +70,15 @@ def load_encoder(path: Path) -> PretrainedEncoder:
         raise EncoderError(f"encoder is {path}: no such file; give the run directory of pretrain_encoder")
     fix = "give a file that pretrain_encoder wrote"
     try:
-        with np.load(path) as file:
-            entries = {name: file[name] for name in file.files}
-    except (OSError, ValueError, AttributeError, zipfile.BadZipFile, EOFError) as error:
-        raise EncoderError(f"encoder is {path}: cannot be read ({error}); {fix}") from error
-    if _ABOUT not in entries:
+        with zipfile.ZipFile(path) as archive:
+            if any(member.comment or member.extra for member in archive.infolist()):
+                raise ValueError("a flipped bit in its list of entries hides some of them")
+            entries = {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+        about = json.loads(entries.pop(_ABOUT).tobytes()) if _ABOUT in entries else None
+    except _BROKEN as error:
+        raise EncoderError(f"encoder is {path}: cannot be read ({error!r}); {fix}") from error
+    if about is None:
         raise EncoderError(f"encoder is {path}: it has no entry {_ABOUT!r}; {fix}")
-    about = json.loads(entries.pop(_ABOUT).tobytes())
     known = {f.name for f in dataclasses.fields(TactileViTConfig)}
     if set(about["config"]) != known:
         odd = sorted(set(about["config"]) ^ known)
@@ -78,3 +89,9 @@ def load_encoder(path: Path) -> PretrainedEncoder:
         params=jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(entries, sep="/")),
         notes=about["notes"],
     )
+
+
+def _array(content: bytes) -> np.ndarray:
+    """The array of a .npy file, whose checksum was verified when all of it was read."""
+    found: np.ndarray = np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    return found

@@ -13,6 +13,7 @@ import pytest
 
 from experiments.core import artifacts
 from experiments.core.artifacts import jsonable
+from sensors_io.json_files import seal
 
 
 class Colour(enum.Enum):
@@ -73,7 +74,7 @@ def test_every_flipped_bit_of_a_sealed_file_is_named_or_harmless(tmp_path, value
     path = tmp_path / "value.json"
     artifacts.write_sealed(path, value)
     if not indented:
-        path.write_text(artifacts.seal(json.dumps(value)))
+        path.write_text(seal(json.dumps(value)))
     sealed = path.read_bytes()
     assert json.loads(sealed).keys() == {*value, "crc32"}
     assert artifacts.read_json(path) == value

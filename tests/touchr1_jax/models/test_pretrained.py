@@ -47,3 +47,16 @@ def test_what_is_no_encoder_is_refused(encoder, tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="it has no entry 'about'"):
         load_encoder(tmp_path / "other.npz")
+
+
+def test_a_flipped_bit_is_named_or_harmless(encoder, tmp_path):
+    """Of every third byte one bit, in turn, and of all of the list of entries at the end."""
+    path, whole = tmp_path / "encoder.npz", encoder.to_bytes()
+    for i in [*range(0, len(whole), 3), *range(whole.index(b"PK\1\2"), len(whole))]:
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :])
+        try:
+            found = load_encoder(path)
+        except EncoderError:
+            continue
+        assert (found.config, found.sensors, found.notes) == (encoder.config, encoder.sensors, encoder.notes)
+        jax.tree.map(np.testing.assert_array_equal, found.params, encoder.params)
