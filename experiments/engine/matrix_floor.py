@@ -1,7 +1,7 @@
-"""Least time of an iteration's matrix products: each shape of the traced program, timed alone on warm operands.
+"""Time of an iteration's matrix products: each shape of the traced program, timed alone on warm operands.
 
-What an iteration takes beyond the sum is not matrix products; how far the sum stays below the speed of large products
-is due to the shapes.
+On a quiet machine the sum estimates the least time of these shapes, and what an iteration takes beyond it is other
+work.  Under load it is no bound: an iteration has been faster.
 """
 
 import math
@@ -154,7 +154,7 @@ def floor_table(prefix: int, found: Sequence[TimedProduct], step_s: float) -> Ta
         meanings={
             "product": "rows × terms · terms × columns, batched where a number precedes",
             "speed": "fastest of the rounds, on warm operands",
-            "share": "of the fastest iteration; what the sum leaves is not matrix products",
+            "share": "of the fastest iteration",
         },
     )
 

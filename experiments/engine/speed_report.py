@@ -76,9 +76,9 @@ def requirements(
 
 
 def peak_shares(size: JobSize, alone: Timings, floors: Mapping[int, Sequence[TimedProduct]]) -> list[Requirement]:
-    """Share of the speed of large products, and the largest share that products of these shapes allow."""
+    """Share of the speed of large products, and that of the products of these shapes alone."""
     share = lambda prefix, seconds: size.gflop(prefix) / seconds / alone[prefix].gflops_peak
-    note = "at most {:.2f} where nothing but the products of these shapes takes time"
+    note = "{:.2f} if nothing but the products of these shapes, each timed alone, took time"
     return [
         at_least(
             f"share of the peak at prefix {prefix}",
