@@ -218,7 +218,7 @@ def train_policy(
         return reinforced(started, name, rates[name], arms[name][rates[name]])
     if not isinstance(config, GrpoVerdictConfig):
         raise TypeError(f"config is a {type(config).__name__}: must be a GrpoVerdictConfig, which has continued_steps")
-    longer = dataclasses.replace(config.decoder, steps=config.continued_steps)
+    longer = dataclasses.replace(config.continued, steps=config.continued_steps)
     held_out = started.val, started.data.labels("val")
     order: dict[str, Any] = {"seed": seed + CONTINUED_ORDER, "stage": f"decoder/{CONTINUED}/{seed}", "share": True}
     return run_decoder(started.policy, started.train, held_out, longer, started.params, started.context, **order)
