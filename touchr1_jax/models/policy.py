@@ -193,11 +193,12 @@ class Policy(nn.Module):
         text = self.decoder.embed(tokens).reshape(turns, width, -1)
         seen = self.project(touch).astype(text.dtype)
         with_last = lambda x: jnp.pad(x, [(0, 1)] + [(0, 0)] * (x.ndim - 1))
-        in_rows = lambda x, y: jnp.concatenate([x, with_last(y)], 1).reshape(-1, *x.shape[2:])
+        rows = turns * (width + touch.shape[1]) - touch.shape[1]  # no observation follows the last turn
+        in_rows = lambda x, y: jnp.concatenate([x, with_last(y)], 1).reshape(-1, *x.shape[2:])[:rows]
         there = in_rows(exists.reshape(turns, width), observed)
         hidden = self.decoder.extend_embedded(in_rows(text, seen), there, prefix)
         latest = jax.lax.cummax(jnp.where(there, 1 + jnp.arange(len(there)), 0))
-        before = jnp.append(0, latest[:-1]).reshape(turns, -1)[:, :width]
+        before = jnp.pad(latest, (1, touch.shape[1] - 1)).reshape(turns, -1)[:, :width]
         return jnp.concatenate([first[None], hidden])[before.reshape(-1)]
 
     def packed_states(self, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
