@@ -10,7 +10,7 @@ contacts by their fields, a linear probe on the encoder of SFT, and the same pro
 object's touch.  Policies and baselines answer about one touch at a time; comparisons follow from these answers (see
 `experiments.paper.bench_scores`).
 
-Cost: some 30 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
+Cost: some 36 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
 Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT reads as much as a

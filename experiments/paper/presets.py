@@ -36,9 +36,9 @@ from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 
 BENCH = StudyConfig(
-    sft=StudySFT(steps=750),
+    sft=StudySFT(steps=1350),
     decoder=dataclasses.replace(DECODER, steps=900),
-    blind=StudySFT(steps=450, micro_contacts=16),
+    blind=StudySFT(steps=1350, micro_contacts=16),
     grpo_steps=200,
 )
 """The default: more SFT than in `ablation_ordinal`, which still gained on validation objects when it stopped; policies
