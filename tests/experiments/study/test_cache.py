@@ -113,7 +113,7 @@ def grpo(policy, params, data, tmp_path):
         ({"weights": (("accuracy", 0.5),)}, 1),
         ({"weights": (("exact", 1.0),)}, 1),
         ({"moved": 1e-6}, 1),
-        ({"steps": 1}, 1),
+        pytest.param({"steps": 1}, 1, marks=pytest.mark.slow),  # compiles the step, as the paper's runs do
         ({"seed": 1}, 1),
     ],
     ids=str,

@@ -94,8 +94,8 @@ def test_rows_train_the_policy_that_padding_trains(train, padded):
     assert jax.tree.structure(found) == jax.tree.structure(padded[0])
 
 
-def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest_also_from_rows(train, padded, policy, data):
-    found, losses = train(lora_rank=2)
+def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest(train, padded, policy, data):
+    found, _ = train(lora_rank=2)
     assert jax.tree.structure(found) == jax.tree.structure(padded[0])
     first = policy.init(0, tiny.one_batch(data))
     before, after = first["decoder"], found["decoder"]
@@ -106,7 +106,6 @@ def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest_also_from_
         assert sizes[0] > 0
         assert sizes[2] < 1e-2 * sizes[0]  # the remainder is the rounding of their sum
     assert (np.asarray(found["tactile_out"]["kernel"]) != np.asarray(first["tactile_out"]["kernel"])).any()
-    same(train(lora_rank=2, pack=WIDTH)[1], losses)
 
 
 def test_a_curriculum_is_a_share_of_the_steps(train, padded):

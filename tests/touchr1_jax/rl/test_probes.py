@@ -95,6 +95,7 @@ def two_steps(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, j
     return paid.astype(jnp.float32), {}, score(tokens, target)[2]
 
 
+@pytest.mark.slow
 def test_credit_reaches_the_first_of_two_steps():
     """One rollout in about twenty-five is paid at first."""
     step = make_grpo_step(FEW, two_steps, OPTIMIZER, CONFIG)

@@ -46,7 +46,7 @@ def test_parser_equals_oracle_on_any_tokens(kind, language):
     tokenizer, length = make_tokenizer(kind, language), LENGTH[kind]
     parser = jax.jit(compile_parser(language, tokenizer))
 
-    @hypothesis.settings(max_examples=200, deadline=None)
+    @hypothesis.settings(max_examples=100, deadline=None)
     @hypothesis.given(token_sequences(language, tokenizer, length))
     def check(ids):
         parsed = parser(jnp.array(ids, jnp.int32))

@@ -140,6 +140,7 @@ def test_rows_without_an_answer_add_nothing(params, batch):
     assert nothing == (0, 0)
 
 
+@pytest.mark.slow
 def test_a_few_answers_are_learned_by_heart(params, batch):
     optimizer = optax.adam(3e-3)
     step = make_sft_step(FNS, optimizer)
