@@ -46,7 +46,7 @@ DECODER = SFTConfig(
 )
 """The decoder's phase: 64 questions a step."""
 
-SFT_STEPS_PER_GRPO_STEP = 1.0
+SFT_STEPS_PER_GRPO_STEP = 1.2
 """Seconds of a step of GRPO over seconds of a step of the decoder's SFT, measured at the default sizes."""
 
 CONTINUED_RATE = 0.2
