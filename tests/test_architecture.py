@@ -68,6 +68,7 @@ LAYERS = {
         "bench",
         "paper",
         "engine",
+        "active",
         "faults",
         "__main__",
     ),

@@ -1,0 +1,1 @@
+"""Policies that choose which touch to make."""

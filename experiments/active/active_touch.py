@@ -1,0 +1,190 @@
+"""Can a policy learn from reward alone which touch to make?
+
+    python -m experiments active_touch [--scale smoke]
+
+With a label for every object, no label says which touch to make.  Generated objects are touched by every motion at two
+forces by each of four sensors.  A policy is asked for one of five properties, chooses a touch, observes it, and touches
+again or concludes.  A warm start imitates touches drawn at random, so that nothing shows which of them is good.  GRPO
+on whole trajectories then rewards the answer, less a price of seconds and of harm: of contacts that strain the gel or
+the object past its limit.  Before anything is learned the report states what there is to win, from probes and from the
+policy's own beliefs.  Controls: touches at random, the best press, the best touch for all questions, the best touch for
+each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
+look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
+
+Cost: about 30 minutes on two cores, a third of it to generate the contacts, once (`smoke` two minutes).
+
+Expected: one touch chosen by question is far better than the best touch for all questions, and reward alone finds it:
+friction by a slide, elasticity by a hold or a tap.  Beyond that a second touch adds little.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+from experiments.active.arms import (
+    EVERY_TOUCH,
+    Arm,
+    LearnerConfig,
+    as_json,
+    at_seconds,
+    beliefs_of,
+    controls,
+    counted,
+    every_touch,
+    from_json,
+    make_policy,
+    one_step_look_ahead,
+    reinforced,
+    warm_start,
+)
+from experiments.active.contacts import PROPERTIES, ContactsConfig
+from experiments.active.encoder import ContactEncoderConfig
+from experiments.active.findings import findings
+from experiments.active.headroom import headroom
+from experiments.active.plans import Played
+from experiments.active.report import headroom_table
+from experiments.active.world import World, WorldConfig, make_world
+from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
+from experiments.core.results import Results, Table
+from experiments.core.runner import Experiment
+from touchr1_jax.models.active_policy import ActivePolicy
+from touchr1_jax.training.train_sft import SFTConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActiveTouchConfig:
+    """World, learner, arms.
+
+    Args:
+      world: contacts, encoder, parts of the objects.
+      learner: training of the policies.
+      contacts: most contacts of a trajectory of several.
+      second_price: price of a second for policies of several contacts, in right answers.
+      second_prices: further prices of a second.
+      harm_price: price of a contact past the strain limit for the arm that pays it.
+      seeds: of the policies.
+      full_seeds: seeds that also train with a price of harm, at further prices, and by imitation.
+    """
+
+    world: WorldConfig = WorldConfig()
+    learner: LearnerConfig = LearnerConfig()
+    contacts: int = 3
+    second_price: float = 0.004
+    second_prices: tuple[float, ...] = (0.0, 0.015)
+    harm_price: float = 0.5
+    seeds: int = 5
+    full_seeds: int = 1
+
+    def __post_init__(self) -> None:
+        given = self.seeds, self.full_seeds, self.contacts
+        if min(given[:2]) < 1 or self.contacts < 2:
+            raise ConfigurationError(
+                f"seeds, full_seeds, contacts are {given}: must be at least 1, 1 and 2; raise them"
+            )
+
+    def arms(self, seed: int) -> dict[str, Arm]:
+        """The reinforced policies of a seed."""
+        several = counted("chosen", self.contacts)
+        usual = Arm(budget=self.contacts, second=self.second_price)
+        found = {"chosen": Arm(budget=1), several: usual}
+        if seed < self.full_seeds:
+            found["chosen_harm"] = dataclasses.replace(usual, harm=self.harm_price)
+            found |= {f"{several}_at_{p:g}": dataclasses.replace(usual, second=p) for p in self.second_prices}
+        return found
+
+
+def run(config: ActiveTouchConfig, context: Context) -> Results:
+    """Make the world, report the headroom, train and score every seed."""
+    world = make_world(config.world, context)
+    policy = make_policy(world, config.learner)
+    tables = [_headroom(world, config, context)]
+    seeds: list[Mapping[str, Played]] = []
+    for seed in context.each("seeds", range(config.seeds)):
+        found, own = _seed(world, policy, config, seed, context)
+        seeds.append(found)
+        tables += own
+    return findings(world, config.learner, config.contacts, seeds, tables, config.arms(0))
+
+
+def _headroom(world: World, config: ActiveTouchConfig, context: Context) -> Table:
+    """What there is to win by the probes' beliefs, printed before anything is trained to choose."""
+    val, test = (world.probes.of(world.parts[part]) for part in ("val", "test"))
+    table = headroom_table(headroom(val, test, config.contacts, config.learner.kept), "probes")
+    _print(table, context)
+    return table
+
+
+def _seed(
+    world: World, policy: ActivePolicy, config: ActiveTouchConfig, seed: int, context: Context
+) -> tuple[dict[str, Played], list[Table]]:
+    """What all plans and policies of one seed do about test objects; of the first seed, its headroom too."""
+    learner = config.learner
+    warm = warm_start(world, policy, learner, config.contacts, seed, context)
+    tables = []
+    found = controls(world, warm, learner, config.contacts, seed)
+    if seed == 0:
+        test = beliefs_of(world, warm.answer, "test")
+        tables.append(headroom_table(headroom(warm.val, test, config.contacts, learner.kept), "the warm start"))
+        _print(tables[0], context)
+        found[EVERY_TOUCH] = every_touch(world, test)
+    for name, arm in config.arms(seed).items():
+        saved = context.once(
+            f"played/{name}/{seed}",
+            lambda n=name, a=arm: as_json(reinforced(world, warm, learner, n, a, seed, context)),
+        )
+        found |= from_json(saved)
+        context.print(_line(name, found[name]))
+    if seed < config.full_seeds:
+        imitated = lambda: as_json(one_step_look_ahead(world, warm, learner, seed, context))
+        found |= from_json(context.once(f"played/imitation/{seed}", imitated))
+    several = counted("chosen", config.contacts)
+    for plan in ("random", "best_press", "best_fixed", "by_question"):
+        seconds = float(found[several].seconds.mean())
+        found[f"{plan}_at_equal_seconds"] = dataclasses.replace(
+            found[several], right=at_seconds(found, plan, seconds, config.contacts)
+        )
+    return found, tables
+
+
+def _line(name: str, played: Played) -> str:
+    by = ", ".join(f"{p} {100 * x:.0f}" for p, x in zip(PROPERTIES, played.right.mean(0), strict=True))
+    return (
+        f"{name}: {100 * played.right.mean():.1f} % right ({by}), {played.seconds.mean():.2f} s, "
+        f"{100 * played.harm.mean():.1f} % past the limit"
+    )
+
+
+def _print(table: Table, context: Context) -> None:
+    context.print(table.title)
+    for row in table.rows:
+        context.print("  " + ", ".join("–" if x is None else x if isinstance(x, str) else f"{x:.1f}" for x in row))
+
+
+DEFAULT = ActiveTouchConfig()
+SMOKE = ActiveTouchConfig(
+    world=WorldConfig(
+        contacts=ContactsConfig(
+            objects=40, motions=("press", "slide_x", "hold"), forces_n=(2.0,), sensors=("tac3d",), picture_px=24
+        ),
+        encoder=ContactEncoderConfig(width=24, layers=1, heads=1, steps=40, batch_size=32),
+    ),
+    learner=LearnerConfig(
+        warm=SFTConfig(steps=20, batch_size=32, questions=1, micro_contacts=32),
+        grpo=dataclasses.replace(LearnerConfig().grpo, prompts=10, group=4, micro_prompts=10),
+        steps=4,
+        kept=3,
+        thresholds=(0.6,),
+    ),
+    contacts=2,
+    second_prices=(),
+    seeds=2,
+)
+
+EXPERIMENT = Experiment(
+    name="active_touch",
+    config=DEFAULT,
+    scales={"smoke": SMOKE},
+    run=run,
+    curves={"grpo": ("accuracy", "reward_mean", "actions", "seconds", "harm"), "warm": ("loss",)},
+    quick=("smoke",),
+)

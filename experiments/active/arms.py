@@ -1,0 +1,221 @@
+"""One seed of `active_touch`: warm start, reinforced policies, controls, and what all of them do about test objects."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from experiments.active.headroom import Beliefs
+from experiments.active.plans import (
+    NO_CHOICE,
+    Answer,
+    LookUps,
+    Played,
+    at_random,
+    look_up,
+    play,
+    same_for_all,
+    same_for_question,
+    until_sure,
+)
+from experiments.active.policies import answerer, explore, imitate, part_of, reinforce, single_beliefs, warm_up
+from experiments.active.world import World
+from experiments.core.context import Context
+from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_sft import SFTConfig
+from touchr1_jax.types import Params
+
+EVERY_TOUCH = "every_touch"
+"""The control that makes every contact; of the first seed alone."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Arm:
+    """A reinforced policy: most contacts, price of a second and of harm in units of a right answer."""
+
+    budget: int
+    second: float = 0.0
+    harm: float = 0.0
+
+    @property
+    def prices(self) -> Prices:
+        """As the step takes them."""
+        return Prices(second=jnp.float32(self.second), harm=jnp.float32(self.harm))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LearnerConfig:
+    """Training of the policies.
+
+    Args:
+      decoder: sizes; the vocabulary comes from the language.
+      warm: warm start on touches drawn at random.
+      grpo: a step of reinforcement; its length follows from the budget.
+      steps: of reinforcement.
+      dropout: probability that a sensor or a motion drops out of a prompt.
+      kept: choices of each question among which look-ups search for several contacts.
+      thresholds: probabilities of the likeliest level at which the controls by threshold stop.
+    """
+
+    decoder: DecoderConfig = DecoderConfig(vocab_size=0)
+    warm: SFTConfig = SFTConfig(
+        steps=500,
+        batch_size=128,
+        questions=1,
+        micro_contacts=128,
+        optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, weight_decay=0.05),
+    )
+    grpo: GRPOConfig = GRPOConfig(
+        prompts=40,
+        group=16,
+        micro_prompts=40,
+        lr_scale=1000.0,
+        algorithm=Paper(beta=0.0, gamma=0.0, drop_degenerate=True, constrained=True),
+    )
+    steps: int = 120
+    dropout: float = 0.1
+    kept: int = 12
+    thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SeedPolicy:
+    """The warm-started policy of one seed, its beliefs, and what was looked up in them."""
+
+    policy: ActivePolicy
+    params: Params
+    answer: Answer
+    val: Beliefs
+    look: LookUps
+
+
+def make_policy(world: World, config: LearnerConfig) -> ActivePolicy:
+    """The policy that speaks of the choices of a world."""
+    return build_active_policy(world.bank.actions, config.decoder)
+
+
+def warm_start(
+    world: World, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
+) -> SeedPolicy:
+    """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
+    bank = world.bank
+    learned = part_of(bank, world.parts["warm"])
+    params = warm_up(policy, learned, contacts, config.warm, context, f"warm/{seed}", seed)
+    answer = answerer(policy, params, bank)
+    val = beliefs_of(world, answer, "val")
+    look = look_up(bank, val, contacts, config.kept)
+    return SeedPolicy(policy=policy, params=params, answer=answer, val=val, look=look)
+
+
+def beliefs_of(world: World, answer: Answer, part: str) -> Beliefs:
+    """A policy's beliefs about the objects of a part after each single contact."""
+    objects, label = world.parts[part], np.asarray(world.bank.label)
+    return Beliefs(single_beliefs(answer, objects, label.shape[1], len(world.bank.choices)), label[objects])
+
+
+def controls(world: World, warm: SeedPolicy, config: LearnerConfig, contacts: int, seed: int) -> dict[str, Played]:
+    """What plans by rule do about test objects; plans of k contacts end in `_k`, but for one contact."""
+    bank, objects, look = world.bank, world.parts["test"], warm.look
+    n, questions = len(objects), bank.label.shape[1]
+    rng = np.random.default_rng([seed, contacts])
+    offered = np.ones((n, questions, len(bank.choices)), bool)
+    made = {"no_touch": np.full((n, questions, 1), NO_CHOICE, np.int32)}
+    for k in range(1, contacts + 1):
+        made[counted("random", k)] = at_random(offered, k, rng)
+        made[counted("best_press", k)] = same_for_all(look.press[k], n, questions)
+        made[counted("best_fixed", k)] = same_for_all(look.fixed[k], n, questions)
+        made[counted("by_question", k)] = same_for_question(look.by_question[k], n)
+    for threshold in config.thresholds:
+        name = f"until_{100 * threshold:.0f}"
+        made[name] = until_sure(objects, look.order, contacts, threshold, warm.answer)
+    return {name: play(bank, objects, choices, warm.answer) for name, choices in made.items()}
+
+
+def counted(plan: str, contacts: int) -> str:
+    """Name of a plan of so many contacts."""
+    return plan if contacts == 1 else f"{plan}_{contacts}"
+
+
+def every_touch(world: World, beliefs: Beliefs) -> Played:
+    """All contacts of every test object, their beliefs added as if their errors were independent."""
+    objects, choices = world.parts["test"], tuple(range(len(world.bank.choices)))
+    right = np.stack([beliefs.right(a, choices) for a in beliefs.questions], 1).astype(float)
+    total = lambda x: np.broadcast_to(np.asarray(x, float)[objects].sum(1)[:, None], right.shape)
+    chosen = same_for_all(choices, *right.shape)
+    return Played(right=right, seconds=total(world.bank.seconds), harm=total(world.bank.harm), choices=chosen)
+
+
+def reinforced(
+    world: World, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
+) -> dict[str, Played]:
+    """What a reinforced policy does about test objects, and what the warm start answers after the same contacts."""
+    loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
+    params = reinforce(
+        warm.policy,
+        warm.params,
+        part_of(world.bank, world.parts["reinforced"]),
+        config.grpo,
+        arm.budget,
+        arm.prices,
+        config.dropout,
+        loop,
+        context,
+        f"grpo/{name}/{seed}",
+        seed,
+    )
+    objects = world.parts["test"]
+    found = explore(warm.policy, params, world.bank, objects, arm.budget)
+    own_answers = play(world.bank, objects, found.choices, warm.answer)
+    unseen = dataclasses.replace(world.bank, available=jnp.zeros_like(world.bank.available))
+    unseeing = explore(warm.policy, params, unseen, objects, arm.budget)
+    chosen_unseen = play(world.bank, objects, unseeing.choices, answerer(warm.policy, params, world.bank))
+    return {name: found, f"{name}_warm_answers": own_answers, f"{name}_unseen": chosen_unseen}
+
+
+def one_step_look_ahead(
+    world: World, warm: SeedPolicy, config: LearnerConfig, seed: int, context: Context
+) -> dict[str, Played]:
+    """SFT that imitates the contact after which the warm start believes most in the true level of training objects."""
+    beliefs = beliefs_of(world, warm.answer, "reinforced")
+    true = np.take_along_axis(beliefs.log_probs, beliefs.label[:, None, :, None], -1)[..., 0]  # n C A
+    learned, best = part_of(world.bank, world.parts["reinforced"]), true.argmax(1).astype(np.int32)
+    params = imitate(warm.policy, warm.params, learned, best, config.warm, context, f"imitation/{seed}", seed)
+    return {"imitation": explore(warm.policy, params, world.bank, world.parts["test"], 1)}
+
+
+def at_seconds(found: Mapping[str, Played], plan: str, seconds: float, contacts: int) -> Float[np.ndarray, "n A"]:
+    """Right answers of a plan at a mean time of touch: a mixture of its plans of one contact fewer and one more."""
+    steps = [found["no_touch"], *(found[counted(plan, k)] for k in range(1, contacts + 1))]
+    times = [float(step.seconds.mean()) for step in steps]
+    upper = min(int(np.searchsorted(times, seconds)), contacts)
+    if upper == 0 or seconds >= times[-1]:
+        return steps[upper].right
+    share = (seconds - times[upper - 1]) / (times[upper] - times[upper - 1])
+    return (1 - share) * steps[upper - 1].right + share * steps[upper].right
+
+
+def as_json(found: Mapping[str, Played]) -> dict[str, Any]:
+    """What is saved of a stage."""
+    return {
+        name: {k: getattr(one, k).tolist() for k in ("right", "seconds", "harm", "choices")}
+        for name, one in found.items()
+    }
+
+
+def from_json(saved: Mapping[str, Any]) -> dict[str, Played]:
+    """What was saved of a stage."""
+    read = lambda one: Played(
+        right=np.array(one["right"]),
+        seconds=np.array(one["seconds"]),
+        harm=np.array(one["harm"]),
+        choices=np.array(one["choices"], np.int32),
+    )
+    return {name: read(one) for name, one in saved.items()}

@@ -1,0 +1,166 @@
+"""Generated objects, each touched by every motion at every force by every sensor: what a policy may choose.
+
+A choice is (sensor, motion, force).  What is kept of a contact is a few frames, and whether gel or object was strained
+past the limit of small strains.  The generator knows the level of all five properties.
+"""
+
+import dataclasses
+import io
+import itertools
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
+from experiments.mechanics.identify_features import in_threads
+from experiments.mechanics.identify_motions import choose_frames
+from experiments.study.cache import fingerprint
+from sensors_io.arrays import load_arrays
+from sensors_io.scenes import motions
+from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes.config import PROTOCOL_FRAMES, SceneConfig, config_hash
+from sensors_io.scenes.schedule import Slot, pace
+from sensors_io.scenes.sequence import make_sequence
+from sensors_io.schema import EXPLORATORY, SENSORS, Flag, Sequence
+from sensors_io.selection import field_images, pick_frames
+
+PROPERTIES = ("hardness", "roughness", "protrusion", "elasticity", "friction")
+"""What is asked for, in the order of the A axis; each has three levels."""
+
+LEVELS = 3
+
+VERSION = 1
+"""Raised whenever the same configuration would give other contacts."""
+
+_OBJECTS_A_FILE = 20
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ContactsConfig:
+    """The contacts of every object: all motions × forces × sensors.
+
+    Args:
+      objects: number of objects.
+      motions, forces_n, sensors: what can be chosen; forces are the greatest normal force, N.
+      frames: of a generated sequence.
+      moments: frames that are kept of it, the untouched first one among them.
+      picture_px: rows and columns of the kept pictures.
+      contact_grid: side of the contact solver's grid.
+      seed: of objects and contacts.
+    """
+
+    objects: int = 600
+    motions: tuple[str, ...] = ("press", *EXPLORATORY)
+    forces_n: tuple[float, ...] = (2.0, 10.0)
+    sensors: tuple[str, ...] = SENSORS
+    frames: int = 20
+    moments: int = 6
+    picture_px: int = 48
+    contact_grid: int = 24
+    seed: int = 34
+
+    def __post_init__(self) -> None:
+        for name, known in (("motions", ("press", *EXPLORATORY)), ("sensors", SENSORS)):
+            given = getattr(self, name)
+            if not given or len(set(given)) != len(given) or set(given) - set(known):
+                raise ConfigurationError(
+                    f"{name} is {given}: must be some of {', '.join(known)}, each once; correct it"
+                )
+        if not self.forces_n or min(self.forces_n) <= 0 or len(set(self.forces_n)) != len(self.forces_n):
+            raise ConfigurationError(f"forces_n is {self.forces_n}: must be different forces above 0 N; correct it")
+        if self.picture_px % 2:
+            raise ConfigurationError(
+                f"picture_px is {self.picture_px}: must be even, for fields of half its rows; change it"
+            )
+
+    @property
+    def choices(self) -> tuple[tuple[str, str, float], ...]:
+        """(sensor, motion, force) of every choice."""
+        return tuple(itertools.product(self.sensors, self.motions, self.forces_n))
+
+    @property
+    def seconds(self) -> Float[np.ndarray, "C"]:
+        """Seconds of every choice: those of its motion in the protocol, from the first frame to the last."""
+        return np.array([motions.plan(m, f, pace(PROTOCOL_FRAMES)).time_s[-1] for _, m, f in self.choices], np.float32)
+
+    @property
+    def scenes(self) -> SceneConfig:
+        """The generator's configuration; frames past the strain limit are flagged."""
+        contacts = self.objects * len(self.motions) * len(self.forces_n)
+        return SceneConfig(
+            objects=self.objects,
+            sequences=len(SENSORS) * contacts,
+            frames=self.frames,
+            image_px=self.picture_px,
+            contact_grid=self.contact_grid,
+            past_limit="flag",
+            seed=self.seed,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactBank:
+    """Every contact of every object.
+
+    `frames` are the pictures with the fields below them, `harm` tells where the strain limit was passed, `label` is the
+    level of each of `PROPERTIES`.
+    """
+
+    frames: UInt8[np.ndarray, "O C F H W 3"]
+    harm: Bool[np.ndarray, "O C"]
+    label: Int[np.ndarray, "O A"]
+
+
+def generate(config: ContactsConfig, context: Context) -> ContactBank:
+    """The bank of a configuration, generated or read from the cache; a stopped run goes on where it was."""
+    values = {"contacts": config, "scenes": config_hash(config.scenes), "version": VERSION}
+    folder = context.cache_dir / "touch_bank" / fingerprint(values, {}, "")
+    starts = range(0, config.objects, _OBJECTS_A_FILE)
+    with context.progress("contacts", config.objects) as advance:
+        for start in starts:
+            path = folder / f"{start:06d}.npz"
+            rows = range(start, min(start + _OBJECTS_A_FILE, config.objects))
+            if not path.exists():
+                made = in_threads(lambda i: object_contacts(config, i), rows, lambda: None)
+                buffer = io.BytesIO()
+                np.savez(buffer, frames=np.stack([x for x, _ in made]), harm=np.stack([x for _, x in made]))
+                write_bytes(path, buffer.getvalue())
+            for _ in rows:
+                advance()
+    read = [load_arrays(folder / f"{start:06d}.npz") for start in starts]
+    return ContactBank(
+        frames=np.concatenate([x.pop("frames") for x in read]),
+        harm=np.concatenate([x["harm"] for x in read]),
+        label=np.array(
+            [[solid_of(config.scenes, i).levels()[name] for name in PROPERTIES] for i in range(config.objects)]
+        ),
+    )
+
+
+def object_contacts(config: ContactsConfig, index: int) -> tuple[UInt8[np.ndarray, "C F H W 3"], Bool[np.ndarray, "C"]]:
+    """Frames and harm of all choices of object number `index`; each motion and force touches a place of its own."""
+    frames, harm = {}, {}
+    tasks = list(itertools.product(config.motions, config.forces_n))
+    for site, (motion, force) in enumerate(tasks):
+        slot = Slot(object_index=index, site=site, motion=motion, force_n=force)
+        for sensor in config.sensors:
+            made = make_sequence(config.scenes, index * len(tasks) + site, slot, SENSORS.index(sensor), 0)
+            frames[sensor, motion, force] = kept_frames(made, config)
+            harm[sensor, motion, force] = bool(np.any(made.flags & np.uint32(Flag.STRAIN_LIMIT)))
+    return np.stack([frames[c] for c in config.choices]), np.array([harm[c] for c in config.choices])
+
+
+def kept_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
+    """The frames that are kept: the picture, and below it the displacement and depth fields at half its rows.
+
+    A sensor without a camera has a black picture; a field that a sensor does not measure is 128.
+    """
+    picked = pick_frames(sequence, choose_frames(sequence.phase, config.moments))
+    wide, half = config.picture_px, config.picture_px // 2
+    fields = np.stack([cv2.resize(x, (wide, half), interpolation=cv2.INTER_AREA) for x in field_images(picked)])
+    fields = np.clip(np.rint(fields), 0, 255).astype(np.uint8)
+    pictures = np.zeros((config.moments, wide, wide, 3), np.uint8) if picked.frames is None else picked.frames
+    return np.concatenate([pictures, fields], 1)

@@ -1,0 +1,307 @@
+"""From what all plans and policies did to the results of `active_touch`."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from experiments.active import report
+from experiments.active.arms import EVERY_TOUCH, Arm, LearnerConfig, counted
+from experiments.active.contacts import PROPERTIES
+from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroom
+from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.world import World
+from experiments.core.results import (
+    Cell,
+    Comparison,
+    Estimate,
+    Requirement,
+    Results,
+    Table,
+    at_least,
+    at_most,
+    named_table,
+)
+from experiments.core.text import bounds
+from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from touchr1_jax.bench.metrics import Scores
+from touchr1_jax.bench.statistics import Interval
+
+METRIC = "acc"
+"""Mean of the accuracy over the five properties."""
+
+RULES = ("random", "best_press", "best_fixed", "by_question")
+EQUAL = "at_equal_seconds"
+Seeds = Sequence[Mapping[str, Played]]
+
+
+def findings(
+    world: World, learner: LearnerConfig, contacts: int, seeds: Seeds, tables: Sequence[Table], arms: Mapping[str, Arm]
+) -> Results:
+    """The report of all seeds."""
+    scores = {name: [scores_of(found[name]) for found in seeds if name in found] for name in seeds[0]}
+    objects = np.repeat(world.parts["test"], len(PROPERTIES))
+    estimates = {name: {METRIC: estimate(of_seeds, objects)} for name, of_seeds in scores.items()}
+    comparisons = compared(scores, estimates, objects, contacts)
+    several, test = counted("chosen", contacts), world.probes.of(world.parts["test"])
+    setup = world.config.contacts
+    chosen = [found["chosen"] for found in seeds]
+    return Results(
+        verdict=verdict(estimates, comparisons, seeds, contacts),
+        requirements=requirements(world, comparisons, seeds, contacts),
+        tables=(
+            *tables,
+            plan_table(seeds, estimates),
+            report.procedures_table(setup, chosen, test),
+            report.probe_table(
+                setup, test, "One contact, by probes", "Right answers of linear probes about test objects, %."
+            ),
+            stop_table(seeds, several),
+            harm_table(world, learner, contacts, seeds, arms),
+            price_table(seeds[0], arms),
+        ),
+        pictures=(
+            report.seconds_picture(curves(seeds, estimates, contacts, learner)),
+            report.first_touch_picture(setup, chosen, test),
+            report.trajectory_picture(trajectories(world, seeds[0][several])),
+        ),
+        settings={
+            "preset": type(learner.grpo.algorithm).__name__.lower(),
+            "lr_scale": learner.grpo.lr_scale,
+            "choices": f"{len(setup.choices)}: {len(setup.sensors)} sensors, {len(setup.motions)} motions, "
+            f"{len(setup.forces_n)} forces",
+            "objects": ", ".join(f"{name} {len(rows)}" for name, rows in world.parts.items()),
+            "a step": f"{learner.grpo.prompts} prompts × {learner.grpo.group} trajectories, {learner.steps} steps",
+        },
+        arms={name: row for name, row in estimates.items() if len(scores[name]) == len(seeds)},
+        baselines={name: row for name, row in estimates.items() if len(scores[name]) < len(seeds)},
+        comparisons=comparisons,
+    )
+
+
+def scores_of(played: Played) -> Scores:
+    """Right answers in %, one stratum for each question."""
+    n, questions = played.right.shape
+    strata = np.tile(np.arange(questions), n)
+    return Scores(values=100 * played.right.ravel(), items=np.arange(n * questions), strata=strata)
+
+
+def compared(
+    scores: Mapping[str, Sequence[Scores]],
+    estimates: Mapping[str, Mapping[str, Estimate]],
+    objects: np.ndarray,
+    contacts: int,
+) -> tuple[Comparison, ...]:
+    """Chosen touches against every rule, over seeds and over objects."""
+    several = counted("chosen", contacts)
+    pairs = [("chosen", rule) for rule in (*RULES, "chosen_warm_answers")]
+    pairs += [("chosen_warm_answers", rule) for rule in RULES]
+    pairs += [(several, f"{rule}_{EQUAL}") for rule in RULES]
+    pairs += [(several, f"{several}_unseen"), (several, "chosen")]
+    found = []
+    for a, b in pairs:
+        if len(scores[a]) > 1:
+            found.append(compare_over_seeds(METRIC, a, b, estimates[a][METRIC], estimates[b][METRIC]))
+        found.append(compare_over_objects(METRIC, a, b, scores[a], scores[b], objects))
+    return tuple(found)
+
+
+def named(comparisons: Sequence[Comparison], a: str, b: str, over: str = "objects") -> Comparison:
+    """The comparison of two arms."""
+    return next(c for c in comparisons if (c.arm, c.against, c.over) == (a, b, over))
+
+
+def requirements(
+    world: World, comparisons: Sequence[Comparison], seeds: Seeds, contacts: int
+) -> tuple[Requirement, ...]:
+    """What the experiment must reach."""
+    several = counted("chosen", contacts)
+    fixed, question = named(comparisons, "chosen", "best_fixed"), named(comparisons, "chosen", "by_question")
+    later = named(comparisons, several, f"by_question_{EQUAL}")
+    every = seeds[0][EVERY_TOUCH]
+    seconds = np.mean([f[several].seconds.mean() for f in seeds])
+    note = f"95 % interval over objects {bounds(fixed.low, fixed.high)}"
+    probes, setup = world.probes.of(world.parts["test"]), world.config.contacts
+    found = [
+        sum(report.found_motion(setup, f["chosen"].choices[:, a, 0], probes, a) for a in range(len(PROPERTIES)))
+        for f in seeds
+    ]
+    accuracy = np.mean([f[several].right.mean() for f in seeds]) - every.right.mean()
+    return (
+        at_least("chosen over best fixed, one contact each", fixed.difference, 6.0, "points", note),
+        at_least("lower end of its interval", fixed.low, 0.0, "points"),
+        at_least("upper end of chosen over best by question", question.high, 0.0, "points"),
+        at_least(f"the same with up to {contacts} contacts, equal seconds", later.high, 0.0, "points"),
+        at_least(f"up to {contacts} contacts over every contact", 100 * accuracy, 0.0, "points"),
+        at_most("seconds of touch, share of every contact's", 100 * seconds / every.seconds.mean(), 15.0, "%"),
+        at_least(
+            "seeds whose first motion is the probes' for 4 of 5 questions",
+            100 * float(np.mean([n >= 4 for n in found])),
+            80.0,
+            "%",
+            f"{found} questions of 5 in the seeds",
+        ),
+    )
+
+
+def verdict(
+    estimates: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison], seeds: Seeds, contacts: int
+) -> tuple[str, ...]:
+    """One sentence for one contact, one for several."""
+    several = counted("chosen", contacts)
+    mean = lambda name: f"{estimates[name][METRIC].mean:.1f} %"
+    against = lambda a, b: (c := named(comparisons, a, b)) and f"{c.difference:+.1f} {bounds(c.low, c.high)}"
+    number = np.mean([f[several].contacts.mean() for f in seeds])
+    return (
+        f"One touch chosen by a policy that learned from reward: {mean('chosen')} right, {against('chosen', 'random')} "
+        f"points over a touch at random, {against('chosen', 'best_fixed')} over the best touch for all questions, "
+        f"{against('chosen', 'by_question')} over the best touch for each question.",
+        f"Answered by the warm start, the same touches are {against('chosen_warm_answers', 'best_fixed')} over the "
+        f"best fixed one and {against('chosen_warm_answers', 'by_question')} over the best by question.",
+        f"Up to {contacts} touches at a price: {mean(several)} right with {number:.2f} touches, "
+        f"{against(several, f'best_fixed_{EQUAL}')} over the best fixed ones and "
+        f"{against(several, f'by_question_{EQUAL}')} over the best by question in the same time; every touch: "
+        f"{mean(EVERY_TOUCH)}.",
+    )
+
+
+def plan_table(seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
+    """Accuracy, seconds and harm of everything that was played."""
+    rows: list[dict[str, Cell]] = []
+    for name, one in estimates.items():
+        if name.endswith(EQUAL):
+            continue
+        mean = lambda field, name=name: float(np.mean([getattr(f[name], field).mean() for f in seeds if name in f]))
+        by = np.mean([f[name].right.mean(0) for f in seeds if name in f], 0)
+        rows.append(
+            {
+                "plan": name,
+                "right": one[METRIC].mean,
+                "from": one[METRIC].low,
+                "to": one[METRIC].high,
+                "contacts": mean("contacts"),
+                "seconds": mean("seconds"),
+                "past the limit": mean("harm"),
+            }
+            | {p: 100 * float(x) for p, x in zip(PROPERTIES, by, strict=True)}
+        )
+    percent = ("right", "from", "to", *PROPERTIES)
+    return named_table(
+        "Plans and policies",
+        rows,
+        formats=dict.fromkeys(percent, ".1f") | {"contacts": ".2f", "seconds": ".1f", "past the limit": ".3f"},
+        units=dict.fromkeys(percent, "%") | {"seconds": "s"},
+        meanings={"past the limit": "contacts of a question that strain gel or object past the limit"},
+        note="Test objects, mean over seeds, intervals over objects. Plans by rule are answered by the warm start; "
+        "`_warm_answers` are the touches of a reinforced policy, answered by the warm start; of `_unseen` the touches "
+        "were chosen without seeing any observation.",
+    )
+
+
+def stop_table(seeds: Seeds, name: str) -> Table:
+    """When the policy stops, by question."""
+    rows: list[dict[str, Cell]] = []
+    for a, question in enumerate(PROPERTIES):
+        number = np.concatenate([f[name].contacts[:, a] for f in seeds])
+        most = seeds[0][name].choices.shape[-1]
+        rows.append(
+            {"question": question}
+            | {f"{k} contacts": 100 * float((number == k).mean()) for k in range(most + 1)}
+            | {"right": 100 * float(np.mean([f[name].right[:, a].mean() for f in seeds]))}
+        )
+    figures = [column for column in rows[0] if column != "question"]
+    return named_table(
+        "When the policy stops",
+        rows,
+        formats=dict.fromkeys(figures, ".0f"),
+        units=dict.fromkeys(figures, "%"),
+        note=f"Share of the test objects, {name}.",
+    )
+
+
+def harm_table(world: World, learner: LearnerConfig, contacts: int, seeds: Seeds, arms: Mapping[str, Arm]) -> Table:
+    """Worth of policies and look-ups where harm has a price, and what the optimum over trees leaves."""
+    arm = arms["chosen_harm"]
+    cost = arm.second * np.asarray(world.bank.seconds) + arm.harm * np.asarray(world.bank.harm)
+    priced = Beliefs(world.probes.log_probs, world.probes.label, cost)
+    parts = [priced.of(world.parts[part]) for part in ("val", "test")]
+    found = headroom(*parts, contacts, learner.kept)
+    rows: list[dict[str, Cell]] = []
+    for name in ("random", "best_fixed", "by_question", counted("chosen", contacts), "chosen_harm"):
+        mean = lambda field, name=name: float(np.mean([getattr(f[name], field).mean() for f in seeds if name in f]))
+        worth = mean("right") - arm.second * mean("seconds") - arm.harm * mean("harm")
+        rows.append({"plan": name, "worth": 100 * worth, "right": 100 * mean("right"), "past the limit": mean("harm")})
+    rows += [
+        {"plan": f"probes, {plan}, {k}", "worth": 100 * float(found[plan, k].mean())}
+        for plan in (BY_QUESTION, BY_BELIEF)
+        for k in range(1, contacts + 1)
+    ]
+    light = [light_first(world, f["chosen_harm"]) for f in seeds if "chosen_harm" in f]
+    return named_table(
+        "Where harm has a price",
+        rows,
+        formats={"worth": ".1f", "right": ".1f", "past the limit": ".3f"},
+        units={"worth": "points", "right": "%"},
+        meanings={"worth": "right answers less prices, in points"},
+        note=f"Price of a second {arm.second:g}, of a contact past the limit {arm.harm:g}. The policy that pays begins "
+        f"with the lightest force in {100 * np.mean(light):.0f} % of its trajectories.",
+    )
+
+
+def light_first(world: World, played: Played) -> float:
+    """Share of trajectories that begin with the lightest force, among those that touch."""
+    force = np.array([f for _, _, f in world.config.contacts.choices])
+    first = played.choices[..., 0]
+    made = first != NO_CHOICE
+    return float((force[first[made]] == force.min()).mean()) if made.any() else 0.0
+
+
+def price_table(found: Mapping[str, Played], arms: Mapping[str, Arm]) -> Table:
+    """Policies of the first seed over the price of a second."""
+    rows: list[dict[str, Cell]] = [
+        {
+            "policy": name,
+            "price of a second": arm.second,
+            "price of harm": arm.harm,
+            "right": 100 * float(found[name].right.mean()),
+            "contacts": float(found[name].contacts.mean()),
+            "past the limit": float(found[name].harm.mean()),
+        }
+        for name, arm in arms.items()
+    ]
+    return named_table(
+        "Prices", rows, formats={"right": ".1f", "contacts": ".2f"}, units={"right": "%"}, note="The first seed."
+    )
+
+
+def curves(
+    seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]], contacts: int, learner: LearnerConfig
+) -> dict[str, list[tuple[float, Interval]]]:
+    """Accuracy over seconds of every plan."""
+
+    def point(name: str) -> tuple[float, Interval]:
+        one = estimates[name][METRIC]
+        seconds = float(np.mean([f[name].seconds.mean() for f in seeds if name in f]))
+        return seconds, Interval(mean=one.mean, low=one.low, high=one.high)
+
+    several = counted("chosen", contacts)
+    found = {rule.replace("_", " "): [point(counted(rule, k)) for k in range(1, contacts + 1)] for rule in RULES}
+    found["by question until sure"] = [point(f"until_{100 * t:.0f}") for t in learner.thresholds]
+    found["imitation of a look-ahead"] = [point("imitation")]
+    found["every contact"] = [point(EVERY_TOUCH)]
+    return found | {"chosen by the policy": [point("chosen"), point(several)]}
+
+
+def trajectories(world: World, played: Played, most: int = 7) -> dict[str, np.ndarray]:
+    """Frames of the contacts of a few trajectories, by what was asked, chosen and concluded."""
+    rows: dict[str, np.ndarray] = {}
+    objects, choices = world.parts["test"], world.bank.choices
+    for i in range(len(objects)):
+        question = i % len(PROPERTIES)
+        for k, choice in enumerate(played.choices[i, question]):
+            if choice == NO_CHOICE or len(rows) >= most:
+                break
+            label = report.level_word(question, int(np.asarray(world.bank.label)[objects[i], question]))
+            outcome = "right" if played.right[i, question] else "wrong"
+            title = f"{PROPERTIES[question]}?\n{choices[choice].words}\n{label}: {outcome}\nobject {i}, touch {k + 1}"
+            rows[title] = world.contacts.frames[objects[i], choice]
+    return rows

@@ -1,0 +1,277 @@
+"""Policies that choose: warm start on touches drawn at random, GRPO on whole trajectories, and what they then do."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from experiments.active.feed import DrawnFeed
+from experiments.active.plans import NO_CHOICE, Answer, Played
+from experiments.core.context import Context, read_metrics
+from experiments.core.loops import stage_hooks
+from experiments.study.stages import ALARM
+from touchr1_jax.models.active_policy import ActivePolicy, Explored
+from touchr1_jax.rl.active import make_explore
+from touchr1_jax.rl.active_alarms import ACTIVE_RULES
+from touchr1_jax.rl.alarms import AlarmMonitor
+from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.environment import TouchBank
+from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.training.exploration import ActiveFeed, RandomTouchFeed, touch_batch_of, train_active
+from touchr1_jax.training.loop import Log, LoopConfig
+from touchr1_jax.training.sft import SFTBatch
+from touchr1_jax.training.train_sft import SFTConfig, train_sft
+from touchr1_jax.types import Params
+
+ROWS = 256
+"""Trajectories that are scored at once."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Script:
+    """Tokens of every turn of a policy: [C, L] of actions, [A, K, L] of answers, padded."""
+
+    actions: Int[np.ndarray, "C L"]
+    answers: Int[np.ndarray, "A K L"]
+    pad: int
+
+    @staticmethod
+    def of(policy: ActivePolicy) -> "Script":
+        """Those of a policy's language."""
+        language, tokenizer, length = policy.language, policy.tokenizer, policy.turns.length
+        row = lambda text: np.array(
+            (ids := tokenizer.encode(text)) + [tokenizer.pad_id] * (length - len(ids)), np.int32
+        )
+        levels = [[row(language.answer_text(words[0])) for words in a.levels] for a in language.attributes]
+        actions = [row(language.action_text(c)) for c in range(len(language.actions))]
+        return Script(np.stack(actions), np.array(levels), tokenizer.pad_id)
+
+    def trajectories(
+        self, choices: Int[np.ndarray, "n B"], question: Int[np.ndarray, "n"], level: Int[np.ndarray, "n"]
+    ) -> Int[np.ndarray, "n T"]:
+        """Tokens of trajectories with these choices, `NO_CHOICE` from where they stop, and the answer after them."""
+        n, budget = choices.shape
+        made = choices != NO_CHOICE
+        turns = np.full((n, budget + 1, self.actions.shape[1]), self.pad, np.int32)
+        turns[:, :budget] = np.where(made[..., None], self.actions[np.maximum(choices, 0)], self.pad)
+        turns[np.arange(n), made.sum(1)] = self.answers[question, level]
+        return turns.reshape(n, -1)
+
+
+def observed(
+    bank: TouchBank, objects: Int[np.ndarray, "*n"], choices: Int[np.ndarray, "*n B"]
+) -> tuple[Float[Array, "*n B N W"], Bool[Array, "*n B N"]]:
+    """What these choices show of objects, and where anything is observed."""
+    at = jnp.asarray(objects)[..., None], jnp.maximum(choices, 0)
+    exists = (jnp.asarray(choices) != NO_CHOICE) & bank.available[at]
+    tokens = jnp.where(exists[..., None, None], bank.tokens[at], 0.0)
+    return tokens, jnp.broadcast_to(exists[..., None], tokens.shape[:-1])
+
+
+def part_of(bank: TouchBank, objects: Int[np.ndarray, "n"]) -> TouchBank:
+    """The contacts of some objects."""
+    rows = {name: getattr(bank, name)[objects] for name in ("tokens", "available", "seconds", "harm", "label")}
+    return dataclasses.replace(bank, **rows)
+
+
+def warm_up(
+    policy: ActivePolicy,
+    bank: TouchBank,
+    contacts: int,
+    config: SFTConfig,
+    context: Context,
+    stage: str,
+    seed: int,
+) -> Params:
+    """SFT of a fresh policy on touches drawn at random, which ends in the right answer.
+
+    Args:
+      policy: to train.
+      bank: contacts of the objects to learn from.
+      contacts: most touches of a trajectory.
+      config: of SFT.
+      context, stage: of the run.
+      seed: of parameters and draws.
+    """
+    feed = RandomTouchFeed(policy, bank, budget=contacts, batch_size=config.batch_size, seed=seed)
+    with stage_hooks(context, stage, config.steps) as hooks:
+        return train_sft(policy, policy.init(seed, bank.tokens.shape[-1]), feed, config, hooks, seed=seed)
+
+
+def imitate(
+    policy: ActivePolicy,
+    params: Params,
+    bank: TouchBank,
+    choice: Int[np.ndarray, "n A"],
+    config: SFTConfig,
+    context: Context,
+    stage: str,
+    seed: int,
+) -> Params:
+    """SFT on trajectories of one given touch for each object of a bank and question, and the right answer."""
+    script, label = Script.of(policy), np.asarray(bank.label)
+
+    def make(rng: np.random.Generator) -> SFTBatch:
+        n = config.batch_size
+        which, question = rng.integers(len(label), size=n), rng.integers(label.shape[1], size=n)
+        chosen = choice[which, question][:, None]
+        tokens = script.trajectories(chosen, question, label[which, question])
+        touch, exists = observed(bank, which, chosen)
+        return SFTBatch(
+            touch=Explored(policy.prompt_features(n), touch[:, None], exists[:, None], np.ones((n, 1), bool)),
+            ids=policy.ids[question][:, None],
+            mask=policy.mask[question][:, None],
+            streams=np.ones((n, 1, 1), bool),
+            tokens=tokens[:, None],
+            token_mask=(tokens != script.pad)[:, None],
+        )
+
+    with stage_hooks(context, stage, config.steps) as hooks:
+        return train_sft(policy, params, DrawnFeed(make, seed), config, hooks, seed=seed)
+
+
+def reinforce(
+    policy: ActivePolicy,
+    params: Params,
+    bank: TouchBank,
+    config: GRPOConfig,
+    budget: int,
+    prices: Prices,
+    dropout: float,
+    loop: LoopConfig,
+    context: Context,
+    stage: str,
+    seed: int,
+) -> Params:
+    """GRPO on trajectories about the objects of a bank; alarms are logged and printed once each.
+
+    Args:
+      policy, params: where it starts.
+      bank: contacts of the objects to learn from.
+      config: of a step; the length follows from the budget.
+      budget: most contacts.
+      prices: of a second and of harm.
+      dropout: probability that a sensor or a motion drops out of a prompt.
+      loop: number of steps.
+      context, stage: of the run.
+      seed: of draws.
+    """
+    config = dataclasses.replace(config, length=policy.tokens(budget))
+    feed = ActiveFeed(policy, bank, batch_size=config.drawn, seed=seed, dropout=dropout)
+    with stage_hooks(context, stage, loop.steps, make_log=_with_alarms) as hooks:
+        return train_active(policy, params, feed, bank, config, loop, hooks, prices=prices, budget=budget, seed=seed)
+
+
+def _with_alarms(context: Context, stage: str, start: int) -> Log:
+    """A function that logs the metrics of each step, and `alarm_A1` with the number that fired."""
+    monitor, told = AlarmMonitor(ACTIVE_RULES), set[str]()
+    for line in read_metrics(context.directory):
+        if line["stage"] == stage and line["step"] < start:
+            told |= {alarm.code for alarm in monitor.update(line)}
+
+    def log(t: int, metrics: dict[str, float]) -> None:
+        alarms = monitor.update(metrics)
+        for alarm in alarms:
+            if alarm.code not in told:
+                context.print(f"{stage}, step {t}: {alarm}")
+                told.add(alarm.code)
+        context.log(stage, t, **metrics, **{f"{ALARM}{alarm.code}": alarm.value for alarm in alarms})
+
+    return log
+
+
+def explore(
+    policy: ActivePolicy,
+    params: Params,
+    bank: TouchBank,
+    objects: Int[np.ndarray, "n"],
+    budget: int,
+    offered: Bool[np.ndarray, "n A C"] | None = None,
+) -> Played:
+    """What a policy does greedily about every question of some objects."""
+    label = np.asarray(bank.label)
+    questions = label.shape[1]
+    rows, asked = np.repeat(objects, questions), np.tile(np.arange(questions), len(objects))
+    free = np.ones((len(rows), bank.tokens.shape[1]), bool) if offered is None else offered.reshape(len(rows), -1)
+    walk = _explorer(policy, budget)
+    parts = []
+    for start in range(0, len(rows), ROWS):
+        at = np.minimum(np.arange(start, start + ROWS), len(rows) - 1)  # one shape, one program
+        batch = touch_batch_of(policy, bank, rows[at], asked[at], free[at])
+        found = jax.device_get(walk(params, bank, batch, jax.random.key(0)))
+        parts.append((found.action[:, 0], found.parsed.conclude[:, 0], found.seconds[:, 0], found.harm[:, 0]))
+    action, level, seconds, harm = (np.concatenate(x)[: len(rows)] for x in zip(*parts, strict=True))
+    right = level[np.arange(len(rows)), asked] == label[rows, asked]
+    shaped = lambda x: x.reshape(len(objects), questions, *x.shape[1:])
+    return Played(
+        shaped(right.astype(float)), shaped(seconds.astype(float)), shaped(harm.astype(float)), shaped(action)
+    )
+
+
+@functools.cache
+def _explorer(policy: ActivePolicy, budget: int) -> Any:
+    """Compiled greedy trajectories."""
+    return make_explore(policy.constrained_fns, budget)
+
+
+def answerer(policy: ActivePolicy, params: Params, bank: TouchBank) -> Answer:
+    """The levels that a policy believes in after given contacts, as if it had chosen to stop there."""
+    script = Script.of(policy)
+
+    def answer(objects: np.ndarray, questions: np.ndarray, choices: np.ndarray) -> np.ndarray:
+        found = np.empty((len(objects), script.answers.shape[1]), np.float32)
+        for question in np.unique(questions):
+            of_question = np.flatnonzero(questions == question)
+            for start in range(0, len(of_question), ROWS):
+                rows = of_question[start : start + ROWS]
+                at = rows[np.minimum(np.arange(ROWS), len(rows) - 1)]
+                found[rows] = _levels(policy, params, bank, script, objects[at], int(question), choices[at])[
+                    : len(rows)
+                ]
+        return found
+
+    return answer
+
+
+def single_beliefs(
+    answer: Answer, objects: Int[np.ndarray, "n"], questions: int, choices: int
+) -> Float[np.ndarray, "n C A K"]:
+    """A policy's beliefs after each single contact."""
+    o, c, a = (x.ravel() for x in np.meshgrid(objects, np.arange(choices), np.arange(questions), indexing="ij"))
+    found = answer(o, a, c[:, None].astype(np.int32))
+    return found.reshape(len(objects), choices, questions, -1)
+
+
+def _levels(
+    policy: ActivePolicy,
+    params: Params,
+    bank: TouchBank,
+    script: Script,
+    objects: np.ndarray,
+    question: int,
+    choices: np.ndarray,
+) -> Float[np.ndarray, "n K"]:
+    """Log-probabilities of the levels of one question."""
+    zeros = np.zeros(len(objects), np.int32)
+    tokens = script.trajectories(choices, zeros + question, zeros)
+    word = np.argmax(script.answers[question, 0] != script.answers[question, 1])  # where answers differ
+    at = (choices != NO_CHOICE).sum(1) * script.actions.shape[1] + word
+    touch, exists = observed(bank, objects, choices)
+    seen = Explored(jax.tree.map(lambda x: x[0], policy.prompt_features(1)), touch, exists, np.ones(1, bool))
+    ids = script.answers[question, :, word]
+    return np.asarray(
+        _level_log_probs(policy.fns, params, seen, policy.ids[question], policy.mask[question], tokens, at, ids)
+    )
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _level_log_probs(
+    fns: Any, params: Params, seen: Explored, ids: Array, mask: Array, tokens: Array, at: Array, words: Array
+) -> Array:
+    states, _ = fns.group_states(params, seen, ids, mask, tokens)
+    states = jnp.take_along_axis(states, at[:, None, None], 1)[:, 0]
+    return jax.nn.log_softmax(fns.logits(params, states)[:, words])

@@ -1,0 +1,101 @@
+"""The world in which a policy chooses: encoded contacts, which objects serve for what, and what probes know."""
+
+import dataclasses
+import io
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from experiments.active.contacts import ContactBank, ContactsConfig, generate
+from experiments.active.encoder import ContactEncoderConfig, encode_contacts
+from experiments.active.headroom import Beliefs
+from experiments.active.probes import PROBE, contact_features, probe_beliefs
+from experiments.core.artifacts import write_bytes
+from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
+from experiments.study.cache import fingerprint
+from sensors_io.arrays import load_arrays
+from sensors_io.scenes.config import config_hash
+from touchr1_jax.rl.environment import TouchBank, TouchChoice
+
+PARTS = ("encoder", "warm", "reinforced", "val", "test")
+"""Parts of the objects: those that the encoder learns from, the warm start, reinforcement; look-ups; scores.
+
+They are disjoint: a policy that is reinforced on objects that its encoder or its warm start knows by heart finds every
+touch equally good."""
+
+VERSION = 1
+"""Raised whenever the same configuration would give other tokens or beliefs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorldConfig:
+    """Contacts, encoder, and the share of the objects in each of `PARTS`."""
+
+    contacts: ContactsConfig = ContactsConfig()
+    encoder: ContactEncoderConfig = ContactEncoderConfig()
+    shares: tuple[float, ...] = (0.36, 0.14, 0.18, 0.16, 0.16)
+
+    def __post_init__(self) -> None:
+        if len(self.shares) != len(PARTS) or min(self.shares) <= 0 or abs(sum(self.shares) - 1) > 1e-6:
+            raise ConfigurationError(
+                f"shares is {self.shares}: must be {len(PARTS)} shares above 0 that sum to 1; correct it"
+            )
+
+    @property
+    def parts(self) -> dict[str, Int[np.ndarray, "n"]]:
+        """Rows of the objects of each part, ascending."""
+        order = np.random.default_rng(self.contacts.seed).permutation(self.contacts.objects)
+        edges = np.round(np.cumsum(self.shares) * self.contacts.objects).astype(int)[:-1]
+        return {name: np.sort(rows) for name, rows in zip(PARTS, np.split(order, edges), strict=True)}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class World:
+    """Encoded contacts and what is known of them; `read` are beliefs of the encoder's head, `probes` of probes."""
+
+    config: WorldConfig
+    contacts: ContactBank
+    bank: TouchBank
+    parts: dict[str, Int[np.ndarray, "n"]]
+    probes: Beliefs
+    read: Beliefs
+
+
+def make_world(config: WorldConfig, context: Context) -> World:
+    """Generate, encode and probe all contacts, or read them from the cache."""
+    contacts, parts = config.contacts, config.parts
+    with context.timed("contacts"):
+        made = generate(contacts, context)
+    values = {"world": config, "scenes": config_hash(contacts.scenes), "probe": PROBE, "version": VERSION}
+    path = context.cache_dir / "touch_bank" / f"{fingerprint(values, {}, '')}.npz"
+    if not path.exists():
+        buffer = io.BytesIO()
+        np.savez(buffer, **_encoded(config, made, parts, context))
+        write_bytes(path, buffer.getvalue())
+    found = load_arrays(path)
+    shape = made.harm.shape
+    bank = TouchBank(
+        tokens=jnp.asarray(found["tokens"], jnp.float32),
+        available=jnp.ones(shape, bool),
+        seconds=jnp.broadcast_to(contacts.seconds, shape),
+        harm=jnp.asarray(made.harm, jnp.float32),
+        label=jnp.asarray(made.label, jnp.int32),
+        choices=tuple(TouchChoice(sensor=s, motion=m, force_n=f) for s, m, f in contacts.choices),
+    )
+    probes, read = Beliefs(found["probes"], made.label), Beliefs(found["read"], made.label)
+    return World(config=config, contacts=made, bank=bank, parts=parts, probes=probes, read=read)
+
+
+def _encoded(
+    config: WorldConfig, made: ContactBank, parts: dict[str, Int[np.ndarray, "n"]], context: Context
+) -> dict[str, Float[np.ndarray, "O C *x"]]:
+    """Tokens, and beliefs of the encoder's head and of probes; the probes are fitted on all objects that train."""
+    with context.timed("encoder"):
+        features = contact_features(made, context)
+        tokens, read = encode_contacts(config.encoder, config.contacts, features, made.label, parts["encoder"], context)
+    fitted = np.concatenate([parts[name] for name in ("encoder", "warm", "reinforced")])
+    with context.timed("probes"):
+        probes = probe_beliefs(features, made.label, fitted, context)
+    return {"tokens": tokens, "read": read, "probes": probes}

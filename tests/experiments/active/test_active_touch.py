@@ -1,0 +1,55 @@
+"""The experiment on active touch, shrunk: contacts of two objects a part, every plan and policy, every table."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.active import active_touch
+from experiments.active.active_touch import ActiveTouchConfig
+from experiments.core.artifacts import read_json
+from experiments.core.errors import ConfigurationError
+from tests.experiments.shrunk import run_shrunk
+
+TINY = dataclasses.replace(
+    active_touch.SMOKE,
+    world=dataclasses.replace(
+        active_touch.SMOKE.world, contacts=dataclasses.replace(active_touch.SMOKE.world.contacts, objects=20)
+    ),
+    learner=dataclasses.replace(active_touch.SMOKE.learner, steps=2),
+)
+
+
+@pytest.mark.slow  # generates contacts and compiles the steps of two budgets
+def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
+    directory = run_shrunk(active_touch, TINY, tmp_path, "--cache-dir", str(tmp_path / "cache"))
+    results = read_json(directory / "results.json")
+    plans = {"chosen", "chosen_2", "random", "best_press", "best_fixed", "by_question"}
+    assert plans <= results["arms"].keys()
+    assert {"every_touch", "imitation", "chosen_harm"} <= results["baselines"].keys()
+    pairs = {(c["arm"], c["against"]) for c in results["comparisons"]}
+    assert {("chosen", rule) for rule in ("random", "best_fixed", "by_question")} <= pairs
+    assert {("chosen_2", f"{rule}_at_equal_seconds") for rule in ("random", "best_fixed", "by_question")} <= pairs
+    charts = {"accuracy_over_seconds.svg", "first_touches.svg", "trajectories.png"}
+    assert {path.name for path in (directory / "plots").iterdir()} == charts
+    headroom = [t for t in results["tables"] if t["title"].startswith("Headroom")]
+    assert len(headroom) == 2
+    every = next(t for t in results["tables"] if t["title"] == "Plans and policies")
+    seconds = {row[0]: row[5] for row in every["rows"]}
+    assert seconds["random_2"] == pytest.approx(2 * seconds["random"])
+    assert seconds["chosen"] <= seconds["random"] + 1e-6
+    assert np.isfinite([row[1] for row in every["rows"]]).all()
+
+
+@pytest.mark.parametrize("field", ["seeds", "full_seeds", "contacts"])
+def test_too_few_seeds_or_contacts_are_refused(field):
+    with pytest.raises(ConfigurationError, match="full_seeds"):
+        ActiveTouchConfig(**{field: 0})
+
+
+def test_a_seed_trains_the_priced_arms_only_where_it_is_asked_for():
+    config = ActiveTouchConfig(second_prices=(0.0,), harm_price=0.7)
+    assert config.arms(1).keys() == {"chosen", "chosen_3"}
+    first = config.arms(0)
+    assert first.keys() == {"chosen", "chosen_3", "chosen_harm", "chosen_3_at_0"}
+    assert (first["chosen"].budget, first["chosen_harm"].harm, first["chosen_3_at_0"].second) == (1, 0.7, 0.0)
