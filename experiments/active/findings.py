@@ -45,6 +45,7 @@ def findings(
     several, test = counted("chosen", contacts), world.probes.of(world.parts["test"])
     setup = world.config.contacts
     chosen = [found["chosen"] for found in seeds]
+    touched = trajectories(world, seeds[0][several])
     return Results(
         verdict=verdict(estimates, comparisons, seeds, contacts),
         requirements=requirements(world, comparisons, seeds, contacts),
@@ -62,7 +63,7 @@ def findings(
         pictures=(
             report.seconds_picture(curves(seeds, estimates, contacts, learner)),
             report.first_touch_picture(setup, chosen, test),
-            report.trajectory_picture(trajectories(world, seeds[0][several])),
+            *([report.trajectory_picture(touched)] if touched else []),
         ),
         settings={
             "preset": type(learner.grpo.algorithm).__name__.lower(),

