@@ -5,19 +5,20 @@ past the limit of small strains.  The generator knows the level of all five prop
 """
 
 import dataclasses
+import hashlib
 import io
 import itertools
+import json
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments.core.artifacts import write_bytes
+from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.mechanics.identify_features import in_threads
 from experiments.mechanics.identify_motions import choose_frames
-from experiments.study.cache import fingerprint
 from sensors_io.arrays import load_arrays
 from sensors_io.scenes import motions
 from sensors_io.scenes.cards import solid_of
@@ -116,8 +117,7 @@ class ContactBank:
 
 def generate(config: ContactsConfig, context: Context) -> ContactBank:
     """The bank of a configuration, generated or read from the cache; a stopped run goes on where it was."""
-    values = {"contacts": config, "scenes": config_hash(config.scenes), "version": VERSION}
-    folder = context.cache_dir / "touch_bank" / fingerprint(values, {}, "")
+    folder = context.cache_dir / "touch_bank" / contacts_hash(config)
     starts = range(0, config.objects, _OBJECTS_A_FILE)
     with context.progress("contacts", config.objects) as advance:
         for start in starts:
@@ -138,6 +138,12 @@ def generate(config: ContactsConfig, context: Context) -> ContactBank:
             [[solid_of(config.scenes, i).levels()[name] for name in PROPERTIES] for i in range(config.objects)]
         ),
     )
+
+
+def contacts_hash(config: ContactsConfig) -> str:
+    """Hash of everything that decides the contacts."""
+    values = {"contacts": config, "scenes": config_hash(config.scenes), "version": VERSION}
+    return hashlib.sha256(json.dumps(jsonable(values), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def object_contacts(config: ContactsConfig, index: int) -> tuple[UInt8[np.ndarray, "C F H W 3"], Bool[np.ndarray, "C"]]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.active.contacts import ContactBank, ContactsConfig, generate
+from experiments.active.contacts import ContactBank, ContactsConfig, contacts_hash, generate
 from experiments.active.encoder import ContactEncoderConfig, encode_contacts
 from experiments.active.headroom import Beliefs
 from experiments.active.probes import PROBE, contact_features, probe_beliefs
@@ -16,7 +16,6 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.study.cache import fingerprint
 from sensors_io.arrays import load_arrays
-from sensors_io.scenes.config import config_hash
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 
 PARTS = ("encoder", "warm", "reinforced", "val", "test")
@@ -68,7 +67,7 @@ def make_world(config: WorldConfig, context: Context) -> World:
     contacts, parts = config.contacts, config.parts
     with context.timed("contacts"):
         made = generate(contacts, context)
-    values = {"world": config, "scenes": config_hash(contacts.scenes), "probe": PROBE, "version": VERSION}
+    values = {"world": config, "contacts": contacts_hash(contacts), "probe": PROBE, "version": VERSION}
     path = context.cache_dir / "touch_bank" / f"{fingerprint(values, {}, '')}.npz"
     if not path.exists():
         buffer = io.BytesIO()
