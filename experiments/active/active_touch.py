@@ -18,13 +18,13 @@ friction by a slide, elasticity by a hold or a tap.  Beyond that a second touch 
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 from experiments.active.arms import (
     EVERY_TOUCH,
     Arm,
     LearnerConfig,
-    as_json,
     at_seconds,
     beliefs_of,
     controls,
@@ -128,15 +128,12 @@ def _seed(
         _print(tables[0], context)
         found[EVERY_TOUCH] = every_touch(world, test)
     for name, arm in config.arms(seed).items():
-        saved = context.once(
-            f"played/{name}/{seed}",
-            lambda n=name, a=arm: as_json(reinforced(world, warm, learner, n, a, seed, context)),
-        )
-        found |= from_json(saved)
+        compute = functools.partial(reinforced, world, warm, learner, name, arm, seed, context)
+        found |= from_json(context.once(f"played/{name}/{seed}", compute))
         context.print(_line(name, found[name]))
     if seed < config.full_seeds:
-        imitated = lambda: as_json(one_step_look_ahead(world, warm, learner, seed, context))
-        found |= from_json(context.once(f"played/imitation/{seed}", imitated))
+        compute = functools.partial(one_step_look_ahead, world, warm, learner, seed, context)
+        found |= from_json(context.once(f"played/imitation/{seed}", compute))
     several = counted("chosen", config.contacts)
     for plan in ("random", "best_press", "best_fixed", "by_question"):
         seconds = float(found[several].seconds.mean())

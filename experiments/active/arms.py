@@ -107,7 +107,7 @@ def warm_start(
 ) -> SeedPolicy:
     """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
     bank = world.bank
-    learned = part_of(bank, world.parts["warm"])
+    learned = part_of(bank, np.concatenate([world.parts["encoder"], world.parts["warm"]]))
     params = warm_up(policy, learned, contacts, config.warm, context, f"warm/{seed}", seed)
     answer = answerer(policy, params, bank)
     val = beliefs_of(world, answer, "val")
@@ -155,8 +155,8 @@ def every_touch(world: World, beliefs: Beliefs) -> Played:
 
 def reinforced(
     world: World, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
-) -> dict[str, Played]:
-    """What a reinforced policy does about test objects, and what the warm start answers after the same contacts."""
+) -> dict[str, Any]:
+    """What a reinforced policy does about test objects, and what the warm start answers after its contacts, as JSON."""
     loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
     params = reinforce(
         warm.policy,
@@ -177,18 +177,18 @@ def reinforced(
     unseen = dataclasses.replace(world.bank, available=jnp.zeros_like(world.bank.available))
     unseeing = explore(warm.policy, params, unseen, objects, arm.budget)
     chosen_unseen = play(world.bank, objects, unseeing.choices, answerer(warm.policy, params, world.bank))
-    return {name: found, f"{name}_warm_answers": own_answers, f"{name}_unseen": chosen_unseen}
+    return as_json({name: found, f"{name}_warm_answers": own_answers, f"{name}_unseen": chosen_unseen})
 
 
 def one_step_look_ahead(
     world: World, warm: SeedPolicy, config: LearnerConfig, seed: int, context: Context
-) -> dict[str, Played]:
+) -> dict[str, Any]:
     """SFT that imitates the contact after which the warm start believes most in the true level of training objects."""
     beliefs = beliefs_of(world, warm.answer, "reinforced")
     true = np.take_along_axis(beliefs.log_probs, beliefs.label[:, None, :, None], -1)[..., 0]  # n C A
     learned, best = part_of(world.bank, world.parts["reinforced"]), true.argmax(1).astype(np.int32)
     params = imitate(warm.policy, warm.params, learned, best, config.warm, context, f"imitation/{seed}", seed)
-    return {"imitation": explore(warm.policy, params, world.bank, world.parts["test"], 1)}
+    return as_json({"imitation": explore(warm.policy, params, world.bank, world.parts["test"], 1)})
 
 
 def at_seconds(found: Mapping[str, Played], plan: str, seconds: float, contacts: int) -> Float[np.ndarray, "n A"]:

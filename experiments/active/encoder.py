@@ -6,6 +6,7 @@ in which friction could simply be read.
 
 import dataclasses
 import functools
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -125,7 +126,8 @@ def encode_contacts(
 
     def draw(rng: np.random.Generator) -> ContactBatch:
         which, chosen = rng.choice(objects, config.batch_size), rng.choice(choice, config.batch_size)
-        return ContactBatch(features[which, chosen], sensor[chosen], chosen, label[which])
+        drawn: Any = (features[which, chosen], sensor[chosen], chosen, label[which])
+        return ContactBatch(*drawn)
 
     params = module.init(jax.random.key(seed), features[0], sensor, choice)["params"]
     optimizer = make_optimizer(config.optimizer, config.steps)
@@ -136,8 +138,9 @@ def encode_contacts(
 
     @jax.jit
     def read(of_object: Float[Array, "C F D"]) -> tuple[Array, Array]:
-        tokens = module.apply({"params": params}, of_object, sensor, method=SingleContact.tokens)
-        return tokens, jax.nn.log_softmax(module.apply({"params": params}, of_object, sensor, choice))
+        tokens: Any = module.apply({"params": params}, of_object, sensor, method=SingleContact.tokens)
+        scores: Any = module.apply({"params": params}, of_object, sensor, choice)
+        return tokens, jax.nn.log_softmax(scores)
 
     found = [jax.device_get(read(x)) for x in features]
     tokens = np.stack([tokens for tokens, _ in found])
@@ -152,7 +155,7 @@ def _update(
 
     def loss(params: Params) -> tuple[Array, Array]:
         inputs = batch.features, batch.sensor, batch.choice
-        scores = module.apply({"params": params}, *inputs, train=True, rngs=noise)
+        scores: Any = module.apply({"params": params}, *inputs, train=True, rngs=noise)
         cost = optax.softmax_cross_entropy_with_integer_labels(scores, batch.label).mean()
         return cost, 100 * (scores.argmax(-1) == batch.label).mean()
 

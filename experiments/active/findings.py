@@ -1,6 +1,7 @@
 """From what all plans and policies did to the results of `active_touch`."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroo
 from experiments.active.plans import NO_CHOICE, Played
 from experiments.active.world import World
 from experiments.core.results import (
-    Cell,
     Comparison,
     Estimate,
     Requirement,
@@ -167,7 +167,7 @@ def verdict(
 
 def plan_table(seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
     """Accuracy, seconds and harm of everything that was played."""
-    rows: list[dict[str, Cell]] = []
+    rows: list[dict[str, Any]] = []
     for name, one in estimates.items():
         if name.endswith(EQUAL):
             continue
@@ -200,7 +200,7 @@ def plan_table(seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]) ->
 
 def stop_table(seeds: Seeds, name: str) -> Table:
     """When the policy stops, by question."""
-    rows: list[dict[str, Cell]] = []
+    rows: list[dict[str, Any]] = []
     for a, question in enumerate(PROPERTIES):
         number = np.concatenate([f[name].contacts[:, a] for f in seeds])
         most = seeds[0][name].choices.shape[-1]
@@ -224,9 +224,9 @@ def harm_table(world: World, learner: LearnerConfig, contacts: int, seeds: Seeds
     arm = arms["chosen_harm"]
     cost = arm.second * np.asarray(world.bank.seconds) + arm.harm * np.asarray(world.bank.harm)
     priced = Beliefs(world.probes.log_probs, world.probes.label, cost)
-    parts = [priced.of(world.parts[part]) for part in ("val", "test")]
-    found = headroom(*parts, contacts, learner.kept)
-    rows: list[dict[str, Cell]] = []
+    val, test = (priced.of(world.parts[part]) for part in ("val", "test"))
+    found = headroom(val, test, contacts, learner.kept)
+    rows: list[dict[str, Any]] = []
     for name in ("random", "best_fixed", "by_question", counted("chosen", contacts), "chosen_harm"):
         mean = lambda field, name=name: float(np.mean([getattr(f[name], field).mean() for f in seeds if name in f]))
         worth = mean("right") - arm.second * mean("seconds") - arm.harm * mean("harm")
@@ -258,7 +258,7 @@ def light_first(world: World, played: Played) -> float:
 
 def price_table(found: Mapping[str, Played], arms: Mapping[str, Arm]) -> Table:
     """Policies of the first seed over the price of a second."""
-    rows: list[dict[str, Cell]] = [
+    rows: list[dict[str, Any]] = [
         {
             "policy": name,
             "price of a second": arm.second,

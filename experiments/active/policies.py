@@ -121,14 +121,15 @@ def imitate(
         chosen = choice[which, question][:, None]
         tokens = script.trajectories(chosen, question, label[which, question])
         touch, exists = observed(bank, which, chosen)
-        return SFTBatch(
-            touch=Explored(policy.prompt_features(n), touch[:, None], exists[:, None], np.ones((n, 1), bool)),
-            ids=policy.ids[question][:, None],
-            mask=policy.mask[question][:, None],
-            streams=np.ones((n, 1, 1), bool),
-            tokens=tokens[:, None],
-            token_mask=(tokens != script.pad)[:, None],
-        )
+        of: dict[str, Any] = {
+            "touch": Explored(policy.prompt_features(n), touch[:, None], exists[:, None], jnp.ones((n, 1), bool)),
+            "ids": policy.ids[question][:, None],
+            "mask": policy.mask[question][:, None],
+            "streams": np.ones((n, 1, 1), bool),
+            "tokens": tokens[:, None],
+            "token_mask": (tokens != script.pad)[:, None],
+        }
+        return SFTBatch(**of)
 
     with stage_hooks(context, stage, config.steps) as hooks:
         return train_sft(policy, params, DrawnFeed(make, seed), config, hooks, seed=seed)
@@ -261,7 +262,7 @@ def _levels(
     word = np.argmax(script.answers[question, 0] != script.answers[question, 1])  # where answers differ
     at = (choices != NO_CHOICE).sum(1) * script.actions.shape[1] + word
     touch, exists = observed(bank, objects, choices)
-    seen = Explored(jax.tree.map(lambda x: x[0], policy.prompt_features(1)), touch, exists, np.ones(1, bool))
+    seen = Explored(jax.tree.map(lambda x: x[0], policy.prompt_features(1)), touch, exists, jnp.ones(1, bool))
     ids = script.answers[question, :, word]
     return np.asarray(
         _level_log_probs(policy.fns, params, seen, policy.ids[question], policy.mask[question], tokens, at, ids)

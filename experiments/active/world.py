@@ -2,10 +2,11 @@
 
 import dataclasses
 import io
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from experiments.active.contacts import ContactBank, ContactsConfig, contacts_hash, generate
 from experiments.active.encoder import ContactEncoderConfig, encode_contacts
@@ -89,7 +90,7 @@ def make_world(config: WorldConfig, context: Context) -> World:
 
 def _encoded(
     config: WorldConfig, made: ContactBank, parts: dict[str, Int[np.ndarray, "n"]], context: Context
-) -> dict[str, Float[np.ndarray, "O C *x"]]:
+) -> dict[str, Any]:
     """Tokens, and beliefs of the encoder's head and of probes; the probes are fitted on all objects that train."""
     with context.timed("encoder"):
         features = contact_features(made, context)
