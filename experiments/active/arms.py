@@ -67,7 +67,7 @@ class LearnerConfig:
 
     decoder: DecoderConfig = DecoderConfig(vocab_size=0)
     warm: SFTConfig = SFTConfig(
-        steps=500,
+        steps=900,
         batch_size=128,
         questions=1,
         micro_contacts=128,
@@ -80,7 +80,7 @@ class LearnerConfig:
         lr_scale=1000.0,
         algorithm=Paper(beta=0.0, gamma=0.0, drop_degenerate=True, constrained=True),
     )
-    steps: int = 120
+    steps: int = 200
     dropout: float = 0.1
     kept: int = 12
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)

@@ -285,11 +285,12 @@ def curves(
         return seconds, Interval(mean=one.mean, low=one.low, high=one.high)
 
     several = counted("chosen", contacts)
-    found = {rule.replace("_", " "): [point(counted(rule, k)) for k in range(1, contacts + 1)] for rule in RULES}
+    found = {"chosen by the policy": [point("chosen"), point(several)]}
+    found |= {rule.replace("_", " "): [point(counted(rule, k)) for k in range(1, contacts + 1)] for rule in RULES}
     found["by question until sure"] = [point(f"until_{100 * t:.0f}") for t in learner.thresholds]
     found["imitation of a look-ahead"] = [point("imitation")]
     found["every contact"] = [point(EVERY_TOUCH)]
-    return found | {"chosen by the policy": [point("chosen"), point(several)]}
+    return found
 
 
 def trajectories(world: World, played: Played, most: int = 7) -> dict[str, np.ndarray]:
@@ -303,6 +304,7 @@ def trajectories(world: World, played: Played, most: int = 7) -> dict[str, np.nd
                 break
             label = report.level_word(question, int(np.asarray(world.bank.label)[objects[i], question]))
             outcome = "right" if played.right[i, question] else "wrong"
-            title = f"{PROPERTIES[question]}?\n{choices[choice].words}\n{label}: {outcome}\nobject {i}, touch {k + 1}"
+            words = choices[choice].words.replace(" ", "\n", 1)
+            title = f"{PROPERTIES[question]}?\n{words}\n{label}: {outcome}\nobject {i}, touch {k + 1}"
             rows[title] = world.contacts.frames[objects[i], choice]
     return rows

@@ -85,7 +85,7 @@ def first_touch_picture(contacts: ContactsConfig, played: Sequence[Played], beli
     """First touches by question and motion, next to the probes' accuracy."""
     right = np.stack([single(beliefs, a).mean(0) for a in beliefs.questions])
     shape = (len(PROPERTIES), len(contacts.sensors), len(contacts.motions), len(contacts.forces_n))
-    columns = [f"{m} {s[:2].upper()}" for m in contacts.motions for s in contacts.sensors]
+    columns = [f"{m}\n{s[:2].upper()}" for m in contacts.motions for s in contacts.sensors]
     chosen = first_choices(contacts, played).reshape(shape).sum(-1).swapaxes(1, 2).reshape(len(PROPERTIES), -1)
     probe = right.reshape(shape).max(-1).swapaxes(1, 2).reshape(len(PROPERTIES), -1)
     percent = lambda x: [[f"{100 * v:.0f}" if v >= 0.005 else "" for v in row] for row in x]
