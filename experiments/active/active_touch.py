@@ -42,7 +42,7 @@ from experiments.active.findings import findings
 from experiments.active.headroom import headroom
 from experiments.active.plans import Played
 from experiments.active.report import headroom_table
-from experiments.active.world import World, WorldConfig, make_world
+from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Results, Table
@@ -53,7 +53,7 @@ from touchr1_jax.training.train_sft import SFTConfig
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActiveTouchConfig:
-    """World, learner, arms.
+    """TouchWorld, learner, arms.
 
     Args:
       world: contacts, encoder, parts of the objects.
@@ -106,8 +106,8 @@ def run(config: ActiveTouchConfig, context: Context) -> Results:
     return findings(world, config.learner, config.contacts, seeds, tables, config.arms(0))
 
 
-def _headroom(world: World, config: ActiveTouchConfig, context: Context) -> Table:
-    """What there is to win by the probes' beliefs, printed before anything is trained to choose."""
+def _headroom(world: TouchWorld, config: ActiveTouchConfig, context: Context) -> Table:
+    """Headroom by the probes' beliefs, printed before anything is trained to choose."""
     val, test = (world.probes.of(world.parts[part]) for part in ("val", "test"))
     table = headroom_table(headroom(val, test, config.contacts, config.learner.kept), "probes")
     _print(table, context)
@@ -115,9 +115,9 @@ def _headroom(world: World, config: ActiveTouchConfig, context: Context) -> Tabl
 
 
 def _seed(
-    world: World, policy: ActivePolicy, config: ActiveTouchConfig, seed: int, context: Context
+    world: TouchWorld, policy: ActivePolicy, config: ActiveTouchConfig, seed: int, context: Context
 ) -> tuple[dict[str, Played], list[Table]]:
-    """What all plans and policies of one seed do about test objects; of the first seed, its headroom too."""
+    """Actions of all plans and policies of one seed about test objects; of the first seed, its headroom too."""
     learner = config.learner
     warm = warm_start(world, policy, learner, config.contacts, seed, context)
     tables = []

@@ -22,7 +22,7 @@ from experiments.active.plans import (
     until_sure,
 )
 from experiments.active.policies import answerer, explore, imitate, part_of, reinforce, single_beliefs, warm_up
-from experiments.active.world import World
+from experiments.active.world import TouchWorld
 from experiments.core.context import Context
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
@@ -97,13 +97,13 @@ class SeedPolicy:
     look: LookUps
 
 
-def make_policy(world: World, config: LearnerConfig) -> ActivePolicy:
+def make_policy(world: TouchWorld, config: LearnerConfig) -> ActivePolicy:
     """The policy that speaks of the choices of a world."""
     return build_active_policy(world.bank.actions, config.decoder)
 
 
 def warm_start(
-    world: World, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
+    world: TouchWorld, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
 ) -> SeedPolicy:
     """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
     bank = world.bank
@@ -115,14 +115,14 @@ def warm_start(
     return SeedPolicy(policy=policy, params=params, answer=answer, val=val, look=look)
 
 
-def beliefs_of(world: World, answer: Answer, part: str) -> Beliefs:
+def beliefs_of(world: TouchWorld, answer: Answer, part: str) -> Beliefs:
     """A policy's beliefs about the objects of a part after each single contact."""
     objects, label = world.parts[part], np.asarray(world.bank.label)
     return Beliefs(single_beliefs(answer, objects, label.shape[1], len(world.bank.choices)), label[objects])
 
 
-def controls(world: World, warm: SeedPolicy, config: LearnerConfig, contacts: int, seed: int) -> dict[str, Played]:
-    """What plans by rule do about test objects; plans of k contacts end in `_k`, but for one contact."""
+def controls(world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, contacts: int, seed: int) -> dict[str, Played]:
+    """Outcomes of plans by rule on test objects; plans of k contacts end in `_k`, but for one contact."""
     bank, objects, look = world.bank, world.parts["test"], warm.look
     n, questions = len(objects), bank.label.shape[1]
     rng = np.random.default_rng([seed, contacts])
@@ -144,7 +144,7 @@ def counted(plan: str, contacts: int) -> str:
     return plan if contacts == 1 else f"{plan}_{contacts}"
 
 
-def every_touch(world: World, beliefs: Beliefs) -> Played:
+def every_touch(world: TouchWorld, beliefs: Beliefs) -> Played:
     """All contacts of every test object, their beliefs added as if their errors were independent."""
     objects, choices = world.parts["test"], tuple(range(len(world.bank.choices)))
     right = np.stack([beliefs.right(a, choices) for a in beliefs.questions], 1).astype(float)
@@ -154,9 +154,9 @@ def every_touch(world: World, beliefs: Beliefs) -> Played:
 
 
 def reinforced(
-    world: World, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
+    world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
 ) -> dict[str, Any]:
-    """What a reinforced policy does about test objects, and what the warm start answers after its contacts, as JSON."""
+    """Outcomes of a reinforced policy on test objects, and of its contacts answered by the warm start, as JSON."""
     loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
     params = reinforce(
         warm.policy,
@@ -181,7 +181,7 @@ def reinforced(
 
 
 def one_step_look_ahead(
-    world: World, warm: SeedPolicy, config: LearnerConfig, seed: int, context: Context
+    world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, seed: int, context: Context
 ) -> dict[str, Any]:
     """SFT that imitates the contact after which the warm start believes most in the true level of training objects."""
     beliefs = beliefs_of(world, warm.answer, "reinforced")
@@ -203,7 +203,7 @@ def at_seconds(found: Mapping[str, Played], plan: str, seconds: float, contacts:
 
 
 def as_json(found: Mapping[str, Played]) -> dict[str, Any]:
-    """What is saved of a stage."""
+    """Saved form of a stage."""
     return {
         name: {k: getattr(one, k).tolist() for k in ("right", "seconds", "harm", "choices")}
         for name, one in found.items()
@@ -211,7 +211,7 @@ def as_json(found: Mapping[str, Played]) -> dict[str, Any]:
 
 
 def from_json(saved: Mapping[str, Any]) -> dict[str, Played]:
-    """What was saved of a stage."""
+    """Outcomes that were saved of a stage."""
     read = lambda one: Played(
         right=np.array(one["right"]),
         seconds=np.array(one["seconds"]),

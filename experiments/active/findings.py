@@ -10,7 +10,7 @@ from experiments.active.arms import EVERY_TOUCH, Arm, LearnerConfig, counted
 from experiments.active.contacts import PROPERTIES
 from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroom
 from experiments.active.plans import NO_CHOICE, Played
-from experiments.active.world import World
+from experiments.active.world import TouchWorld
 from experiments.core.results import (
     Comparison,
     Estimate,
@@ -35,7 +35,12 @@ Seeds = Sequence[Mapping[str, Played]]
 
 
 def findings(
-    world: World, learner: LearnerConfig, contacts: int, seeds: Seeds, tables: Sequence[Table], arms: Mapping[str, Arm]
+    world: TouchWorld,
+    learner: LearnerConfig,
+    contacts: int,
+    seeds: Seeds,
+    tables: Sequence[Table],
+    arms: Mapping[str, Arm],
 ) -> Results:
     """The report of all seeds."""
     scores = {name: [scores_of(found[name]) for found in seeds if name in found] for name in seeds[0]}
@@ -112,9 +117,9 @@ def named(comparisons: Sequence[Comparison], a: str, b: str, over: str = "object
 
 
 def requirements(
-    world: World, comparisons: Sequence[Comparison], seeds: Seeds, contacts: int
+    world: TouchWorld, comparisons: Sequence[Comparison], seeds: Seeds, contacts: int
 ) -> tuple[Requirement, ...]:
-    """What the experiment must reach."""
+    """Bounds that the experiment must reach."""
     several = counted("chosen", contacts)
     fixed, question = named(comparisons, "chosen", "best_fixed"), named(comparisons, "chosen", "by_question")
     later = named(comparisons, several, f"by_question_{EQUAL}")
@@ -219,7 +224,9 @@ def stop_table(seeds: Seeds, name: str) -> Table:
     )
 
 
-def harm_table(world: World, learner: LearnerConfig, contacts: int, seeds: Seeds, arms: Mapping[str, Arm]) -> Table:
+def harm_table(
+    world: TouchWorld, learner: LearnerConfig, contacts: int, seeds: Seeds, arms: Mapping[str, Arm]
+) -> Table:
     """Worth of policies and look-ups where harm has a price, and what the optimum over trees leaves."""
     arm = arms["chosen_harm"]
     cost = arm.second * np.asarray(world.bank.seconds) + arm.harm * np.asarray(world.bank.harm)
@@ -248,7 +255,7 @@ def harm_table(world: World, learner: LearnerConfig, contacts: int, seeds: Seeds
     )
 
 
-def light_first(world: World, played: Played) -> float:
+def light_first(world: TouchWorld, played: Played) -> float:
     """Share of trajectories that begin with the lightest force, among those that touch."""
     force = np.array([f for _, _, f in world.config.contacts.choices])
     first = played.choices[..., 0]
@@ -293,7 +300,7 @@ def curves(
     return found
 
 
-def trajectories(world: World, played: Played, most: int = 7) -> dict[str, np.ndarray]:
+def trajectories(world: TouchWorld, played: Played, most: int = 7) -> dict[str, np.ndarray]:
     """Frames of the contacts of a few trajectories, by what was asked, chosen and concluded."""
     rows: dict[str, np.ndarray] = {}
     objects, choices = world.parts["test"], world.bank.choices

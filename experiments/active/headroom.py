@@ -1,4 +1,4 @@
-"""What there is to win by choosing: plans of one, two and three contacts, from beliefs about every contact.
+"""Headroom, the gain that choosing can bring: plans of one, two and three contacts, from beliefs about every contact.
 
 A belief is the log-probability of each level given one contact; those of several contacts are added, as if their errors
 were independent.  A plan is worth its right answers less the cost of its contacts.  It is looked up on some objects and

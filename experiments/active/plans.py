@@ -17,7 +17,7 @@ Answer = Callable[[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Int[np.ndarray, "
 
 @dataclasses.dataclass(frozen=True)
 class Played:
-    """What a plan did about every object and question, [O, A], and its choices in order [O, A, k]."""
+    """Outcome of a plan for every object and question, [O, A], and its choices in order [O, A, k]."""
 
     right: Float[np.ndarray, "O A"]
     seconds: Float[np.ndarray, "O A"]

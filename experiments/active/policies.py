@@ -65,7 +65,7 @@ class Script:
 def observed(
     bank: TouchBank, objects: Int[np.ndarray, "*n"], choices: Int[np.ndarray, "*n B"]
 ) -> tuple[Float[Array, "*n B N W"], Bool[Array, "*n B N"]]:
-    """What these choices show of objects, and where anything is observed."""
+    """Observations of these choices about objects, and where anything is observed."""
     at = jnp.asarray(objects)[..., None], jnp.maximum(choices, 0)
     exists = (jnp.asarray(choices) != NO_CHOICE) & bank.available[at]
     tokens = jnp.where(exists[..., None, None], bank.tokens[at], 0.0)
@@ -193,7 +193,7 @@ def explore(
     budget: int,
     offered: Bool[np.ndarray, "n A C"] | None = None,
 ) -> Played:
-    """What a policy does greedily about every question of some objects."""
+    """Greedy trajectories of a policy about every question of some objects."""
     label = np.asarray(bank.label)
     questions = label.shape[1]
     rows, asked = np.repeat(objects, questions), np.tile(np.arange(questions), len(objects))

@@ -52,7 +52,7 @@ class WorldConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class World:
+class TouchWorld:
     """Encoded contacts and what is known of them; `read` are beliefs of the encoder's head, `probes` of probes."""
 
     config: WorldConfig
@@ -63,7 +63,7 @@ class World:
     read: Beliefs
 
 
-def make_world(config: WorldConfig, context: Context) -> World:
+def make_world(config: WorldConfig, context: Context) -> TouchWorld:
     """Generate, encode and probe all contacts, or read them from the cache."""
     contacts, parts = config.contacts, config.parts
     with context.timed("contacts"):
@@ -85,7 +85,7 @@ def make_world(config: WorldConfig, context: Context) -> World:
         choices=tuple(TouchChoice(sensor=s, motion=m, force_n=f) for s, m, f in contacts.choices),
     )
     probes, read = Beliefs(found["probes"], made.label), Beliefs(found["read"], made.label)
-    return World(config=config, contacts=made, bank=bank, parts=parts, probes=probes, read=read)
+    return TouchWorld(config=config, contacts=made, bank=bank, parts=parts, probes=probes, read=read)
 
 
 def _encoded(
