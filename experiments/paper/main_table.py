@@ -13,8 +13,8 @@ object's touch.  Policies and baselines answer about one touch at a time; compar
 Cost: some 36 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
-Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT reads as much as a
-linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch
+Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT is about a point
+behind a linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch
 stay near chance in comparisons.  A constant already has an average of about 28.
 """
 
