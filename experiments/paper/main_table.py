@@ -14,8 +14,8 @@ Cost: some 36 minutes of one core with five seeds; the other studies of the benc
 smoke` under two.
 
 Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT is about a point
-behind a linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch
-stay near chance in comparisons.  A constant already has an average of about 28.
+behind a linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without
+touch stay near chance in comparisons.  A constant already has an average of about 28.
 """
 
 import dataclasses
