@@ -25,8 +25,18 @@ from experiments.core.runs import ROOT, versions
 from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
 
-NEVER = ("touchr1_jax/bench/", "touchr1_jax/distributed/", "sensors_io/commands/", "sensors_io/viewer/")
-"""Source that training never runs."""
+NEVER = (
+    "touchr1_jax/bench/",
+    "touchr1_jax/distributed/",
+    "touchr1_jax/models/description_policy.py",
+    "touchr1_jax/training/description_tuning.py",
+    "touchr1_jax/training/exploration.py",
+    "touchr1_jax/training/fine_tuning.py",
+    "touchr1_jax/training/kernel_probe.py",
+    "sensors_io/commands/",
+    "sensors_io/viewer/",
+)
+"""Source that the training of these policies never runs."""
 
 LATER = (
     "touchr1_jax/rl/",

@@ -1,9 +1,11 @@
 """Two runs side by side: figures of hand-made results, and two real runs of the fake experiment."""
 
+import json
 from pathlib import Path
 
 import pytest
 
+from experiments.core.artifacts import read_json, write_sealed
 from experiments.core.compare import compare_results
 from experiments.core.runner import main
 
@@ -89,7 +91,7 @@ def test_the_gravest_differences_come_first_and_the_others_are_counted(home, cap
     text = second.read_text()
     assert first.read_text() != text
     try:
-        second.write_text(text.replace('"blind"', '"deaf"'))
+        write_sealed(second, json.loads(json.dumps(read_json(second)).replace('"blind"', '"deaf"')))
         arguments = ["compare", f"coin/{stamps(home)[0]}", "coin", "--runs-dir", str(home), "--most", "1"]
         assert main(arguments, package=FAKES) == 0
     finally:

@@ -149,7 +149,7 @@ def test_loss_is_its_formula(algorithm):
     arguments = loss_arguments()
     config = GRPOConfig(prompts=4, micro_prompts=4, group=4, length=9, algorithm=algorithm)
     arrays = {name: jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for name, x in arguments.items()}
-    terms = TokenTerms(**{name: arrays.pop(name) for name in TokenTerms._fields})
+    terms = TokenTerms(*(arrays.pop(name) for name in ("log_prob", "reference_kl", "grounding", "entropy")))
     loss, parts = grpo_loss(terms, **arrays, config=config)
     expected, means = reference.loss(algorithm, prompts=4, longest=9, **arguments)
     assert float(loss) == pytest.approx(expected, rel=1e-5)
