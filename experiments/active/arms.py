@@ -26,7 +26,7 @@ from experiments.active.world import TouchWorld
 from experiments.core.context import Context
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
@@ -58,7 +58,8 @@ class LearnerConfig:
     Args:
       decoder: sizes; the vocabulary comes from the language.
       warm: warm start on touches drawn at random.
-      grpo: a step of reinforcement; its length follows from the budget.
+      grpo: a step of reinforcement; its length follows from the budget.  By default it learns touches alone, from the
+        probability of the right answer; the KL to the warm start keeps the answers, and touches apart.
       steps: of reinforcement.
       dropout: probability that a sensor or a motion drops out of a prompt.
       kept: choices of each question among which look-ups search for several contacts.
@@ -78,7 +79,9 @@ class LearnerConfig:
         group=16,
         micro_prompts=40,
         lr_scale=1000.0,
-        algorithm=Paper(beta=0.0, gamma=0.0, drop_degenerate=True, constrained=True),
+        algorithm=Paper(
+            beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False
+        ),
     )
     steps: int = 200
     dropout: float = 0.1

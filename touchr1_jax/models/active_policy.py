@@ -23,6 +23,7 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES, Attribute
+from touchr1_jax.text.template import LevelTokens, level_tokens
 from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.text.turns import QUESTIONS_OF_TOUCH, TurnLanguage, Turns, compile_turns, turn_tokenizer
 from touchr1_jax.types import Params, Target
@@ -54,10 +55,12 @@ class ActiveFns(PolicyFns):
 
     Attributes:
       turns: automaton of the turns.
+      levels: token of each level; `None` where the tokenizer splits one.
       constrained: give tokens that continue no turn the probability 0, for the sampler and for the learner.
     """
 
     turns: Turns
+    levels: LevelTokens | None
     constrained: bool
 
     @property
@@ -238,6 +241,7 @@ def build_active_policy(
         end_ids=tokenizer.end_ids,
         pad_id=tokenizer.pad_id,
         turns=turns,
+        levels=level_tokens(language, tokenizer),
         constrained=False,
     )
     return ActivePolicy(

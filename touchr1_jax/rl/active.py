@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.models.active_policy import ActiveFns, Explored
 from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
+from touchr1_jax.rl.enumerated import LevelRewards, conclusion_place
 from touchr1_jax.rl.environment import Environment
 from touchr1_jax.rl.gradient import Experience
 from touchr1_jax.rl.grpo import Group, GRPOEngine, GRPOState, compile_step
@@ -28,7 +29,7 @@ from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answer
 from touchr1_jax.rl.trajectory import ActiveBatch, Trajectories, sample_trajectories
-from touchr1_jax.types import Params
+from touchr1_jax.types import Params, Target
 
 
 class ActiveInputs(NamedTuple):
@@ -60,7 +61,7 @@ def make_active_step(
     """
     check_active_config(fns, config, budget)
     fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16)) if config.bfloat16 else fns
-    engine = ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, None, budget)
+    engine = ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, fns.levels, budget)
     return compile_step(engine, config)
 
 
@@ -82,8 +83,11 @@ def check_active_config(fns: ActiveFns, config: GRPOConfig, budget: int) -> None
             f"constrained is {algorithm.constrained}, but the policy's functions are constrained={fns.constrained}; "
             "choose the functions that fit"
         )
-    if algorithm.enumerated is not None:
-        raise ValueError(f"enumerated is {algorithm.enumerated}: must be None for trajectories; leave it out")
+    if algorithm.enumerated is not None and fns.levels is None:
+        raise ValueError(
+            f"enumerated is {algorithm.enumerated}, but the tokenizer splits a level: each must be one token; leave it "
+            "out"
+        )
     if algorithm.tactile_use is not TactileUse.OFF:
         raise ValueError(
             f"tactile_use is {algorithm.tactile_use}: must be OFF for trajectories, whose touch has a price instead"
@@ -125,6 +129,12 @@ class ActiveEngine(GRPOEngine):
         score = jax.vmap(jax.vmap(self.score, in_axes=(0, None, 0, None)), in_axes=(0, 0, 0, None))
         terms = score(found.parsed, batch.target, spent, frozen.prices)
         reward = sum(terms.values(), start=jnp.zeros_like(found.seconds))
+
+        def with_answer(level: Int[Array, "P A"]) -> Float[Array, "P G"]:
+            answer = jnp.broadcast_to(level[:, None], found.parsed.conclude.shape)
+            parsed = dataclasses.replace(found.parsed, conclude=answer)
+            return sum(score(parsed, batch.target, spent, frozen.prices).values(), start=jnp.zeros_like(reward))
+
         reward, terms, finite, left_out = left_out_groups(reward, terms)
         seen = Explored(batch.features, found.touch, found.exists, jnp.any(found.exists, (1, 2, 3))[:, None])
         shown: dict[str, Any] = {"features": seen}
@@ -136,8 +146,30 @@ class ActiveEngine(GRPOEngine):
             terms=terms,
             finite=finite,
             bonus=jnp.zeros_like(reward),
+            levels=self.level_rewards(found, batch.target, reward, finite, with_answer),
         )
         return group, left_out | exploration_metrics(found, batch, frozen.environment.kinds)
+
+    def level_rewards(
+        self,
+        found: Trajectories,
+        target: Target,
+        sampled: Float[Array, "P G"],
+        finite: Bool[Array, "P"],
+        with_answer: Callable[[Int[Array, "P A"]], Float[Array, "P G"]],
+    ) -> LevelRewards | None:
+        """Rewards of the trajectories for each level in turn as the answer, where the algorithm enumerates them."""
+        if self.config.algorithm.enumerated is None or self.levels is None:
+            return None
+        ids = jnp.asarray(self.levels.level)[jnp.argmax(target.asked, -1)]  # P K
+        rewards = jnp.stack([with_answer(jnp.where(target.asked, k, -1)) for k in range(ids.shape[1])], -1)
+        usable = (ids >= 0)[:, None] & finite[:, None, None] & jnp.isfinite(rewards)
+        return LevelRewards(
+            ids=ids,
+            at=conclusion_place(found.rollout.tokens, self.levels.opens),
+            reward=jnp.where(usable, rewards, 0.0),
+            sampled=sampled,
+        )
 
     def perturbed(
         self, batch: ActiveBatch, frozen: ActiveInputs, key: Array
@@ -166,14 +198,17 @@ def exploration_metrics(found: Trajectories, batch: ActiveBatch, kinds: tuple[st
 
     `actions` is the mean number of actions, `seconds` and `harm` mean totals; `no_action_share`, `one_action_share` and
     `all_actions_share` are shares of trajectories with none, one and as many actions as allowed; `silent_share` is the
-    share of actions without observation; `first_kind_peak` the share of the most frequent kind among first actions;
+    share of actions without observation; `first_kind_peak` the share of the most frequent kind among first actions, and
+    `first_kind_information` what the question tells about that kind: their mutual information in the batch, nat;
     `kinds` the number of kinds, `questions` that of different questions of the batch, `budget` the most actions.
     """
     acts = found.action >= 0
     number, budget = jnp.sum(acts, -1), acts.shape[-1]
     names = sorted(set(kinds))
     kind = jnp.asarray(np.array([names.index(k) for k in kinds]))[jnp.maximum(found.action[..., 0], 0)]
-    first = jnp.stack([masked.mean(kind == k, acts[..., 0]) for k in range(len(names))])
+    is_kind = (kind[..., None] == jnp.arange(len(names))) & acts[..., :1]  # P G kinds
+    joint = jnp.einsum("pa,pgk->ak", batch.target.asked.astype(jnp.float32), is_kind.astype(jnp.float32))
+    first = masked.mean(is_kind, acts[..., :1], (0, 1))
     return {
         "actions": jnp.mean(number.astype(jnp.float32)),
         "seconds": jnp.mean(found.seconds),
@@ -183,7 +218,15 @@ def exploration_metrics(found: Trajectories, batch: ActiveBatch, kinds: tuple[st
         "all_actions_share": jnp.mean(number == budget),
         "silent_share": masked.mean(~jnp.any(found.exists, -1), acts),
         "first_kind_peak": jnp.max(first),
+        "first_kind_information": mutual_information(joint),
         "kinds": jnp.float32(len(names)),
         "questions": jnp.sum(jnp.any(batch.target.asked, 0)).astype(jnp.float32),
         "budget": jnp.float32(budget),
     }
+
+
+def mutual_information(count: Float[Array, "A K"]) -> Float[Array, ""]:
+    """Mutual information Σ p_ak log(p_ak / (p_a p_k)) of two variables that occurred together so often, nat."""
+    p = count / jnp.maximum(jnp.sum(count), 1.0)
+    apart = jnp.sum(p, 0) * jnp.sum(p, 1, keepdims=True)
+    return jnp.sum(jnp.where(p > 0, p * jnp.log(jnp.where(p > 0, p, 1.0) / jnp.where(p > 0, apart, 1.0)), 0.0))

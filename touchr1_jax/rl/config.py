@@ -88,6 +88,8 @@ class Algorithm:
     """Rewards count by the best of k rollouts, pass@k or max@k (see `best_of`); 1 counts each by itself."""
     enumerated: Norm | None = None
     """Enumerate the level that concludes an answer, rewards over this norm; `None` samples it (see `enumerated`)."""
+    learn_conclusion: bool = True
+    """Learn the level that concludes, too; False needs `enumerated` and learns only the tokens before it."""
     segment_credit: bool = False
     """Credit a token only with rewards that are not settled before its segment (`advantages.segment_advantages`)."""
     stable_rewards: bool = False
@@ -151,6 +153,8 @@ class Algorithm:
             if getattr(self, field) != value:
                 needs = f"must be {value} where enumerated is set, because it needs a sampled conclusion; change either"
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
+        if not self.learn_conclusion and self.enumerated is None:
+            raise ValueError("learn_conclusion is False, but enumerated is None: must be set; choose a norm for it")
         if self.stale < 0:
             raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
         if not 0 < self.reference_share <= 1:

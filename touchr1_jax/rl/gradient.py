@@ -96,7 +96,9 @@ def grpo_gradient(
     over_prompts = lambda name: {"loss": jnp.sum}.get(name, jnp.max if name.endswith("_peak") else jnp.mean)
     parts = {name: over_prompts(name)(value) for name, value in by_prompt.items()}
     parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
-    return grads, parts | _grounding_by_stream(in_order(by_prompt["grounding"]), experience), in_order(old)
+    if not left_out(algorithm.gamma):
+        parts |= _grounding_by_stream(in_order(by_prompt["grounding"]), experience)
+    return grads, parts, in_order(old)
 
 
 def batches_of(size: int, tree: Any) -> Any:
@@ -199,11 +201,10 @@ def prompt_terms(
 
 
 def level_log_probs(
-    fns: PolicyFns, config: GRPOConfig, params: Params, states: Float[Array, "G T D"], levels: LevelRewards
+    fns: PolicyFns, config: GRPOConfig, params: Params, states: Any, levels: LevelRewards
 ) -> Float[Array, "G K"]:
     """log π of each level where each completion of one prompt concludes; −∞ past the last level."""
-    at = jnp.minimum(levels.at, states.shape[1] - 1)
-    here = jnp.take_along_axis(states, at[:, None, None], 1)[:, 0]
+    here = jax.tree.map(lambda x: jax.vmap(lambda row, at: row[at])(x, jnp.minimum(levels.at, x.shape[1] - 1)), states)
     log_p = jax.nn.log_softmax(tempered(fns.logits(params, here), config.temperature))
     return jnp.where(levels.ids >= 0, log_p[:, levels.ids], -jnp.inf)
 

@@ -117,7 +117,8 @@ def policy_objective(
     if levels is None or exact is None:
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
-    return conclude_exactly(objective, exact.objective, levels.at), clipped, expected
+    concluded = exact.objective if algorithm.learn_conclusion else jax.lax.stop_gradient(exact.objective)
+    return conclude_exactly(objective, concluded, levels.at), clipped, expected
 
 
 def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) -> ExactTerms:

@@ -16,6 +16,7 @@ import numpy as np
 
 from touchr1_jax.text.language import Attribute, Language
 from touchr1_jax.text.tokenizer import Tokenizer
+from touchr1_jax.text.turns import TurnLanguage
 
 QUESTIONS: Mapping[str, str] = {
     "hardness": "how hard is it",
@@ -162,10 +163,10 @@ class LevelTokens:
     level: np.ndarray
 
 
-def level_tokens(language: Language, tokenizer: Tokenizer) -> LevelTokens | None:
+def level_tokens(language: Language | TurnLanguage, tokenizer: Tokenizer) -> LevelTokens | None:
     """The tokens of the levels; `None` where the tokenizer splits a level or the tag."""
     words = [[tokenizer.encode(level[0]) for level in attribute.levels] for attribute in language.attributes]
-    opens = tokenizer.encode(f"<{language.tags[2]}>")
+    opens = tokenizer.encode(f"<{language.tags[-1]}>")
     if any(len(ids) != 1 for ids in [opens, *(ids for row in words for ids in row)]):
         return None
     level = np.full((len(words), max(map(len, words))), -1, np.int32)

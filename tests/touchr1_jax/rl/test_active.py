@@ -12,11 +12,17 @@ from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, N, T
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.models.policy import Policy
-from touchr1_jax.rl.active import ActiveInputs, check_active_config, make_active_step
-from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Paper, Stable
+from touchr1_jax.rl.active import (
+    ActiveEngine,
+    ActiveInputs,
+    check_active_config,
+    make_active_step,
+    mutual_information,
+)
+from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Norm, Paper, Stable
 from touchr1_jax.rl.gradient import Experience, grpo_gradient
 from touchr1_jax.rl.grpo import start_state
-from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.rl.touch_reward import Prices, priced_answer
 from touchr1_jax.types import Rollout
 
 PRICES = Prices(jnp.float32(0.05), jnp.float32(0.1))
@@ -141,6 +147,33 @@ def test_one_program_serves_all_prices_and_batches():
         assert metrics["grad_norm"] > 0
         assert metrics["grounding"] > 0
     assert step._cache_size() == 1
+
+
+def test_answers_are_enumerated_with_the_price_of_their_touches():
+    """Each level earns what a trajectory with that answer does."""
+    algorithm = Paper(constrained=True, gamma=0.0, beta=0.0, enumerated=Norm.NONE, learn_conclusion=False)
+    config = dataclasses.replace(STEP, algorithm=algorithm)
+    fns, optimizer, bank = POLICY.constrained_fns, optax.sgd(1e-3), jax.tree.map(jnp.asarray, BANK)
+    engine = ActiveEngine(fns, priced_answer, optimizer, config, None, lambda p: p, fns.levels, BUDGET)
+    inputs, batch = ActiveInputs(explored.params(), bank, PRICES), explored.batch_of(0, 1, 2, 3)
+    key = jax.random.key(0)
+    group, metrics = jax.jit(lambda: engine.rollouts(inputs.reference, batch, inputs, key, key))()
+    label = BANK.label[np.arange(4), np.arange(4) % 2]
+    right = label[:, None, None] == np.arange(3)
+    cost = group.terms["seconds"] + group.terms["harm"]
+    np.testing.assert_allclose(group.levels.reward, right + cost[..., None], atol=1e-6)
+    word = np.take_along_axis(np.asarray(group.rollout.tokens), np.asarray(group.levels.at)[..., None], -1)[..., 0]
+    answered = (word[..., None] == np.asarray(group.levels.ids)[:, None]) @ np.arange(1, 4) - 1
+    np.testing.assert_array_equal(answered, np.asarray(group.parsed.conclude)[np.arange(4), :, np.arange(4) % 2])
+    assert 0 <= metrics["first_kind_information"] < np.log(2)
+
+
+def test_information_of_a_question_about_a_kind():
+    """Independent: 0.  One kind for each of two questions: log 2.  No action at all: 0."""
+    tables = {0.0: [[2, 4], [1, 2]], np.log(2): [[3, 0], [0, 3]]}
+    for nat, count in tables.items():
+        np.testing.assert_allclose(mutual_information(jnp.asarray(count, jnp.float32)), nat, atol=1e-6)
+    assert mutual_information(jnp.zeros((2, 2))) == 0
 
 
 WRONG = {

@@ -23,14 +23,15 @@ HEALTHY = {
     "one_action_share": 0.6,
     "all_actions_share": 0.1,
     "silent_share": 0.1,
-    "first_kind_peak": 0.4,
+    "first_kind_peak": 0.6,
+    "first_kind_information": 0.5,
     "reward_seconds": -0.1,
 }
 FAILURES = {
     "A1": ({"no_action_share": 1.0}, 1.0),
     "A2": ({"one_action_share": 1.0}, 1.0),
     "A3": ({"all_actions_share": 1.0}, 1.0),
-    "A4": ({"first_kind_peak": 1.0}, 1.0),
+    "A4": ({"first_kind_information": 0.02}, 0.02),
     "A5": ({"silent_share": 0.8}, 0.8),
 }
 
@@ -57,8 +58,9 @@ NO_FAILURE = {
     "one touch, and answers are better": {"one_action_share": 1.0, "accuracy": 0.7},
     "one touch of one": {"one_action_share": 1.0, "budget": 1.0},
     "every touch, and time is free": {"all_actions_share": 1.0, "reward_seconds": 0.0},
-    "one question": {"first_kind_peak": 1.0, "questions": 1.0},
-    "one kind of touch": {"first_kind_peak": 1.0, "kinds": 1.0},
+    "one question": {"first_kind_information": 0.0, "questions": 1.0},
+    "one kind of touch": {"first_kind_information": 0.0, "kinds": 1.0},
+    "touches at random": {"first_kind_information": 0.0, "first_kind_peak": 0.3},
 }
 
 

@@ -103,12 +103,16 @@ ALGORITHMS = (
     Rloo(enumerated=Norm.NONE),
     Dapo(enumerated=Norm.NONE, average=Average.LENGTH),
     Cispo(enumerated=Norm.NONE, average=Average.LENGTH),
+    Rloo(enumerated=Norm.NONE, learn_conclusion=False),
 )
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda a: type(a).__name__)
+@pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda a: f"{type(a).__name__}, {a.learn_conclusion}")
 def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm):
-    """A policy of two traces, one token each, and three levels; every group of two traces by its probability."""
+    """A policy of two traces, one token each, and three levels; every group of two traces by its probability.
+
+    Without learning of the conclusion the levels have no gradient, and the traces the same.
+    """
     config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=2, algorithm=algorithm)
 
     def loss(trace_logits, level_logits, pair):
@@ -129,7 +133,8 @@ def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm)
         chance = np.prod(softmax(TRACE)[list(pair)])
         for sum_, g in zip(total, grad(jnp.asarray(TRACE), jnp.asarray(LEVEL), pair), strict=True):
             sum_ -= config.length * chance * np.asarray(g, float)
-    for found, exact in zip(total, true_gradient(), strict=True):
+    of_trace, of_level = true_gradient()
+    for found, exact in zip(total, (of_trace, algorithm.learn_conclusion * of_level), strict=True):
         np.testing.assert_allclose(found, exact, atol=2e-6)
 
 
@@ -185,6 +190,11 @@ def test_prompts_whose_levels_all_earn_the_same_teach_nothing():
 def test_options_that_need_a_sampled_conclusion_are_refused(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         Paper(enumerated=Norm.STD, **change)
+
+
+def test_a_sampled_conclusion_is_always_learned():
+    with pytest.raises(ValueError, match="learn_conclusion"):
+        Paper(learn_conclusion=False)
 
 
 def test_a_step_needs_the_tokens_of_the_levels():
