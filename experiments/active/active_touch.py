@@ -16,8 +16,8 @@ the first seed about fifteen, others about eight (`smoke` one minute and a half)
 
 Expected: one touch chosen by question is seven to ten points better than the best touch for all questions, and a second
 touch adds little.  In trials of one seed and one touch on validation objects, reward finds the touch of each question
-where the probability of the right answer is the reward and touches alone are learned; from sampled answers it takes
-nearly the same touch for all of them (LOG.md).
+where the probability of the right answer is the reward and touches alone are learned; where answers are learned too,
+it takes the same touch for all of them (LOG.md).
 """
 
 import dataclasses
