@@ -81,6 +81,10 @@ class SpeedConfig:
         missing = sorted({*self.repeated_at} - {*self.prefixes})
         if missing or not self.repeated_at:
             raise ValueError(f"repeated_at is {self.repeated_at}: must be of prefixes {self.prefixes}; add them there")
+        if self.steps < speed.RESIDENT_EVERY:
+            raise ValueError(
+                f"steps is {self.steps}: must be at least {speed.RESIDENT_EVERY}, where memory is first read; raise it"
+            )
 
 
 def run(config: SpeedConfig, context: Context) -> Results:

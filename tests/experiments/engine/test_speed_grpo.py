@@ -19,6 +19,11 @@ from tests.experiments.shrunk import run_shrunk
 TINY = speed_grpo.SMOKE.size
 
 
+def test_a_run_too_short_for_a_look_at_the_memory_is_refused():
+    with pytest.raises(ValueError, match="steps is 4: must be at least 100"):
+        speed_grpo.SpeedConfig(steps=4)
+
+
 def test_the_decoder_has_its_advertised_size():
     fns, batch = make_fns(JobSize(), 64), make_batch(JobSize(), 64, 1)
     assert sum(x.size for x in jax.tree.leaves(init_decoder(fns, batch))) == 1_050_752
