@@ -97,18 +97,6 @@ def at_random(offered: Bool[np.ndarray, "O A C"], count: int, rng: np.random.Gen
     return np.argsort(-drawn, axis=-1)[..., :count].astype(np.int32)
 
 
-def first_offered(
-    order: Sequence[Sequence[int]], offered: Bool[np.ndarray, "O A C"], count: int
-) -> Int[np.ndarray, "O A k"]:
-    """The first choices of each question's order that are offered."""
-    objects, questions, _ = offered.shape
-    found = np.full((objects, questions, count), NO_CHOICE, np.int32)
-    for i, a in np.ndindex(objects, questions):
-        able = [c for c in order[a] if offered[i, a, c]][:count]
-        found[i, a, : len(able)] = able
-    return found
-
-
 def until_sure(
     objects: Int[np.ndarray, "n"], order: Sequence[tuple[int, ...]], contacts: int, threshold: float, answer: Answer
 ) -> Int[np.ndarray, "n A k"]:
