@@ -15,12 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.models.active_policy import ActiveFns, Explored
 from touchr1_jax.rl.config import GRPOConfig, TactileUse, at_precision
-from touchr1_jax.rl.enumerated import LevelRewards, conclusion_place
+from touchr1_jax.rl.enumerated import level_rewards
 from touchr1_jax.rl.environment import Environment
 from touchr1_jax.rl.gradient import Experience
 from touchr1_jax.rl.grpo import Group, GRPOEngine, GRPOState, compile_step
@@ -29,7 +29,7 @@ from touchr1_jax.rl.rollout import SampleConfig
 from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answer
 from touchr1_jax.rl.trajectory import ActiveBatch, Trajectories, sample_trajectories
-from touchr1_jax.types import Params, Target
+from touchr1_jax.types import Params
 
 
 class ActiveInputs(NamedTuple):
@@ -130,12 +130,15 @@ class ActiveEngine(GRPOEngine):
         terms = score(found.parsed, batch.target, spent, frozen.prices)
         reward = sum(terms.values(), start=jnp.zeros_like(found.seconds))
 
-        def with_answer(level: Int[Array, "P A"]) -> Float[Array, "P G"]:
-            answer = jnp.broadcast_to(level[:, None], found.parsed.conclude.shape)
+        def with_answer(tokens: Array, level: Int[Array, ""]) -> Float[Array, "P G"]:
+            answer = jnp.broadcast_to(jnp.where(batch.target.asked, level, -1)[:, None], found.parsed.conclude.shape)
             parsed = dataclasses.replace(found.parsed, conclude=answer)
             return sum(score(parsed, batch.target, spent, frozen.prices).values(), start=jnp.zeros_like(reward))
 
         reward, terms, finite, left_out = left_out_groups(reward, terms)
+        levels = None
+        if self.config.algorithm.enumerated is not None and self.levels is not None:
+            levels = level_rewards(with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite)
         seen = Explored(batch.features, found.touch, found.exists, jnp.any(found.exists, (1, 2, 3))[:, None])
         shown: dict[str, Any] = {"features": seen}
         group = Group(
@@ -146,30 +149,9 @@ class ActiveEngine(GRPOEngine):
             terms=terms,
             finite=finite,
             bonus=jnp.zeros_like(reward),
-            levels=self.level_rewards(found, batch.target, reward, finite, with_answer),
+            levels=levels,
         )
         return group, left_out | exploration_metrics(found, batch, frozen.environment.kinds)
-
-    def level_rewards(
-        self,
-        found: Trajectories,
-        target: Target,
-        sampled: Float[Array, "P G"],
-        finite: Bool[Array, "P"],
-        with_answer: Callable[[Int[Array, "P A"]], Float[Array, "P G"]],
-    ) -> LevelRewards | None:
-        """Rewards of the trajectories for each level in turn as the answer, where the algorithm enumerates them."""
-        if self.config.algorithm.enumerated is None or self.levels is None:
-            return None
-        ids = jnp.asarray(self.levels.level)[jnp.argmax(target.asked, -1)]  # P K
-        rewards = jnp.stack([with_answer(jnp.where(target.asked, k, -1)) for k in range(ids.shape[1])], -1)
-        usable = (ids >= 0)[:, None] & finite[:, None, None] & jnp.isfinite(rewards)
-        return LevelRewards(
-            ids=ids,
-            at=conclusion_place(found.rollout.tokens, self.levels.opens),
-            reward=jnp.where(usable, rewards, 0.0),
-            sampled=sampled,
-        )
 
     def perturbed(
         self, batch: ActiveBatch, frozen: ActiveInputs, key: Array

@@ -53,20 +53,22 @@ class ExactTerms(NamedTuple):
 
 
 def level_rewards(
-    reward_of: Callable[[Int[Array, "P G T"], Target], Float[Array, "P G"]],
+    reward_of: Callable[[Int[Array, "P G T"], Int[Array, ""]], Float[Array, "P G"]],
     levels: LevelTokens,
     tokens: Int[Array, "P G T"],
     target: Target,
     sampled: Float[Array, "P G"],
+    finite: Bool[Array, "P"],
 ) -> LevelRewards:
     """Rewards of all completions with each level in turn as their conclusion; tokens after it stay as sampled.
 
     Args:
-      reward_of: rewards of groups of completions.
+      reward_of: rewards of groups of completions with that level, which their tokens name.
       levels: token of each level, and the one that opens the conclusion.
       tokens: completions.
       target: of the prompts; one that asks for several attributes keeps its sampled rewards.
       sampled: rewards of the completions as they are.
+      finite: prompts whose group counts; the rewards of others are 0.
     """
     length = tokens.shape[-1]
     ids = jnp.asarray(levels.level, jnp.int32)[jnp.argmax(target.asked, -1)]  # P K
@@ -74,11 +76,12 @@ def level_rewards(
     at = jnp.where((jnp.sum(target.asked, -1) == 1)[:, None], at, length)
     here = jnp.arange(length) == at[..., None]
 
-    def with_level(word: Int[Array, "P"]) -> Float[Array, "P G"]:
-        reward = reward_of(jnp.where(here, jnp.maximum(word, 0)[:, None, None], tokens), target)
-        return jnp.where((word >= 0)[:, None] & jnp.isfinite(reward), reward, 0.0)
+    def with_level(level: tuple[Int[Array, ""], Int[Array, "P"]]) -> Float[Array, "P G"]:
+        k, word = level
+        reward = reward_of(jnp.where(here, jnp.maximum(word, 0)[:, None, None], tokens), k)
+        return jnp.where((finite & (word >= 0))[:, None] & jnp.isfinite(reward), reward, 0.0)
 
-    reward = jnp.moveaxis(jax.lax.map(with_level, ids.T), 0, -1)
+    reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
     return LevelRewards(ids=ids, at=at, reward=reward, sampled=sampled)
 
 

@@ -233,9 +233,8 @@ class GRPOEngine:
             reward = reward + terms[tactile_use.TERM]
         levels = None
         if algorithm.enumerated is not None and self.levels is not None:
-            reward_of = lambda tokens, target: score(tokens, target)[0]
-            levels = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward)
-            levels = levels._replace(reward=jnp.where(finite[:, None, None], levels.reward, 0.0))
+            reward_of = lambda tokens, level: score(tokens, batch.target)[0]
+            levels = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward, finite)
         return Group(batch, rollout, parsed, reward, terms, finite, bonus, levels), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:

@@ -162,9 +162,9 @@ def rewards():
     target = target.replace(asked=target.asked.at[1].set(True))
     worth = make_score(PARSER, make_rewards(uniform_prior((3, 3, 3, 9))), {"accuracy": 1.0})
     each = jax.vmap(jax.vmap(worth, in_axes=(0, None), axis_name="group"))
-    reward_of = lambda tokens, target: each(tokens, target)[0]
+    reward_of = lambda tokens, level: each(tokens, target)[0]
     both = jnp.stack([tokens, tokens])
-    return level_rewards(reward_of, LEVELS, both, target, jnp.full((2, 2), 0.25))
+    return level_rewards(reward_of, LEVELS, both, target, jnp.full((2, 2), 0.25), jnp.ones(2, bool))
 
 
 def test_rewards_of_every_conclusion_by_hand(rewards):
