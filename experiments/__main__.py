@@ -1,11 +1,11 @@
-"""`python -m experiments`: run, continue, list, start and compare experiments."""
+"""`python -m experiments`: run, continue, list, start and compare experiments, ask trained policies."""
 
 import multiprocessing
 import os
 import signal
 import sys
 
-from experiments.core.commands import print_error, run_command
+from experiments.core.commands import ASKING, print_error, run_command
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -30,6 +30,10 @@ def main() -> None:
     """Run the command line and end the process."""
     arguments = sys.argv[1:]
     try:
+        if arguments and arguments[0] in ASKING:
+            from experiments.ask.command import run_asking
+
+            leave(run_asking(arguments))
         status = run_command(arguments, "experiments")
         if status is None:
             from experiments.core.runner import run  # JAX and charts, which only runs need

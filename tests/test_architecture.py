@@ -31,6 +31,7 @@ LAYERS = {
         "training",
         "distributed",
         "bench",
+        "asking",
     ),
     "sensors_io": (
         "errors",
@@ -70,6 +71,7 @@ LAYERS = {
         "engine",
         "active",
         "faults",
+        "ask",
         "__main__",
     ),
 }

@@ -1,1 +1,13 @@
 """Touch-R1 in JAX: a tactile encoder, a small multimodal language model, rewards and one jitted GRPO step."""
+
+import importlib
+from typing import Any
+
+_ASKING = ("load_policy", "TouchInput")
+
+
+def __getattr__(name: str) -> Any:
+    """What asks a trained policy, imported when it is first used: no module of the package needs it."""
+    if name not in _ASKING:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.asking"), name)

@@ -20,9 +20,15 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
        {PROG} list [NAME]            experiments, their runs, cost and results
        {PROG} new NAME [--reward]    a template that runs
        {PROG} compare RUN_A RUN_B    two runs, figure by figure
+       {PROG} ask [POLICY] INPUT     ask a trained policy about a touch
+       {PROG} export POLICY FOLDER   a trained policy as a folder for others
+       {PROG} demo [POLICY]          ask in the browser
 """
 
-COMMANDS = ("list", "new", "compare")
+ASKING = ("ask", "export", "demo")
+"""Commands on trained policies, which `experiments.ask` defines."""
+
+COMMANDS = ("list", "new", "compare", *ASKING)
 """Names that no experiment can have."""
 
 
@@ -150,7 +156,7 @@ Command = (
 
 def run_command(arguments: Sequence[str], package: str) -> int | None:
     """Run one of `COMMANDS`, print help, or correct a name; the exit status, `None` where an experiment is named."""
-    if arguments and arguments[0] in COMMANDS:
+    if arguments and arguments[0] in COMMANDS and arguments[0] not in ASKING:
         return tyro.cli(Command, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,)).run(package)
     entries = find(package)
     if not arguments or arguments[0] in ("-h", "--help"):

@@ -26,9 +26,12 @@ from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
 
 NEVER = (
+    "touchr1_jax/asking.py",
     "touchr1_jax/bench/",
     "touchr1_jax/distributed/",
     "touchr1_jax/models/description_policy.py",
+    "touchr1_jax/models/saved_policy.py",
+    "touchr1_jax/text/plain_questions.py",
     "touchr1_jax/training/description_tuning.py",
     "touchr1_jax/training/exploration.py",
     "touchr1_jax/training/fine_tuning.py",

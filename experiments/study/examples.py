@@ -11,7 +11,6 @@ from experiments.study.stages import Weights
 from experiments.study.study import Study
 from sensors_io.pipeline import make_clip
 from sensors_io.schema import Sequence
-from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
 from touchr1_jax.training.evaluation import Evaluation, reward_terms
@@ -71,7 +70,10 @@ def rollouts_of(
         clip = make_clip(recorded, card, data.clip)
         attribute = policy.language.attributes[answers.attribute[row]]
         shown = [(s, name) for s, name in enumerate(data.clip.sensors) if clip.stream_mask[s]]
-        trace, reward = _trace(policy, answers, row), {name: float(values[row]) for name, values in terms.items()}
+        trace, reward = (
+            marked(policy.tokenizer.decode(answers.tokens[row])),
+            {name: float(values[row]) for name, values in terms.items()},
+        )
         return RolloutExample(
             arm=arm,
             object_id=card.object_id,
@@ -85,7 +87,7 @@ def rollouts_of(
             force_n={name: clip.force_n[s][clip.frame_mask[s]] for s, name in shown},
             view=card.view,
             fields={name: drawn for _, name in shown if (drawn := field_picture(recorded[name])) is not None},
-            instead={name: _trace(policy, other, row) for name, other in instead.items()},
+            instead={name: marked(policy.tokenizer.decode(o.tokens[row])) for name, o in instead.items()},
             group=group,
         )
 
@@ -117,9 +119,8 @@ def field_picture(recording: Sequence) -> np.ndarray | None:
     return np.ascontiguousarray(picture[..., ::-1])
 
 
-def _trace(policy: TouchPolicy, answers: Evaluation, row: int) -> Trace:
+def marked(text: str) -> Trace:
     """An answer with start, end and name of the body of each segment, in order of the text."""
-    text = policy.tokenizer.decode(answers.tokens[row])
     found = [(m.start(1), m.end(1), tag) for tag in SEGMENTS for m in re.finditer(rf"<{tag}>\s*(.*?)\s*</{tag}>", text)]
     slots: list[Slot] = []
     for start, end, tag in sorted(found):

@@ -1,6 +1,7 @@
 """A study: several arms of GRPO from one SFT checkpoint per seed, on the same data in the same order.
 
-The answers of a finished policy are kept in `answers/NAME-SEED.npz` of the run, so a resumed run repeats no evaluation.
+The answers of a finished policy are kept in `answers/NAME-SEED.npz` of the run, so a resumed run repeats no evaluation,
+and the policy itself in `policies/NAME/SEED`, so that it can be asked about new data (`python -m experiments ask`).
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.cache import DAMAGED
 from experiments.study.dataset import Dataset
+from experiments.study.policies import publish_policy
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -326,7 +328,8 @@ class _Seed(StudySeed):
         return run_sft(self.policy, self.data, self.evidence, config, self.context, **order, **options)
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
-        """Evaluate a policy, then all variants of it."""
+        """Save and evaluate a policy, then evaluate all variants of it."""
+        publish_policy(self.policy, params, self.data, name, self.seed, self.context)
         self._evaluate(name, lambda: self.ask(params, test, samples=self.config.samples))
         of_study = {field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}
         for title, variant in self.variants.items():

@@ -6,7 +6,7 @@ params = policy.init(seed, batch)
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -23,7 +23,7 @@ from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.text.constraint import Constraint, compile_constraint
 from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.parser import Parser, compile_parser
-from touchr1_jax.text.template import LevelTokens, PromptLayout, build_layout, level_tokens, prompt_words
+from touchr1_jax.text.template import QUESTIONS, LevelTokens, PromptLayout, build_layout, level_tokens, prompt_words
 from touchr1_jax.text.tokenizer import Tokenizer, word_level
 from touchr1_jax.types import Params, Target, TouchBatch
 
@@ -138,13 +138,20 @@ def build_policy(model: ModelConfig, sensors: tuple[str, ...]) -> TouchPolicy:
       ValueError: a sensor that the language does not know.
     """
     language = language_of(sensors)
-    tokenizer = word_level(language, prompt_words())
+    return assemble_policy(model, language, word_level(language, prompt_words()))
+
+
+def assemble_policy(
+    model: ModelConfig, language: Language, tokenizer: Tokenizer, questions: Mapping[str, str] = QUESTIONS
+) -> TouchPolicy:
+    """The policy of a language, a vocabulary that has all of its words, and the question for each attribute."""
     config = PolicyConfig(
-        tactile=dataclasses.replace(model.tactile, sensors=len(sensors)),
+        tactile=dataclasses.replace(model.tactile, sensors=len(language.sensors)),
         vision=model.vision,
         decoder=dataclasses.replace(model.decoder, vocab_size=tokenizer.vocab_size),
     )
-    layout = build_layout(tokenizer, language, tactile_tokens=model.stream_tokens, view_tokens=model.vision.grid**2)
+    prompt: dict[str, Any] = {"tactile_tokens": model.stream_tokens, "view_tokens": model.vision.grid**2}
+    layout = build_layout(tokenizer, language, questions=questions, **prompt)
     return TouchPolicy(
         model=model,
         language=language,

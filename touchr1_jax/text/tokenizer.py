@@ -88,10 +88,8 @@ def word_level(language: Language, extra_words: Iterable[str] = ()) -> Tokenizer
 def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
     """A tokenizer with one id for each blank-separated word of some phrases; the first word has no blank before it."""
     words = list(dict.fromkeys(" ".join(phrases).split()))
-    specials = [PAD, END, TACTILE, VIEW]
-    vocabulary = {word: i for i, word in enumerate([*specials, *words])}
-    library = tokenizers.Tokenizer(models.WordLevel(vocabulary, unk_token=PAD))
-    library.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
+    library, specials = word_library(words), [PAD, END, TACTILE, VIEW]
+    vocabulary = library.get_vocab()
 
     def encode(text: str) -> list[int]:
         unknown = [word for word in text.split() if word not in vocabulary or word in specials]
@@ -101,6 +99,14 @@ def word_tokenizer(phrases: Iterable[str]) -> Tokenizer:
 
     pieces = [b""] * len(specials) + [(w if w == words[0] else f" {w}").encode() for w in words]
     return Tokenizer(pieces=tuple(pieces), pad_id=0, end_ids=(1,), tactile_id=2, view_id=3, encoder=encode)
+
+
+def word_library(words: Iterable[str]) -> tokenizers.Tokenizer:
+    """The special tokens and then these words, in their order, as a tokenizer of the `tokenizers` library."""
+    vocabulary = {word: i for i, word in enumerate([PAD, END, TACTILE, VIEW, *words])}
+    library = tokenizers.Tokenizer(models.WordLevel(vocabulary, unk_token=PAD))
+    library.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
+    return library
 
 
 def from_tokenizers(

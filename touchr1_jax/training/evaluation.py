@@ -119,10 +119,14 @@ def answer_program(policy: TouchPolicy) -> Any:
 
 
 @functools.cache
-def sample_program(policy: TouchPolicy, samples: int) -> Any:
-    """Compiled sampler, (params, questions, key) → conclusions [P, samples, A] and marginal [P, K], made once."""
+def sample_program(policy: TouchPolicy, samples: int, *, constrained: bool = False) -> Any:
+    """Compiled sampler, (params, questions, key) → conclusions [P, samples, A] and marginal [P, K], made once.
+
+    A constrained one draws only formatted answers, so that the marginal sums to 1.
+    """
     fns, length = policy.fns, policy.model.completion_tokens
-    draw = SampleConfig(group=samples, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id)
+    grammar = policy.constraint if constrained else None
+    draw = SampleConfig(group=samples, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, constraint=grammar)
     known = level_tokens(policy.language, policy.tokenizer)
 
     def of_prompt(params: Params, batch: GRPOBatch, tokens: jax.Array, level: jax.Array) -> jax.Array:

@@ -22,6 +22,9 @@ DTYPES: Mapping[str, np.dtype] = {
 }
 """Types of tensors that can be weights, by the format's names."""
 
+STORED: Mapping[str, np.dtype] = {**DTYPES, "I8": np.dtype(np.int8)}
+"""Types of tensors that are read and written; whole numbers are weights only together with a scale."""
+
 METADATA = "__metadata__"
 POINTER = b"version "
 """Begins what stands in the place of a file that Git LFS has not fetched."""
@@ -77,7 +80,7 @@ def read_tensor(entry: TensorEntry) -> np.ndarray:
     Raises:
       ValueError: the file got shorter since its header was read.
     """
-    dtype = DTYPES[entry.dtype]
+    dtype = STORED[entry.dtype]
     with entry.path.open("rb") as file:
         data = np.fromfile(file, dtype, entry.size // dtype.itemsize, offset=entry.start)
     if data.nbytes != entry.size:
@@ -96,9 +99,9 @@ def write_file(
       progress: called after each tensor.
 
     Raises:
-      ValueError: a tensor of a type that no weight has.
+      ValueError: a tensor of a type that is not stored.
     """
-    names = {dtype: name for name, dtype in DTYPES.items()}
+    names = {dtype: name for name, dtype in STORED.items()}
     header: dict[str, dict[str, Any]] = {}
     end = 0
     for name, x in tensors.items():
@@ -124,8 +127,8 @@ def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int
         raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")
     start, end = (body + offset for offset in found["data_offsets"])
     entry = TensorEntry(path, found["dtype"], tuple(found["shape"]), start, end)
-    if entry.dtype in DTYPES:
-        needed = DTYPES[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
+    if entry.dtype in STORED:
+        needed = STORED[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
         if entry.size != needed:
             raise ValueError(
                 f"{entry.path}: {name} has {entry.size} bytes, its type and shape need {needed}; fetch the file again"

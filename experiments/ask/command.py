@@ -1,0 +1,166 @@
+"""`python -m experiments ask | export | demo`: commands on trained policies."""
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from experiments.ask.answers import as_json, ask_policy, text_lines
+from experiments.ask.inputs import AskedTouch, read_contacts, read_touch
+from experiments.ask.page import write_page
+from experiments.core.artifacts import DamagedFileError
+from experiments.core.commands import PROG, print_error, print_lines
+from experiments.core.errors import DataError
+from experiments.core.text import bounds
+from experiments.study.policies import find_policy, is_policy
+from sensors_io.errors import UserError
+from sensors_io.records import RecordStore
+from touchr1_jax.asking import HUB, AskablePolicy, TouchAnswer, push
+from touchr1_jax.bench.statistics import clustered_bootstrap
+from touchr1_jax.models.load import WeightsError
+from touchr1_jax.models.saved_policy import Precision, save_policy
+from touchr1_jax.text.plain_questions import QuestionError
+from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
+
+COMPILED = "compiled"
+"""Folder of the cache for compiled programs, that of the runner."""
+
+FAILURES = (UserError, WeightsError, QuestionError, DamagedFileError, OSError)
+"""Errors whose message is all that a user needs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Places:
+    """Folders of runs and of compiled programs."""
+
+    runs_dir: Path = Path("runs")
+    """Folder of all runs."""
+    cache_dir: Path = Path("data")
+    """Folder of compiled programs, which the next call reuses."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AskCommand(Places):
+    """Ask a trained policy about a touch: the answer, its trace, the levels' probabilities, the same without touch.
+
+    POLICY is a run, RUN/ARM, RUN/ARM/SEED, a policy's folder, hub:USER/NAME, or the name of one that comes with the
+    package, which is taken where none is given.  INPUT is `generated`, `generated:NUMBER`, `generated:soft,wood`,
+    RECORDS, RECORDS:CONTACT, a video, or a folder of pictures; two INPUTs are compared.
+    """
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[POLICY] INPUT [INPUT]")]
+    question: str = ""
+    """Such as "How hard is it?" or, of two INPUTs, "Which is softer?"; everything that can be asked by default."""
+    sensor: str = ""
+    """Sensor of a video or of pictures; the policy's first one by default."""
+    every: Literal["", "all", "train", "val", "test", "unlabelled"] = ""
+    """Ask about all contacts of RECORDS, or of a split, and count the right answers."""
+    json: bool = False
+    """Print JSON for programs."""
+    html: Path | None = None
+    """Also write a page with the frames."""
+
+    def run(self) -> int:
+        """Ask, print, and return the exit status."""
+        given = list(self.names)
+        policy = given.pop(0) if given and is_policy(given[0], self.runs_dir) else ""
+        if not policy and len(given) > 1 and not _is_input(given[0]):
+            policy = given.pop(0)  # names neither: the error says what a policy can be
+        if len(given) not in (1, 2) or (self.every and len(given) != 1):
+            raise DataError(f"names are {self.names}: must be at most one POLICY and one or two INPUTs; correct them")
+        found = find_policy(policy, self.runs_dir)
+        if self.every:
+            print_lines(*self._count(found, Path(given[0])))
+            return 0
+        touches = [read_touch(name, found.saved, self.sensor) for name in given]
+        answered = ask_policy(found, touches, self.question)
+        print_lines(json.dumps(as_json(answered), ensure_ascii=False) if self.json else "\n".join(text_lines(answered)))
+        if self.html is not None:
+            write_page(self.html, answered)
+        return 0
+
+    def _count(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
+        """The answers about every contact as JSON lines, or the share of right ones by attribute."""
+        store = RecordStore(path)
+        rows = range(len(store)) if self.every == "all" else store.contacts_of_split(self.every).tolist()
+        if not rows:
+            raise DataError(f"every is {self.every!r}: {path} has no such contact; choose another split, or all")
+        touches = read_contacts(store, rows, policy.saved)
+        answers = policy.answers([touch.touch for touch in touches])
+        if self.json:
+            for touch, of_touch in zip(touches, answers, strict=True):
+                said = {name: {"word": a.word, "probabilities": dict(a.probabilities)} for name, a in of_touch.items()}
+                yield json.dumps({"touch": touch.name, "answers": said, "truth": dict(touch.truth)}, ensure_ascii=False)
+            return
+        objects = np.array([store.contacts[i].object_id for i in rows])
+        yield f"policy  {policy.saved.notes.get('name', policy.name)}"
+        for name in policy.attributes:
+            yield f"  {name:<12}{_share_right(name, touches, answers, objects)}"
+
+
+def _share_right(
+    name: str, touches: Sequence[AskedTouch], answers: Sequence[dict[str, TouchAnswer]], objects: np.ndarray
+) -> str:
+    """Right answers with touch and without, 95 % over objects."""
+    known = np.array([name in touch.truth for touch in touches])
+    if len(set(objects[known])) < 2:
+        return "labels of fewer than two objects are known"
+    told = []
+    for said in (lambda a: a.word, lambda a: a.untouched.word):
+        right = np.array([100.0 * (said(a[name]) == t.truth.get(name)) for a, t in zip(answers, touches, strict=True)])
+        share = clustered_bootstrap(right[known], objects[known])
+        told.append(f"{share.mean:.1f} % {bounds(share.low, share.high, '.1f')}")
+    return f"{told[0]} right of {int(known.sum())}, {told[1]} without touch"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportCommand(Places):
+    """Write a trained policy as a folder in the layout of model hubs: config, safetensors, tokenizer, model card.
+
+    The folder is a POLICY of `ask`; so is a policy of the hub, hub:USER/NAME, which this command also copies.
+    """
+
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    folder: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER|hub:USER/NAME")]
+    precision: Precision = "float32"
+    """Of the parameters: int8 takes a quarter of the bytes."""
+    card: Path | None = None
+    """Model card to enclose; by default a table of what is known of the policy."""
+
+    def run(self) -> int:
+        """Write the folder and return the exit status."""
+        saved = find_policy(self.policy, self.runs_dir).saved
+        card = "" if self.card is None else self.card.read_text(encoding="utf-8")
+        if self.folder.startswith(HUB):
+            print_lines(push(saved, self.folder.removeprefix(HUB), precision=self.precision, card=card))
+            return 0
+        save_policy(Path(self.folder), saved, precision=self.precision, card=card)
+        size = sum(path.stat().st_size for path in Path(self.folder).iterdir())
+        print_lines(f"{self.folder}: {size / 1e6:.2f} MB")
+        return 0
+
+
+def _is_input(name: str) -> bool:
+    return name.startswith("generated") or Path(name).exists() or Path(name.rpartition(":")[0] or name).exists()
+
+
+AskingCommand = (
+    Annotated[AskCommand, tyro.conf.subcommand("ask")] | Annotated[ExportCommand, tyro.conf.subcommand("export")]
+)
+
+
+def run_asking(arguments: Sequence[str]) -> int:
+    """Run one of these commands; the exit status."""
+    command = tyro.cli(AskingCommand, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,))
+    kept = compilations_kept(command.cache_dir / COMPILED) if arguments[0] != "export" else contextlib.nullcontext()
+    try:
+        with kept, compiled_quickly():
+            return command.run()
+    except FAILURES as error:
+        print_error(f"{type(error).__name__}: {error}")
+        return 1

@@ -1,0 +1,183 @@
+"""Inputs that a policy can be asked about: generated objects, contacts of records, videos, folders of pictures.
+
+generated            a generated object, drawn at random; generated:7 the seventh
+generated:soft,wood  one with these properties
+RECORDS              a folder of records: its first contact; RECORDS:12 contact 12, RECORDS:mug the first of an object
+press.mp4            a video of one sensor
+FOLDER               pictures of one sensor, in the order of the numbers in their names
+"""
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.core.errors import DataError
+from experiments.study.policies import SCENES, clip_of
+from sensors_io.importers.keep import Keep, UnreadableError
+from sensors_io.importers.pictures import film, nominal_ns, numbered, read_pictures
+from sensors_io.importers.video import read_video
+from sensors_io.index import INDEX
+from sensors_io.live import LiveScenes
+from sensors_io.pipeline import make_clip
+from sensors_io.records import RecordStore
+from sensors_io.scenes.cards import solid_of
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import ATTRIBUTES, ContactKey, ObjectCard
+from sensors_io.schema import Sequence as TouchSequence
+from touchr1_jax.asking import TouchInput
+from touchr1_jax.models.saved_policy import SavedPolicy, words
+
+GENERATED = "generated"
+
+UNSEEN_SEED = 1_000_000
+"""Added to the numbers of generated objects, so that none is an object of training."""
+
+MOST_DRAWN = 50_000
+"""Objects that are drawn in search of given properties; the rarest combination is one in some thousands."""
+
+FILM_RATE_HZ = 30.0
+"""Assumed rate of a folder of pictures; only the order of frames counts."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class AskedTouch:
+    """An input: its name, its touch, the true level of each attribute in words where known, and remarks."""
+
+    name: str
+    touch: TouchInput
+    truth: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    force_known: bool = False
+
+
+def read_touch(source: str | Path, saved: SavedPolicy, sensor: str = "") -> AskedTouch:
+    """Read an input as a policy reads its training data.
+
+    Args:
+      source: as in the docstring of this module.
+      saved: the policy.
+      sensor: of a video or of pictures; by default the policy's first one.
+
+    Raises:
+      DataError: an input that cannot be read.
+    """
+    text = str(source)
+    if text.partition(":")[0] == GENERATED:
+        return _generated(text.partition(":")[2], saved)
+    path, _, which = (text, "", "") if Path(text).exists() else text.rpartition(":")
+    if (Path(path) / INDEX).exists():
+        return _recorded(Path(path), which, saved)
+    if not path or not Path(path).exists():
+        raise DataError(
+            f"input is {text!r}: no such file; must be a folder of records (RECORDS:CONTACT), a video, a folder of "
+            f"pictures, or {GENERATED}"
+        )
+    return _filmed(Path(path), saved, sensor)
+
+
+def read_contacts(store: RecordStore, rows: Sequence[int], saved: SavedPolicy) -> list[AskedTouch]:
+    """Some contacts of records."""
+    return [_of_contact(store, i, saved, f"contact {i} of {store.path}") for i in rows]
+
+
+def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
+    """A generated object that training never saw, pressed by all sensors as those of training were."""
+    known = {word: (name, level) for name in ATTRIBUTES for level, word in enumerate(words(saved, name))}
+    given = dict(saved.notes.get(SCENES) or {})
+    fields = {field.name for field in dataclasses.fields(SceneConfig)} & given.keys() - {"split_shares"}
+    config = SceneConfig(**{name: given[name] for name in fields} | {"objects": 1, "sites": 1, "sequences": None})
+    wanted: dict[str, int] = {}
+    for word in filter(None, which.split(",")) if not which.isdigit() else ():
+        if word not in known:
+            raise DataError(
+                f"input is {GENERATED}:{which}: {word!r} is no property; choose from {', '.join(known)}, or a number"
+            )
+        name, level = known[word]
+        if wanted.setdefault(name, level) != level:
+            raise DataError(f"input is {GENERATED}:{which}: an object has one {name}; drop a word")
+    first = int(which) if which.isdigit() else int(np.random.default_rng().integers(10_000)) if not which else 0
+    for number in itertools.islice(itertools.count(first), MOST_DRAWN):
+        scene = dataclasses.replace(config, seed=UNSEEN_SEED + number)
+        if wanted.items() <= solid_of(scene, 0).labels().items():
+            return _of_contact(LiveScenes(scene), 0, saved, f"generated object {number} ({GENERATED}:{number})")
+    raise DataError(f"input is {GENERATED}:{which}: no such object in {MOST_DRAWN} draws; ask for fewer properties")
+
+
+def _recorded(path: Path, which: str, saved: SavedPolicy) -> AskedTouch:
+    store = RecordStore(path)
+    rows = [i for i, key in enumerate(store.contacts) if which in ("", str(i), key.object_id)]
+    if not rows:
+        raise DataError(
+            f"input is {path}:{which}: must name a contact 0..{len(store) - 1} or an object; "
+            f"`python -m sensors_io list {path}` shows them"
+        )
+    return _of_contact(store, rows[0], saved, f"contact {rows[0]} of {path}")
+
+
+def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, name: str) -> AskedTouch:
+    """A contact with its object's card."""
+    card = store.objects[store.contacts[i].object_id]
+    return _asked(store.contact(i, fields=False), card, saved, name)
+
+
+def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:
+    """A video, or a folder of pictures, of one sensor."""
+    keep, named = Keep(), sensor or saved.sensors[0]
+    if named not in saved.sensors:
+        raise DataError(f"sensor is {named!r}: the policy reads {', '.join(saved.sensors)}; choose one of them")
+    arrays: dict[str, Any]
+    try:
+        if path.is_dir():
+            files = numbered(path)
+            if not files:
+                raise UnreadableError("holds neither records nor pictures (.jpg, .png)")
+            pictures = read_pictures(files, keep.positions(len(files)), keep)
+            index, rate_hz = pictures.index, FILM_RATE_HZ
+            arrays = {"frames": pictures.frames, "gap": pictures.after_loss()}
+        else:
+            video = read_video(path, keep)
+            index, rate_hz = video.index, video.rate_hz
+            arrays = {"frames": video.frames, "gap": np.zeros(len(video.index), bool)}
+    except UnreadableError as error:
+        raise DataError(f"input is {path}: {error}; give a video, a folder of pictures or of records") from error
+    name = re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-") or "object"
+    key = ContactKey(object_id=name, site=0, motion="free", trial=0)
+    sequence = film(key, named, host_time_ns=nominal_ns(index, rate_hz), **arrays)
+    card = ObjectCard(object_id=name, split="unlabelled", labels={}, annotator="")
+    asked = _asked({named: sequence}, card, saved, str(path))
+    remark = () if sensor else (f"read as pictures of {named}; --sensor names another",)
+    return dataclasses.replace(asked, remarks=(*remark, *asked.remarks))
+
+
+def _asked(contact: Mapping[str, TouchSequence], card: ObjectCard, saved: SavedPolicy, name: str) -> AskedTouch:
+    """The clip of a contact as a touch, with what training had and this input lacks."""
+    sensors = [sensor for sensor in saved.sensors if sensor in contact]
+    if not sensors:
+        raise DataError(
+            f"input is {name}, recorded by {', '.join(contact)}: the policy reads {', '.join(saved.sensors)}; "
+            "ask a policy that was trained on this sensor"
+        )
+    clip = make_clip(contact, card, clip_of(saved))
+    real = {sensor: clip.frame_mask[s] for s, sensor in enumerate(saved.sensors) if sensor in sensors}
+    of = lambda array: {sensor: array[saved.sensors.index(sensor)][mask] for sensor, mask in real.items()}
+    known = {a: level for a, level in card.labels.items() if level >= 0 and a in saved.questions}
+    remarks = []
+    force_known = any(contact[sensor].force_n is not None for sensor in sensors)
+    if saved.reads.force and not force_known:
+        remarks.append("no force was measured; the policy was trained with it")
+    if saved.reads.view and card.view is None:
+        remarks.append("there is no picture of the object; the policy was trained with one")
+    if len(sensors) < len(saved.sensors):
+        remarks.append(f"touched by {', '.join(sensors)} alone; the policy reads {', '.join(saved.sensors)}")
+    return AskedTouch(
+        name=name,
+        touch=TouchInput(frames=of(clip.frames), force_n=of(clip.force_n), index=of(clip.frame_index), view=card.view),
+        truth={a: words(saved, a)[level] for a, level in known.items()},
+        remarks=tuple(remarks),
+        force_known=force_known,
+    )

@@ -1,0 +1,113 @@
+"""The trained policies of a run, `policies/NAME/SEED`: published by studies, found again by name."""
+
+from pathlib import Path
+
+from experiments.core import runs
+from experiments.core.artifacts import jsonable, read_json
+from experiments.core.context import Context
+from experiments.study.dataset import Dataset
+from sensors_io.pipeline import ClipConfig
+from sensors_io.schema import Flag
+from touchr1_jax.asking import HUB, SHIPPED, AskablePolicy, load_policy
+from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy
+from touchr1_jax.types import Params
+
+POLICIES = "policies"
+"""Folder of a run with its trained policies."""
+
+SCENES = "scenes"
+"""Note with the configuration of the generated scenes that a policy was trained on."""
+
+
+def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str, seed: int, context: Context) -> None:
+    """Save a policy in its run; released models have a format of their own, in which `touch_r1` writes them."""
+    if not isinstance(policy.model, ModelConfig):
+        return
+    summary, meta = data.summary(), data.store.meta
+    reads = PolicyInput(
+        rejected=tuple(str(flag.name) for flag in data.clip.rejected),
+        choose=data.clip.choose,
+        force=data.has_force,
+        view=any(card.view is not None for card in data.store.objects.values()),
+    )
+    notes = {
+        "name": f"{context.directory.parent.name}, {name}, seed {seed}",
+        "trained on": f"{meta.source}: {summary['sft_objects']} objects by SFT, {summary['grpo_objects']} for GRPO",
+        "records": data.store.digest,
+        SCENES: meta.notes.get("config", {}),
+    }
+    saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
+    folder = context.directory / POLICIES / name / str(seed)
+    context.processes.write_once(lambda: save_policy(folder, saved))
+
+
+def find_policy(name: str, runs_dir: Path) -> AskablePolicy:
+    """A policy by the folder of a run, RUN, RUN/ARM or RUN/ARM/SEED, or by what `load_policy` takes.
+
+    Of a run the policy of SFT and the first seed is taken, since every study has it.
+
+    Raises:
+      PolicyError: there is none, or it cannot be read.
+    """
+    path = Path(name)
+    folder = run_policy(name, runs_dir)
+    if folder is not None:
+        return load_policy(folder)
+    if not name or name.startswith(HUB) or path.exists() or name in shipped():
+        return load_policy(name or None)
+    raise PolicyError(
+        f"policy is {name!r}: must be a run, RUN/ARM or RUN/ARM/SEED under {runs_dir}, a policy's folder, "
+        f"{HUB}USER/NAME, or one of {', '.join(shipped()) or 'those that come with the package (none)'}"
+    )
+
+
+def is_policy(name: str, runs_dir: Path) -> bool:
+    """True if a name is that of a policy rather than of an input."""
+    try:
+        found = run_policy(name, runs_dir) is not None
+    except PolicyError:
+        return True
+    return found or name.startswith(HUB) or name in shipped() or (Path(name) / CONFIG_FILE).is_file()
+
+
+def shipped() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(folder.name for folder in SHIPPED.glob("*/"))
+
+
+def run_policy(name: str, runs_dir: Path) -> Path | None:
+    """The folder of a policy of a run; `None` where the name is that of no run.
+
+    Raises:
+      PolicyError: a run without this policy.
+    """
+    parts = Path(name).parts
+    for count in range(len(parts), max(len(parts) - 3, 0), -1):
+        try:
+            run = runs.locate(str(Path(*parts[:count])), runs_dir)
+        except FileNotFoundError:
+            continue
+        if "experiment" not in read_json(run / "config.json"):
+            return None  # the config.json of a policy itself
+        arm, seed = [*parts[count:], *["sft", "0"][len(parts) - count :]]
+        folder = run / POLICIES / arm / seed
+        if not folder.is_dir():
+            saved = sorted(str(p.relative_to(run / POLICIES)) for p in (run / POLICIES).glob("*/*/"))
+            has = f"has {', '.join(saved)}" if saved else "has none: it trains none, or is of an earlier version"
+            raise PolicyError(f"policy is {name!r}: {run} {has}; name RUN/ARM/SEED, or run the experiment again")
+        return folder
+    return None
+
+
+def clip_of(saved: SavedPolicy) -> ClipConfig:
+    """The clips that a policy reads."""
+    return ClipConfig(
+        frames=saved.model.frames,
+        image_px=saved.model.image_px,
+        view_px=saved.model.vision.image_px,
+        sensors=saved.sensors,
+        rejected=tuple(Flag[name] for name in saved.reads.rejected),
+        choose=saved.reads.choose,  # type: ignore[arg-type]
+    )

@@ -1,0 +1,342 @@
+"""Ask a trained policy about a touch.
+
+    policy = load_policy("runs/ablation_ordinal/latest/policies/sft/0")
+    answer = policy.ask({"gelsight_mini": frames}, "How hard is it?")  # frames: uint8 [F, H, W, 3], RGB
+    answer.word, answer.trace, answer.probabilities, answer.untouched.word
+
+The answer is the policy's greedy one, as in every report.  Probabilities are p(level | touch), the mean over sampled
+traces of p(level | trace).
+"""
+
+import dataclasses
+import functools
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+
+from touchr1_jax.models.saved_policy import PolicyError, Precision, SavedPolicy, read_policy, save_policy, words
+from touchr1_jax.rl.rollout import GRPOBatch
+from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError, read_question
+from touchr1_jax.training.compilation import compiled_quickly
+from touchr1_jax.training.encoding import encode_contacts
+from touchr1_jax.training.evaluation import answer_program, sample_program
+from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.questions import equal_blocks, question_batch
+from touchr1_jax.types import Params
+
+SHIPPED = Path(__file__).resolve().parent / "policies"
+"""Folder of the policies that come with the package, each a folder that `load_policy` reads by its name."""
+
+HUB = "hub:"
+"""Begins the name of a policy on the Hugging Face Hub, as in `hub:USER/NAME`."""
+
+SAMPLES = 32
+"""Traces whose probabilities are averaged: the standard error of a share is at most 9 points, usually below 3."""
+
+TOGETHER = 8
+"""Touches that are answered at once where there are several."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TouchInput:
+    """One touch of an object as some of a policy's sensors recorded it.
+
+    Attributes:
+      frames: sensor → RGB pictures in the order of time, uint8 [F, H, W, 3], at most as many as the policy reads.
+      force_n: sensor → force on the gel, pressing is z < 0, float [F, 3]; absent where it was not measured.
+      index: sensor → position of each frame in its recording, int [F]; 0, 1, … by default.
+      view: RGB picture of the object, uint8 [H, W, 3], or `None`.
+    """
+
+    frames: Mapping[str, np.ndarray]
+    force_n: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    index: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    view: np.ndarray | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TouchAnswer:
+    """An answer about one attribute of one touch.
+
+    Attributes:
+      question, attribute: as the policy was asked.
+      word: the level that the answer concludes; empty where it cannot be parsed.
+      trace: the whole answer.
+      probabilities: word of each level → p(level | touch).
+      untouched: the answer to the same question without the touch; `None` in itself.
+    """
+
+    question: str
+    attribute: str
+    word: str
+    trace: str
+    probabilities: Mapping[str, float]
+    untouched: "TouchAnswer | None" = None
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{word} {p:.0%}" for word, p in self.probabilities.items())
+        said = f"{self.word or 'no readable answer'} ({shares})"
+        return said if self.untouched is None else f"{said}; without touch {self.untouched}"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ComparedTouches:
+    """Which of two touched objects has more of an attribute, by the probabilities of their levels.
+
+    Attributes:
+      question, attribute: as asked.
+      word: "first" or "second".
+      probabilities: "first", "same level" and "second" → probability, for levels that are independent of one another.
+      first, second: the answers about each.
+      untouched: the comparison without touch; `None` in itself.
+    """
+
+    question: str
+    attribute: str
+    word: str
+    probabilities: Mapping[str, float]
+    first: TouchAnswer
+    second: TouchAnswer
+    untouched: "ComparedTouches | None" = None
+
+
+class AskablePolicy:
+    """A trained policy that answers questions about touches; programs are compiled when it is first asked.
+
+    Args:
+      saved: the policy.
+      name: for messages.
+    """
+
+    def __init__(self, saved: SavedPolicy, name: str = "policy") -> None:
+        self.saved, self.name = saved, name
+
+    @functools.cached_property
+    def attributes(self) -> dict[str, list[str]]:
+        """Attribute → the words of its levels."""
+        return {a.name: words(self.saved, a.name) for a in self.saved.policy.language.attributes}
+
+    def ask(self, touch: TouchInput | Mapping[str, np.ndarray], question: str) -> TouchAnswer:
+        """The answer to a question about one touch, given as `TouchInput` or as its frames alone.
+
+        Raises:
+          QuestionError: a question for no attribute or for a difference, or a touch that the policy cannot read.
+        """
+        asked = read_question(question, self.attributes)
+        if asked.compares:
+            raise QuestionError(f"question is {question!r}: it compares two objects; give two touches, by `compare`")
+        return self.answers([touch])[0][asked.name]
+
+    def probabilities(self, touch: TouchInput | Mapping[str, np.ndarray]) -> dict[str, dict[str, float]]:
+        """Attribute → word of each level → p(level | touch).
+
+        Raises:
+          QuestionError: a touch that the policy cannot read.
+        """
+        return {name: dict(answer.probabilities) for name, answer in self.answers([touch])[0].items()}
+
+    def compare(
+        self,
+        first: TouchInput | Mapping[str, np.ndarray],
+        second: TouchInput | Mapping[str, np.ndarray],
+        question: str,
+    ) -> ComparedTouches:
+        """Which of two objects has more, or less, of an attribute: P(first) = Σ_{i > j} p₁(i) p₂(j).
+
+        Raises:
+          QuestionError: as `ask`, or an attribute whose levels have no order.
+        """
+        asked = read_question(question, self.attributes)
+        language = self.saved.policy.language
+        if not language.attributes[language.attribute_index(asked.name)].ordinal:
+            raise QuestionError(f"question is {question!r}: levels of {asked.name} have no order; ask about each touch")
+        one, two = (found[asked.name] for found in self.answers([first, second]))
+        return compared(question, asked, one, two)
+
+    def answers(self, touches: Sequence[TouchInput | Mapping[str, np.ndarray]]) -> list[dict[str, TouchAnswer]]:
+        """For each touch, the answer to the question for every attribute, by its name.
+
+        Raises:
+          QuestionError: a touch that the policy cannot read.
+        """
+        given = [touch if isinstance(touch, TouchInput) else TouchInput(frames=touch) for touch in touches]
+        size = 1 if len(given) < TOGETHER else TOGETHER
+        found: list[dict[str, TouchAnswer]] = []
+        with compiled_quickly():  # programs that run a few times
+            for rows, real in equal_blocks(len(given), size):
+                found += list(self._answered([given[i] for i in rows]))[:real]
+        return found
+
+    def _answered(self, touches: Sequence[TouchInput]) -> Iterator[dict[str, TouchAnswer]]:
+        """Answers about a block of touches: with touch in the first half of the questions, without in the second."""
+        policy, params, n, a = self.saved.policy, self.saved.params, len(touches), len(self.attributes)
+        clip = [clip_arrays(touch, self.saved) for touch in touches]
+        stacked = {name: np.stack([arrays[name] for arrays in clip]) for name in clip[0]}
+        features = encode_contacts(policy.fns, params, [touch_batch(stacked)])
+        contact, attribute = (np.tile(x.ravel(), 2) for x in np.mgrid[:n, :a])
+        felt = np.arange(len(contact))[:, None] < n * a
+        streams = stacked["stream_mask"][contact] & felt
+        batch = question_batch(policy, features, stacked["label"], contact, attribute, streams)
+        tokens, level, share = self._decoded({"decoder": params["decoder"]}, batch)
+
+        def answer(row: int, untouched: TouchAnswer | None = None) -> TouchAnswer:
+            name, asked = list(self.attributes.items())[attribute[row]], int(level[row, attribute[row]])
+            return TouchAnswer(
+                question=f"{self.saved.questions[name[0]]}?",
+                attribute=name[0],
+                word=name[1][asked] if asked >= 0 else "",
+                trace=policy.tokenizer.decode(tokens[row]).strip(),
+                probabilities={word: float(p) for word, p in zip(name[1], share[row], strict=False)},
+                untouched=untouched,
+            )
+
+        for i in range(n):
+            rows = range(i * a, (i + 1) * a)
+            yield dict(zip(self.attributes, (answer(row, answer(row + n * a)) for row in rows), strict=True))
+
+    def _decoded(self, decoder: Params, batch: GRPOBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Greedy tokens and concluded levels of questions, and the probabilities of the levels that are asked for."""
+        policy = self.saved.policy
+        greedy = answer_program(policy)(decoder, batch)
+        _, marginal = sample_program(policy, SAMPLES, constrained=True)(decoder, batch, jax.random.key(0))
+        share = np.asarray(marginal, np.float64)
+        share /= np.maximum(share.sum(-1, keepdims=True), np.finfo(np.float64).tiny)
+        return np.asarray(greedy.tokens), np.asarray(greedy.parsed.conclude), share
+
+
+def load_policy(path: str | Path | None = None) -> AskablePolicy:
+    """A trained policy, ready to be asked.
+
+    Args:
+      path: folder of a saved policy, name of one that comes with the package, or `hub:USER/NAME` on the Hugging Face
+        Hub; without one, the policy that comes with the package.
+
+    Raises:
+      PolicyError: there is none, or it cannot be read.
+    """
+    shipped = sorted(folder.name for folder in SHIPPED.iterdir() if folder.is_dir()) if SHIPPED.is_dir() else []
+    if path is None and not shipped:
+        raise PolicyError("policy is None: none comes with this version; give the folder of one, or of a run")
+    name = str(path or shipped[0])
+    if name.startswith(HUB):
+        return AskablePolicy(read_policy(fetch(name.removeprefix(HUB))), name)
+    folder = SHIPPED / name if name in shipped else Path(name)
+    if not folder.exists():
+        known = f"one of {', '.join(shipped)}, " if shipped else ""
+        raise PolicyError(
+            f"policy is {name!r}: no such folder; must be {known}the folder of a policy or {HUB}USER/NAME"
+        )
+    return AskablePolicy(read_policy(folder), name)
+
+
+def fetch(repository: str) -> Path:
+    """The folder of a policy of the Hugging Face Hub, downloaded first where its cache lacks it.
+
+    Raises:
+      PolicyError: no such repository, or it cannot be reached.
+    """
+    import huggingface_hub  # takes a second; only policies of the hub need it
+
+    try:
+        return Path(huggingface_hub.snapshot_download(repository))
+    except (OSError, ValueError) as error:  # its errors, those of the network among them, are these
+        raise PolicyError(f"policy is {HUB}{repository}: cannot be fetched ({error}); correct the name") from error
+
+
+def push(saved: SavedPolicy, repository: str, *, precision: Precision = "float32", card: str = "") -> str:
+    """Publish a policy in a repository of the Hugging Face Hub, made where there is none; its address.
+
+    Args:
+      saved, precision, card: as in `save_policy`.
+      repository: `USER/NAME`; the user must be logged in (`hf auth login`).
+
+    Raises:
+      PolicyError: it cannot be reached, or not be written to.
+    """
+    import huggingface_hub
+
+    with tempfile.TemporaryDirectory() as home:
+        folder = Path(home) / "policy"
+        save_policy(folder, saved, precision=precision, card=card)
+        try:
+            huggingface_hub.create_repo(repository, exist_ok=True)
+            return str(huggingface_hub.upload_folder(repo_id=repository, folder_path=folder))
+        except (OSError, ValueError) as error:
+            raise PolicyError(f"{HUB}{repository} cannot be written ({error}): log in by `hf auth login`") from error
+
+
+def compared(question: str, asked: AskedAttribute, one: TouchAnswer, two: TouchAnswer) -> ComparedTouches:
+    """The comparison of two answers, each with probabilities of ordered levels; see `AskablePolicy.compare`."""
+    joint = np.outer([*one.probabilities.values()], [*two.probabilities.values()])
+    more, less = float(np.tril(joint, -1).sum()), float(np.triu(joint, 1).sum())
+    if asked.sign < 0:
+        more, less = less, more
+    both = one.untouched is not None and two.untouched is not None
+    return ComparedTouches(
+        question=question,
+        attribute=asked.name,
+        word="first" if more >= less else "second",
+        probabilities={"first": more, "same level": float(np.trace(joint)), "second": less},
+        first=one,
+        second=two,
+        untouched=compared(question, asked, one.untouched, two.untouched) if both else None,  # type: ignore[arg-type]
+    )
+
+
+def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
+    """The arrays of `TouchBatch` for one touch, without P: pictures resized, absent streams and frames masked.
+
+    Raises:
+      QuestionError: no sensor or an unknown one, arrays of other shapes, or more frames than the policy reads.
+    """
+    model, sensors = saved.model, saved.sensors
+    unknown = sorted(touch.frames.keys() - {*sensors})
+    if unknown or not touch.frames:
+        raise QuestionError(
+            f"frames are of {unknown or 'no sensor'}: the policy reads {', '.join(sensors)}; rename them"
+        )
+    shape = (len(sensors), model.frames)
+    of: dict[str, np.ndarray] = {
+        "frames": np.zeros((*shape, model.image_px, model.image_px, 3), np.uint8),
+        "force_n": np.zeros((*shape, 3), np.float32),
+        "frame_index": np.zeros(shape, np.int32),
+        "frame_mask": np.zeros(shape, bool),
+        "stream_mask": np.array([sensor in touch.frames for sensor in sensors]),
+        "view": np.zeros((model.vision.image_px, model.vision.image_px, 3), np.uint8),
+        "view_mask": np.array(touch.view is not None),
+        "label": np.full(len(saved.policy.language.attributes), -1, np.int32),
+    }
+    for s, sensor in enumerate(sensors):
+        if sensor not in touch.frames:
+            continue
+        frames = np.asarray(touch.frames[sensor])
+        n = len(frames)
+        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3 or not 1 <= n <= model.frames:
+            raise QuestionError(
+                f"frames[{sensor}] are {frames.dtype}{list(frames.shape)}: must be uint8 [F, H, W, 3] with 1 ≤ F ≤ "
+                f"{model.frames}; choose frames that cover the contact, as sensors_io.selection.choose_frames does"
+            )
+        force, index = touch.force_n.get(sensor, np.zeros((n, 3))), touch.index.get(sensor, np.arange(n))
+        if np.shape(force) != (n, 3) or np.shape(index) != (n,):
+            raise QuestionError(
+                f"force_n[{sensor}] and index[{sensor}] are {np.shape(force)} and {np.shape(index)}: must be "
+                f"({n}, 3) and ({n},) for {n} frames; align them"
+            )
+        of["frames"][s, :n] = [_resized(frame, model.image_px) for frame in frames]
+        of["force_n"][s, :n], of["frame_index"][s, :n], of["frame_mask"][s, :n] = force, index, True
+    if touch.view is not None:
+        of["view"] = _resized(np.asarray(touch.view), model.vision.image_px)
+    return of
+
+
+def _resized(image: np.ndarray, px: int) -> np.ndarray:
+    """The whole picture at px × px, as clips of training are made."""
+    if image.shape[:2] == (px, px):
+        return image
+    how: Any = cv2.INTER_AREA if min(image.shape[:2]) >= px else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(image, (px, px), interpolation=how))

@@ -1,0 +1,284 @@
+"""A trained policy as a folder that describes itself, in the layout of model hubs.
+
+DIR/config.json         sizes, language, questions, the frames that it reads, its training, checksums
+DIR/model.safetensors   parameters
+DIR/tokenizer.json      vocabulary, as the `tokenizers` library writes it
+DIR/README.md           model card
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import os
+import shutil
+import types
+import typing
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+
+from touchr1_jax.models.load import TOKENIZER_FILE, WeightsError
+from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
+from touchr1_jax.models.qwen.weights import SINGLE
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, assemble_policy, touch_shapes
+from touchr1_jax.text.language import Language
+from touchr1_jax.text.template import QUESTIONS
+from touchr1_jax.text.tokenizer import word_library, word_tokenizer
+from touchr1_jax.types import Params
+
+FORMAT, VERSION = "touchr1-policy", 1
+CARD = "README.md"
+SCALE = ":step"
+"""Ends the name of the steps of a tensor that is stored in whole numbers."""
+
+CHECKSUM = "checksum"
+"""Field of `config.json`: the SHA-256 of all other fields."""
+
+Precision = Literal["float32", "float16", "int8"]
+"""Type of the stored parameters; `int8` stores a matrix as 127 steps of each output's largest weight."""
+
+
+class PolicyError(WeightsError):
+    """A folder that is no policy which this version can read; the message names it, the problem and the fix."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyInput:
+    """Frames that a policy reads of a recording, and what its training data had besides them.
+
+    Attributes:
+      rejected: names of the quality flags whose frames are left out.
+      choose: rule by which the frames of a sequence are chosen (`sensors_io.selection.choose_frames`).
+      force, view: whether a force was measured, and whether objects had a picture.
+    """
+
+    rejected: tuple[str, ...] = ()
+    choose: str = "auto"
+    force: bool = True
+    view: bool = True
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SavedPolicy:
+    """A trained policy and what must be known to ask it about new data; `notes` say in JSON where it comes from."""
+
+    policy: TouchPolicy
+    params: Params
+    reads: PolicyInput
+    notes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    questions: Mapping[str, str] = dataclasses.field(default_factory=lambda: QUESTIONS)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the streams, in order."""
+        return tuple(sensor.name for sensor in self.policy.language.sensors)
+
+    @property
+    def model(self) -> ModelConfig:
+        """Sizes."""
+        assert isinstance(self.policy.model, ModelConfig)
+        return self.policy.model
+
+
+def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "float32", card: str = "") -> None:
+    """Publish a policy as a folder in one move; a policy that is there already is replaced.
+
+    Args:
+      folder: where.
+      saved: the policy.
+      precision: of the parameters on disk.
+      card: the model card; by default a table of `notes`.
+
+    Raises:
+      PolicyError: the folder exists and holds something else.
+    """
+    if folder.exists() and _format(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
+        raise PolicyError(f"folder is {folder}: it exists and is no policy; choose a new one")
+    unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    try:
+        write_file(unfinished / SINGLE, _stored(saved.params, precision))
+        words = [piece.decode().strip() for piece in saved.policy.tokenizer.pieces if piece]
+        word_library(words).save(str(unfinished / TOKENIZER_FILE))
+        (unfinished / CARD).write_text(card or default_card(saved, precision), encoding="utf-8")
+        config = json.dumps(_config(saved, precision, unfinished), indent=2, ensure_ascii=False)
+        (unfinished / CONFIG_FILE).write_text(config + "\n", encoding="utf-8")
+        if folder.exists():
+            folder.rename(old)
+        unfinished.rename(folder)
+    finally:
+        for rest in (unfinished, old):
+            shutil.rmtree(rest, ignore_errors=True)
+
+
+def read_policy(folder: Path) -> SavedPolicy:
+    """The policy of a folder that `save_policy` wrote.
+
+    Raises:
+      PolicyError: no such folder, a folder of something else, of a newer version, or damaged.
+    """
+    config = _read_config(folder)
+    for name, digest in config["files"].items():
+        if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != digest:
+            raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+    try:
+        model, language = _rebuilt(ModelConfig, config["model"]), _rebuilt(Language, config["language"])
+        reads, questions = _rebuilt(PolicyInput, config["input"]), dict(config["questions"])
+        vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
+        words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
+        policy = assemble_policy(model, language, word_tokenizer(words), questions)
+        wanted = jax.eval_shape(
+            functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, config["sensors"])
+        )
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise PolicyError(
+            f"policy is {folder}: its config does not fit this version ({error}); save it anew"
+        ) from error
+    params = _read_params(folder)
+    shapes = {name: x.shape for name, x in traverse_util.flatten_dict(wanted, sep=".").items()}
+    odd = sorted(n for n in shapes.keys() | params.keys() if n not in params or shapes.get(n) != params[n].shape)
+    if odd:
+        raise PolicyError(
+            f"policy is {folder}: parameters differ from this version's model in {', '.join(odd[:5])}; save it anew"
+        )
+    tree = traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in params.items()}, sep=".")
+    return SavedPolicy(policy=policy, params=tree, reads=reads, notes=config["notes"], questions=questions)
+
+
+def default_card(saved: SavedPolicy, precision: Precision) -> str:
+    """A model card of the policy's sizes, inputs and notes."""
+    size = sum(x.size for x in jax.tree.leaves(saved.params))
+    rows: dict[str, object] = {
+        "parameters": f"{size:,}, stored as {precision}",
+        "sensors": ", ".join(saved.sensors),
+        "frames of each sensor": f"{saved.model.frames} of {saved.model.image_px} × {saved.model.image_px} pixels",
+        "force, picture of the object in training": f"{_yes(saved.reads.force)}, {_yes(saved.reads.view)}",
+        "questions": ", ".join(f"{q}? ({', '.join(words(saved, a))})" for a, q in saved.questions.items()),
+        **{name: value for name, value in saved.notes.items() if not isinstance(value, Mapping)},
+    }
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    return (
+        "---\nlibrary_name: touchr1-jax\nlicense: apache-2.0\ntags: [tactile, reinforcement-learning, jax]\n---\n\n"
+        f"# {saved.notes.get('name', 'A policy of touch')}\n\n| | |\n|---|---|\n{table}\n\n"
+        'Use: `touchr1_jax.load_policy("FOLDER").ask({"SENSOR": frames}, "How hard is it?")`, or\n'
+        '`python -m experiments ask FOLDER INPUT --question "How hard is it?"`.\n'
+    )
+
+
+def words(saved: SavedPolicy, attribute: str) -> list[str]:
+    """The word for each level of an attribute."""
+    language = saved.policy.language
+    return [level[0] for level in language.attributes[language.attribute_index(attribute)].levels]
+
+
+def _yes(value: bool) -> str:
+    return "yes" if value else "no"
+
+
+def _config(saved: SavedPolicy, precision: Precision, folder: Path) -> dict[str, Any]:
+    """Contents of `config.json`, with the checksums of the files that are in the folder."""
+    fields: dict[str, Any] = {
+        "model_type": FORMAT,
+        "version": VERSION,
+        "precision": precision,
+        "sensors": saved.sensors,
+        "model": dataclasses.asdict(saved.model),
+        "language": dataclasses.asdict(saved.policy.language),
+        "questions": {a.name: saved.questions[a.name] for a in saved.policy.language.attributes},
+        "input": dataclasses.asdict(saved.reads),
+        "notes": dict(saved.notes),
+        "files": {name: _sha256((folder / name).read_bytes()) for name in (SINGLE, TOKENIZER_FILE)},
+    }
+    return fields | {CHECKSUM: _digest(fields)}
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    """Contents of `config.json`, held against their checksum."""
+    where = f"policy is {folder}"
+    if not (folder / CONFIG_FILE).is_file():
+        what = f"holds no {CONFIG_FILE}" if folder.is_dir() else "no such folder"
+        raise PolicyError(f"{where}: {what}; give a folder that `save_policy` or `python -m experiments export` wrote")
+    try:
+        found = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+        kind, version = found.get("model_type"), found.get("version")
+    except (ValueError, AttributeError) as error:
+        raise PolicyError(f"{where}: {CONFIG_FILE} is damaged ({error}); copy the folder again") from error
+    if kind != FORMAT:
+        raise PolicyError(
+            f"{where}: model_type in {CONFIG_FILE} is {kind!r}: must be {FORMAT!r}; a released Qwen2.5-VL is read by "
+            "`experiments touch_r1 --weights`"
+        )
+    if version != VERSION:
+        raise PolicyError(f"{where}: version is {version}: this code reads {VERSION}; update touchr1-jax")
+    if found.pop(CHECKSUM, None) != _digest(found):
+        raise PolicyError(f"{where}: {CONFIG_FILE} was changed after it was written; copy the folder again")
+    return found
+
+
+def _format(folder: Path) -> str | None:
+    """The `model_type` of a folder, if it has one."""
+    try:
+        return json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["model_type"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+
+
+def _stored(params: Params, precision: Precision) -> dict[str, np.ndarray]:
+    """Tensors as they are written, by dotted names."""
+    flat = {name: np.asarray(x, np.float32) for name, x in traverse_util.flatten_dict(params, sep=".").items()}
+    if precision != "int8":
+        return {name: x.astype(precision) for name, x in flat.items()}
+    stored: dict[str, np.ndarray] = {}
+    for name, x in flat.items():
+        if x.ndim < 2:
+            stored[name] = x
+            continue
+        scale = np.maximum(np.abs(x).max(tuple(range(x.ndim - 1))), np.finfo(np.float32).tiny) / 127
+        stored[name], stored[name + SCALE] = np.rint(x / scale).astype(np.int8), scale
+    return stored
+
+
+def _read_params(folder: Path) -> dict[str, np.ndarray]:
+    """Parameters in float32, by dotted names."""
+    try:
+        found = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
+    except (ValueError, LookupError) as error:
+        raise PolicyError(f"policy is {folder}: {error}") from error
+    params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
+    return {name: x * found[name + SCALE] if name + SCALE in found else x for name, x in params.items()}
+
+
+def _rebuilt(kind: Any, value: Any) -> Any:
+    """A value of a type, which may be a dataclass, a tuple of types or a plain value, from its JSON form.
+
+    Raises:
+      ValueError, TypeError: fields that the type lacks, or that it has and the value lacks.
+    """
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind)
+        names = {field.name for field in dataclasses.fields(kind)}
+        if names != value.keys():
+            raise ValueError(f"{getattr(kind, '__name__', kind)} differs in {sorted(names ^ value.keys())}")
+        return kind(**{name: _rebuilt(hints[name], value[name]) for name in names})  # type: ignore[operator]
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)
+        each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
+        return tuple(_rebuilt(of, item) for of, item in zip(each, value, strict=True))
+    plain = typing.get_origin(kind) in (None, Literal, typing.Union, types.UnionType)
+    return value if plain else list(value)
+
+
+def _digest(fields: Mapping[str, Any]) -> str:
+    return _sha256(json.dumps(fields, sort_keys=True).encode())
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
