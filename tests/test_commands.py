@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 import tyro
 
+from experiments.ask.command import AskingCommand
 from experiments.bench.__main__ import Command as Bench
-from experiments.core.commands import COMMANDS, Command, find
+from experiments.core.commands import ASKING, COMMANDS, Command, find
 from experiments.core.runner import parse
 from sensors_io.__main__ import read as sensors_command
 from touchr1_jax.models.load import Load
@@ -65,7 +66,8 @@ def read(module: str, arguments: str) -> None:
         parse(importlib.import_module(EXPERIMENTS[words[0]].module).EXPERIMENT, words[1:], "")
     elif module == "experiments" and words[0] not in {"NAME", *WRITTEN_BY_TUTORIAL}:
         assert words[0] in COMMANDS, f"there is no experiment {words[0]!r}"
-        tyro.cli(Command, args=words, config=(tyro.conf.OmitArgPrefixes,))
+        kind: object = AskingCommand if words[0] in ASKING else Command
+        tyro.cli(kind, args=words, config=(tyro.conf.OmitArgPrefixes,))
     elif module == "touchr1_jax.models.load":
         tyro.cli(Load, args=words)
     elif module in ("experiments.bench", "touchr1_jax.rewards"):

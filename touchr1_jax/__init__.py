@@ -7,7 +7,7 @@ _ASKING = ("load_policy", "TouchInput")
 
 
 def __getattr__(name: str) -> Any:
-    """What asks a trained policy, imported when it is first used: no module of the package needs it."""
+    """The names of `asking`, imported when they are first used: no module of the package needs them."""
     if name not in _ASKING:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.asking"), name)

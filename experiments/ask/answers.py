@@ -1,4 +1,4 @@
-"""What a policy says of its inputs: answers with the truth, for the terminal, for programs, for the page."""
+"""Answers of a policy about its inputs, with the truth: for the terminal, for programs, for the page."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence

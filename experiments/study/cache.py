@@ -26,6 +26,7 @@ from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
 
 NEVER = (
+    "experiments/study/policies.py",
     "touchr1_jax/asking.py",
     "touchr1_jax/bench/",
     "touchr1_jax/distributed/",

@@ -24,6 +24,7 @@ from experiments.paper import (
     scaling,
 )
 from experiments.paper.components import BASE, COMPONENTS
+from experiments.study.policies import find_policy
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.bench.questions.draw import Quota
@@ -82,6 +83,13 @@ def test_results_hold_every_arm_and_baseline(directory):
     assert [column["name"] for column in sampled["columns"]] == ["policy", "greedy", "pass@1", "pass@2", "maj@2", "ECE"]
     assert [row[0] for row in sampled["rows"]] == [*ARMS, "tactile_blind"]
     assert (directory / "plots" / "calibration.svg").exists()
+
+
+def test_every_policy_of_every_seed_is_saved_and_found(directory, home):
+    saved = {str(path.relative_to(directory / "policies")) for path in (directory / "policies").glob("*/*")}
+    assert saved == {f"{name}/{seed}" for name in ARMS for seed in (0, 1)}
+    found = find_policy("ablation_ordinal/latest/ordinal/1", home)
+    assert found.saved.notes["name"] == "ablation_ordinal, ordinal, seed 1"
 
 
 def test_comparisons_pair_arms_by_seed_and_baselines_by_object(directory):

@@ -1,0 +1,206 @@
+"""Asking a tiny policy: the same answers as a study gives, from every kind of input, in words, JSON and on a page."""
+
+import dataclasses
+import json
+import re
+import sys
+import types
+
+import cv2
+import numpy as np
+import pytest
+
+from experiments.ask.answers import ask_policy
+from experiments.ask.command import run_asking
+from experiments.ask.inputs import read_touch
+from experiments.core.errors import DataError
+from experiments.study.policies import find_policy, publish_policy
+from experiments.study.stages import encode_rows
+from sensors_io.schema import SENSORS
+from tests.experiments import tiny
+from tests.sensors_io.importers.films import film
+from touchr1_jax.asking import TouchAnswer, TouchInput, compared, load_policy
+from touchr1_jax.models.saved_policy import PolicyError
+from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError
+from touchr1_jax.training.evaluation import evaluate_policy
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory, policy, params, data):
+    """A run `trial/latest` with a policy of SFT."""
+    run = tmp_path_factory.mktemp("runs") / "trial" / "latest"
+    run.mkdir(parents=True)
+    (run / "config.json").write_text(json.dumps({"experiment": "trial"}))
+    context = types.SimpleNamespace(directory=run, processes=types.SimpleNamespace(write_once=lambda write: write()))
+    publish_policy(policy, params, data, "sft", 0, context)
+    return run.parents[1]
+
+
+@pytest.fixture(scope="module")
+def asked(runs):
+    return find_policy(str(runs / "trial"), runs)
+
+
+def ask(runs, *words):
+    return run_asking(["ask", *map(str, words), "--runs-dir", str(runs), "--cache-dir", str(runs / "cache")])
+
+
+def test_the_answers_are_those_of_a_study(asked, policy, params, data, records, context):
+    rows = data.parts["test"][:2]
+    features = encode_rows(policy, params, data, rows, context)
+    study = evaluate_policy(policy, params, features, data.label[rows], alone=False)
+    none = dataclasses.replace(features, stream_mask=np.zeros_like(features.stream_mask))
+    blind = evaluate_policy(policy, params, none, data.label[rows], alone=False)
+    touches = [read_touch(f"{records}:{i}", asked.saved) for i in rows]
+    answers = asked.answers([touch.touch for touch in touches])
+    for n, (contact, attribute) in enumerate(zip(study.contact, study.attribute, strict=True)):
+        name = policy.language.attributes[attribute].name
+        answer = answers[contact][name]
+        assert answer.trace == policy.tokenizer.decode(study.tokens[n]).strip()
+        assert answer.untouched.trace == policy.tokenizer.decode(blind.tokens[n]).strip()
+        assert sum(answer.probabilities.values()) == pytest.approx(1)
+        levels = [level[0] for level in policy.language.attributes[attribute].levels]
+        assert list(answer.probabilities) == levels
+        assert touches[contact].truth[name] == levels[data.label[rows][contact, attribute]]
+    assert touches[0].remarks == ()
+
+
+def answer(*p: float) -> TouchAnswer:
+    words = dict(zip(("soft", "firm", "hard"), p, strict=True))
+    return TouchAnswer(question="how hard is it?", attribute="hardness", word="", trace="", probabilities=words)
+
+
+@pytest.mark.parametrize(("sign", "word", "first"), [(1, "first", 0.2 * 0.2 + 0.8 * 0.6), (-1, "second", 0.2 * 0.4)])
+def test_comparisons_follow_from_the_levels(sign, word, first):
+    """The first is harder if firm against soft, or hard against soft or firm; softer if firm against hard."""
+    one, two = answer(0.0, 0.2, 0.8), answer(0.2, 0.4, 0.4)
+    found = compared("?", AskedAttribute(name="hardness", sign=sign, compares=True), one, two)
+    assert found.probabilities["first"] == pytest.approx(first)
+    assert found.probabilities["same level"] == pytest.approx(0.2 * 0.4 + 0.8 * 0.4)
+    assert sum(found.probabilities.values()) == pytest.approx(1)
+    assert found.word == word
+
+
+def test_plain_arrays_are_enough_and_misfits_are_named(asked):
+    rng = np.random.default_rng(0)
+    frames = {"tac3d": rng.integers(0, 255, (3, 40, 60, 3), dtype=np.uint8)}
+    same = asked.ask(TouchInput(frames=frames, force_n={"tac3d": np.zeros((3, 3))}), "How hard is it?")
+    assert asked.ask(frames, "Is it soft?") == same
+    assert asked.probabilities(frames)["hardness"] == same.probabilities
+    with pytest.raises(QuestionError, match="it compares two objects; give two touches"):
+        asked.ask(frames, "Which is harder?")
+    with pytest.raises(QuestionError, match="levels of material have no order"):
+        asked.compare(frames, frames, "Which material?")
+    for wrong, message in (
+        ({"digit": frames["tac3d"]}, r"frames are of \['digit'\]: the policy reads gelsight_mini"),
+        ({}, "frames are of no sensor"),
+        ({"xense": np.zeros((5, 4, 4, 3), np.uint8)}, r"uint8\[5, 4, 4, 3\]: must be uint8 .* 1 ≤ F ≤ 4"),
+        (TouchInput(frames=frames, force_n={"tac3d": np.zeros((2, 3))}), r"are \(2, 3\) and \(3,\): must be"),
+    ):
+        with pytest.raises(QuestionError, match=message):
+            asked.ask(wrong, "How hard is it?")
+
+
+def test_inputs_are_read_as_training_data_are(asked, tmp_path):
+    for n in range(6):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((24, 32, 3), 40 * n, np.uint8))
+    pictures = read_touch(tmp_path, asked.saved, "xense")
+    video = read_touch(film(tmp_path / "press.avi", frames=6), asked.saved)
+    assert {name: x.shape for name, x in pictures.touch.frames.items()} == {"xense": (4, 28, 28, 3)}
+    assert list(video.touch.frames) == ["gelsight_mini"]
+    assert pictures.touch.index["xense"].tolist() == video.touch.index["gelsight_mini"].tolist()
+    assert [r.partition(";")[0] for r in video.remarks] == [
+        "read as pictures of gelsight_mini",
+        "no force was measured",
+        "there is no picture of the object",
+        "touched by gelsight_mini alone",
+    ]
+    drawn = read_touch("generated:soft,wood", asked.saved)
+    assert (drawn.truth["hardness"], drawn.truth["material"]) == ("soft", "wood")
+    assert list(drawn.touch.frames) == [*SENSORS]
+    number = re.search(r"generated:(\d+)", drawn.name)[1]
+    again = read_touch(f"generated:{number}", asked.saved)
+    assert np.array_equal(again.touch.frames["tac3d"], drawn.touch.frames["tac3d"])
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("generated:squishy", "'squishy' is no property; choose from soft, firm"),
+        ("generated:soft,hard", "an object has one hardness"),
+        ("nowhere.mp4", "no such file; must be a folder of records"),
+        ("RECORDS:99", "must name a contact 0..15 or an object"),
+        ("FILE", "does not open as a video"),
+        ("EMPTY", "holds neither records nor pictures"),
+    ],
+)
+def test_what_is_no_input_is_named(asked, records, tmp_path, source, message):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file.mp4").write_text("no video")
+    for name, path in (("RECORDS", records), ("FILE", tmp_path / "file.mp4"), ("EMPTY", tmp_path / "empty")):
+        source = source.replace(name, str(path))
+    with pytest.raises(DataError, match=message):
+        read_touch(source, asked.saved)
+
+
+def test_the_command_prints_json_and_writes_a_page(runs, records, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    words = [runs / "trial" / "latest" / "sft", f"{records}:0", f"{records}:1", "--question", "Which is softer?"]
+    assert ask(runs, *words, "--json", "--html", page) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["policy"] == "trial, sft, seed 0"
+    assert [touch["answers"][0]["attribute"] for touch in found["touches"]] == ["hardness"] * 2
+    [comparison] = found["comparisons"]
+    assert sum(comparison["probabilities"].values()) == pytest.approx(1)
+    html = page.read_text(encoding="utf-8")
+    assert len(html) < 3e6
+    assert html.count("<img") == html.count("data:image/png;base64,") == 2 * (1 + len(SENSORS))
+    assert "http" not in html
+    assert "Which is softer?" in html
+    assert ask(runs, "trial", records, "--every", "test") == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"hardness +[\d.]+ % \[[\d.]+, [\d.]+\] right of 5, ", printed)
+
+
+def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
+    for words, message in (
+        (("trial/latest/ordinal", "generated"), "has sft/0; name RUN/ARM/SEED"),
+        (("no-such-run", records), "must be a run, RUN/ARM or RUN/ARM/SEED under"),
+        (("trial", records, "--question", "How heavy is it?"), "it names no attribute"),
+        (
+            ("trial", records, "--question", "Which is harder?"),
+            "give two INPUTs, or ask about one, as in 'how hard",
+        ),
+        (("trial",), "must be at most one POLICY and one or two INPUTs"),
+    ):
+        assert ask(runs, *words) == 1
+        error = capsys.readouterr().err
+        assert message in error
+        assert "Traceback" not in error
+
+
+def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked, tmp_path, monkeypatch, capsys):
+    folder, uploaded = tmp_path / "exported", []
+    assert run_asking(["export", "trial/latest/sft/0", str(folder), "--runs-dir", str(runs)]) == 0
+    hub = types.SimpleNamespace(
+        snapshot_download=lambda name: {"me/touch": folder}[name],
+        create_repo=lambda name, exist_ok: None,
+        upload_folder=lambda repo_id, folder_path: uploaded.extend(p.name for p in folder_path.iterdir()) or "address",
+    )
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    frames = {"tac3d": np.zeros((1, 28, 28, 3), np.uint8)}
+    assert load_policy("hub:me/touch").ask(frames, "How hard?") == asked.ask(frames, "How hard?")
+    assert run_asking(["export", str(folder), "hub:me/touch"]) == 0
+    assert "model.safetensors" in uploaded
+    assert "address" in capsys.readouterr().out
+    with pytest.raises(PolicyError, match="no such folder"):
+        load_policy("nowhere")
+
+
+def test_a_comparison_needs_two_touches_in_code_too(asked):
+    with pytest.raises(QuestionError, match="give two INPUTs"):
+        ask_policy(asked, [read_touch("generated:1", asked.saved)], "Which is harder?")
+
+
+def test_tiny_scenes_are_noted(asked):
+    assert asked.saved.notes["scenes"]["image_px"] == tiny.SCENES.image_px

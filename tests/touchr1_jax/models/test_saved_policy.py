@@ -1,0 +1,108 @@
+"""A policy survives its folder; folders of something else, of another version and damaged ones are named."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.faults.trainings.small_study import MODEL
+from tests.touchr1_jax.drawn import draw_params
+from touchr1_jax.asking import load_policy
+from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, read_policy, save_policy
+from touchr1_jax.models.touch_policy import build_policy, touch_shapes
+from touchr1_jax.text.tokenizer import word_tokenizer
+
+SENSORS = ("xense", "gelsight_mini")
+
+
+@pytest.fixture(scope="module")
+def saved():
+    policy = build_policy(MODEL, SENSORS)
+    shapes = jax.eval_shape(lambda b: policy.init(0, b), touch_shapes(MODEL, MODEL.vision.image_px, SENSORS))
+    reads = PolicyInput(rejected=("SATURATED",), choose="force", view=False)
+    return SavedPolicy(policy=policy, params=draw_params(shapes), reads=reads, notes={"name": "tiny", "seed": 3})
+
+
+@pytest.fixture
+def folder(saved, tmp_path):
+    save_policy(tmp_path / "policy", saved)
+    return tmp_path / "policy"
+
+
+def largest_error(saved, found) -> float:
+    errors = jax.tree.map(lambda a, b: float(np.abs(a - b).max() / np.abs(a).max()), saved.params, found.params)
+    return max(jax.tree.leaves(errors))
+
+
+def test_everything_survives(saved, folder):
+    found = read_policy(folder)
+    assert largest_error(saved, found) == 0
+    assert (found.reads, found.notes, found.model) == (saved.reads, saved.notes, saved.model)
+    assert found.sensors == SENSORS
+    assert found.policy.language == saved.policy.language
+    assert found.policy.tokenizer.pieces == saved.policy.tokenizer.pieces
+    assert np.array_equal(found.policy.layout.ids, saved.policy.layout.ids)
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "README.md", "config.json", "model.safetensors", "tokenizer.json"
+    ]  # fmt: skip
+    assert [p.name for p in folder.parent.iterdir()] == ["policy"]
+
+
+@pytest.mark.parametrize(("precision", "bound"), [("float16", 2**-11), ("int8", 1 / 254)])
+def test_rounding_is_at_most_half_a_step_of_the_largest_weight(saved, tmp_path, precision, bound):
+    save_policy(tmp_path / "p", saved, precision=precision)
+    error = largest_error(saved, read_policy(tmp_path / "p"))
+    assert bound / 3 < error <= bound * 1.001
+
+
+def test_questions_and_words_are_those_of_training_whatever_the_code_asks_today(saved, tmp_path):
+    words = [p.decode() for p in saved.policy.tokenizer.pieces if p]
+    older = dataclasses.replace(saved.policy, tokenizer=word_tokenizer([*words[:5], *words[5:][::-1]]))
+    questions = {**saved.questions, "hardness": "which material hard"}
+    save_policy(tmp_path / "p", dataclasses.replace(saved, policy=older, questions=questions))
+    found = read_policy(tmp_path / "p")
+    assert found.policy.tokenizer.pieces == older.tokenizer.pieces
+    asked = found.policy.layout.ids[0][found.policy.layout.mask[0]]
+    assert found.policy.tokenizer.decode(asked).endswith("which material hard")
+
+
+def test_a_policy_is_replaced_and_nothing_else_is(saved, folder):
+    save_policy(folder, dataclasses.replace(saved, notes={"name": "second"}))
+    assert read_policy(folder).notes == {"name": "second"}
+    (folder.parent / "thesis").mkdir()
+    (folder.parent / "thesis" / "text").write_text("x")
+    with pytest.raises(PolicyError, match="exists and is no policy"):
+        save_policy(folder.parent / "thesis", saved)
+    assert (folder.parent / "thesis" / "text").read_text() == "x"
+
+
+def edit(folder, **changes):
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | changes))
+
+
+DAMAGE = {
+    "no such folder": lambda f: f.rename(f.with_name("away")),
+    "holds no config.json": lambda f: (f / "config.json").unlink(),
+    "config.json is damaged": lambda f: (f / "config.json").write_text("{"),
+    "model_type in config.json is 'qwen2_5_vl': must be 'touchr1-policy'": lambda f: edit(f, model_type="qwen2_5_vl"),
+    "version is 2: this code reads 1; update": lambda f: edit(f, version=2),
+    "config.json was changed": lambda f: edit(f, sensors=["tac3d", "xense"]),
+    "tokenizer.json is missing or damaged": lambda f: (f / "tokenizer.json").unlink(),
+    "model.safetensors is missing or damaged": lambda f: flip(f / "model.safetensors"),
+}
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("message", DAMAGE)
+def test_what_is_no_policy_is_named(folder, message):
+    DAMAGE[message](folder)
+    with pytest.raises(PolicyError, match=message):
+        load_policy(folder)
