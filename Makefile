@@ -8,7 +8,7 @@ READY  := $(VENV)/.ready
 
 PYTHONS ?= python3.11 python3.12
 
-.PHONY: help setup experiment test test-slow test-matrix lint format clean
+.PHONY: help setup experiment demo test test-slow test-matrix lint format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -24,6 +24,9 @@ $(READY): pyproject.toml constraints.txt
 
 experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
 	$(BIN)/python -m experiments $(EXP) $(ARGS)
+
+demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the package by default
+	$(BIN)/python -m experiments demo $(ARGS)
 
 test: setup  ## pass the tests (under ten minutes on two cores)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -3,6 +3,8 @@
 import contextlib
 import dataclasses
 import json
+import threading
+import webbrowser
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,6 +13,7 @@ import numpy as np
 import tyro
 
 from experiments.ask.answers import as_json, ask_policy, text_lines
+from experiments.ask.demo import demo_server
 from experiments.ask.inputs import AskedTouch, read_contacts, read_touch
 from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError
@@ -145,12 +148,41 @@ class ExportCommand(Places):
         return 0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DemoCommand(Places):
+    """Open a page in the browser: choose a generated object or drop a video, and see touch, answer and trace.
+
+    POLICY as for `ask`.  The page is served to this machine alone, until Ctrl-C.
+    """
+
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")] = ""
+    port: int = 8766
+    """Port of the page; 0 takes a free one."""
+    open: bool = True
+    """Open the browser, if there is one."""
+
+    def run(self) -> int:
+        """Serve until Ctrl-C and return the exit status."""
+        policy = find_policy(self.policy, self.runs_dir)
+        with demo_server(policy, self.port) as address:
+            print_lines("compiling, about ten seconds")
+            ask_policy(policy, [read_touch("generated:0", policy.saved)])  # the first answer of the page comes at once
+            print_lines(f"{address}, Ctrl-C ends")
+            if self.open:
+                webbrowser.open(address)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
+        return 0
+
+
 def _is_input(name: str) -> bool:
     return name.startswith("generated") or Path(name).exists() or Path(name.rpartition(":")[0] or name).exists()
 
 
 AskingCommand = (
-    Annotated[AskCommand, tyro.conf.subcommand("ask")] | Annotated[ExportCommand, tyro.conf.subcommand("export")]
+    Annotated[AskCommand, tyro.conf.subcommand("ask")]
+    | Annotated[ExportCommand, tyro.conf.subcommand("export")]
+    | Annotated[DemoCommand, tyro.conf.subcommand("demo")]
 )
 
 

@@ -100,7 +100,7 @@ def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
         name, level = known[word]
         if wanted.setdefault(name, level) != level:
             raise DataError(f"input is {GENERATED}:{which}: an object has one {name}; drop a word")
-    first = int(which) if which.isdigit() else int(np.random.default_rng().integers(10_000)) if not which else 0
+    first = int(which) if which.isdigit() else int(np.random.default_rng().integers(UNSEEN_SEED))
     for number in itertools.islice(itertools.count(first), MOST_DRAWN):
         scene = dataclasses.replace(config, seed=UNSEEN_SEED + number)
         if wanted.items() <= solid_of(scene, 0).labels().items():

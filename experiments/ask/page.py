@@ -7,14 +7,16 @@ from experiments.core.artifacts import write_text
 from experiments.core.report import ENVIRONMENT
 from experiments.study.examples import marked
 
-TEMPLATE = "ask.jinja"
-
 
 def write_page(path: Path, found: AskedPolicy) -> None:
-    """Write the page."""
-    write_text(path, page(found))
+    """Write the page, whole or not at all."""
+    write_text(path, _filled("ask.jinja", found))
 
 
-def page(found: AskedPolicy) -> str:
-    """The page as HTML."""
-    return ENVIRONMENT.get_template(TEMPLATE).render(found=found, verdict=verdict, marked=marked)
+def answered_part(found: AskedPolicy) -> str:
+    """The answers as a part of a page."""
+    return _filled("answered.jinja", found)
+
+
+def _filled(template: str, found: AskedPolicy) -> str:
+    return ENVIRONMENT.get_template(template).render(found=found, verdict=verdict, marked=marked)

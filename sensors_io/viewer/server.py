@@ -96,7 +96,7 @@ class LiveView:
 
     def __init__(self, *, port: int = 8765, host: str = "127.0.0.1"):
         self._wanted = (host, port)
-        self._token = "" if _loopback(host) else secrets.token_urlsafe(16)
+        self._token = "" if is_loopback(host) else secrets.token_urlsafe(16)
         self._changed = threading.Condition()
         self._shown = PublishedState(0, {}, Numbers(title="touch", time_s=0.0, force_n=None, tables={}))
         self._version = 0
@@ -114,7 +114,7 @@ class LiveView:
         """True if a request may be answered: it names this machine, so that no other page can ask, or has the token."""
         if self._token:
             return secrets.compare_digest(token.encode(), self._token.encode())
-        return _loopback(urllib.parse.urlsplit(f"//{host}").hostname or "")
+        return names_this_machine(host)
 
     def publish(self, panels: Mapping[str, Panel], numbers: Numbers) -> None:
         """Show these panels and numbers from now on; returns at once, and nothing is drawn that nobody watches."""
@@ -138,7 +138,7 @@ class LiveView:
 
     def __enter__(self) -> Self:
         handler = type("Handler", (_Handler,), {"live": self})
-        self._server = _Server(self._wanted, handler)
+        self._server = LimitedServer(self._wanted, handler)
         self._server.daemon_threads = True  # a watcher may be asleep on a dead connection
         self._thread = threading.Thread(target=self._server.serve_forever, name="live-view", daemon=True)
         self._thread.start()
@@ -157,7 +157,7 @@ class LiveView:
         self._server.server_close()
 
 
-class _Server(http.server.ThreadingHTTPServer):
+class LimitedServer(http.server.ThreadingHTTPServer):
     """A thread for each connection, of which there are so many at most."""
 
     request_queue_size = _CONNECTIONS
@@ -248,7 +248,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             self.wfile.flush()
 
 
-def _loopback(host: str) -> bool:
+def names_this_machine(host: str) -> bool:
+    """True if the `Host` of a request names this machine, so that no page of another name can ask through a browser."""
+    return is_loopback(urllib.parse.urlsplit(f"//{host}").hostname or "")
+
+
+def is_loopback(host: str) -> bool:
     """True of the names and addresses by which a machine reaches itself alone."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback

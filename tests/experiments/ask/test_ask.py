@@ -5,6 +5,8 @@ import json
 import re
 import sys
 import types
+import urllib.error
+import urllib.request
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 
 from experiments.ask.answers import ask_policy
 from experiments.ask.command import run_asking
+from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
 from experiments.study.policies import find_policy, publish_policy
@@ -195,6 +198,46 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
     assert "address" in capsys.readouterr().out
     with pytest.raises(PolicyError, match="no such folder"):
         load_policy("nowhere")
+
+
+@pytest.fixture(scope="module")
+def address(asked):
+    with demo_server(asked, 0) as address:
+        yield address
+
+
+def fetch(address, path="", body=None, **headers):
+    request = urllib.request.Request(address + path, data=body, headers=headers)
+    try:
+        with urllib.request.urlopen(request) as reply:
+            return reply.status, reply.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_the_demo_answers_about_objects_and_videos(address, tmp_path):
+    status, page = fetch(address)
+    assert status == 200
+    assert "trial, sft, seed 0" in page
+    assert "<option>protruding</option>" in page
+    status, answers = fetch(address, "generated?words=soft,smooth")
+    assert status == 200
+    assert "<b>soft</b> (true)" in answers
+    video = film(tmp_path / "press.avi").read_bytes()
+    status, answers = fetch(address, "video?name=press.avi&sensor=xense", video, Origin=address.rstrip("/"))
+    assert status == 200
+    assert answers.count("<img") == 1
+    assert fetch(address, "video?name=press.avi&sensor=xense", b"no video")[0] == 400
+    assert "no property" in fetch(address, "generated?words=squishy")[1]
+    assert fetch(address, "records")[0] == 404
+
+
+def test_the_demo_is_closed_to_other_pages_and_files(address, records):
+    assert fetch(address, Host="evil.example:80")[0] == 403
+    assert fetch(address, "video?name=a.avi", b"x", Origin="http://evil.example")[0] == 403
+    assert fetch(address, f"generated?words={records}")[0] == 400
+    assert fetch(address, "video?name=a.avi", b"", **{"Content-Length": str(2**40)})[0] == 413
 
 
 def test_a_comparison_needs_two_touches_in_code_too(asked):

@@ -1,0 +1,131 @@
+"""A page in the browser where one touches an object, or drops a video, and sees what a policy answers."""
+
+import contextlib
+import http.server
+import tempfile
+import threading
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+from experiments.ask.answers import ask_policy
+from experiments.ask.inputs import GENERATED, read_touch
+from experiments.ask.page import answered_part
+from experiments.core.report import ENVIRONMENT
+from sensors_io.errors import UserError
+from sensors_io.viewer.server import LimitedServer, names_this_machine
+from touchr1_jax.asking import AskablePolicy
+from touchr1_jax.text.plain_questions import QuestionError
+
+MOST_BYTES = 200 * 2**20
+"""Size of a video that is taken."""
+
+SILENT_S = 30.0
+"""A connection that sends nothing for so long is closed."""
+
+
+class Demo:
+    """A policy and the questions that the page asks of it, one at a time."""
+
+    def __init__(self, policy: AskablePolicy) -> None:
+        self.policy = policy
+        self._lock = threading.Lock()
+
+    def page(self) -> str:
+        """The page before anything was asked."""
+        saved = self.policy.saved
+        values = {"attributes": self.policy.attributes, "sensors": saved.sensors}
+        return ENVIRONMENT.get_template("demo.jinja").render(policy=saved.notes.get("name", self.policy.name), **values)
+
+    def answer(self, source: str | Path, sensor: str = "") -> str:
+        """All answers about an input as a part of the page.
+
+        Raises:
+          DataError, QuestionError: an input that cannot be read.
+        """
+        with self._lock:
+            return answered_part(ask_policy(self.policy, [read_touch(source, self.policy.saved, sensor)]))
+
+
+class DemoHandler(http.server.BaseHTTPRequestHandler):
+    """Requests of the page; others are refused, as are those of other pages."""
+
+    demo: ClassVar[Demo]
+    timeout = SILENT_S
+
+    def do_GET(self) -> None:
+        """The page, or the answers about a generated object."""
+        split = urllib.parse.urlsplit(self.path)
+        words = urllib.parse.parse_qs(split.query).get("words", [""])[0]
+        if not self._admitted():
+            return
+        if split.path == "/":
+            self._reply(self.demo.page())
+        elif split.path == "/generated":
+            self._answer(f"{GENERATED}:{words}")
+        else:
+            self.send_error(404)
+
+    def do_POST(self) -> None:
+        """The answers about a video, which is the body of the request."""
+        split = urllib.parse.urlsplit(self.path)
+        asked = {name: values[0] for name, values in urllib.parse.parse_qs(split.query).items()}
+        if not self._admitted():
+            return
+        length = self.headers.get("Content-Length", "")
+        if split.path != "/video" or not length.isdigit() or int(length) > MOST_BYTES:
+            self.close_connection = True
+            self._reply(f"a video of at most {MOST_BYTES // 2**20} MB is expected", status=413)
+            return
+        with tempfile.TemporaryDirectory() as home:
+            path = Path(home) / f"video{Path(asked.get('name', '')).suffix[:8]}"
+            path.write_bytes(self.rfile.read(int(length)))
+            self._answer(path, asked.get("sensor", ""))
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Keep the terminal free."""
+
+    def _admitted(self) -> bool:
+        """True for requests of this page: its host is this machine, and so is the origin of what is sent."""
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        if names_this_machine(host) and origin in (None, f"http://{host}"):
+            return True
+        self.send_error(403, "open the address that the program printed")
+        return False
+
+    def _answer(self, source: str | Path, sensor: str = "") -> None:
+        try:
+            self._reply(self.demo.answer(source, sensor))
+        except (UserError, QuestionError) as error:
+            self._reply(str(error), status=400)
+
+    def _reply(self, text: str, status: int = 200) -> None:
+        content = text.encode()
+        self.send_response(status)
+        self.send_header("Content-Type", f"text/{'html' if status == 200 else 'plain'}; charset=utf-8")
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the browser was closed
+            self.wfile.write(content)
+
+
+@contextlib.contextmanager
+def demo_server(policy: AskablePolicy, port: int) -> Iterator[str]:
+    """Serve the page on this machine alone, inside the block; its address.
+
+    Raises:
+      OSError: the port is taken.
+    """
+    handler = type("Handler", (DemoHandler,), {"demo": Demo(policy)})
+    server = LimitedServer(("127.0.0.1", port), handler)
+    server.daemon_threads = True
+    thread = threading.Thread(target=server.serve_forever, name="demo", daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
