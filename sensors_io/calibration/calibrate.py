@@ -6,7 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from sensors_io.calibration.circles import Circles, find_circles
-from sensors_io.calibration.fit import ColourMapSettings, fit_map
+from sensors_io.calibration.coverage import coverage
+from sensors_io.calibration.fit import ColourMapSettings, prepare, solve_map
 from sensors_io.calibration.presses import BallPresses, Touches
 from sensors_io.calibration.validate import BallErrors, cross_validate
 from sensors_io.fields.contact import ContactConfig, steepest_change
@@ -19,7 +20,7 @@ class CalibrateConfig:
 
     Args:
       least_presses: that remain after bad ones are left out.
-      folds: of the held-out errors, by press.
+      folds, repeats: of the held-out errors, by press; the presses are divided anew in each repeat.
       most_misfit: share of a press's change that a ball may leave unexplained.
       most_saturated: share of the contact's pixels with a channel at 255.
       most_drift: grey levels that a picture may differ from the background by its median, which contact hardly moves.
@@ -27,10 +28,14 @@ class CalibrateConfig:
         mm, and of 14 to 30 mm a pitch that is wrong by a factor of 3 makes too little or too much.
       contact_radii: between which the median contact radius must lie, in ball radii.
       most_depth_um, most_radius: held-out errors beyond which nothing was learnt.
+      sure_radius, sure_bias: held-out error of the radius and its part that all presses share, beyond which a warning
+        says that the map will not transfer to other objects.
+      sure_cover: share of the window that presses must cover, below which a warning says where to press.
     """
 
     least_presses: int = 8
     folds: int = 5
+    repeats: int = 6
     most_misfit: float = 0.7
     most_saturated: float = 0.5
     most_drift: float = 40.0
@@ -38,6 +43,9 @@ class CalibrateConfig:
     contact_radii: tuple[float, float] = (0.15, 0.95)
     most_depth_um: float = 60.0
     most_radius: float = 0.25
+    sure_radius: float = 0.05
+    sure_bias: float = 0.04
+    sure_cover: float = 0.8
     seed: int = 0
 
 
@@ -51,7 +59,10 @@ class UnusedPress:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """Origin of a calibration: presses used and left out, their contacts, chosen settings, errors on unseen presses."""
+    """Origin of a calibration: presses used and left out, their contacts, chosen settings, errors on unseen presses.
+
+    `warnings` say why the map may not transfer to other objects or places, and what to do.
+    """
 
     kept: tuple[str, ...]
     left_out: tuple[UnusedPress, ...]
@@ -59,6 +70,7 @@ class CalibrationReport:
     misfit: np.ndarray
     choice: ColourMapSettings
     errors: BallErrors
+    warnings: tuple[str, ...] = ()
 
 
 def calibrate(
@@ -69,6 +81,8 @@ def calibrate(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Calibration, CalibrationReport]:
     """Find circles, leave bad presses out, fit the map, measure it on held-out presses.
+
+    The result is the same, bit by bit, whatever the order of the presses.
 
     Args:
       presses: the pictures.
@@ -90,19 +104,28 @@ def calibrate(
         circles = find_circles(presses.chosen(remaining))
     kept = presses.chosen(remaining)
     _check_size(kept, circles.touches, config)
-    colours, touches, choice = fit_map(kept, circles.touches, seed=config.seed, folds=config.folds)
-    fits = 1 + config.folds
+    equations = prepare(kept, circles.touches, seed=config.seed, folds=config.folds)
+    colours, choice = solve_map(equations.grams, seed=config.seed, folds=config.folds)
+    fits = 1 + config.folds * config.repeats
     progress(1, fits)
-    told = lambda done: progress(1 + done, fits)
-    errors = cross_validate(kept, sensor, folds=config.folds, seed=config.seed, progress=told)
+    errors = cross_validate(
+        kept,
+        sensor,
+        folds=config.folds,
+        repeats=config.repeats,
+        seed=config.seed,
+        equations=equations,
+        progress=lambda done: progress(1 + done, fits),
+    )
     _check_errors(errors, config)
     report = CalibrationReport(
         kept=tuple(names[i] for i in remaining),
         left_out=tuple(UnusedPress(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
-        touches=touches,
+        touches=Touches.of(equations.touches.stacked()[np.argsort(kept.canonical_order())]),
         misfit=circles.misfit,
         choice=choice,
         errors=errors,
+        warnings=_warnings(errors, equations.touches, kept.shape, config),
     )
     made_from = {"ball_diameter_mm": 2 * presses.radius_mm, **{f"held-out {k}": v for k, v in errors.figures().items()}}
     made = Calibration(
@@ -184,6 +207,30 @@ def _check_size(presses: BallPresses, touches: Touches, config: CalibrateConfig)
             f"contact radius is {share:.2f} ball radii (median): must lie in [{low}, {high}]; "
             f"check --ball-diameter-mm ({2 * presses.radius_mm:g}) and --mm-per-px ({presses.mm_per_px:g})"
         )
+
+
+def _warnings(errors: BallErrors, touches: Touches, shape: tuple[int, int], config: CalibrateConfig) -> tuple[str, ...]:
+    """Why the map may not transfer, and what to do about it."""
+    figures, said = errors.figures(), []
+    radius, bias = (figures[f"radius error {name}, %"] / 100 for name in ("median", "of the median"))
+    if radius > config.sure_radius:
+        said.append(
+            f"the map will not transfer: unseen presses have a radius error of {radius:.1%}, must be "
+            f"≤ {config.sure_radius:.1%}; press more often, all over the window, with contacts of several sizes"
+        )
+    if abs(bias) > config.sure_bias:
+        said.append(
+            f"slopes are {'steep' if bias < 0 else 'flat'}: unseen balls come out {abs(bias):.1%} too "
+            f"{'small' if bias < 0 else 'large'}, must be ≤ {config.sure_bias:.1%}; check the ball's diameter, and "
+            "that camera, lamps and background are those of the presses"
+        )
+    seen = coverage(touches, shape)
+    if seen.share < config.sure_cover:
+        said.append(
+            f"presses cover {seen.share:.0%} of the window, must be ≥ {config.sure_cover:.0%}: the map is extrapolated "
+            f"in {seen.where()}; press there, at about ({seen.next_px[0]:.0f}, {seen.next_px[1]:.0f}) px"
+        )
+    return tuple(said)
 
 
 def _check_errors(errors: BallErrors, config: CalibrateConfig) -> None:

@@ -1,7 +1,7 @@
 """The contact circles of ball presses, found by how well a ball explains the colours.
 
-A press is three numbers, the *touch*: centre and contact radius.  Given touches, slopes and depth follow
-(`indentation`) and the change of channel c at the position (x, y) is linear in unknown constants,
+A press is three numbers, the *touch*: centre and contact radius.  Given touches, normals and depth follow (`imprint`)
+and the change of channel c at the position (x, y) is linear in unknown constants,
 
     ΔI_c = Σ_k S_ck(x, y) φ_k + D_c(x, y) u,   φ = (n_x, n_y, n_x², n_x n_y, n_y²),
 
@@ -11,12 +11,14 @@ degree of S rises.  No pixel is labelled and no brightness is thresholded: the c
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import cv2
 import numpy as np
-from scipy import fft, optimize
+from scipy import fft
 
-from sensors_io.calibration.presses import BallPresses, Touches, indentation, shrink
+from sensors_io.calibration.imprint import BLUR_MM, CONTACTS, Imprint
+from sensors_io.calibration.presses import BallPresses, Touches, shrink
 from sensors_io.fields.slopes import legendre
 
 SCHEDULE = (1, 1, 2, 2, 3, 3)
@@ -27,9 +29,6 @@ DEPTH_DEGREE = 1
 STARTS = (0.5, 0.8)
 """Contact radii, in ball radii, from which the rounds begin; the better end is kept."""
 
-CONTACTS = (0.12, 0.97)
-"""Contact radii considered, in ball radii."""
-
 REACH = 1.6
 """Contact radii from the centre, up to which a press is fitted; farther out a layer sinks less than the half-space."""
 
@@ -38,6 +37,9 @@ RIDGE = 1e-5
 
 SOFT = 6.0
 """Grey levels; a greater residual is a speck or a shadow and counts in proportion, not by its square."""
+
+STEPS, HALVES, NUDGE, SETTLED = 8, (1.0, 0.5, 0.25, 0.125), 0.02, 0.01
+"""Of the search for a touch: most steps, their lengths tried, the difference of a derivative and the last step, px."""
 
 FINE = 18
 """Pixels per ball radius that are enough: pictures are shrunk to at least as many."""
@@ -61,23 +63,34 @@ class Optics:
 
 
 def find_circles(presses: BallPresses) -> Circles:
-    """Touches of all presses, and the optics that explain them."""
-    small = _Small(presses)
+    """Touches of all presses, and the optics that explain them; the order of the presses changes no bit of either."""
+    order = presses.canonical_order()
+    small = _Small(presses.chosen(order))
     begun = small.located()
     ends = [_alternate(small, begun * (1, 1, start), SCHEDULE[:4]) for start in STARTS]
     rows, _ = min(ends, key=lambda end: float(np.median(end[1])))
     rows, misfit = _alternate(small, rows, SCHEDULE[4:])
     optics = _fit(small, rows, SCHEDULE[-1])
-    return Circles(touches=small.full(rows), misfit=misfit, optics=optics)
+    back = np.argsort(order)
+    return Circles(touches=small.full(rows[back]), misfit=misfit[back], optics=optics)
 
 
-def align_circles(presses: BallPresses, optics: Optics) -> Circles:
-    """Touches of presses that the optics have not seen."""
+def fit_optics(presses: BallPresses, touches: Touches) -> Optics:
+    """The optics that explain presses whose touches are known."""
     small = _Small(presses)
-    begun = small.located()
-    ends = [_align(small, begun * (1, 1, start), optics) for start in STARTS]
-    better = np.argmin([misfit for _, misfit in ends], axis=0)
-    rows = np.where(better[:, None] == 0, ends[0][0], ends[1][0])
+    return _fit(small, small.reduced(touches), SCHEDULE[-1])
+
+
+def align_circles(presses: BallPresses, optics: Optics, start: Touches | None = None) -> Circles:
+    """Touches of presses that the optics have not seen, from a start that is known or from several."""
+    small = _Small(presses)
+    if start is None:
+        begun = small.located()
+        ends = [_align(small, begun * (1, 1, share), optics) for share in STARTS]
+        better = np.argmin([misfit for _, misfit in ends], axis=0)
+        rows = np.where(better[:, None] == 0, ends[0][0], ends[1][0])
+    else:
+        rows = small.reduced(start)
     rows, misfit = _align(small, rows, optics)
     return Circles(touches=small.full(rows), misfit=misfit, optics=optics)
 
@@ -95,6 +108,7 @@ class _Small:
         self.shape = (background.shape[0], background.shape[1])
         self.y, self.x = np.mgrid[: self.shape[0], : self.shape[1]].astype(float)
         self.places = legendre(*self.shape, max(SCHEDULE))
+        self.imprint = Imprint(presses.radius_mm, BLUR_MM)
 
     @property
     def ball_px(self) -> float:
@@ -110,19 +124,21 @@ class _Small:
         mask: np.ndarray = np.hypot(self.x - row[0], self.y - row[1]) < radius
         return mask
 
-    def features(self, row: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """φ_1..φ_5 and u of a touch at the pixels of a mask, [6, n]."""
-        contact = np.clip(row[2] / self.ball_px, *CONTACTS) * self.radius_mm
-        dx, dy = ((c[mask] - at) * self.mm_per_px for c, at in ((self.x, row[0]), (self.y, row[1])))
-        depth, d_x, d_y = indentation(dx, dy, contact, self.radius_mm)
-        up = 1 / np.sqrt(1 + d_x**2 + d_y**2)
-        n_x, n_y = d_x * up, d_y * up
+    def features(self, row: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """φ_1..φ_5 and u of a touch at pixels, [6, n]."""
+        pitch = self.mm_per_px
+        n_x, n_y, depth = self.imprint((x - row[0]) * pitch, (y - row[1]) * pitch, row[2] * pitch)
         return np.stack([n_x, n_y, n_x**2, n_x * n_y, n_y**2, depth])
 
     def full(self, rows: np.ndarray) -> Touches:
         """On the pixels of the pictures themselves."""
         centre = (rows[:, :2] + 0.5) * self.factor - 0.5
         return Touches.of(np.column_stack([centre, rows[:, 2] * self.factor]))
+
+    def reduced(self, touches: Touches) -> np.ndarray:
+        """On the fewer pixels, [P, 3]."""
+        rows = touches.stacked()
+        return np.column_stack([(rows[:, :2] + 0.5) / self.factor - 0.5, rows[:, 2] / self.factor])
 
 
 def _odd_centre(change: np.ndarray, ball_px: float) -> tuple[float, float]:
@@ -154,20 +170,25 @@ def _alternate(small: _Small, rows: np.ndarray, degrees: tuple[int, ...]) -> tup
 def _fit(small: _Small, rows: np.ndarray, degree: int) -> Optics:
     """Constants by least squares, then once more with the residuals beyond `SOFT` weighted down."""
     slope, depth = _terms(degree), _terms(DEPTH_DEGREE)
-    weights = np.zeros((5 * slope + depth, 3))
-    for first in (True, False):
-        normal, right = np.zeros((len(weights), len(weights))), np.zeros_like(weights)
-        for row, change in zip(rows, small.changes, strict=True):
-            mask = small.near(row, REACH * row[2] + 1.5)
-            features, places = small.features(row, mask), small.places[:, mask]
-            design = np.concatenate([(f * places[:slope]) for f in features[:5]] + [features[5] * places[:depth]]).T
-            left = change[mask] - design @ weights
-            trust = np.ones(len(left)) if first else 1 / np.sqrt(1 + (left**2).mean(-1) / SOFT**2)
-            weighted = design * trust[:, None]
-            normal, right = normal + weighted.T @ design, right + weighted.T @ change[mask]
-        ridge = RIDGE * np.trace(normal) / len(normal)
-        weights = np.linalg.solve(normal + ridge * np.eye(len(normal)), right)
-    return Optics(weights=weights, degree=degree)
+    designs, seen = [], []
+    for row, change in zip(rows, small.changes, strict=True):
+        mask = small.near(row, REACH * row[2] + 1.5)
+        features, places = small.features(row, small.x[mask], small.y[mask]), small.places[:, mask]
+        by_slope = (features[:5, None] * places[:slope]).reshape(5 * slope, -1)
+        designs.append(np.concatenate([by_slope, features[5] * places[:depth]]).T)
+        seen.append(change[mask])
+    design, change = np.concatenate(designs), np.concatenate(seen)
+    weights = _ridge(design, change, np.ones(len(design)))
+    trust = 1 / np.sqrt(1 + ((change - design @ weights) ** 2).mean(-1) / SOFT**2)
+    return Optics(weights=_ridge(design, change, trust), degree=degree)
+
+
+def _ridge(design: np.ndarray, change: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    weighted = design * trust[:, None]
+    normal = weighted.T @ design
+    ridge = RIDGE * np.trace(normal) / len(normal)
+    solved: np.ndarray = np.linalg.solve(normal + ridge * np.eye(len(normal)), weighted.T @ change)
+    return solved
 
 
 def _align(small: _Small, rows: np.ndarray, optics: Optics) -> tuple[np.ndarray, np.ndarray]:
@@ -175,30 +196,57 @@ def _align(small: _Small, rows: np.ndarray, optics: Optics) -> tuple[np.ndarray,
     slope, depth = _terms(optics.degree), _terms(DEPTH_DEGREE)
     shares = np.einsum("fjc,jyx->fcyx", optics.weights[: 5 * slope].reshape(5, slope, 3), small.places[:slope])
     nearer = np.einsum("jc,jyx->cyx", optics.weights[5 * slope :], small.places[:depth])
-    found = [
-        _align_one(small, row, change, np.concatenate([shares, nearer[None]]))
-        for row, change in zip(rows, small.changes, strict=True)
-    ]
+    model = np.concatenate([shares, nearer[None]])
+    found = [_align_one(small, row, change, model) for row, change in zip(rows, small.changes, strict=True)]
     return np.array([row for row, _ in found]), np.array([misfit for _, misfit in found])
 
 
 def _align_one(small: _Small, row: np.ndarray, change: np.ndarray, model: np.ndarray) -> tuple[np.ndarray, float]:
-    """One touch; `model` is what each feature adds to each channel, [6, 3, h, w]."""
+    """One touch by damped Gauss-Newton steps; `model` is what each feature adds to each channel, [6, 3, h, w]."""
     ball = small.ball_px
     mask = small.near(row, max(REACH * row[2], 0.6 * ball) + 2)
-    seen, model = change[mask].T, model[..., mask]
+    x, y, seen, model = small.x[mask], small.y[mask], change[mask].T, model[..., mask].copy()
 
     def residual(candidate: np.ndarray) -> np.ndarray:
-        return (np.einsum("fn,fcn->cn", small.features(candidate, mask), model) - seen).ravel()
+        return ((small.features(candidate, x, y)[:, None] * model).sum(0) - seen).ravel()
 
     low = np.array([row[0] - 0.7 * ball, row[1] - 0.7 * ball, CONTACTS[0] * ball])
     high = np.array([row[0] + 0.7 * ball, row[1] + 0.7 * ball, CONTACTS[1] * ball])
-    start = np.clip(row, low + 1e-3, high - 1e-3)
-    end = optimize.least_squares(
-        residual, start, bounds=(low, high), diff_step=1e-3, max_nfev=8, loss="soft_l1", f_scale=SOFT
-    ).x
+    end = minimise(residual, np.clip(row, low, high), low, high, SOFT)
     share = np.sqrt(np.mean(residual(end) ** 2) / max(np.mean(seen**2), 1e-9))
     return end, float(share)
+
+
+def minimise(
+    residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray, low: np.ndarray, high: np.ndarray, soft: float
+) -> np.ndarray:
+    """Parameters within bounds that minimise Σ √(1 + r²/s²), by Gauss-Newton steps that are halved until they help.
+
+    Args:
+      residual: r [n] of parameters [k].
+      start, low, high: parameters [k].
+      soft: s, beyond which a residual counts in proportion.
+    """
+    at, left = start, residual(start)
+    loss = np.sqrt(1 + (left / soft) ** 2).sum()
+    for _ in range(STEPS):
+        trust = 1 / np.sqrt(1 + (left / soft) ** 2)
+        slopes = np.stack([(residual(at + d) - left) / NUDGE for d in NUDGE * np.eye(len(at))])
+        weighted = slopes * trust
+        normal = weighted @ slopes.T
+        step = np.linalg.solve(normal + 1e-6 * np.trace(normal) * np.eye(len(at)), -(weighted @ left))
+        for share in HALVES:
+            trial = np.clip(at + share * step, low, high)
+            then = residual(trial)
+            if (loss_then := np.sqrt(1 + (then / soft) ** 2).sum()) < loss:
+                break
+        else:
+            return at
+        settled = np.abs(trial - at).max() < SETTLED
+        at, left, loss = trial, then, loss_then
+        if settled:
+            break
+    return at
 
 
 def _terms(degree: int) -> int:

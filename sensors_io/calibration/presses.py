@@ -1,6 +1,7 @@
 """Pictures of one rigid ball pressed into a gel, and what a press looks like: its touch and its indentation."""
 
 import dataclasses
+import hashlib
 
 import cv2
 import numpy as np
@@ -46,6 +47,11 @@ class BallPresses:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.background.shape[0], self.background.shape[1]
+
+    def canonical_order(self) -> np.ndarray:
+        """Indices that sort the presses by the hash of their pixels: the same presses in any order come out alike."""
+        hashes = [hashlib.sha256(np.ascontiguousarray(picture).tobytes()).digest() for picture in self.pictures]
+        return np.array(sorted(range(len(hashes)), key=hashes.__getitem__), np.int64)
 
     def chosen(self, index: np.ndarray) -> "BallPresses":
         """Some of the presses."""

@@ -59,7 +59,7 @@ class Calibrate:
             radius_mm=self.ball_diameter_mm / 2,
             mm_per_px=straight.mm_per_px,
         )
-        OUT.print(f"{len(presses)} pictures; finding circles, fitting, leaving out each fifth in turn …")
+        OUT.print(f"{len(presses)} pictures; finding circles, fitting, leaving parts out in turn …")
         with progress_bar("fits") as progress:
             made, report = calibrate(presses, pictures.names, self.sensor, self.config, progress)
         made = straight.signed(made)
@@ -101,9 +101,11 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
     table.add_row("the picture shows, mm (hold a ruler to it)", f"{columns_mm:.1f} × {rows_mm:.1f}")
     contact_mm = float(np.median(report.touches.radius_px)) * made.mm_per_px
     table.add_row("radius of the contacts, mm (median)", f"{contact_mm:.2f}")
-    table.add_row("degree in colour, in position", f"{report.choice.degree}, {report.choice.position_degree}")
+    table.add_row("strength of the smoothness prior", f"{report.choice.ridge:.0e}")
     for name, value in report.errors.figures().items():
         table.add_row(f"held out: {name}", f"{value:.3g}")
+    for warning in report.warnings:
+        table.add_row("warning", warning)
     for press in report.left_out:
         table.add_row(f"left out: {press.name}", press.reason)
     return table

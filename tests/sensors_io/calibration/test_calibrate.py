@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -16,12 +17,14 @@ from tests.sensors_io.checks import refused
 
 CLIPS = pathlib.Path(__file__).parents[2] / "data" / "gelslam"
 MM_PER_PX = 3 * 0.0634
-QUICK = CalibrateConfig(folds=2)
+QUICK = CalibrateConfig(folds=2, repeats=1)
+TOUCHES = spread_touches(12)
+SAID = ("will not transfer.*press more often", "slopes are (steep|flat)", r"cover \d+% of.*right; press there")
 
 
 @pytest.fixture(scope="module")
 def presses() -> BallPresses:
-    return press_ball(spread_touches(12))
+    return press_ball(TOUCHES)
 
 
 def names(presses: BallPresses) -> tuple[str, ...]:
@@ -33,7 +36,7 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A calibration by the command, from real presses."""
     out = tmp_path_factory.mktemp("calibration") / "mini.npz"
     command = ["calibrate", str(CLIPS), "--background", str(CLIPS / "background.png"), "--ball-diameter-mm", "6.31"]
-    assert main([*command, "--mm-per-px", str(MM_PER_PX), "--out", str(out), "--folds", "3"]) == 0
+    assert main([*command, "--mm-per-px", str(MM_PER_PX), "--out", str(out), "--folds", "3", "--repeats", "2"]) == 0
     return out
 
 
@@ -62,6 +65,27 @@ def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib
             assert np.isnan(fields[name]).all()
         assert (fields["flags"].astype(int) & 2048).all()
         assert str(fields["calibration"]) == Calibration.load(real).hash
+
+
+def test_the_order_of_the_presses_changes_no_bit(presses: BallPresses) -> None:
+    order = np.random.default_rng(2).permutation(len(presses))
+    named = np.array(names(presses))
+    one, told = calibrate(presses, tuple(named), "x", QUICK)
+    two, other = calibrate(presses.chosen(order), tuple(named[order]), "x", QUICK)
+    assert one.hash == two.hash
+    assert one.made_from == two.made_from
+    np.testing.assert_array_equal(told.touches.stacked()[order], other.touches.stacked())
+    np.testing.assert_array_equal(told.errors.depth_um[:, order], other.errors.depth_um)
+    assert [told.kept[i] for i in order] == list(other.kept)
+
+
+def test_a_map_that_will_not_transfer_says_so(presses: BallPresses) -> None:
+    left = dataclasses.replace(presses, pictures=presses.pictures[TOUCHES[:, 0] < 50])
+    strict = dataclasses.replace(QUICK, least_presses=4, sure_radius=1e-4, sure_bias=1e-5)
+    said = calibrate(left, names(left), "x", strict)[1].warnings
+    assert [bool(re.search(part, text)) for part, text in zip(SAID, said, strict=True)] == [True] * 3
+    fine = dataclasses.replace(QUICK, sure_radius=0.2, sure_bias=0.2, sure_cover=0.2)
+    assert calibrate(presses, names(presses), "x", fine)[1].warnings == ()
 
 
 def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None:
