@@ -51,7 +51,7 @@ def run(installed: Path, empty: Path, *arguments: str) -> subprocess.CompletedPr
 
 def test_every_source_is_there_and_nothing_else(wheel):
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
-    shipped = ("*.py", "py.typed", "*.jinja")
+    shipped = ("*.py", "py.typed", "*.jinja", "policies/*/*")
     paths = [path for package in PACKAGES for pattern in shipped for path in (ROOT / package).rglob(pattern)]
     assert held == {path.relative_to(ROOT).as_posix() for path in paths}
 

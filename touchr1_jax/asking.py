@@ -4,10 +4,12 @@
     answer = policy.ask({"gelsight_mini": frames}, "How hard is it?")  # frames: uint8 [F, H, W, 3], RGB
     answer.word, answer.trace, answer.probabilities, answer.untouched.word
 
-The answer is the policy's greedy one, as in every report.  Probabilities are p(level | touch), the mean over sampled
-traces of p(level | trace).
+The answer is the most likely one, token by token, of those that the grammar allows.  Without touch, for which no policy
+is trained, it may name no level of the attribute.  Probabilities are p(level | touch), the mean over sampled traces of
+p(level | trace).
 """
 
+import contextlib
 import dataclasses
 import functools
 import tempfile
@@ -19,13 +21,14 @@ import cv2
 import jax
 import numpy as np
 
+from touchr1_jax.models.policy import Features
 from touchr1_jax.models.saved_policy import PolicyError, Precision, SavedPolicy, read_policy, save_policy, words
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError, read_question
 from touchr1_jax.training.compilation import compiled_quickly
 from touchr1_jax.training.encoding import encode_contacts
 from touchr1_jax.training.evaluation import answer_program, sample_program
-from touchr1_jax.training.feeds import touch_batch
+from touchr1_jax.training.feeds import take, touch_batch
 from touchr1_jax.training.questions import equal_blocks, question_batch
 from touchr1_jax.types import Params
 
@@ -65,7 +68,7 @@ class TouchAnswer:
 
     Attributes:
       question, attribute: as the policy was asked.
-      word: the level that the answer concludes; empty where it cannot be parsed.
+      word: the level that the answer concludes; empty where its level is of another attribute.
       trace: the whole answer.
       probabilities: word of each level → p(level | touch).
       untouched: the answer to the same question without the touch; `None` in itself.
@@ -167,21 +170,32 @@ class AskablePolicy:
         given = [touch if isinstance(touch, TouchInput) else TouchInput(frames=touch) for touch in touches]
         size = 1 if len(given) < TOGETHER else TOGETHER
         found: list[dict[str, TouchAnswer]] = []
-        with compiled_quickly():  # programs that run a few times
+        with compiled_quickly() if size == 1 else contextlib.nullcontext():  # programs that run a few times
             for rows, real in equal_blocks(len(given), size):
                 found += list(self._answered([given[i] for i in rows]))[:real]
         return found
 
+    def encode(self, touches: Sequence[TouchInput]) -> Features:
+        """Features of touches on the host, which every other evaluation of the policy takes.
+
+        Raises:
+          QuestionError: a touch that the policy cannot read.
+        """
+        batches = []
+        for rows, _ in equal_blocks(len(touches), min(len(touches), TOGETHER)):
+            clips = [clip_arrays(touches[i], self.saved) for i in rows]
+            batches.append(touch_batch({name: np.stack([clip[name] for clip in clips]) for name in clips[0]}))
+        every = encode_contacts(self.saved.policy.fns, self.saved.params, batches)
+        return take(every, np.arange(len(touches)))
+
     def _answered(self, touches: Sequence[TouchInput]) -> Iterator[dict[str, TouchAnswer]]:
         """Answers about a block of touches: with touch in the first half of the questions, without in the second."""
         policy, params, n, a = self.saved.policy, self.saved.params, len(touches), len(self.attributes)
-        clip = [clip_arrays(touch, self.saved) for touch in touches]
-        stacked = {name: np.stack([arrays[name] for arrays in clip]) for name in clip[0]}
-        features = encode_contacts(policy.fns, params, [touch_batch(stacked)])
+        features, unknown = self.encode(touches), np.full((n, a), -1, np.int32)
         contact, attribute = (np.tile(x.ravel(), 2) for x in np.mgrid[:n, :a])
         felt = np.arange(len(contact))[:, None] < n * a
-        streams = stacked["stream_mask"][contact] & felt
-        batch = question_batch(policy, features, stacked["label"], contact, attribute, streams)
+        streams = np.asarray(features.stream_mask)[contact] & felt
+        batch = question_batch(policy, features, unknown, contact, attribute, streams)
         tokens, level, share = self._decoded({"decoder": params["decoder"]}, batch)
 
         def answer(row: int, untouched: TouchAnswer | None = None) -> TouchAnswer:
@@ -202,7 +216,7 @@ class AskablePolicy:
     def _decoded(self, decoder: Params, batch: GRPOBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Greedy tokens and concluded levels of questions, and the probabilities of the levels that are asked for."""
         policy = self.saved.policy
-        greedy = answer_program(policy)(decoder, batch)
+        greedy = answer_program(policy, constrained=True)(decoder, batch)
         _, marginal = sample_program(policy, SAMPLES, constrained=True)(decoder, batch, jax.random.key(0))
         share = np.asarray(marginal, np.float64)
         share /= np.maximum(share.sum(-1, keepdims=True), np.finfo(np.float64).tiny)

@@ -4,14 +4,19 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from experiments.ask.inputs import AskedTouch
+from experiments.core.text import bounds
 from touchr1_jax.asking import (
     AskablePolicy,
     ComparedTouches,
     TouchAnswer,
     compared,
 )
+from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError, read_question
+from touchr1_jax.training.evaluation import answer_program, evaluate_policy
 
 COMPARATIVE: Mapping[str, str] = {"hardness": "harder", "roughness": "rougher", "protrusion": "more protruding"}
 """Of each attribute that is compared where no question is given."""
@@ -121,3 +126,27 @@ def comparison_json(one: ComparedTouches) -> dict[str, Any]:
     without = None if one.untouched is None else dict(one.untouched.probabilities)
     plain = {name: getattr(one, name) for name in ("question", "attribute", "word")}
     return plain | {"probabilities": dict(one.probabilities), "without_touch": without}
+
+
+def count_right(policy: AskablePolicy, touches: Sequence[AskedTouch], objects: np.ndarray) -> Iterator[str]:
+    """For each attribute the share of right answers, 95 % over objects [n], and that of the best constant answer.
+
+    Raises:
+      NoLabelsError: no label is known.
+    """
+    saved, features = policy.saved, policy.encode([touch.touch for touch in touches])
+    levels = list(policy.attributes.items())
+    label = np.array([[words.index(t.truth[a]) if a in t.truth else -1 for a, words in levels] for t in touches])
+    answer = answer_program(saved.policy, constrained=True)
+    asked = evaluate_policy(saved.policy, saved.params, features, label, alone=False, answer=answer)
+    yield f"policy  {saved.notes.get('name', policy.name)}"
+    for i, (name, _) in enumerate(levels):
+        rows = np.flatnonzero(asked.attribute == i)
+        true, of = label[asked.contact[rows], i], objects[asked.contact[rows]]
+        if len(set(of)) < 2:
+            yield f"  {name:<12} labels of fewer than two objects are known"
+            continue
+        share = clustered_bootstrap(100.0 * (np.asarray(asked.parsed.conclude)[rows, i] == true), of)
+        constant = 100 * np.bincount(true).max() / len(true)
+        told = f"{share.mean:.1f} % {bounds(share.low, share.high, '.1f')} right of {len(rows)}"
+        yield f"  {name:<12} {told}; always the most frequent level {constant:.1f} %"

@@ -12,28 +12,27 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from experiments.ask.answers import as_json, ask_policy, text_lines
+from experiments.ask.answers import answer_json, as_json, ask_policy, count_right, text_lines
 from experiments.ask.demo import demo_server
-from experiments.ask.inputs import AskedTouch, read_contacts, read_touch
+from experiments.ask.inputs import read_contacts, read_touch
 from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError
 from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
-from experiments.core.text import bounds
-from experiments.study.policies import find_policy, is_policy
+from experiments.study.policies import find_policy, is_policy, measured_figures
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
-from touchr1_jax.asking import HUB, AskablePolicy, TouchAnswer, push
-from touchr1_jax.bench.statistics import clustered_bootstrap
+from touchr1_jax.asking import HUB, AskablePolicy, push
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.saved_policy import Precision, save_policy
 from touchr1_jax.text.plain_questions import QuestionError
-from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
+from touchr1_jax.training.compilation import compilations_kept
+from touchr1_jax.training.questions import NoLabelsError
 
 COMPILED = "compiled"
 """Folder of the cache for compiled programs, that of the runner."""
 
-FAILURES = (UserError, WeightsError, QuestionError, DamagedFileError, OSError)
+FAILURES = (UserError, WeightsError, QuestionError, NoLabelsError, DamagedFileError, OSError)
 """Errors whose message is all that a user needs."""
 
 
@@ -78,7 +77,7 @@ class AskCommand(Places):
             raise DataError(f"names are {self.names}: must be at most one POLICY and one or two INPUTs; correct them")
         found = find_policy(policy, self.runs_dir)
         if self.every:
-            print_lines(*self._count(found, Path(given[0])))
+            print_lines(*self._every(found, Path(given[0])))
             return 0
         touches = [read_touch(name, found.saved, self.sensor) for name in given]
         answered = ask_policy(found, touches, self.question)
@@ -87,38 +86,20 @@ class AskCommand(Places):
             write_page(self.html, answered)
         return 0
 
-    def _count(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
+    def _every(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
         """The answers about every contact as JSON lines, or the share of right ones by attribute."""
         store = RecordStore(path)
         rows = range(len(store)) if self.every == "all" else store.contacts_of_split(self.every).tolist()
         if not rows:
             raise DataError(f"every is {self.every!r}: {path} has no such contact; choose another split, or all")
         touches = read_contacts(store, rows, policy.saved)
-        answers = policy.answers([touch.touch for touch in touches])
-        if self.json:
-            for touch, of_touch in zip(touches, answers, strict=True):
-                said = {name: {"word": a.word, "probabilities": dict(a.probabilities)} for name, a in of_touch.items()}
-                yield json.dumps({"touch": touch.name, "answers": said, "truth": dict(touch.truth)}, ensure_ascii=False)
+        if not self.json:
+            yield from count_right(policy, touches, np.array([store.contacts[i].object_id for i in rows]))
             return
-        objects = np.array([store.contacts[i].object_id for i in rows])
-        yield f"policy  {policy.saved.notes.get('name', policy.name)}"
-        for name in policy.attributes:
-            yield f"  {name:<12}{_share_right(name, touches, answers, objects)}"
-
-
-def _share_right(
-    name: str, touches: Sequence[AskedTouch], answers: Sequence[dict[str, TouchAnswer]], objects: np.ndarray
-) -> str:
-    """Right answers with touch and without, 95 % over objects."""
-    known = np.array([name in touch.truth for touch in touches])
-    if len(set(objects[known])) < 2:
-        return "labels of fewer than two objects are known"
-    told = []
-    for said in (lambda a: a.word, lambda a: a.untouched.word):
-        right = np.array([100.0 * (said(a[name]) == t.truth.get(name)) for a, t in zip(answers, touches, strict=True)])
-        share = clustered_bootstrap(right[known], objects[known])
-        told.append(f"{share.mean:.1f} % {bounds(share.low, share.high, '.1f')}")
-    return f"{told[0]} right of {int(known.sum())}, {told[1]} without touch"
+        answers = policy.answers([touch.touch for touch in touches])
+        for touch, of_touch in zip(touches, answers, strict=True):
+            said = {name: answer_json(answer) for name, answer in of_touch.items()}
+            yield json.dumps({"touch": touch.name, "answers": said, "truth": dict(touch.truth)}, ensure_ascii=False)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,6 +119,8 @@ class ExportCommand(Places):
     def run(self) -> int:
         """Write the folder and return the exit status."""
         saved = find_policy(self.policy, self.runs_dir).saved
+        figures = measured_figures(self.policy, self.runs_dir)
+        saved = dataclasses.replace(saved, notes={**saved.notes, **figures})
         card = "" if self.card is None else self.card.read_text(encoding="utf-8")
         if self.folder.startswith(HUB):
             print_lines(push(saved, self.folder.removeprefix(HUB), precision=self.precision, card=card))
@@ -191,7 +174,7 @@ def run_asking(arguments: Sequence[str]) -> int:
     command = tyro.cli(AskingCommand, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,))
     kept = compilations_kept(command.cache_dir / COMPILED) if arguments[0] != "export" else contextlib.nullcontext()
     try:
-        with kept, compiled_quickly():
+        with kept:
             return command.run()
     except FAILURES as error:
         print_error(f"{type(error).__name__}: {error}")

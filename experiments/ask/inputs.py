@@ -31,6 +31,7 @@ from sensors_io.schema import ATTRIBUTES, ContactKey, ObjectCard
 from sensors_io.schema import Sequence as TouchSequence
 from touchr1_jax.asking import TouchInput
 from touchr1_jax.models.saved_policy import SavedPolicy, words
+from touchr1_jax.training.compilation import compiled_quickly
 
 GENERATED = "generated"
 
@@ -104,7 +105,8 @@ def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
     for number in itertools.islice(itertools.count(first), MOST_DRAWN):
         scene = dataclasses.replace(config, seed=UNSEEN_SEED + number)
         if wanted.items() <= solid_of(scene, 0).labels().items():
-            return _of_contact(LiveScenes(scene), 0, saved, f"generated object {number} ({GENERATED}:{number})")
+            with compiled_quickly():  # programs that run once
+                return _of_contact(LiveScenes(scene), 0, saved, f"generated object {number} ({GENERATED}:{number})")
     raise DataError(f"input is {GENERATED}:{which}: no such object in {MOST_DRAWN} draws; ask for fewer properties")
 
 

@@ -5,14 +5,19 @@ from pathlib import Path
 from experiments.core import runs
 from experiments.core.artifacts import jsonable, read_json
 from experiments.core.context import Context
+from experiments.core.text import bounds, number
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import ClipConfig
 from sensors_io.schema import Flag
 from touchr1_jax.asking import HUB, SHIPPED, AskablePolicy, load_policy
+from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy
 from touchr1_jax.types import Params
+
+FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")
+"""Metrics of a model card."""
 
 POLICIES = "policies"
 """Folder of a run with its trained policies."""
@@ -61,6 +66,25 @@ def find_policy(name: str, runs_dir: Path) -> AskablePolicy:
         f"policy is {name!r}: must be a run, RUN/ARM or RUN/ARM/SEED under {runs_dir}, a policy's folder, "
         f"{HUB}USER/NAME, or one of {', '.join(shipped()) or 'those that come with the package (none)'}"
     )
+
+
+def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
+    """Scores of a run's policy on unseen objects, for its model card; empty for other policies and unfinished runs."""
+    folder = run_policy(name, runs_dir)
+    results = None if folder is None else folder.parents[2] / "results.json"
+    if folder is None or results is None or not results.exists():
+        return {}
+    found, arm = read_json(results), folder.parent.name
+    row = found.get("arms", {}).get(arm, {})
+    figures = {}
+    for metric in FIGURES:
+        if metric in row:
+            kind, (low, high) = REPORTED[metric], row[metric]["ci95"]
+            shown = f"{number(row[metric]['mean'], kind.format)} {bounds(low, high, kind.format)} {kind.unit}"
+            figures[f"{kind.title} ({kind.meaning})"] = shown.strip()
+    seeds = max((len(one["per_seed"]) for one in row.values()), default=0)
+    objects = found["data"].get("test_objects", "?")
+    return {"measured": f"on {objects} unseen objects, {seeds} seeds, 95 % over objects"} | figures if figures else {}
 
 
 def is_policy(name: str, runs_dir: Path) -> bool:

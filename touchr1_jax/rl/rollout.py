@@ -7,7 +7,7 @@ runs where whole steps are batched by `vmap`.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -100,10 +100,11 @@ def sample_group(fns: PolicyFns, params: Params, batch: GRPOBatch, key: Array, d
 
 
 def make_answer(
-    fns: PolicyFns, parser: Callable[[Int[Array, "T"]], Parsed], length: int
+    fns: PolicyFns, parser: Callable[[Int[Array, "T"]], Parsed], length: int, constraint: Constraint | None = None
 ) -> Callable[[Params, GRPOBatch], GreedyAnswers]:
-    """Build the jitted (params, batch) → greedy answers of at most `length` tokens."""
-    draw = SampleConfig(group=1, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, greedy=True)
+    """Build the jitted (params, batch) → greedy answers of at most `length` tokens, under a constraint if any."""
+    of: dict[str, Any] = {"length": length, "end_ids": fns.end_ids, "pad_id": fns.pad_id, "constraint": constraint}
+    draw = SampleConfig(group=1, greedy=True, **of)
 
     @jax.jit
     def answer(params: Params, batch: GRPOBatch) -> GreedyAnswers:

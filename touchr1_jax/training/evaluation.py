@@ -113,9 +113,10 @@ def evaluate_policy(
 
 
 @functools.cache
-def answer_program(policy: TouchPolicy) -> Any:
-    """Compiled greedy decoder and parser, made once."""
-    return make_answer(policy.fns, policy.parser, policy.model.completion_tokens)
+def answer_program(policy: TouchPolicy, *, constrained: bool = False) -> Any:
+    """Compiled greedy decoder and parser, made once; a constrained one writes formatted answers alone."""
+    grammar = policy.constraint if constrained else None
+    return make_answer(policy.fns, policy.parser, policy.model.completion_tokens, grammar)
 
 
 @functools.cache

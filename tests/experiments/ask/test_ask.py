@@ -1,6 +1,7 @@
 """Asking a tiny policy: the same answers as a study gives, from every kind of input, in words, JSON and on a page."""
 
 import dataclasses
+import functools
 import json
 import re
 import sys
@@ -17,15 +18,16 @@ from experiments.ask.command import run_asking
 from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
-from experiments.study.policies import find_policy, publish_policy
+from experiments.core.runs import ROOT
+from experiments.study.policies import find_policy, publish_policy, shipped
 from experiments.study.stages import encode_rows
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
 from tests.sensors_io.importers.films import film
-from touchr1_jax.asking import TouchAnswer, TouchInput, compared, load_policy
+from touchr1_jax.asking import SHIPPED, TouchAnswer, TouchInput, compared, load_policy
 from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError
-from touchr1_jax.training.evaluation import evaluate_policy
+from touchr1_jax.training.evaluation import answer_program, evaluate_policy
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +36,8 @@ def runs(tmp_path_factory, policy, params, data):
     run = tmp_path_factory.mktemp("runs") / "trial" / "latest"
     run.mkdir(parents=True)
     (run / "config.json").write_text(json.dumps({"experiment": "trial"}))
+    scores = {"acc": {"mean": 68.13, "ci95": [60.0, 70.0], "per_seed": [68.13]}}
+    (run / "results.json").write_text(json.dumps({"arms": {"sft": scores}, "data": {"test_objects": 5}}))
     context = types.SimpleNamespace(directory=run, processes=types.SimpleNamespace(write_once=lambda write: write()))
     publish_policy(policy, params, data, "sft", 0, context)
     return run.parents[1]
@@ -51,9 +55,12 @@ def ask(runs, *words):
 def test_the_answers_are_those_of_a_study(asked, policy, params, data, records, context):
     rows = data.parts["test"][:2]
     features = encode_rows(policy, params, data, rows, context)
-    study = evaluate_policy(policy, params, features, data.label[rows], alone=False)
+    evaluate = functools.partial(evaluate_policy, policy, params, label=data.label[rows], alone=False)
+    evaluate = functools.partial(evaluate, answer=answer_program(policy, constrained=True))
+    study = evaluate(features)
     none = dataclasses.replace(features, stream_mask=np.zeros_like(features.stream_mask))
-    blind = evaluate_policy(policy, params, none, data.label[rows], alone=False)
+    blind = evaluate(none)
+    assert np.asarray(study.parsed.formatted).all()
     touches = [read_touch(f"{records}:{i}", asked.saved) for i in rows]
     answers = asked.answers([touch.touch for touch in touches])
     for n, (contact, attribute) in enumerate(zip(study.contact, study.attribute, strict=True)):
@@ -162,7 +169,7 @@ def test_the_command_prints_json_and_writes_a_page(runs, records, tmp_path, caps
     assert "Which is softer?" in html
     assert ask(runs, "trial", records, "--every", "test") == 0
     printed = capsys.readouterr().out
-    assert re.search(r"hardness +[\d.]+ % \[[\d.]+, [\d.]+\] right of 5, ", printed)
+    assert re.search(r"hardness +[\d.]+ % \[[\d.]+, [\d.]+\] right of 5; always the most frequent level ", printed)
 
 
 def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
@@ -191,6 +198,9 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
         upload_folder=lambda repo_id, folder_path: uploaded.extend(p.name for p in folder_path.iterdir()) or "address",
     )
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    card = (folder / "README.md").read_text(encoding="utf-8")
+    assert "| measured | on 5 unseen objects, 1 seeds, 95 % over objects |" in card
+    assert "| 68.1 [60.0, 70.0] % |" in card
     frames = {"tac3d": np.zeros((1, 28, 28, 3), np.uint8)}
     assert load_policy("hub:me/touch").ask(frames, "How hard?") == asked.ask(frames, "How hard?")
     assert run_asking(["export", str(folder), "hub:me/touch"]) == 0
@@ -243,6 +253,20 @@ def test_the_demo_is_closed_to_other_pages_and_files(address, records):
 def test_a_comparison_needs_two_touches_in_code_too(asked):
     with pytest.raises(QuestionError, match="give two INPUTs"):
         ask_policy(asked, [read_touch("generated:1", asked.saved)], "Which is harder?")
+
+
+def test_the_readme_asks_the_policy_of_the_package(capsys):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    [snippet] = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "load_policy" in block]
+    exec(snippet, {})
+    assert re.match(r"(soft|firm|hard) \(soft \d+%, firm \d+%, hard \d+%\); without touch ", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_policies_of_the_package_are_small_and_have_a_card(name):
+    files = {path.name: path.stat().st_size for path in (SHIPPED / name).iterdir()}
+    assert sum(files.values()) < 800_000
+    assert {"limits", "measured"} <= load_policy(name).saved.notes.keys()
 
 
 def test_tiny_scenes_are_noted(asked):
