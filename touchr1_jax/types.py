@@ -15,9 +15,12 @@ Params = Any  # a pytree of float arrays, as flax.linen returns it
 
 @struct.dataclass
 class TouchBatch:
-    """P contacts, each recorded by all sensors; the JAX side of `sensors_io.schema.CLIP_ARRAYS`."""
+    """P contacts, each recorded by all sensors; the JAX side of `sensors_io.schema.CLIP_ARRAYS`.
 
-    frames: UInt8[Array, "P S F H W 3"]
+    The statistics of the patches of `frames` may take their place, for an encoder that reads these alone.
+    """
+
+    frames: UInt8[Array, "P S F H W 3"] | Float[Array, "P S F patch statistic"]
     force_n: Float[Array, "P S F 3"]
     frame_index: Int[Array, "P S F"]
     frame_mask: Bool[Array, "P S F"]

@@ -64,7 +64,7 @@ def open_touch(
 
 def training_rows(data: Dataset) -> np.ndarray:
     """Contacts of all training objects, ascending; all are used, since no later stage shares these scenes."""
-    return np.sort(np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+    return data.training
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -187,7 +187,7 @@ def linear_probe(
 def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False) -> Evaluation:
     """Levels by a linear probe on the encoded touch; `swapped` gives every contact the touch of another object."""
     data = trained.data
-    rows = np.concatenate([data.parts["sft"], data.parts["grpo"]])
+    rows = data.training
     known = mean_tokens(encode_rows(trained.policy, trained.params, data, rows, trained.context))
     asked = mean_tokens(trained.test)
     if swapped:

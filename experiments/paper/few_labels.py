@@ -47,7 +47,6 @@ from experiments.study.scores import score, study_settings
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
-    StudySFT,
     Weights,
     encode_rows,
     gather_evidence,
@@ -56,7 +55,6 @@ from experiments.study.stages import (
     probe_features,
     run_decoder,
     run_grpo,
-    run_sft,
 )
 from experiments.study.study import (
     SMOKE as SMOKE_STUDY,
@@ -64,9 +62,11 @@ from experiments.study.study import (
 from experiments.study.study import (
     Study,
     StudyConfig,
+    StudySeed,
     load_answers,
     open_study_data,
     save_answers,
+    supervised,
 )
 from experiments.study.training import DECODER, starting_model
 from sensors_io.schema import SENSORS
@@ -80,6 +80,7 @@ from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.feeds import FULL_SHARE
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.pretraining import PretrainConfig, encoder_of
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
@@ -96,7 +97,7 @@ class FewLabelsConfig(StudyConfig):
     """Labelled contacts; more than there are means all."""
     unlabelled: int = 300
     """Contacts without labels that label-free rewards ask about."""
-    sft: StudySFT = StudySFT(steps=150)
+    encoders: EncoderTrainingConfig = EncoderTrainingConfig(steps=500)
     decoder: SFTConfig = dataclasses.replace(DECODER, steps=150, save_every=50)
     grpo: GRPOConfig = GRPOConfig(
         prompts=32,
@@ -156,10 +157,9 @@ class LabelledSet:
     def _train(self) -> None:
         config, data = self.config, self.data
         order: dict[str, Any] = {"seed": self.seed, "share": True}
-        stage = f"sft/{self.name}/{self.seed}"
-        start = run_sft(
-            self.policy, data, self.evidence, config.sft, self.context, stage=stage, tactile=self.tactile, **order
-        )
+        of: dict[str, Any] = {"config": config, "data": data, "policy": self.policy, "context": self.context}
+        seed = StudySeed(**of, evidence=self.evidence, seed=self.seed)
+        start = supervised(seed, tactile=self.tactile, name=self.name, share=True)
         test, val = (encode_rows(self.policy, start, data, data.parts[part], self.context) for part in ("test", "val"))
         self._keep("sft", start, test)
         known, free = self._contacts(start)
@@ -230,7 +230,7 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
     """Pretrain once, train every set, compare."""
     check_model(config.model, SENSORS)
     data = open_study_data(config, context)
-    train = np.concatenate([data.parts["sft"], data.parts["grpo"]])
+    train = data.training
     path = pretrained_encoder(config, data, train, context)
     model, tactile = starting_model(config.model, path, data.clip.sensors)
     policy, probed = build_policy(model, data.clip.sensors), probe_features(data, context)
@@ -331,7 +331,7 @@ SMOKE = FewLabelsConfig(
     labelled=(5, 12),
     unlabelled=8,
     scenes=SMOKE_STUDY.scenes,
-    sft=StudySFT(steps=3, batch_size=4),
+    encoders=EncoderTrainingConfig(steps=3, batch_size=4),
     decoder=dataclasses.replace(SMOKE_STUDY.decoder, steps=2, save_every=1),
     grpo=dataclasses.replace(FewLabelsConfig().grpo, prompts=2, group=2, micro_prompts=2),
     grpo_steps=1,

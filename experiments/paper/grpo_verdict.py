@@ -40,7 +40,6 @@ from experiments.study.stages import (
     probe_features,
     run_decoder,
     run_grpo,
-    run_sft,
 )
 from experiments.study.study import (
     CONTINUED,
@@ -52,6 +51,7 @@ from experiments.study.study import (
     load_answers,
     open_study_data,
     save_answers,
+    supervised,
 )
 from experiments.study.study import (
     SMOKE as SMOKE_STUDY,
@@ -174,7 +174,7 @@ def algorithm_of(preset: Preset, *, exact: bool) -> AnyAlgorithm:
 def start_seed(of: StudySeed, fresh: Dataset, rows: np.ndarray) -> StartedSeed:
     """SFT in both phases, from the cache where a study made it, and the contacts encoded by it."""
     config, data, policy, context, seed = of.config, of.data, of.policy, of.context, of.seed
-    params = run_sft(policy, data, of.evidence, config.sft, context, seed=seed, stage=f"sft/{seed}", share=True)
+    params = supervised(of, share=True)
     train, val = of.contacts(params), encode_rows(policy, params, data, data.parts["val"], context)
     order: dict[str, Any] = {"seed": seed, "stage": f"decoder/{SFT}/{seed}", "share": True}
     params = run_decoder(policy, train, (val, data.labels("val")), config.decoder, params, context, **order)

@@ -119,7 +119,7 @@ def run(config: MainConfig, context: Context) -> Results:
 def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
     """Answers of the baselines that need no policy, to the questions that policies were asked."""
     data, levels = study.data, study.policy.levels
-    train, test = np.concatenate([data.parts["sft"], data.parts["grpo"]]), data.parts["test"]
+    train, test = data.training, data.parts["test"]
     with context.progress("reading fields", len(train) + len(test)) as advance:
         fields = [features.field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
     view = lambda row: data.store.objects[data.store.contacts[int(row)].object_id].view

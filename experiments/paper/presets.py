@@ -34,9 +34,10 @@ from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 
 BENCH = StudyConfig(
-    sft=StudySFT(steps=1350),
+    encoders=EncoderTrainingConfig(steps=3000),
     decoder=dataclasses.replace(DECODER, steps=900),
     blind=StudySFT(steps=1350, micro_contacts=16),
     grpo_steps=200,

@@ -25,6 +25,7 @@ from touchr1_jax.training.loop import HELD_OUT
 COMPARED = ("acc", "omae", "middle_rate", "csc", "parse_rate", "reward")
 
 SFT_CURVES: Mapping[str, tuple[str, ...]] = {
+    "encoders": ("loss", "accuracy"),
     "sft": ("loss", "token_accuracy"),
     "decoder": ("loss", HELD_OUT),
     "blind": ("loss",),

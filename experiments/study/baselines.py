@@ -16,7 +16,7 @@ from touchr1_jax.types import Parsed
 
 def baselines(study: Study) -> dict[str, Evaluation]:
     """Answers of every baseline to the questions that the policies were asked."""
-    train = study.data.label[np.concatenate([study.data.parts["sft"], study.data.parts["grpo"]])]
+    train = study.data.label[study.data.training]
     n = len(study.data.parts["test"])
     constants = {
         "constant": study.prior.argmax(-1),

@@ -12,6 +12,7 @@ from experiments.core.errors import DataError
 from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, LEVELS
+from touchr1_jax.types import TouchBatch
 
 PARTS = ("sft", "grpo", "val", "test")
 
@@ -20,8 +21,10 @@ PARTS = ("sft", "grpo", "val", "test")
 class Dataset:
     """Contacts on disk and what the stages need to know of them.
 
-    `parts` maps each of `PARTS` to contact indices; no object is in two of them.  `label` is int32 [contact, A].
-    Every seed reads the same clips, so `memory` keeps them; `threads` read those of the batches to come.
+    `parts` maps each of `PARTS` to contact indices; no object is in two of them, but for `sft` and `grpo` where both
+    learn from the same contacts.  `label` is int32 [contact, A].  Every seed reads the same clips, so `memory` keeps
+    them; `threads` read those of the batches to come.  `statistics` are all contacts as the statistics stem of an
+    encoder reads them, by the side of its patches, once a stage has computed them.
     """
 
     store: RecordStore
@@ -33,6 +36,12 @@ class Dataset:
     visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
     has_force: bool
     threads: int = 1
+    statistics: dict[int, TouchBatch] = dataclasses.field(default_factory=dict)
+
+    @property
+    def training(self) -> np.ndarray:
+        """Contacts that any stage learns from, ascending."""
+        return np.union1d(self.parts["sft"], self.parts["grpo"])
 
     def batches(self, rows: np.ndarray, **order: Any) -> grain.IterDataset:
         """Clips of some contacts, as `clip_batches` takes the other arguments, through the memory and the threads."""
@@ -47,7 +56,7 @@ class Dataset:
 
         An attribute that nobody annotated has equal shares: no question asks for it.
         """
-        train = self.label[np.concatenate([self.parts["sft"], self.parts["grpo"]])]
+        train = self.label[self.training]
         rows = np.zeros((len(ATTRIBUTES), max(LEVELS.values())), np.float32)
         for a, name in enumerate(ATTRIBUTES):
             known = train[train[:, a] >= 0, a]
@@ -70,13 +79,13 @@ class Dataset:
 
 
 def split_parts(
-    store: RecordStore, grpo_share: float, seed: int = 0, left_out: Sequence[int] = ()
+    store: RecordStore, grpo_share: float | None, seed: int = 0, left_out: Sequence[int] = ()
 ) -> dict[str, np.ndarray]:
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
 
     Args:
       store: the records.
-      grpo_share: of the training objects.
+      grpo_share: of the training objects; `None` lets both stages learn from all of them.
       seed: of the draw.
       left_out: contacts that are in no part.
 
@@ -86,9 +95,10 @@ def split_parts(
     train = store.contacts_of_split("train")
     ids = np.array([store.contacts[i].object_id for i in train])
     names = np.unique(ids)
-    kept = np.isin(ids, np.random.default_rng(seed).permutation(names)[: round(grpo_share * len(names))])
+    share = 0.0 if grpo_share is None else grpo_share
+    kept = np.isin(ids, np.random.default_rng(seed).permutation(names)[: round(share * len(names))])
     val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
-    parts = {"sft": train[~kept], "grpo": train[kept], "val": val, "test": test}
+    parts = {"sft": train[~kept], "grpo": train if grpo_share is None else train[kept], "val": val, "test": test}
     parts = {name: rows[~np.isin(rows, left_out)] for name, rows in parts.items()}
     for name, rows in parts.items():
         if not len(rows):
@@ -102,7 +112,7 @@ def split_parts(
 def open_dataset(
     path: Path,
     clip: ClipConfig,
-    grpo_share: float,
+    grpo_share: float | None,
     memory_gib: float = 0.0,
     threads: int = 1,
     left_out: Sequence[int] = (),

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -32,9 +33,10 @@ from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, to
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
 from touchr1_jax.training.loop import SKIPPED, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
 from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
-from touchr1_jax.types import Params
+from touchr1_jax.types import Params, TouchBatch
 
 Weights = Mapping[str, float]
 """Reward → weight."""
@@ -91,17 +93,17 @@ def _clips(data: Dataset, rows: np.ndarray, context: Context, title: str, **orde
 def gather_evidence(
     data: Dataset, probed: ProbeFeatures, config: ProbeConfig, context: Context
 ) -> Float[np.ndarray, "contact S A K"]:
-    """`sensor_evidence` of the training contacts, from probes of the SFT contacts; all others count as not recorded."""
-    sft, grpo = (np.isin(np.arange(len(data.store)), data.parts[part]) for part in ("sft", "grpo"))
+    """`sensor_evidence` of the training contacts, from probes of those of SFT; all others count as not recorded."""
+    sft, train = (np.isin(np.arange(len(data.store)), rows) for rows in (data.parts["sft"], data.training))
     return sensor_evidence(
         probed.streams,
-        probed.present & (sft | grpo)[:, None],
+        probed.present & train[:, None],
         data.label,
         data.object_ids,
         [LEVELS[name] for name in ATTRIBUTES],
         config,
         track=functools.partial(context.each, "evidence"),
-        read_only=grpo,
+        read_only=train & ~sft,
     )
 
 
@@ -115,10 +117,10 @@ def run_sft(
     seed: int,
     stage: str,
     blind: bool = False,
-    tactile: Params | None = None,
+    start: Params | None = None,
     share: bool = False,
 ) -> Params:
-    """SFT of fresh parameters, or of a pretrained tactile encoder; a blind policy is never shown any touch.
+    """SFT end to end of fresh parameters, in which those of `start` take their places; a blind policy has no touch.
 
     With `share` the policy comes from the cache where an experiment trained it before.
     """
@@ -126,7 +128,7 @@ def run_sft(
     def train() -> Params:
         own, devices = context.devices.local_rows(config.batch_size), math.prod(context.devices.shape[:2])
         feed = answer_feed(policy, data, evidence, config, seed=seed, blind=blind, own=own, devices=devices)
-        params = untrained(policy, data, seed) | ({} if tactile is None else {"tactile": tactile})
+        params = untrained(policy, data, seed) | (start or {})
         with stage_hooks(context, stage, config.steps) as hooks:
             return train_sft(policy, params, feed, config, hooks, seed=seed, blind=blind)
 
@@ -134,7 +136,7 @@ def run_sft(
         return train()
     values = {"records": data.store.digest, "config": config, "model": policy.model, "clip": data.clip}
     values |= {"seed": seed, "blind": blind, "mesh": context.devices.shape}
-    arrays = {"evidence": evidence, "rows": data.parts["sft"], "tactile": tactile or {}}
+    arrays = {"evidence": evidence, "rows": data.parts["sft"], "start": start or {}}
     return cached("sft", values, arrays, train, context, stage)
 
 
@@ -163,8 +165,61 @@ def answer_feed(
     )
 
 
+def run_encoders(
+    policy: TouchPolicy,
+    data: Dataset,
+    config: EncoderTrainingConfig,
+    context: Context,
+    *,
+    seed: int,
+    stage: str,
+    start: Params | None = None,
+    share: bool = False,
+) -> Params:
+    """Training of the encoders by a linear head on the contacts of SFT; other arguments as in `run_sft`."""
+    rows = data.parts["sft"]
+
+    def train() -> Params:
+        order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed}
+        order |= {"own": context.devices.local_rows(config.batch_size)}
+        touch = computed_touch(policy, data, context)
+        clips = None if touch is not None else data.batches(rows, **order).map(host_touch)
+        feed = touch_rows(_rows(touch, rows), **order) if clips is None else iter(clips)
+        params = untrained(policy, data, seed) | (start or {})
+        with stage_hooks(context, stage, config.steps) as hooks:
+            return train_encoder(policy, params, feed, config, hooks)
+
+    if not share:
+        return train()
+    values = {"records": data.store.digest, "encoders": config, "model": policy.model, "clip": data.clip}
+    values |= {"seed": seed, "mesh": context.devices.shape}
+    return cached("sft", values, {"rows": rows, "start": start or {}}, train, context, stage)
+
+
+def _rows(touch: TouchBatch | None, rows: np.ndarray) -> TouchBatch:
+    return jax.tree.map(lambda x: x[rows], touch)
+
+
+def computed_touch(policy: TouchPolicy, data: Dataset, context: Context) -> TouchBatch | None:
+    """All contacts on the host with the statistics that a policy's stem reads; `None` for stems that read pixels.
+
+    They have no parameters, so that one computation serves all seeds and stages; every process does its part.
+    """
+    tactile = policy.model.tactile
+    if tactile.stem != "statistics":
+        return None
+
+    def compute(rows: np.ndarray) -> TouchBatch:
+        clips = _clips(data, rows, context, "computing statistics", batch_size=ENCODE_BATCH)
+        return encoding.touch_statistics(tactile, map(touch_batch, clips))
+
+    if tactile.patch_px not in data.statistics:
+        data.statistics[tactile.patch_px] = context.processes.split_work(np.arange(len(data.store)), compute)
+    return data.statistics[tactile.patch_px]
+
+
 def untrained(policy: TouchPolicy, data: Dataset, seed: int) -> Params:
-    """The parameters that SFT of a seed starts from."""
+    """The parameters that training of a seed starts from."""
     clips = data.batches(data.parts["sft"][:1], batch_size=1, seed=0, repeat=False)
     return policy.init(seed, touch_batch(next(iter(clips))))
 
@@ -174,9 +229,14 @@ def encode_rows(
 ) -> Features:
     """Features of some contacts on the host, in the order of `rows`; each process encodes its part."""
 
+    touch = None if blind else computed_touch(policy, data, context)
+
     def encode(own: np.ndarray) -> Features:
-        clips = _clips(data, own, context, "encoding", batch_size=ENCODE_BATCH, felt=not blind)
-        return encoding.encode_contacts(policy.fns, params, map(touch_batch, clips), blind=blind)
+        if touch is None:
+            batches = map(touch_batch, _clips(data, own, context, "encoding", batch_size=ENCODE_BATCH, felt=not blind))
+        else:
+            batches = (_rows(touch, part) for part in encoding.parts_of(own, ENCODE_BATCH))
+        return encoding.encode_contacts(policy.fns, params, batches, blind=blind)
 
     return context.processes.split_work(rows, encode)
 
@@ -361,7 +421,7 @@ def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[s
 
 def force_only(data: Dataset, probed: ProbeFeatures, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
     """Levels of contacts by a probe on the measured forces alone, int [len(rows), A]: what the force ramp reveals."""
-    train = np.isin(np.arange(len(data.store)), np.concatenate([data.parts["sft"], data.parts["grpo"]]))
+    train = np.isin(np.arange(len(data.store)), data.training)
     columns = []
     for a, name in enumerate(ATTRIBUTES):
         weight = (train & (data.label[:, a] >= 0))[None]

@@ -31,6 +31,7 @@ from experiments.study.stages import (
     noise_bank,
     probe_features,
     run_decoder,
+    run_encoders,
     run_grpo,
     run_sft,
 )
@@ -47,12 +48,14 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
+from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.feeds import FULL_SHARE
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_grpo import check_rewards
 from touchr1_jax.types import Params, Parsed
 
@@ -64,11 +67,15 @@ CONTINUED_ORDER = 1_000
 """Added to the seed of the questions of the control, which would otherwise be those of the phase before it."""
 
 
+MODEL = ModelConfig(tactile=TactileViTConfig(sensors=0, num_layers=1, stem="statistics", stem_width=64))
+"""The default policy; its stem has no parameters before its first layer, so that it is computed once."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudyConfig(TrainingConfig):
     """All settings of a study whose towers start from fresh parameters."""
 
-    model: ModelConfig = ModelConfig()
+    model: ModelConfig = MODEL
     share: bool = True
     """Take policies from the cache where an experiment with the same data, settings and code trained them."""
 
@@ -80,7 +87,7 @@ class StudyConfig(TrainingConfig):
 SMOKE = StudyConfig(
     seeds=2,
     scenes=SceneConfig(objects=60, sites=1),
-    sft=StudySFT(steps=12, batch_size=8),
+    encoders=EncoderTrainingConfig(steps=12, batch_size=8),
     blind=StudySFT(steps=12, batch_size=8, micro_contacts=8),
     decoder=dataclasses.replace(DECODER, steps=6, batch_size=4, save_every=3),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
@@ -103,7 +110,7 @@ class StudySeed:
     def contacts(self, params: Params) -> EncodedContacts:
         """The contacts that a policy's decoder is trained on, encoded by it (see `training.Recipe`)."""
         data, paper = self.data, self.config.recipe == "paper"
-        rows = data.parts["grpo"] if paper else np.concatenate([data.parts["sft"], data.parts["grpo"]])
+        rows = data.parts["grpo"]
         truth = data.label[rows]
         return EncodedContacts(
             features=encode_rows(self.policy, params, data, rows, self.context),
@@ -120,6 +127,27 @@ class StudySeed:
         with self.context.progress_callback("asking") as progress:
             order: dict[str, Any] = {"alone": alone, "samples": samples, "progress": progress}
             return evaluate_policy(self.policy, params, features, label, **order)
+
+
+def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", share: bool = False) -> Params:
+    """The policy of a seed before the phase of its decoder: its encoders trained by a head, then SFT end to end.
+
+    Args:
+      of: the seed.
+      tactile: parameters of the tactile encoder to start from.
+      name: of the policy in the names of its stages, where a run trains several with one seed.
+      share: take the policy from the cache where an experiment trained it before.
+    """
+    config, start = of.config, {} if tactile is None else {"tactile": tactile}
+    order: dict[str, Any] = {"seed": of.seed, "share": share}
+    ending = f"{name}/{of.seed}" if name else f"{of.seed}"
+    if config.recipe == "touch" and config.encoders.steps:
+        order |= {"stage": f"encoders/{ending}", "start": start}
+        start = run_encoders(of.policy, of.data, config.encoders, of.context, **order)
+    if not config.sft.steps:
+        return start
+    order |= {"stage": f"sft/{ending}", "start": start}
+    return run_sft(of.policy, of.data, of.evidence, config.sft, of.context, **order)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -302,7 +330,7 @@ class _Seed(StudySeed):
     def _train(self) -> None:
         """SFT in its phases, its control, and every arm."""
         data, policy, context, config, seed = self.data, self.policy, self.context, self.config, self.seed
-        params = self._sft(config.sft, f"sft/{seed}", tactile=self.tactile)
+        params = supervised(self, tactile=self.tactile, share=self.share)
         contacts = self.contacts(params)
         test, val = (encode_rows(policy, params, data, data.parts[part], context) for part in ("test", "val"))
         held_out = val, data.labels("val")
@@ -319,13 +347,10 @@ class _Seed(StudySeed):
             self._evaluate_all(name, tuned, test, contacts.noise)
 
     def _blind(self) -> Evaluation:
-        params = self._sft(self.config.blind, f"blind/{self.seed}", blind=True)
+        order: dict[str, Any] = {"seed": self.seed, "stage": f"blind/{self.seed}", "share": self.share}
+        params = run_sft(self.policy, self.data, self.evidence, self.config.blind, self.context, blind=True, **order)
         features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
         return self.ask(params, features, samples=self.config.samples)
-
-    def _sft(self, config: StudySFT, stage: str, **options: Any) -> Params:
-        order: dict[str, Any] = {"seed": self.seed, "stage": stage, "share": self.share}
-        return run_sft(self.policy, self.data, self.evidence, config, self.context, **order, **options)
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Save and evaluate a policy, then evaluate all variants of it."""

@@ -21,22 +21,25 @@ from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
 GRPO_SHARE = 0.35
-"""Share of the training objects that SFT never sees."""
+"""Share of the training objects that SFT never sees under recipe `paper`."""
 
 GRPO_ATTRIBUTES = ORDINAL
 """Attributes that GRPO asks about under recipe `paper`; the arms may differ in how they pay for the answers."""
 
 Recipe = Literal["touch", "paper"]
-"""Training after the end-to-end phase of SFT.
+"""Stages of training.
 
-`paper`: GRPO on contacts that SFT never saw, about hardness, roughness and protrusion, as published.
-`touch`: first SFT of the decoder alone on all training contacts, encoded once; then GRPO on the same contacts, about
-all attributes, half of the questions with a part of the sensors, anchored by the likelihood of the verified answers.
+`paper`: SFT end to end, then GRPO on contacts that SFT never saw, about hardness, roughness and protrusion, as
+published.
+`touch`: the encoders learn levels by a linear head, then SFT teaches the decoder alone to read what they encode, then
+GRPO on the same contacts, about all attributes, half of the questions with a part of the sensors, anchored by the
+likelihood of the verified answers.  All stages learn from all training contacts.
 """
 
 DECODER = SFTConfig(
@@ -71,11 +74,14 @@ class TrainingConfig(SourceConfig):
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
     probe: ProbeConfig = ProbeConfig()
-    sft: StudySFT = StudySFT(steps=300)
+    encoders: EncoderTrainingConfig = EncoderTrainingConfig()
+    """Training of the encoders by a linear head, under recipe `touch`; 0 steps leave it out."""
+    sft: StudySFT = StudySFT(steps=0)
+    """SFT end to end, after that of the encoders where there is any; recipe `paper` needs it."""
     blind: StudySFT = StudySFT(steps=300, micro_contacts=16)
     """Without touch there is no encoder, and micro-batches would only cost."""
     recipe: Recipe = "touch"
-    """`paper` is the published recipe; `touch` adds the decoder's phase of SFT and anchors GRPO (see `Recipe`)."""
+    """`paper` is the published recipe; `touch` trains in phases and anchors GRPO (see `Recipe`)."""
     decoder: SFTConfig = DECODER
     """The decoder's phase of SFT on encoded contacts; the control that continues SFT has its batches and rates too."""
     anchor: float = 1.0
@@ -116,6 +122,11 @@ class TrainingConfig(SourceConfig):
         super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
         at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples", "anchor")
+        if not self.sft.steps and (self.recipe == "paper" or not self.encoders.steps):
+            raise ValueError(
+                f"sft.steps is 0: must be at least 1 where recipe {self.recipe!r} trains the encoders by nothing else; "
+                "set it, for example to 1350"
+            )
         require_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(
@@ -149,7 +160,8 @@ def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset
     path = prepare_records(config, context)
     odd = odd_contacts(config, path, context)
     left_out = odd if config.drop_odd else ()
-    return open_dataset(path, clip, GRPO_SHARE, config.clip_memory_gib, config.read_threads, left_out)
+    grpo_share = GRPO_SHARE if config.recipe == "paper" else None
+    return open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
 
 
 M = TypeVar("M", bound=TouchConfig)

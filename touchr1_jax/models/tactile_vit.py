@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from touchr1_jax.models.layers import MASKED, RMSNorm, check_heads, check_layers, check_sizes
+from touchr1_jax.models.frame_statistics import WIDTH, scaled_statistics
+from touchr1_jax.models.layers import MASKED, RMSNorm, SizeError, check_heads, check_layers, check_sizes
 from touchr1_jax.models.salience import busiest_patches, patch_change, rest_mean
 
 
@@ -24,7 +25,8 @@ class TactileViTConfig:
     frames make one time step.  With the defaults 4 frames at 112² give 4 steps × 16 patches = 64 tokens, pooled to 8.
 
     The `energy` stem sums the energy of its filters over each patch (see `patch_tokens`).  The `linear` one is a vision
-    transformer's plain patch embedding, of the pixels and of their change; `stem_width` is not used then.
+    transformer's plain patch embedding, of the pixels and of their change.  The `statistics` stem is a layer of
+    `stem_width` units for each patch's fixed statistics and those of its frame, and an embedding of these.
 
     A `causal` encoder lets a step see itself and earlier ones alone, as the prediction of the next step needs.  With
     `patches_kept` the transformer gets only the patches of a stream that change most, the same ones in every step; the
@@ -39,7 +41,7 @@ class TactileViTConfig:
     num_layers: int = 2
     num_heads: int = 3
     mlp_ratio: int = 2
-    stem: Literal["energy", "linear"] = "energy"
+    stem: Literal["energy", "linear", "statistics"] = "energy"
     stem_px: int = 4
     stem_width: int = 16
     patch_cells: int = 7
@@ -50,11 +52,21 @@ class TactileViTConfig:
     patches_kept: int | None = None
     rest: Literal["drop", "merge"] = "drop"
 
+    @property
+    def patch_px(self) -> int:
+        """Side of a patch."""
+        return self.stem_px * self.patch_cells
+
     def __post_init__(self) -> None:
         check_sizes(self, "width", "num_heads", "mlp_ratio", "stem_px", "stem_width", "patch_cells")
         check_sizes(self, "frames_per_step", "tokens_per_step")
         check_layers(self, least=0)
         check_heads(self.width, self.num_heads)
+        if self.stem == "statistics" and self.patches_kept is not None:
+            raise SizeError(
+                f"patches_kept is {self.patches_kept}: must be None for the statistics stem, which reads whole frames; "
+                "leave it out or choose another stem"
+            )
 
 
 class Encoded(NamedTuple):
@@ -71,7 +83,7 @@ class TactileViT(nn.Module):
 
     def __call__(
         self,
-        frames: Real[Array, "*n F H W 3"],
+        frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
         force_n: Float[Array, "*n F 3"],
         frame_index: Int[Array, "*n F"],
         frame_mask: Bool[Array, "*n F"],
@@ -83,7 +95,7 @@ class TactileViT(nn.Module):
     @nn.compact
     def encode(
         self,
-        frames: Real[Array, "*n F H W 3"],
+        frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
         force_n: Float[Array, "*n F 3"],
         frame_index: Int[Array, "*n F"],
         frame_mask: Bool[Array, "*n F"],
@@ -92,14 +104,15 @@ class TactileViT(nn.Module):
         """Encode streams.
 
         Args:
-          frames: pixel values 0..255.
+          frames: pixel values 0..255; for the statistics stem they may be the statistics of its patches instead, which
+            have no parameters and need be computed only once (`statistics_of`).
           force_n: measured force of each frame, newton; a zero vector where it is unknown.
           frame_index: position of each frame in its recording.
           frame_mask: which frames exist.
           sensor: index of the sensor that saw them.
         """
         c = self.config
-        frames = jnp.where(frame_mask[..., None, None, None], frames, 0)  # padding must hold nothing
+        frames = statistics_of(frames, frame_mask, c) if c.stem == "statistics" else of_frames(frame_mask, frames)
         force_n = jnp.where(frame_mask[..., None], force_n, 0.0)
         kept = kept_patches(frames, frame_mask, c)
         x = self._placed_patches(frames, kept)  # *n step patch D
@@ -127,8 +140,7 @@ class TactileViT(nn.Module):
         c = self.config
         merge = kept is not None and c.rest == "merge"
         x = patch_tokens(frames, c, None if merge else kept)
-        cell = c.stem_px * c.patch_cells
-        grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
+        grid = x.shape[-2] if kept is None else frames.shape[-3] // c.patch_px * (frames.shape[-2] // c.patch_px)
         place = self.param("patch_position", nn.initializers.normal(0.02), (grid, c.width))
         if kept is None:
             return x + place
@@ -147,7 +159,7 @@ def kept_patches(
     """
     if c.patches_kept is None:
         return None
-    cell = c.stem_px * c.patch_cells
+    cell = c.patch_px
     grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
     if not 1 <= c.patches_kept <= grid:
         raise ValueError(f"patches_kept is {c.patches_kept}: must lie in 1..{grid}, the patches of a frame; change it")
@@ -169,7 +181,7 @@ def cut_patches(
       ValueError: when the frames do not divide into the configured patches or steps.
     """
     *lead, f, h, w, _ = frames.shape
-    cell = c.stem_px * c.patch_cells
+    cell = c.patch_px
     if h % cell or w % cell or f % c.frames_per_step:
         raise ValueError(
             f"frames of {h}×{w} px and {f} per stream must divide into {cell} px patches and steps of "
@@ -192,17 +204,18 @@ def patch_tokens(
     The energy stem's nonlinearity lets a patch sum texture energy, which a single linear patch embedding averages away.
 
     Args:
-      frames: pixel values 0..255.
+      frames: pixel values 0..255, or the statistics of patches for their stem.
       c: shape of the encoder.
       kept: the only patches to read; all by default.
 
     Raises:
       ValueError: when the frames do not divide into the configured patches or steps.
     """
-    *lead, f = frames.shape[:-3]
-    x = cut_patches(frames, c, kept)
-    patches = x.shape[-3]
     embed = lambda y, name: nn.Dense(c.width, name=name)(_steps(y, c.frames_per_step))
+    if c.stem == "statistics":
+        return embed(nn.gelu(nn.Dense(c.stem_width, name="stem")(frames)), "patch")
+    x = cut_patches(frames, c, kept)
+    *lead, f, patches, _, _ = x.shape
     if c.stem == "linear":
         x = x.reshape(*lead, f, patches, -1).astype(jnp.float32) / 127.5 - 1.0
         return embed(jnp.concatenate([x, x - x[..., :1, :, :]], -1), "patch")
@@ -216,6 +229,22 @@ def patch_tokens(
     energy = jnp.concatenate([texture, texture - texture[..., :1, :, :], moved, change.mean(-2)], -1)
     x = nn.relu(level + 4.0 * change).reshape(*lead, f, patches, -1)
     return embed(x, "patch") + embed(energy, "energy")
+
+
+def statistics_of(
+    frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
+    frame_mask: Bool[Array, "*n F"],
+    c: TactileViTConfig,
+) -> Float[Array, "*n F patch statistic"]:
+    """Input of the statistics stem: `scaled_statistics` of its patches unless they are given, and 0 in padding."""
+    if frames.shape[-1] != WIDTH:
+        frames = scaled_statistics(of_frames(frame_mask, frames), c.patch_px)
+    return of_frames(frame_mask, frames)
+
+
+def of_frames(frame_mask: Bool[Array, "*n F"], x: Real[Array, "*m"]) -> Real[Array, "*m"]:
+    """Numbers [*n, F, …] of the frames that exist, and 0 for padding, which must hold nothing."""
+    return jnp.where(frame_mask.reshape(*frame_mask.shape, *(1,) * (x.ndim - frame_mask.ndim)), x, 0)
 
 
 def log_energy(x: Float[Array, "*n cell channel"]) -> Float[Array, "*n channel"]:

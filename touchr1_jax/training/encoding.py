@@ -1,7 +1,8 @@
 """Contacts encoded once by a frozen encoder: the input of GRPO and of evaluation."""
 
+import dataclasses
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.tactile_vit import TactileViTConfig, statistics_of
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -19,6 +21,19 @@ def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch
     encode = encode_program(fns, blind)
     parts = [jax.device_get(encode(params, batch)) for batch in batches]
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def touch_statistics(config: TactileViTConfig, batches: Iterable[TouchBatch]) -> TouchBatch:
+    """All contacts of some batches on the host, with the statistics of the stem in the place of the frames."""
+    compute = jax.jit(functools.partial(statistics_of, c=config))
+    changed = lambda batch: dataclasses.replace(batch, frames=compute(batch.frames, batch.frame_mask))
+    parts = [jax.device_get(changed(batch)) for batch in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def parts_of(rows: np.ndarray, size: int) -> Iterator[np.ndarray]:
+    """Rows in parts of one size, and a smaller last one."""
+    return (rows[start : start + size] for start in range(0, len(rows), size))
 
 
 @functools.cache

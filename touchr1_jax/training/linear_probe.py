@@ -17,10 +17,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8
 
+from touchr1_jax.models.frame_statistics import frame_statistics
 from touchr1_jax.models.tactile_vit import force_features
 from touchr1_jax.validation import above, at_least
 
-TINY = 1e-4  # keeps log(energy) of a constant image finite; energies are in units of full scale
 ROUNDING = 1e-5  # a spread below this share of the mean is that of a constant feature in float32
 
 
@@ -40,27 +40,8 @@ class ProbeConfig:
 
 @jax.jit
 def stream_features(frames: UInt8[Array, "*n F H W 3"], force_n: Float[Array, "*n F 3"]) -> Float[Array, "*n D"]:
-    """Fixed summary of one stream: how much each frame changed, at which scales it has gradients, and its force.
-
-    Per frame and channel: mean, mean absolute and spread of the change since the first frame, and the logarithm of the
-    mean absolute gradient at pixel and at 4-pixel scale, with its change since the first frame.
-    """
-    x = frames.astype(jnp.float32) / 255.0
-    change = x - x[..., :1, :, :, :]
-    *lead, h, w, c = x.shape
-    coarse = x.reshape(*lead, h // 4, 4, w * c).mean(-2).reshape(*lead, h // 4, w // 4, 4, c).mean(-2)
-    fine_energy, coarse_energy = _gradient_energy(x), _gradient_energy(coarse)
-    centre = _pixel_mean(change)
-    parts = [
-        centre,
-        jnp.log(_pixel_mean(jnp.abs(change)) + TINY),
-        jnp.log(jnp.sqrt(jnp.maximum(_pixel_mean(change**2) - centre**2, 0.0)) + TINY),
-        fine_energy,
-        coarse_energy,
-        fine_energy - fine_energy[..., :1, :],
-        coarse_energy - coarse_energy[..., :1, :],
-    ]
-    stacked = jnp.concatenate([*parts, force_features(force_n)], -1)
+    """Fixed summary of one stream: the statistics of each whole frame (`frame_statistics`), and its force."""
+    stacked = jnp.concatenate([frame_statistics(frames)[..., 0, :], force_features(force_n)], -1)
     return stacked.reshape(*stacked.shape[:-2], -1)
 
 
@@ -204,15 +185,3 @@ def _fit_probe(
     start = (jnp.zeros((x.shape[1], levels)), jnp.zeros(levels))
     (matrix, bias), _ = jax.lax.fori_loop(0, config.iterations, body, (start, solver.init(start)))
     return z @ matrix + bias
-
-
-def _gradient_energy(x: Float[Array, "*n h w c"]) -> Float[Array, "*n c"]:
-    vertical = _pixel_mean(jnp.abs(jnp.diff(x, axis=-3)))
-    horizontal = _pixel_mean(jnp.abs(jnp.diff(x, axis=-2)))
-    return jnp.log(vertical + horizontal + TINY)
-
-
-def _pixel_mean(x: Float[Array, "*n h w c"]) -> Float[Array, "*n c"]:
-    """Mean over pixels; rows first, over long contiguous lines, because three channels alone do not vectorise."""
-    *lead, h, w, c = x.shape
-    return x.reshape(*lead, h, w * c).mean(-2).reshape(*lead, w, c).mean(-2)

@@ -23,6 +23,7 @@ from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.linear_probe import ProbeConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 
 ARM = "paper"
 
@@ -47,6 +48,7 @@ STUDY = StudyConfig(
     scenes=SCENES,
     model=MODEL,
     probe=ProbeConfig(folds=2, iterations=4),
+    encoders=EncoderTrainingConfig(steps=60, batch_size=4, save_every=3),
     sft=StudySFT(steps=60, batch_size=4, save_every=3),
     blind=StudySFT(steps=30, batch_size=4, save_every=3, micro_contacts=4),
     decoder=dataclasses.replace(DECODER, steps=30, batch_size=2, questions=2, save_every=3),
@@ -57,6 +59,7 @@ STUDY = StudyConfig(
 
 SHORT = dataclasses.replace(
     STUDY,
+    encoders=dataclasses.replace(STUDY.encoders, steps=12),
     sft=dataclasses.replace(STUDY.sft, steps=12),
     blind=dataclasses.replace(STUDY.blind, steps=6),
     decoder=dataclasses.replace(STUDY.decoder, steps=6),

@@ -1,0 +1,134 @@
+"""Supervised training of a policy's encoders by a linear head, before its decoder is trained on what they encode.
+
+    L = mean −log softmax(b + W h)_label over known labels,   h = the tokens that the decoder reads, side by side
+
+Every contact has one label of each attribute in each step, and no token has to be predicted that is not a level: per
+contact this teaches the encoders several times as much as the answers do.  The head reads each sensor and the view by
+weights of their own, and half of the contacts show a random part of their sensors, so that the tokens of each sensor
+alone tell the levels.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+
+import grain
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from touchr1_jax import masked
+from touchr1_jax.models.policy import Features
+from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rl.losses import token_log_probs
+from touchr1_jax.training.feeds import FULL_SHARE, ONE_AT_A_TIME
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
+from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
+from touchr1_jax.types import Params, TouchBatch
+from touchr1_jax.validation import at_least
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EncoderTrainingConfig:
+    """Supervised training of the encoders; the learning rate is the paper's 1e-5 times `lr_scale`."""
+
+    steps: int = 1000
+    batch_size: int = 16
+    save_every: int = 500
+    optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, weight_decay=0.05)
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "steps")
+        at_least(self, 1, "batch_size", "save_every")
+
+
+@struct.dataclass
+class EncoderState:
+    """State of training; `params` holds the "encoders" of a policy and the "head", a kernel [W, A, K] and a bias."""
+
+    params: Params
+    opt_state: optax.OptState
+    step: Int[Array, ""]
+
+
+def train_encoder(
+    policy: TouchPolicy, params: Params, batches: Batches, config: EncoderTrainingConfig, hooks: Hooks = SILENT
+) -> Params:
+    """Train everything of a policy but its decoder and its frozen towers; the head is not kept.
+
+    Args:
+      policy: its forward passes, attributes and levels.
+      params: where it begins.
+      batches: `TouchBatch`es with labels, −1 where one is unknown, for example of `touch_rows`.
+      config: steps and optimizer.
+      hooks: log, checkpoints, devices.
+    """
+    kept = {name: tree for name, tree in params.items() if name in ("decoder", *policy.frozen)}
+    encoders = jax.tree.map(jnp.copy, {name: tree for name, tree in params.items() if name not in kept})
+    width = jax.eval_shape(lambda p, b: tokens_of(policy.fns.encode(p, b)), params, peek(batches)).shape[-1]
+    levels = len(policy.levels), max(policy.levels)
+    trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, *levels)), "bias": jnp.zeros(levels)}}
+    optimizer, step = encoder_program(policy, config)
+    state = EncoderState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
+    step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, kept)
+    state = fit(step, state, batches, LoopConfig(steps=config.steps, save_every=config.save_every), hooks)
+    return kept | hooks.devices.gather(state.params)["encoders"]
+
+
+@functools.cache
+def encoder_program(
+    policy: TouchPolicy, config: EncoderTrainingConfig
+) -> tuple[optax.GradientTransformation, Callable[..., tuple[EncoderState, dict[str, Array]]]]:
+    """Optimizer and compiled step, (state, batch, frozen towers) → (state, metrics), made once for all seeds."""
+    optimizer = make_optimizer(config.optimizer, config.steps)
+
+    def step(state: EncoderState, batch: TouchBatch, kept: Params) -> tuple[EncoderState, dict[str, Array]]:
+        shown = some_streams(jax.random.key(state.step), batch.stream_mask)
+
+        def loss(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
+            features = policy.fns.encode(kept | params["encoders"], batch)
+            log_p = level_log_probs(policy.levels, params["head"], dataclasses.replace(features, stream_mask=shown))
+            right = masked.mean(log_p.argmax(-1) == batch.label, batch.label >= 0)
+            return -masked.mean(token_log_probs(log_p, jnp.maximum(batch.label, 0)), batch.label >= 0), right
+
+        (value, right), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+        updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, updates)
+        metrics = {"loss": value, "accuracy": right, "grad_norm": optax.tree.norm(grads)}
+        return EncoderState(params=params, opt_state=opt_state, step=state.step + 1), metrics
+
+    return optimizer, jax.jit(step, donate_argnums=0)
+
+
+def level_log_probs(levels: Sequence[int], head: Params, features: Features) -> Float[Array, "P A K"]:
+    """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
+    logits = jnp.einsum("pw,wak->pak", tokens_of(features), head["kernel"]) + head["bias"]
+    exists = np.arange(logits.shape[-1]) < np.array(levels)[:, None]
+    return jax.nn.log_softmax(jnp.where(exists, logits, -jnp.inf))
+
+
+def tokens_of(features: Features) -> Float[Array, "P W"]:
+    """All tokens of each contact side by side, 0 where there is no touch or no view."""
+    exists = features.stream_mask[..., None] & (features.touch_time >= 0)
+    touch = jnp.where(exists[..., None], features.touch, 0.0)
+    view = jnp.where(features.view_mask[:, None, None], features.view, 0.0)
+    return jnp.concatenate([x.reshape(len(x), -1).astype(jnp.float32) for x in (touch, view)], -1)
+
+
+def some_streams(key: Array, present: Bool[Array, "P S"]) -> Bool[Array, "P S"]:
+    """`random_streams` in the graph: all present streams with probability `FULL_SHARE`, else a random part of them."""
+    order, size, full = jax.random.split(key, 3)
+    rank = jnp.argsort(jnp.argsort(jax.random.uniform(order, present.shape), -1), -1)
+    part = present & (rank < jax.random.randint(size, (len(present), 1), 1, present.shape[1] + 1))
+    use = (jax.random.uniform(full, (len(present), 1)) >= FULL_SHARE) & part.any(-1, keepdims=True)
+    return jnp.where(use, part, present)
+
+
+def touch_rows(touch: TouchBatch, *, batch_size: int, seed: int, own: np.ndarray | None = None) -> Batches:
+    """Contacts on the host in random order, again and again; `own` are the rows of a batch that this process reads."""
+    own = np.arange(batch_size) if own is None else own
+    order = grain.MapDataset.range(len(touch.label)).seed(seed).shuffle().repeat().batch(batch_size)
+    return iter(order.map(lambda rows: jax.tree.map(lambda x: x[rows[own]], touch)).to_iter_dataset(ONE_AT_A_TIME))
