@@ -39,7 +39,8 @@ def parts(networks: DynamicsConfig, params: Params, batch: TouchBatch) -> dict[s
 
     def each(one: Callable[[jax.Array, jax.Array | None], Any], b: TouchBatch) -> Any:
         b = read_frames(networks, b)
-        kept = lambda x: None if e.rest == "merge" else kept_patches(x[0], x[1], e)  # merging reads every patch
+        number = None if e.rest == "merge" else e.patches_kept  # merging reads every patch
+        kept = lambda x: None if number is None else kept_patches(x[0], x[1], e, number)
         return jax.lax.map(lambda x: one(x[0], kept(x)), (b.frames, b.frame_mask))
 
     cut = lambda x, kept: cut_patches(x, e, kept).astype(jnp.float32) / 127.5

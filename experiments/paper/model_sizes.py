@@ -17,7 +17,7 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Estimate, Table, named_table
 from experiments.core.text import bounds, number
 from experiments.paper.components import run_full_model
-from experiments.study.stages import ENCODE_BATCH, answer_feed
+from experiments.study.stages import answer_feed
 from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.bench.statistics import Interval, student_interval
@@ -25,7 +25,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
-from touchr1_jax.training.encoding import encode_program
+from touchr1_jax.training.encoding import BATCH, encode_program
 from touchr1_jax.training.evaluation import answer_program
 from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.questions import labelled_questions, question_batch
@@ -108,7 +108,7 @@ class TimedPrograms:
 def timed_programs(study: Study) -> TimedPrograms:
     """A step of SFT and a block of questions about some test contacts, ready to be timed."""
     data, policy = study.data, study.policy
-    rows = data.parts["test"][:ENCODE_BATCH]
+    rows = data.parts["test"][:BATCH]
     clips = data.batches(rows, batch_size=len(rows), seed=0, shuffle=False, repeat=False)
     touch, label = touch_batch(next(iter(clips))), data.label[rows]
     params = policy.init(0, touch)

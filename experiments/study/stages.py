@@ -7,10 +7,9 @@ stopped run continues from its last checkpoint.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -31,7 +30,7 @@ from touchr1_jax.training import encoding
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
-from touchr1_jax.training.loop import SKIPPED, LoopConfig
+from touchr1_jax.training.loop import SKIPPED, Batches, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
 from touchr1_jax.training.train_grpo import train_grpo
@@ -40,9 +39,6 @@ from touchr1_jax.types import Params, TouchBatch
 
 Weights = Mapping[str, float]
 """Reward → weight."""
-
-ENCODE_BATCH = 8
-"""Contacts that are encoded at once: eight stay in cache, sixteen take twice the time each."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,8 +179,10 @@ def run_encoders(
         order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed}
         order |= {"own": context.devices.local_rows(config.batch_size)}
         touch = computed_touch(policy, data, context)
-        clips = None if touch is not None else data.batches(rows, **order).map(host_touch)
-        feed = touch_rows(_rows(touch, rows), **order) if clips is None else iter(clips)
+        if touch is None:
+            feed: Batches = iter(data.batches(rows, **order).map(host_touch))
+        else:
+            feed = touch_rows(touch, rows, **order)
         params = untrained(policy, data, seed) | (start or {})
         with stage_hooks(context, stage, config.steps) as hooks:
             return train_encoder(policy, params, feed, config, hooks)
@@ -194,10 +192,6 @@ def run_encoders(
     values = {"records": data.store.digest, "encoders": config, "model": policy.model, "clip": data.clip}
     values |= {"seed": seed, "mesh": context.devices.shape}
     return cached("sft", values, {"rows": rows, "start": start or {}}, train, context, stage)
-
-
-def _rows(touch: TouchBatch | None, rows: np.ndarray) -> TouchBatch:
-    return jax.tree.map(lambda x: x[rows], touch)
 
 
 def computed_touch(policy: TouchPolicy, data: Dataset, context: Context) -> TouchBatch | None:
@@ -210,7 +204,7 @@ def computed_touch(policy: TouchPolicy, data: Dataset, context: Context) -> Touc
         return None
 
     def compute(rows: np.ndarray) -> TouchBatch:
-        clips = _clips(data, rows, context, "computing statistics", batch_size=ENCODE_BATCH)
+        clips = _clips(data, rows, context, "computing statistics", batch_size=encoding.BATCH)
         return encoding.touch_statistics(tactile, map(touch_batch, clips))
 
     if tactile.patch_px not in data.statistics:
@@ -232,10 +226,8 @@ def encode_rows(
     touch = None if blind else computed_touch(policy, data, context)
 
     def encode(own: np.ndarray) -> Features:
-        if touch is None:
-            batches = map(touch_batch, _clips(data, own, context, "encoding", batch_size=ENCODE_BATCH, felt=not blind))
-        else:
-            batches = (_rows(touch, part) for part in encoding.parts_of(own, ENCODE_BATCH))
+        clips = lambda: _clips(data, own, context, "encoding", batch_size=encoding.BATCH, felt=not blind)
+        batches: Iterable[TouchBatch] = map(touch_batch, clips()) if touch is None else encoding.parts(touch, own)
         return encoding.encode_contacts(policy.fns, params, batches, blind=blind)
 
     return context.processes.split_work(rows, encode)

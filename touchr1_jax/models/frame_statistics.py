@@ -16,8 +16,8 @@ COARSE_PX = 4
 WIDTH = 2 * 7 * 3
 """Numbers of a patch: seven statistics of three channels, of the patch and of all patches together."""
 
-CENTRE = np.repeat(np.float32([0.0, -4.5, -4.5, -3.4, -3.2, 0.3, 0.35]), 3)
-SPREAD = np.repeat(np.float32([0.03, 2.8, 2.9, 2.0, 1.2, 0.5, 0.6]), 3)
+CENTRE = np.repeat(np.array([0.0, -4.5, -4.5, -3.4, -3.2, 0.3, 0.35], np.float32), 3)
+SPREAD = np.repeat(np.array([0.03, 2.8, 2.9, 2.0, 1.2, 0.5, 0.6], np.float32), 3)
 """Mean and spread of the statistics of patches of 28 px in generated scenes."""
 
 

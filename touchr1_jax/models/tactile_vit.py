@@ -5,7 +5,7 @@ after the transformer each step is pooled by learned queries to `tokens_per_step
 """
 
 import dataclasses
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from jaxtyping import Array, Bool, Float, Int, Real
 from touchr1_jax.models.frame_statistics import WIDTH, scaled_statistics
 from touchr1_jax.models.layers import MASKED, RMSNorm, SizeError, check_heads, check_layers, check_sizes
 from touchr1_jax.models.salience import busiest_patches, patch_change, rest_mean
+
+Frames: TypeAlias = Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"]
+"""Pixel values 0..255, or the statistics of the patches."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,7 +86,7 @@ class TactileViT(nn.Module):
 
     def __call__(
         self,
-        frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
+        frames: Frames,
         force_n: Float[Array, "*n F 3"],
         frame_index: Int[Array, "*n F"],
         frame_mask: Bool[Array, "*n F"],
@@ -95,7 +98,7 @@ class TactileViT(nn.Module):
     @nn.compact
     def encode(
         self,
-        frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
+        frames: Frames,
         force_n: Float[Array, "*n F 3"],
         frame_index: Int[Array, "*n F"],
         frame_mask: Bool[Array, "*n F"],
@@ -114,7 +117,7 @@ class TactileViT(nn.Module):
         c = self.config
         frames = statistics_of(frames, frame_mask, c) if c.stem == "statistics" else of_frames(frame_mask, frames)
         force_n = jnp.where(frame_mask[..., None], force_n, 0.0)
-        kept = kept_patches(frames, frame_mask, c)
+        kept = None if c.patches_kept is None else kept_patches(frames, frame_mask, c, c.patches_kept)
         x = self._placed_patches(frames, kept)  # *n step patch D
         steps = x.shape[-3]
         step_mask = _group(frame_mask, c.frames_per_step).any(-1)
@@ -133,9 +136,7 @@ class TactileViT(nn.Module):
         x = RMSNorm(name="norm")(x).reshape(*x.shape[:-2], steps, -1, c.width)
         return Encoded(patches=x, pooled=QueryPool(c.tokens_per_step, name="pool")(x))
 
-    def _placed_patches(
-        self, frames: Real[Array, "*n F H W 3"], kept: Int[Array, "*n k"] | None
-    ) -> Float[Array, "*n step patch D"]:
+    def _placed_patches(self, frames: Frames, kept: Int[Array, "*n k"] | None) -> Float[Array, "*n step patch D"]:
         """Embedded patches with their positions: all, the kept ones, or the kept ones and the mean of the others."""
         c = self.config
         merge = kept is not None and c.rest == "merge"
@@ -150,20 +151,17 @@ class TactileViT(nn.Module):
 
 
 def kept_patches(
-    frames: Real[Array, "*n F H W 3"], frame_mask: Bool[Array, "*n F"], c: TactileViTConfig
-) -> Int[Array, "*n k"] | None:
-    """The patches of each stream that are read, in their order; `None` for all.
+    frames: Real[Array, "*n F H W 3"], frame_mask: Bool[Array, "*n F"], c: TactileViTConfig, number: int
+) -> Int[Array, "*n k"]:
+    """The patches of each stream that are read, in their order.
 
     Raises:
       ValueError: more patches to keep than there are.
     """
-    if c.patches_kept is None:
-        return None
-    cell = c.patch_px
-    grid = frames.shape[-3] // cell * (frames.shape[-2] // cell)
-    if not 1 <= c.patches_kept <= grid:
-        raise ValueError(f"patches_kept is {c.patches_kept}: must lie in 1..{grid}, the patches of a frame; change it")
-    return busiest_patches(patch_change(frames, cell), frame_mask, c.patches_kept)
+    grid = frames.shape[-3] // c.patch_px * (frames.shape[-2] // c.patch_px)
+    if not 1 <= number <= grid:
+        raise ValueError(f"patches_kept is {number}: must lie in 1..{grid}, the patches of a frame; change it")
+    return busiest_patches(patch_change(frames, c.patch_px), frame_mask, number)
 
 
 def earlier_steps(steps: int, tokens: int) -> Bool[np.ndarray, "N N"]:
@@ -197,7 +195,7 @@ def cut_patches(
 
 
 def patch_tokens(
-    frames: Real[Array, "*n F H W 3"], c: TactileViTConfig, kept: Int[Array, "*n k"] | None = None
+    frames: Frames, c: TactileViTConfig, kept: Int[Array, "*n k"] | None = None
 ) -> Float[Array, "*n step patch D"]:
     """Cut frames and their change since the first frame into tubelets and embed them (called inside a compact module).
 
@@ -232,7 +230,7 @@ def patch_tokens(
 
 
 def statistics_of(
-    frames: Real[Array, "*n F H W 3"] | Float[Array, "*n F patch statistic"],
+    frames: Frames,
     frame_mask: Bool[Array, "*n F"],
     c: TactileViTConfig,
 ) -> Float[Array, "*n F patch statistic"]:

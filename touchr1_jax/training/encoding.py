@@ -15,25 +15,30 @@ from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig, statistics_of
 from touchr1_jax.types import Params, TouchBatch
 
+BATCH = 8
+"""Contacts that are encoded at once: eight stay in cache, sixteen take twice the time each."""
+
 
 def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch], *, blind: bool = False) -> Features:
     """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams."""
     encode = encode_program(fns, blind)
-    parts = [jax.device_get(encode(params, batch)) for batch in batches]
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    found = [jax.device_get(encode(params, batch)) for batch in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
 def touch_statistics(config: TactileViTConfig, batches: Iterable[TouchBatch]) -> TouchBatch:
     """All contacts of some batches on the host, with the statistics of the stem in the place of the frames."""
     compute = jax.jit(functools.partial(statistics_of, c=config))
     changed = lambda batch: dataclasses.replace(batch, frames=compute(batch.frames, batch.frame_mask))
-    parts = [jax.device_get(changed(batch)) for batch in batches]
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    found = [jax.device_get(changed(batch)) for batch in batches]
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
-def parts_of(rows: np.ndarray, size: int) -> Iterator[np.ndarray]:
-    """Rows in parts of one size, and a smaller last one."""
-    return (rows[start : start + size] for start in range(0, len(rows), size))
+def parts(touch: TouchBatch, rows: np.ndarray) -> Iterator[TouchBatch]:
+    """Some contacts of a batch on the host, `BATCH` at a time."""
+    for start in range(0, len(rows), BATCH):
+        part = rows[start : start + BATCH]
+        yield jax.tree.map(lambda x, part=part: x[part], touch)
 
 
 @functools.cache

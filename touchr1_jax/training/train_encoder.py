@@ -127,8 +127,18 @@ def some_streams(key: Array, present: Bool[Array, "P S"]) -> Bool[Array, "P S"]:
     return jnp.where(use, part, present)
 
 
-def touch_rows(touch: TouchBatch, *, batch_size: int, seed: int, own: np.ndarray | None = None) -> Batches:
-    """Contacts on the host in random order, again and again; `own` are the rows of a batch that this process reads."""
+def touch_rows(
+    touch: TouchBatch, rows: np.ndarray, *, batch_size: int, seed: int, own: np.ndarray | None = None
+) -> Batches:
+    """Batches of some contacts on the host in random order, again and again.
+
+    Args:
+      touch: all contacts.
+      rows: those to train on.
+      batch_size, seed: of the batches and their order.
+      own: rows of a batch that this process reads; all by default.
+    """
     own = np.arange(batch_size) if own is None else own
-    order = grain.MapDataset.range(len(touch.label)).seed(seed).shuffle().repeat().batch(batch_size)
-    return iter(order.map(lambda rows: jax.tree.map(lambda x: x[rows[own]], touch)).to_iter_dataset(ONE_AT_A_TIME))
+    order = grain.MapDataset.range(len(rows)).seed(seed).shuffle().repeat().batch(batch_size)
+    batches = order.map(lambda at: jax.tree.map(lambda x: x[rows[at[own]]], touch))
+    return iter(batches.to_iter_dataset(ONE_AT_A_TIME))

@@ -102,7 +102,7 @@ def test_a_study_starts_from_it(directory, data, context):
     evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
     untouched = dataclasses.replace(tiny.STUDY.sft, steps=0)
     policy = build_policy(model, data.clip.sensors)
-    params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", tactile=tactile)
+    params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", start={"tactile": tactile})
     jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
     assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)
 

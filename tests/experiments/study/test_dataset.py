@@ -32,6 +32,9 @@ def test_a_share_of_the_training_objects_is_kept_for_grpo_with_all_their_contact
     ids = {part: {store.contacts[i].object_id for i in rows} for part, rows in parts.items()}
     assert len(parts["grpo"]) == 4
     assert not ids["sft"] & ids["grpo"]
+    shared = split_parts(store, None)
+    np.testing.assert_array_equal(shared["grpo"], store.contacts_of_split("train"))
+    np.testing.assert_array_equal(shared["sft"], shared["grpo"])
 
 
 @pytest.mark.parametrize(
