@@ -5,12 +5,14 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.study.stages import force_only
+from experiments.study.dataset import Dataset
+from experiments.study.stages import ProbeFeatures
 from experiments.study.study import SFT, Study
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.training.evaluation import Evaluation
+from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 from touchr1_jax.types import Parsed
 
 
@@ -83,3 +85,17 @@ def level_answers(
         alone=single if sensors > 1 else None,
         truth=asked.truth,
     )
+
+
+def force_only(data: Dataset, probed: ProbeFeatures, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
+    """Levels of contacts by a probe on the measured forces alone, int [len(rows), A]: what the force ramp reveals."""
+    train = np.isin(np.arange(len(data.store)), data.training)
+    columns = []
+    for a, name in enumerate(ATTRIBUTES):
+        weight = (train & (data.label[:, a] >= 0))[None]
+        if not weight.any():  # not annotated, so no question asks for it
+            columns.append(np.zeros(len(rows), int))
+            continue
+        log_prob = probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)
+        columns.append(log_prob[0, rows].argmax(-1))
+    return np.stack(columns, 1)

@@ -29,7 +29,7 @@ from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score, reward_wei
 from touchr1_jax.training import encoding
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
-from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, sensor_evidence, stream_features
+from touchr1_jax.training.linear_probe import ProbeConfig, sensor_evidence, stream_features
 from touchr1_jax.training.loop import SKIPPED, Batches, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
@@ -409,17 +409,3 @@ def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[s
         context.log(stage, t, **metrics, **alarms_of(metrics, t, aloud=True))
 
     return log
-
-
-def force_only(data: Dataset, probed: ProbeFeatures, rows: np.ndarray, config: ProbeConfig) -> np.ndarray:
-    """Levels of contacts by a probe on the measured forces alone, int [len(rows), A]: what the force ramp reveals."""
-    train = np.isin(np.arange(len(data.store)), data.training)
-    columns = []
-    for a, name in enumerate(ATTRIBUTES):
-        weight = (train & (data.label[:, a] >= 0))[None]
-        if not weight.any():  # not annotated, so no question asks for it
-            columns.append(np.zeros(len(rows), int))
-            continue
-        log_prob = probe_log_probs(probed.force, data.label[:, a], weight, LEVELS[name], config)
-        columns.append(log_prob[0, rows].argmax(-1))
-    return np.stack(columns, 1)

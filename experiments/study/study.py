@@ -132,11 +132,8 @@ class StudySeed:
 def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", share: bool = False) -> Params:
     """The policy of a seed before the phase of its decoder: its encoders trained by a head, then SFT end to end.
 
-    Args:
-      of: the seed.
-      tactile: parameters of the tactile encoder to start from.
-      name: of the policy in the names of its stages, where a run trains several with one seed.
-      share: take the policy from the cache where an experiment trained it before.
+    `tactile` are parameters of the tactile encoder to start from, `name` is that of the policy in its stages where a
+    run trains several with one seed; `share` as in `run_sft`.
     """
     config, start = of.config, {} if tactile is None else {"tactile": tactile}
     order: dict[str, Any] = {"seed": of.seed, "share": share}
@@ -152,13 +149,7 @@ def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainedPolicy(StudySeed):
-    """A trained policy of one seed, and everything that another evaluation of it needs.
-
-    Attributes:
-      params: its parameters.
-      test: encoded test contacts; `noise` is the noise bank of its encoder.
-      evaluation: its answers about them.
-    """
+    """A trained policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
 
     params: Params
     test: Features
@@ -176,10 +167,7 @@ class EvalVariant:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
-    """The result of a study; `answers[name][seed]` are a policy's answers about the test contacts.
-
-    `variants[name][seed]` are those of an `EvalVariant`.
-    """
+    """The result of a study; `answers[name][seed]` are a policy's answers, `variants[…]` those of an `EvalVariant`."""
 
     config: TrainingConfig
     data: Dataset
@@ -347,8 +335,8 @@ class _Seed(StudySeed):
             self._evaluate_all(name, tuned, test, contacts.noise)
 
     def _blind(self) -> Evaluation:
-        order: dict[str, Any] = {"seed": self.seed, "stage": f"blind/{self.seed}", "share": self.share}
-        params = run_sft(self.policy, self.data, self.evidence, self.config.blind, self.context, blind=True, **order)
+        order: dict[str, Any] = {"seed": self.seed, "stage": f"blind/{self.seed}", "share": self.share, "blind": True}
+        params = run_sft(self.policy, self.data, self.evidence, self.config.blind, self.context, **order)
         features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
         return self.ask(params, features, samples=self.config.samples)
 
