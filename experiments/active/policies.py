@@ -13,7 +13,7 @@ from experiments.active.feed import DrawnFeed
 from experiments.active.plans import NO_CHOICE, Answer, Played
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import stage_hooks
-from experiments.study.stages import ALARM
+from experiments.study.alarm_log import ALARM
 from touchr1_jax.models.active_policy import ActivePolicy, Explored
 from touchr1_jax.rl.active import make_explore
 from touchr1_jax.rl.active_alarms import ACTIVE_RULES

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.study.stages import ALARM
+from experiments.study.alarm_log import ALARM
 from touchr1_jax.rl.alarms import RULES, START, WINDOW
 
 MOST = 0.5

@@ -7,14 +7,15 @@ stopped run continues from its last checkpoint.
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
+from experiments.study.alarm_log import alarm_log
 from experiments.study.cache import cached
 from experiments.study.dataset import Dataset
 from sensors_io.augment import AugmentConfig
@@ -23,14 +24,13 @@ from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
-from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import GRPOConfig, left_out
-from touchr1_jax.rl.scoring import NONFINITE_IN, ScoreFn, make_score, reward_weights
+from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.training import encoding
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, sensor_evidence, stream_features
-from touchr1_jax.training.loop import SKIPPED, Batches, LoopConfig
+from touchr1_jax.training.loop import Batches, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
 from touchr1_jax.training.train_grpo import train_grpo
@@ -368,44 +368,3 @@ def run_grpo(
     inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
     values |= {"full_share": contacts.full_share}
     return cached("grpo", values, {**params, "input": inputs}, train, context, stage)
-
-
-ALARM = "alarm_"
-"""Prefix of the logged metrics that hold alarms, followed by their code."""
-
-
-def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[str, float]], None]:
-    """A function that logs the metrics of each step and the alarms they raise, `alarm_F7` with the number that fired.
-
-    Each alarm of a stage is also printed once, and so is each reward that is not finite and the first update that is
-    left out.  A stage that resumes at step `start` first looks at the steps that it logged before, so that its lines
-    are those of an uninterrupted run.
-    """
-    monitor, printed = AlarmMonitor(), set[str]()
-
-    def alarms_of(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
-        left_out = SKIPPED in metrics  # then the numbers that are not finite are missing
-        alarms = monitor.update({} if left_out else metrics, left_out=left_out)
-        notes = {f"{alarm.code} {alarm.meaning}": str(alarm) for alarm in alarms}
-        if left_out:
-            notes[SKIPPED] = "the update is left out, for its gradient is not finite; the report counts all of them"
-        for name, share in metrics.items():
-            if name.startswith(NONFINITE_IN) and share > 0:
-                reward = name.removeprefix(NONFINITE_IN)
-                what = f"reward {reward!r} is not finite in {share:.0%} of the groups, which are left out"
-                notes[name] = f"{what}; the report counts all of them"
-        for name, note in notes.items():
-            if aloud and name not in printed:
-                context.print(f"{stage}, step {t}: {note}")
-            printed.add(name)
-        return {f"{ALARM}{alarm.code}": alarm.value for alarm in alarms}
-
-    for line in read_metrics(context.directory):
-        if line["stage"] == stage and line["step"] < start:
-            metrics = {n: x for n, x in line.items() if n not in ("stage", "step") and not n.startswith(ALARM)}
-            alarms_of(metrics, line["step"], aloud=False)
-
-    def log(t: int, metrics: dict[str, float]) -> None:
-        context.log(stage, t, **metrics, **alarms_of(metrics, t, aloud=True))
-
-    return log

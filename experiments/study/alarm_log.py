@@ -1,0 +1,48 @@
+"""The log of a GRPO stage: metrics of each step, the alarms they raise, and what was left out of the update."""
+
+from collections.abc import Callable
+
+from experiments.core.context import Context, read_metrics
+from touchr1_jax.rl.alarms import AlarmMonitor
+from touchr1_jax.rl.scoring import NONFINITE_IN
+from touchr1_jax.training.loop import SKIPPED
+
+ALARM = "alarm_"
+"""Prefix of the logged metrics that hold alarms, followed by their code."""
+
+
+def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[str, float]], None]:
+    """A function that logs the metrics of each step and the alarms they raise, `alarm_F7` with the number that fired.
+
+    Each alarm of a stage is also printed once, and so is each reward that is not finite and the first update that is
+    left out.  A stage that resumes at step `start` first looks at the steps that it logged before, so that its lines
+    are those of an uninterrupted run.
+    """
+    monitor, printed = AlarmMonitor(), set[str]()
+
+    def alarms_of(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
+        left_out = SKIPPED in metrics  # then the numbers that are not finite are missing
+        alarms = monitor.update({} if left_out else metrics, left_out=left_out)
+        notes = {f"{alarm.code} {alarm.meaning}": str(alarm) for alarm in alarms}
+        if left_out:
+            notes[SKIPPED] = "the update is left out, for its gradient is not finite; the report counts all of them"
+        for name, share in metrics.items():
+            if name.startswith(NONFINITE_IN) and share > 0:
+                reward = name.removeprefix(NONFINITE_IN)
+                what = f"reward {reward!r} is not finite in {share:.0%} of the groups, which are left out"
+                notes[name] = f"{what}; the report counts all of them"
+        for name, note in notes.items():
+            if aloud and name not in printed:
+                context.print(f"{stage}, step {t}: {note}")
+            printed.add(name)
+        return {f"{ALARM}{alarm.code}": alarm.value for alarm in alarms}
+
+    for line in read_metrics(context.directory):
+        if line["stage"] == stage and line["step"] < start:
+            metrics = {n: x for n, x in line.items() if n not in ("stage", "step") and not n.startswith(ALARM)}
+            alarms_of(metrics, line["step"], aloud=False)
+
+    def log(t: int, metrics: dict[str, float]) -> None:
+        context.log(stage, t, **metrics, **alarms_of(metrics, t, aloud=True))
+
+    return log
