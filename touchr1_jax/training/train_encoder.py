@@ -46,7 +46,7 @@ class EncoderTrainingConfig:
 
 
 @struct.dataclass
-class EncoderState:
+class LevelHeadState:
     """State of training; `params` holds the "encoders" of a policy and the "head", a kernel [W, A, K] and a bias."""
 
     params: Params
@@ -72,7 +72,7 @@ def train_encoder(
     levels = len(policy.levels), max(policy.levels)
     trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, *levels)), "bias": jnp.zeros(levels)}}
     optimizer, step = encoder_program(policy, config)
-    state = EncoderState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
+    state = LevelHeadState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, kept)
     state = fit(step, state, batches, LoopConfig(steps=config.steps, save_every=config.save_every), hooks)
     return kept | hooks.devices.gather(state.params)["encoders"]
@@ -81,11 +81,11 @@ def train_encoder(
 @functools.cache
 def encoder_program(
     policy: TouchPolicy, config: EncoderTrainingConfig
-) -> tuple[optax.GradientTransformation, Callable[..., tuple[EncoderState, dict[str, Array]]]]:
+) -> tuple[optax.GradientTransformation, Callable[..., tuple[LevelHeadState, dict[str, Array]]]]:
     """Optimizer and compiled step, (state, batch, frozen towers) → (state, metrics), made once for all seeds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
 
-    def step(state: EncoderState, batch: TouchBatch, kept: Params) -> tuple[EncoderState, dict[str, Array]]:
+    def step(state: LevelHeadState, batch: TouchBatch, kept: Params) -> tuple[LevelHeadState, dict[str, Array]]:
         shown = some_streams(jax.random.key(state.step), batch.stream_mask)
 
         def loss(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -98,7 +98,7 @@ def encoder_program(
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics = {"loss": value, "accuracy": right, "grad_norm": optax.tree.norm(grads)}
-        return EncoderState(params=params, opt_state=opt_state, step=state.step + 1), metrics
+        return LevelHeadState(params=params, opt_state=opt_state, step=state.step + 1), metrics
 
     return optimizer, jax.jit(step, donate_argnums=0)
 

@@ -24,8 +24,8 @@ from experiments.core.loops import run_loop
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
 from experiments.faults.trainings.small_study import ARM, MODEL
+from experiments.study.alarm_log import alarm_log
 from experiments.study.scores import PUBLISHED
-from experiments.study.stages import alarm_log
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, touch_shapes
