@@ -24,6 +24,7 @@ COMMANDS: Mapping[str, str] = {
     "devices": "devices.Devices",
     "view": "view.View",
     "record": "record.Record",
+    "snap": "snap.Snap",
     "calibrate": "calibrate.Calibrate",
     "geometry": "geometry.MeasureGeometry",
     "extract": "extract.Extract",

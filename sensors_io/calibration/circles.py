@@ -75,22 +75,30 @@ def find_circles(presses: BallPresses) -> Circles:
     return Circles(touches=small.full(rows[back]), misfit=misfit[back], optics=optics)
 
 
-def fit_optics(presses: BallPresses, touches: Touches) -> Optics:
-    """The optics that explain presses whose touches are known."""
-    small = _Small(presses)
-    return _fit(small, small.reduced(touches), SCHEDULE[-1])
+def first_touch(picture: np.ndarray, background: np.ndarray, radius_mm: float, mm_per_px: float) -> np.ndarray:
+    """First guess of one touch, without optics: (x, y, contact radius) in px, float64 [3].
+
+    The change is greatest where the slope is: the radius is that of the ring in which it is greatest on average.
+    """
+    one = BallPresses(pictures=picture[None], background=background, radius_mm=radius_mm, mm_per_px=mm_per_px)
+    small = _Small(one)
+    row = small.located()[0]
+    away = np.hypot(small.x - row[0], small.y - row[1])
+    ring = np.minimum(away, CONTACTS[1] * small.ball_px).round().astype(np.int64)
+    size = np.sqrt((small.changes[0] ** 2).sum(-1))
+    mean = np.bincount(ring.ravel(), size.ravel()) / np.maximum(np.bincount(ring.ravel()), 1)
+    row[2] = max(float(mean[:-1].argmax()), 1.0)
+    found: np.ndarray = small.full(row[None]).stacked()[0]
+    return found
 
 
-def align_circles(presses: BallPresses, optics: Optics, start: Touches | None = None) -> Circles:
-    """Touches of presses that the optics have not seen, from a start that is known or from several."""
+def align_circles(presses: BallPresses, optics: Optics) -> Circles:
+    """Touches of presses that the optics have not seen."""
     small = _Small(presses)
-    if start is None:
-        begun = small.located()
-        ends = [_align(small, begun * (1, 1, share), optics) for share in STARTS]
-        better = np.argmin([misfit for _, misfit in ends], axis=0)
-        rows = np.where(better[:, None] == 0, ends[0][0], ends[1][0])
-    else:
-        rows = small.reduced(start)
+    begun = small.located()
+    ends = [_align(small, begun * (1, 1, start), optics) for start in STARTS]
+    better = np.argmin([misfit for _, misfit in ends], axis=0)
+    rows = np.where(better[:, None] == 0, ends[0][0], ends[1][0])
     rows, misfit = _align(small, rows, optics)
     return Circles(touches=small.full(rows), misfit=misfit, optics=optics)
 
@@ -134,11 +142,6 @@ class _Small:
         """On the pixels of the pictures themselves."""
         centre = (rows[:, :2] + 0.5) * self.factor - 0.5
         return Touches.of(np.column_stack([centre, rows[:, 2] * self.factor]))
-
-    def reduced(self, touches: Touches) -> np.ndarray:
-        """On the fewer pixels, [P, 3]."""
-        rows = touches.stacked()
-        return np.column_stack([(rows[:, :2] + 0.5) / self.factor - 0.5, rows[:, 2] / self.factor])
 
 
 def _odd_centre(change: np.ndarray, ball_px: float) -> tuple[float, float]:

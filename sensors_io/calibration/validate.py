@@ -125,7 +125,7 @@ def cross_validate(
     """Errors of every press under maps solved without it, [repeats, P] in the order of the presses.
 
     What presses share beside the map, circles and the weights of their pixels, is found once with all of them.  To find
-    it anew in every fold takes five times as long and changes the medians by less than a tenth.
+    it anew in every fold takes five times as long; on 44 real presses it gave 5.1 µm and 2.6 % instead of 4.8 and 2.5.
 
     Args:
       presses: the pictures.

@@ -1,0 +1,133 @@
+"""`python -m sensors_io snap`."""
+
+import contextlib
+import dataclasses
+import functools
+import pathlib
+from typing import Annotated
+
+import cv2
+import numpy as np
+import tyro
+
+from sensors_io.calibration.guide import Guidance, GuideConfig, PressGuide, drawn
+from sensors_io.commands.choices import Bench, opened, stop_on_interrupt
+from sensors_io.commands.console import OUT
+from sensors_io.devices.base import Device
+from sensors_io.devices.errors import DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
+from sensors_io.fields.sources import read_picture
+from sensors_io.fields.types import CalibrationError
+from sensors_io.viewer.server import LiveView, Numbers
+
+_TIMEOUT_S = 2.0  # for one frame
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Snap(Bench):
+    """Take the pictures that `calibrate` needs, with guidance: the gel at rest, then presses of a ball all over it.
+
+    Open the printed address: the page shows the circle found, what the presses cover, and where to press next.
+    Interrupted, the same command goes on with the presses that it has.
+    """
+
+    out: pathlib.Path
+    """Folder to write: background.png and presses/."""
+    ball_diameter_mm: float
+    """Diameter of the ball."""
+    mm_per_px: float | None = None
+    """Millimetres per pixel, where the device does not state them."""
+    port: int = 8765
+    """Port of the page."""
+    config: Annotated[GuideConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=GuideConfig)
+
+    def run(self) -> int:
+        if self.more:
+            raise DeviceNotFoundError("snap takes one camera: leave the others out")
+        with contextlib.ExitStack() as stack:
+            stop = stack.enter_context(stop_on_interrupt())
+            device = stack.enter_context(opened(self.device))
+            pitch = self.mm_per_px or device.identity.mm_per_px
+            if not pitch or not self.ball_diameter_mm > 0:
+                raise CalibrationError(
+                    f"mm_per_px is {pitch}, ball_diameter_mm {self.ball_diameter_mm:g}: both must be > 0; measure them "
+                    "(mm_per_px: width of the gel that the picture shows over its pixels)"
+                )
+            live = stack.enter_context(LiveView(port=self.port))
+            OUT.print(f"guidance at {live.address}, Ctrl-C ends", highlight=False)
+            guide, said = self._guide(pitch), ""
+            while not stop.is_set() and not guide.done:
+                try:
+                    sample = device.read(_TIMEOUT_S)
+                except DeviceTimeoutError:
+                    continue
+                except StreamEndedError as end:
+                    OUT.print(str(end), markup=False)
+                    break
+                if sample.frame is None or sample.frame.ndim != 3:
+                    raise DeviceNotFoundError(f"{device.identity.sensor} gives no pictures: snap needs a camera")
+                guidance = self._see(guide, sample.frame)
+                self._show(live, device, guide, sample.frame, guidance)
+                if guidance.prompt.partition(",")[0] != said:
+                    said = guidance.prompt.partition(",")[0]
+                    OUT.print(guidance.prompt, markup=False, highlight=False)
+        self._close(guide, pitch)
+        return 0
+
+    @property
+    def _background(self) -> pathlib.Path:
+        return self.out / "background.png"
+
+    def _guide(self, pitch: float) -> PressGuide:
+        """A guide, with the presses of an earlier run."""
+        if not self._background.exists():
+            return PressGuide(self.ball_diameter_mm / 2, pitch, self.config)
+        guide = PressGuide(self.ball_diameter_mm / 2, pitch, self.config, read_picture(self._background))
+        for path in sorted((self.out / "presses").glob("*.png")):
+            guide.resume(read_picture(path))
+        return guide
+
+    def _see(self, guide: PressGuide, frame: np.ndarray) -> Guidance:
+        """One frame; what it completes is written."""
+        resting = guide.background is None
+        guidance = guide.look(frame)
+        if resting and guide.background is not None:
+            _write(self._background, guide.background)
+        if guidance.taken is not None:
+            _write(self.out / "presses" / f"press_{len(guide.touches):03d}.png", guidance.taken)
+        return guidance
+
+    def _show(self, live: LiveView, device: Device, guide: PressGuide, frame: np.ndarray, guidance: Guidance) -> None:
+        seen = guide.coverage((frame.shape[0], frame.shape[1]))
+        table = {"presses": f"{len(guide.touches)} of {self.config.presses}", "covered": f"{seen.share:.0%}"}
+        numbers = Numbers(
+            title=device.identity.sensor,
+            time_s=0.0,
+            force_n=None,
+            tables={"calibration": table},
+            captions={"camera": "green: covered; cross: press here next; circle: the contact found"},
+            alarm="",
+            prompt=guidance.prompt,
+        )
+        live.publish({"camera": functools.partial(drawn, frame, guidance, seen)}, numbers)
+
+    def _close(self, guide: PressGuide, pitch: float) -> None:
+        """Say what there is and what to do with it."""
+        OUT.print(f"{len(guide.touches)} presses in {self.out / 'presses'}", highlight=False)
+        if guide.touches:
+            OUT.print(
+                f"next: python -m sensors_io calibrate {self.out / 'presses'} --background {self._background} "
+                f"--ball-diameter-mm {self.ball_diameter_mm:g} --mm-per-px {pitch:g} --out {self.out / 'cal.npz'}",
+                highlight=False,
+                soft_wrap=True,
+            )
+
+
+def _write(path: pathlib.Path, picture: np.ndarray) -> None:
+    """A picture, RGB, as PNG.
+
+    Raises:
+      OSError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"{path} cannot be written: the folder must be writable; choose another --out")
