@@ -13,6 +13,8 @@ from sensors_io.calibration.validate import BallErrors, cross_validate
 from sensors_io.fields.contact import ContactConfig, steepest_change
 from sensors_io.fields.types import Calibration, CalibrationError
 
+_STRIDE, _STRONG = 4, 8.0  # pixels that the colours are judged by: every so many, of changes beyond noise, grey levels
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrateConfig:
@@ -26,6 +28,8 @@ class CalibrateConfig:
       most_drift: grey levels that a picture may differ from the background by its median, which contact hardly moves.
       window_mm: between which the longer side of the pictures must lie at their pitch; the four sensors show 15 to 31
         mm, and of 14 to 30 mm a pitch that is wrong by a factor of 3 makes too little or too much.
+      least_colours: rms of the second principal component of the changes of colour against that of the first; eleven
+        recordings of lamps of several colours have 0.41 to 0.96, two sensors of one light 0.08 to 0.10.
       contact_radii: between which the median contact radius must lie, in ball radii.
       most_depth_um, most_radius: held-out errors beyond which nothing was learnt.
       sure_radius, sure_bias: held-out error of the radius and its part that all presses share, beyond which a warning
@@ -40,6 +44,7 @@ class CalibrateConfig:
     most_saturated: float = 0.5
     most_drift: float = 40.0
     window_mm: tuple[float, float] = (10.0, 40.0)
+    least_colours: float = 0.2
     contact_radii: tuple[float, float] = (0.15, 0.95)
     most_depth_um: float = 60.0
     most_radius: float = 0.25
@@ -96,6 +101,7 @@ def calibrate(
     """
     config = config or CalibrateConfig()
     _check_window(presses, config)
+    _check_colours(presses, config)
     bad = {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
     good = _enough(presses, names, bad, config)
     circles = find_circles(presses.chosen(good))
@@ -190,6 +196,23 @@ def _check_window(presses: BallPresses, config: CalibrateConfig) -> None:
             f"pictures of {presses.shape[1]} × {presses.shape[0]} px show {columns_mm:.1f} × {rows_mm:.1f} mm at "
             f"--mm-per-px {presses.mm_per_px:g}: the longer side must lie in [{low:g}, {high:g}] mm; measure the "
             "window and divide by the pixels of these pictures, or set --window-mm for a sensor of another size"
+        )
+
+
+def _check_colours(presses: BallPresses, config: CalibrateConfig) -> None:
+    """Under lamps of one colour all channels change alike, and a change tells no direction of a slope."""
+    change = presses.pictures[:, ::_STRIDE, ::_STRIDE].astype(np.float32) - presses.background[::_STRIDE, ::_STRIDE]
+    change = change.reshape(-1, 3) - np.median(change, axis=(0, 1, 2))
+    strong = change[np.abs(change).max(1) > _STRONG]
+    if not len(strong):
+        return  # no contact at all, which is said of each press
+    _, second, first = np.sqrt(np.maximum(np.linalg.eigvalsh(strong.T @ strong / len(strong)), 0))
+    if second < config.least_colours * first:
+        raise CalibrationError(
+            f"the colours of the presses change alike: their second component is {second / first:.2f} of the first, "
+            f"must be ≥ {config.least_colours:g}; slopes need lamps of several colours from several sides. A sensor of "
+            "one light shows depth as darkness: read it by its maker's table from grey level to depth; here `extract` "
+            "gives its contacts without a calibration, and its shear where the gel has markers"
         )
 
 

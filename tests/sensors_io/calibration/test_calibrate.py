@@ -90,6 +90,7 @@ def test_a_map_that_will_not_transfer_says_so(presses: BallPresses) -> None:
 
 def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None:
     washed = np.clip(presses.pictures.astype(int) * 8 - 770, 0, 255).astype(np.uint8)
+    grey = np.repeat(presses.pictures[..., :1], 3, -1)
     blank = np.repeat(presses.background[None], 10, 0)
     window = "pictures of 106 × 80 px show {}.*longer side must lie in"
     for said, change in (
@@ -99,6 +100,7 @@ def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None
         (r"saturated|no ball|everywhere", {"pictures": washed}),
         ("by 60 grey levels everywhere", {"background": presses.background - np.uint8(60)}),
         (r"0 of 10 presses can be used[\s\S]*press 3 shows no contact", {"pictures": blank}),
+        ("change alike.*maker's table", {"pictures": grey}),
         ("5 of 5 presses can be used: must be ≥ 8", {"pictures": presses.pictures[:5]}),
     ):
         wrong = dataclasses.replace(presses, **change)
