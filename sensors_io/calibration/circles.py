@@ -62,15 +62,20 @@ class Optics:
     degree: int
 
 
-def find_circles(presses: BallPresses) -> Circles:
-    """Touches of all presses, and the optics that explain them; the order of the presses changes no bit of either."""
+def find_circles(presses: BallPresses, schedule: tuple[int, ...] = SCHEDULE) -> Circles:
+    """Touches of all presses, and the optics that explain them; the order of the presses changes no bit of either.
+
+    Args:
+      presses: the pictures.
+      schedule: degree of S in each round; more rounds bring contact radii nearer to where they settle.
+    """
     order = presses.canonical_order()
     small = _Small(presses.chosen(order))
     begun = small.located()
-    ends = [_alternate(small, begun * (1, 1, start), SCHEDULE[:4]) for start in STARTS]
+    ends = [_alternate(small, begun * (1, 1, start), schedule[:4]) for start in STARTS]
     rows, _ = min(ends, key=lambda end: float(np.median(end[1])))
-    rows, misfit = _alternate(small, rows, SCHEDULE[4:])
-    optics = _fit(small, rows, SCHEDULE[-1])
+    rows, misfit = _alternate(small, rows, schedule[4:])
+    optics = _fit(small, rows, schedule[-1])
     back = np.argsort(order)
     return Circles(touches=small.full(rows[back]), misfit=misfit[back], optics=optics)
 

@@ -34,6 +34,7 @@ _WAVES = 0.05 * np.arange(0.5, 8000)  # qa; the sum beyond is under 1e-4 of δ
 _CONTACTS = (0.02, 0.95)  # a/R that are considered
 _WINDOW_MM = 16.0  # width of the picture from which the search begins; the four sensors have 15 to 24
 _MAD_TO_SIGMA, _OF_MEDIAN = 1.4826, 1.2533  # of a normal distribution; standard error of a median over the mean's
+_SCHEDULE = (1, 1, 2, 2, 3, 3, 3, 3, 3, 3, 3, 3)  # degrees of the optics: the pitch needs radii that have settled
 _ROUNDS, _SETTLED = 8, 2e-3  # of finding circles, and the relative change of the pitch that ends them
 
 
@@ -127,7 +128,7 @@ def measure_scale(
     pitch = _WINDOW_MM / pictures.shape[2]
     for _ in range(_ROUNDS):
         presses = BallPresses(pictures=pictures, background=background, radius_mm=ball_diameter_mm / 2, mm_per_px=pitch)
-        circles = find_circles(presses)
+        circles = find_circles(presses, _SCHEDULE)
         scale = scale_from_presses(circles.touches.radius_px, depth_mm, ball_diameter_mm=ball_diameter_mm, gel=gel)
         if abs(scale.mm_per_px / pitch - 1) < _SETTLED:
             return scale, circles
