@@ -11,8 +11,8 @@ policy's own beliefs.  Controls: touches at random, the best press, the best tou
 each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
 look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
 
-Cost: not measured at the default scale, which has no recorded run.  The contacts take seven minutes of CPU time, once,
-the first seed about fifteen, others about eight (`smoke` one minute and a half).
+Cost: not measured at the default scale, which has no recorded run.  The contacts take about thirteen minutes of CPU
+time, once, the first seed about twelve, others about eight (`smoke` one minute and a half).
 
 Expected: one touch chosen by question is seven to ten points better than the best touch for all questions, and a second
 touch adds little.  In trials of one seed and one touch on validation objects, reward finds the touch of each question
@@ -73,7 +73,7 @@ class ActiveTouchConfig:
     learner: LearnerConfig = LearnerConfig()
     contacts: int = 3
     second_price: float = 0.004
-    second_prices: tuple[float, ...] = (0.0, 0.015)
+    second_prices: tuple[float, ...] = (0.015,)
     harm_price: float = 0.5
     seeds: int = 5
     full_seeds: int = 1

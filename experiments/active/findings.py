@@ -102,7 +102,7 @@ def compared(
     pairs = [("chosen", rule) for rule in (*RULES, "chosen_warm_answers")]
     pairs += [("chosen_warm_answers", rule) for rule in RULES]
     pairs += [(several, f"{rule}_{EQUAL}") for rule in RULES]
-    pairs += [(several, f"{several}_unseen"), (several, "chosen")]
+    pairs += [(several, f"{several}_unseen"), (several, "chosen"), ("by_question", "no_touch")]
     found = []
     for a, b in pairs:
         if len(scores[a]) > 1:
@@ -152,10 +152,16 @@ def requirements(
 def verdict(
     estimates: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison], seeds: Seeds, contacts: int
 ) -> tuple[str, ...]:
-    """One sentence for one contact, one for several."""
+    """One sentence for one contact, one for several; none of them where the warm start cannot read a touch."""
     several = counted("chosen", contacts)
     mean = lambda name: f"{estimates[name][METRIC].mean:.1f} %"
     against = lambda a, b: (c := named(comparisons, a, b)) and f"{c.difference:+.1f} {bounds(c.low, c.high)}"
+    if named(comparisons, "by_question", "no_touch").low <= 0:
+        return (
+            f"The warm start answers {mean('by_question')} after the best touch for each question, "
+            f"{against('by_question', 'no_touch')} points over no touch: it does not read touches, so that this run "
+            "says nothing about choosing them.",
+        )
     number = np.mean([f[several].contacts.mean() for f in seeds])
     return (
         f"One touch chosen by a policy that learned from reward: {mean('chosen')} right, {against('chosen', 'random')} "

@@ -1,12 +1,14 @@
 """The experiment on active touch, shrunk: contacts of two objects a part, every plan and policy, every table."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from experiments.active import active_touch
 from experiments.active.active_touch import ActiveTouchConfig
+from experiments.active.findings import METRIC, verdict
 from experiments.core.artifacts import read_json
 from experiments.core.errors import ConfigurationError
 from tests.experiments.shrunk import run_shrunk
@@ -53,3 +55,21 @@ def test_a_seed_trains_the_priced_arms_only_where_it_is_asked_for():
     first = config.arms(0)
     assert first.keys() == {"chosen", "chosen_3", "chosen_harm", "chosen_3_at_0"}
     assert (first["chosen"].budget, first["chosen_harm"].harm, first["chosen_3_at_0"].second) == (1, 0.7, 0.0)
+
+
+def test_a_warm_start_that_cannot_read_touch_concludes_nothing_about_choosing():
+    plans = ("chosen", "chosen_2", "chosen_warm_answers", "by_question", "every_touch")
+    estimates = {name: {METRIC: SimpleNamespace(mean=40.0)} for name in plans}
+    seeds = [{"chosen_2": SimpleNamespace(contacts=np.ones(3))}]
+    rules = ("random", "best_fixed", "by_question")
+    pairs = [("chosen", rule) for rule in rules] + [("chosen_warm_answers", rule) for rule in rules[1:]]
+    pairs += [("chosen_2", f"{rule}_at_equal_seconds") for rule in rules[1:]] + [("by_question", "no_touch")]
+
+    def said(low):
+        one = {"difference": low + 1, "low": low, "high": low + 2, "over": "objects"}
+        return verdict(estimates, [SimpleNamespace(arm=a, against=b, **one) for a, b in pairs], seeds, 2)
+
+    assert len(said(0.5)) == 3
+    (only,) = said(-0.5)
+    assert "says nothing about choosing" in only
+    assert "+0.5" in only
