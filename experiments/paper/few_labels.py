@@ -3,11 +3,11 @@
     make experiment EXP=few_labels
 
 Policies are trained with 10, 30, 100, 300 and all labelled contacts, from a random encoder and from one that stage 1
-has pretrained on the touch of all training objects.  On each go SFT end to end (`sft`), then SFT of the decoder
-(`two_phases`), and from there GRPO on the labelled contacts (`grpo`), GRPO that also asks about unlabelled contacts and
-pays the level that most sensors alone agree on (`agreement`), and GRPO that pays the level that measured physics
-implies (`physics`): hardness from the slope of force over indentation, roughness from friction force over load where a
-contact slides.  All are scored once on test objects.
+has pretrained on the touch of all training objects: by SFT end to end (`sft`), or in two phases, of the encoders by a
+linear head and of the decoder (`two_phases`), and from there by GRPO on the labelled contacts (`grpo`), GRPO that also
+asks about unlabelled contacts and pays the level that most sensors alone agree on (`agreement`), and GRPO that pays the
+level that measured physics implies (`physics`): hardness from the slope of force over indentation, roughness from
+friction force over load where a contact slides.  All are scored once on test objects.
 
 Cost: about half an hour on two cores; `--scale smoke` under two minutes.
 
@@ -47,6 +47,7 @@ from experiments.study.scores import score, study_settings
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
+    StudySFT,
     Weights,
     encode_rows,
     gather_evidence,
@@ -55,6 +56,7 @@ from experiments.study.stages import (
     probe_features,
     run_decoder,
     run_grpo,
+    run_sft,
 )
 from experiments.study.study import (
     SMOKE as SMOKE_STUDY,
@@ -98,6 +100,7 @@ class FewLabelsConfig(StudyConfig):
     unlabelled: int = 300
     """Contacts without labels that label-free rewards ask about."""
     encoders: EncoderTrainingConfig = EncoderTrainingConfig(steps=500)
+    sft: StudySFT = StudySFT(steps=150)
     decoder: SFTConfig = dataclasses.replace(DECODER, steps=150, save_every=50)
     grpo: GRPOConfig = GRPOConfig(
         prompts=32,
@@ -157,11 +160,15 @@ class LabelledSet:
     def _train(self) -> None:
         config, data = self.config, self.data
         order: dict[str, Any] = {"seed": self.seed, "share": True}
-        of: dict[str, Any] = {"config": config, "data": data, "policy": self.policy, "context": self.context}
+        tactile = {} if self.tactile is None else {"tactile": self.tactile}
+        stage = f"sft/{self.name}/{self.seed}"
+        whole = run_sft(self.policy, data, self.evidence, config.sft, self.context, stage=stage, start=tactile, **order)
+        self._keep("sft", whole, encode_rows(self.policy, whole, data, data.parts["test"], self.context))
+        phases = dataclasses.replace(config, sft=dataclasses.replace(config.sft, steps=0))
+        of: dict[str, Any] = {"config": phases, "data": data, "policy": self.policy, "context": self.context}
         seed = StudySeed(**of, evidence=self.evidence, seed=self.seed)
         start = supervised(seed, tactile=self.tactile, name=self.name, share=True)
         test, val = (encode_rows(self.policy, start, data, data.parts[part], self.context) for part in ("test", "val"))
-        self._keep("sft", start, test)
         known, free = self._contacts(start)
         stage = f"decoder/{self.name}/{self.seed}"
         held_out = val, data.labels("val")
@@ -332,6 +339,7 @@ SMOKE = FewLabelsConfig(
     unlabelled=8,
     scenes=SMOKE_STUDY.scenes,
     encoders=EncoderTrainingConfig(steps=3, batch_size=4),
+    sft=StudySFT(steps=3, batch_size=4),
     decoder=dataclasses.replace(SMOKE_STUDY.decoder, steps=2, save_every=1),
     grpo=dataclasses.replace(FewLabelsConfig().grpo, prompts=2, group=2, micro_prompts=2),
     grpo_steps=1,

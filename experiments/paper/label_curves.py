@@ -50,7 +50,7 @@ def compare(
 def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[str, ...]:
     """For each step of training, numbers of labels at which it pays, and at which it costs, beyond both intervals."""
     steps = {
-        "SFT of the decoder": ("two_phases", "sft", None),
+        "SFT in two phases": ("two_phases", "sft", None),
         "GRPO on labelled contacts": ("grpo", "two_phases", None),
         "agreement of sensors without labels": ("agreement", "two_phases", None),
         "measured physics without labels": ("physics", "two_phases", None),
@@ -98,7 +98,7 @@ def curve_table(
         formats={"OMAE": ".3f", "material": ".1f"},
         units={"accuracy": "%", "OMAE": "levels", "material": "%", "gain": "points"},
         meanings={"gain": "accuracy minus that of the policy that training starts from, 95 % over objects"},
-        note="The decoder's phase starts from sft; GRPO, agreement and physics start from two_phases.",
+        note="sft is end to end; GRPO, agreement and physics start from two_phases.",
     )
 
 

@@ -59,7 +59,8 @@ def seconds_table(study: Study, context: Context) -> tuple[Table, ...]:
     """Seconds of training of every policy, mean over the seeds that this run trained; none where the cache had all."""
     timing = context.timing()
     phases = {name: f"grpo/{name}" for name in study.arms} | {CONTINUED: f"decoder/{CONTINUED}"}
-    phases = {"SFT, end to end": "sft", "SFT, decoder": "decoder/sft", **phases, "SFT without touch": "blind"}
+    of_sft = {"SFT, encoders": "encoders", "SFT, end to end": "sft", "SFT, decoder": "decoder/sft"}
+    phases = {**of_sft, **phases, "SFT without touch": "blind"}
     rows: list[dict[str, Cell]] = []
     for name, phase in phases.items():
         seconds = [timing.get(f"{STEPPING}/{phase}/{seed}") for seed in range(study.config.seeds)]

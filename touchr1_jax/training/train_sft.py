@@ -1,7 +1,7 @@
 """Stage 2 from parameters to parameters: the settings of supervised fine-tuning, and the stage itself.
 
-It has two phases, each a call of `train_sft`: end to end on clips, then the decoder alone on encoded contacts, which
-costs a fraction of a step and is what makes the answers say what the encoder sees.
+`train_sft` trains end to end on clips, or the decoder alone on encoded contacts, at a fraction of the cost: after
+`train_encoder` has trained the encoders, that is what makes the answers say what they see.
 """
 
 import dataclasses
