@@ -4,7 +4,8 @@ import dataclasses
 import pathlib
 from collections.abc import Callable
 
-from sensors_io.records import RecordsMeta, RecordWriter
+from sensors_io.index import INDEX, RecordsMeta
+from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.scenes.protocol import contacts
@@ -39,6 +40,10 @@ def generate_records(
         sensors=SENSORS,
         notes={"config": dataclasses.asdict(config)},
     )
+    if _is_complete(config, out):  # no lock is taken, so that several processes may use the same records
+        if progress is not None:
+            progress(config.contact_count, config.contact_count)
+        return
     per_shard = max(1, records_per_shard // (len(SENSORS) * config.frame_count))
     with RecordWriter(out, meta=meta, contacts_per_shard=per_shard, resume=True) as writer:
         for card in object_cards(config):
@@ -50,3 +55,11 @@ def generate_records(
             writer.write_contact(sequences)
             if progress is not None:
                 progress(writer.contacts_done, config.contact_count)
+
+
+def _is_complete(config: SceneConfig, out: pathlib.Path) -> bool:
+    """True if `out` holds all contacts of the configuration."""
+    if not (out / INDEX).exists():
+        return False
+    store = RecordStore(out)
+    return store.meta.config_hash == config_hash(config) and len(store) == config.contact_count
