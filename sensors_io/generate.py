@@ -4,8 +4,8 @@ import dataclasses
 import pathlib
 from collections.abc import Callable
 
-from sensors_io.index import INDEX, RecordsMeta
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.index import INDEX, Index, RecordsMeta
+from sensors_io.records import RecordWriter
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.scenes.protocol import contacts
@@ -61,5 +61,5 @@ def _is_complete(config: SceneConfig, out: pathlib.Path) -> bool:
     """True if `out` holds all contacts of the configuration."""
     if not (out / INDEX).exists():
         return False
-    store = RecordStore(out)
-    return store.meta.config_hash == config_hash(config) and len(store) == config.contact_count
+    index = Index.read(out)
+    return index.complete and index.meta.config_hash == config_hash(config)

@@ -31,6 +31,7 @@ from experiments.paper.components import FULL
 from experiments.study import paper_numbers as paper
 from experiments.study.examples import rollout_examples
 from experiments.study.scores import PUBLISHED, score_study, study_settings
+from experiments.study.stages import StudySFT
 from experiments.study.study import BLIND, SFT, SMOKE, StudyConfig
 from touchr1_jax.bench.items import Ask
 from touchr1_jax.bench.questions.draw import Quota
@@ -39,6 +40,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.models.vision import VisionConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 
 POLICIES = {FULL: "full model", SFT: "SFT", BLIND: "without touch"}
 """Policies that are drawn, and their names in the report."""
@@ -54,9 +56,14 @@ DIFFERENCES = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ScalingConfig:
-    """The study, the sizes that replace its model, the bench's questions, and how often steps are timed."""
+    """The study, the sizes that replace its model, the bench's questions, and how often steps are timed.
 
-    study: StudyConfig = StudyConfig(seeds=3)
+    All sizes are trained end to end, so that one step of SFT has one cost.
+    """
+
+    study: StudyConfig = StudyConfig(
+        seeds=3, model=ModelConfig(), encoders=EncoderTrainingConfig(steps=0), sft=StudySFT(steps=450)
+    )
     small: ModelConfig = sizes.SMALL
     large: ModelConfig = sizes.LARGE
     quota: Quota = Quota()
@@ -208,7 +215,12 @@ EXPERIMENT = presets.paper_experiment(
     ScalingConfig(),
     {
         "smoke": ScalingConfig(
-            study=dataclasses.replace(SMOKE, model=_narrow(24)),
+            study=dataclasses.replace(
+                SMOKE,
+                model=_narrow(24),
+                encoders=EncoderTrainingConfig(steps=0),
+                sft=StudySFT(steps=12, batch_size=8),
+            ),
             small=_narrow(16),
             large=_narrow(32),
             quota=presets.SMALL_QUOTA,

@@ -18,6 +18,7 @@ from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.training.feeds import touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params, TouchBatch
 
@@ -26,6 +27,7 @@ STUDY = StudyConfig(
     scenes=SCENES,
     model=MODEL,
     probe=ProbeConfig(folds=2, iterations=4),
+    encoders=EncoderTrainingConfig(steps=2, batch_size=4),
     sft=StudySFT(steps=3, batch_size=4),
     blind=StudySFT(steps=2, batch_size=4),
     decoder=SFTConfig(steps=2, batch_size=2, questions=2, save_every=1, optimizer=OptimizerConfig(learning_rate=1e-3)),

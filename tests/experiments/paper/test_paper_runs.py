@@ -114,7 +114,13 @@ def test_results_tell_data_and_the_time_of_every_stage(directory):
     results = read_json(directory / "results.json")
     assert results["data"]["source"] == "generated"
     assert results["data"]["test_objects"] == 5
-    phases = ("sft", "blind", *(f"decoder/{name}" for name in CONTROLS), *(f"grpo/{arm}" for arm in TRAINED))
+    phases = (
+        "encoders",
+        "sft",
+        "blind",
+        *(f"decoder/{name}" for name in CONTROLS),
+        *(f"grpo/{arm}" for arm in TRAINED),
+    )
     stages = {f"{phase}/{seed}" for phase in phases for seed in (0, 1)}
     asked = {f"ask/{name}/{seed}" for name in (*ARMS, "tactile_blind") for seed in (0, 1)}
     inside = {f"{what}/{stage}" for what in (STEPPING, WAITING) for stage in stages}
