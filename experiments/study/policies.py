@@ -25,6 +25,9 @@ POLICIES = "policies"
 SCENES = "scenes"
 """Note with the configuration of the generated scenes that a policy was trained on."""
 
+ONLY_SCENES = "generated scenes only: pictures of real sensors look different, and answers about them are guesses"
+"""Note on the limits of a policy that was trained on generated scenes."""
+
 
 def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str, seed: int, context: Context) -> None:
     """Save a policy in its run; released models have a format of their own, in which `touch_r1` writes them."""
@@ -42,7 +45,7 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
         "trained on": f"{meta.source}: {summary['sft_objects']} objects by SFT, {summary['grpo_objects']} for GRPO",
         "records": data.store.digest,
         SCENES: meta.notes.get("config", {}),
-    }
+    } | ({"limits": ONLY_SCENES} if meta.source == "generated" else {})
     saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
     folder = context.directory / POLICIES / name / str(seed)
     context.processes.write_once(lambda: save_policy(folder, saved))
