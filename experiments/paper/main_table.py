@@ -10,12 +10,12 @@ contacts by their fields, a linear probe on the encoder of SFT, and the same pro
 object's touch.  Policies and baselines answer about one touch at a time; comparisons follow from these answers (see
 `experiments.paper.bench_scores`).
 
-Cost: some 36 minutes of one core with five seeds; the other studies of the bench reuse its policies. `--scale
+Cost: about 45 minutes on two cores with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
-Expected: touch is worth thirty points over every baseline without it; after its decoder's phase SFT is about a point
-behind a linear probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without
-touch stay near chance in comparisons.  A constant already has an average of about 28.
+Expected: touch is worth over thirty points over every baseline without it; SFT stays one to two points behind a linear
+probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch stay near
+chance in comparisons.  A constant already has an average of about 28.
 """
 
 import dataclasses
