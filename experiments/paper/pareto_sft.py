@@ -114,7 +114,7 @@ def seed_scores(
         spent = trained_s(context, f"{'encoders' if phase == HEAD else 'sft'}/{name}/{seed.seed}")
         found = list[Mapping[str, float]]()
         for length in lengths:
-            stage, decoder = f"decoder/{name}+{length}/{seed.seed}", dataclasses.replace(config.decoder, steps=length)
+            stage, decoder = f"decoder/{name}-{length}/{seed.seed}", dataclasses.replace(config.decoder, steps=length)
             order: dict[str, Any] = {"seed": seed.seed, "stage": stage}
             longer = run_decoder(seed.policy, contacts, held_out, decoder, params, context, **order)
             seconds = spent + trained_s(context, stage)
