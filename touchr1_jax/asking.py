@@ -233,19 +233,24 @@ def load_policy(path: str | Path | None = None) -> AskablePolicy:
     Raises:
       PolicyError: there is none, or it cannot be read.
     """
-    shipped = sorted(folder.name for folder in SHIPPED.iterdir() if folder.is_dir()) if SHIPPED.is_dir() else []
-    if path is None and not shipped:
+    known = shipped()
+    if path is None and not known:
         raise PolicyError("policy is None: none comes with this version; give the folder of one, or of a run")
-    name = str(path or shipped[0])
+    name = str(path or known[0])
     if name.startswith(HUB):
         return AskablePolicy(read_policy(fetch(name.removeprefix(HUB))), name)
-    folder = SHIPPED / name if name in shipped else Path(name)
+    folder = SHIPPED / name if name in known else Path(name)
     if not folder.exists():
-        known = f"one of {', '.join(shipped)}, " if shipped else ""
+        names = f"one of {', '.join(known)}, " if known else ""
         raise PolicyError(
-            f"policy is {name!r}: no such folder; must be {known}the folder of a policy or {HUB}USER/NAME"
+            f"policy is {name!r}: no such folder; must be {names}the folder of a policy or {HUB}USER/NAME"
         )
     return AskablePolicy(read_policy(folder), name)
+
+
+def shipped() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(folder.name for folder in SHIPPED.glob("*/"))
 
 
 def fetch(repository: str) -> Path:

@@ -19,6 +19,7 @@ from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError
 from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
+from experiments.core.runner import COMPILED
 from experiments.study.policies import find_policy, is_policy, measured_figures
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
@@ -28,9 +29,6 @@ from touchr1_jax.models.saved_policy import Precision, save_policy
 from touchr1_jax.text.plain_questions import QuestionError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.questions import NoLabelsError
-
-COMPILED = "compiled"
-"""Folder of the cache for compiled programs, that of the runner."""
 
 FAILURES = (UserError, WeightsError, QuestionError, NoLabelsError, DamagedFileError, OSError)
 """Errors whose message is all that a user needs."""

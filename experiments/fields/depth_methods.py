@@ -67,12 +67,12 @@ def _places(presses: BallPresses, kind: type) -> np.ndarray:
 
 def package_map(presses: BallPresses, touches: Touches, seed: int) -> SlopeMap:
     """The package's polynomial of colour, whose constants vary over the picture."""
-    return SlopeReader(fit_map(presses, touches, seed=seed)[0], presses.background)
+    return SlopeReader(fit_map(presses, touches, seed=seed), presses.background)
 
 
 def calibrated(presses: BallPresses, seed: int) -> Calibration:
     """The package's calibration, made with all presses, whose circles are found without labels."""
-    colours, _, _ = fit_map(presses, find_circles(presses).touches, seed=seed)
+    colours = fit_map(presses, find_circles(presses).touches, seed=seed)
     background, pitch = presses.background, presses.mm_per_px
     return Calibration(sensor="gelsight_mini", background=background, mm_per_px=pitch, colours=colours, made_from={})
 

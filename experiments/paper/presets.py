@@ -77,7 +77,16 @@ def _study(
         remat=True,
     )
     decoder = dataclasses.replace(sft, questions=len(ATTRIBUTES))
-    return StudyConfig(sft=sft, blind=sft, decoder=decoder, grpo=grpo, grpo_steps=steps[1], read_threads=12, **other)
+    return StudyConfig(
+        encoders=EncoderTrainingConfig(steps=0),  # SFT end to end trains them
+        sft=sft,
+        blind=sft,
+        decoder=decoder,
+        grpo=grpo,
+        grpo_steps=steps[1],
+        read_threads=12,
+        **other,
+    )
 
 
 GPU_MODEL = ModelConfig(

@@ -76,6 +76,7 @@ from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 
@@ -142,6 +143,8 @@ class TouchR1Config(TrainingConfig):
     read_threads: int = 8
     noise_contacts: int = 16
     model: ReleasedModel = ReleasedModel()
+    encoders: EncoderTrainingConfig = EncoderTrainingConfig(steps=0)
+    """None: what a released decoder reads is learned end to end, with its adapters."""
     sft: StudySFT = adapted_sft(1_500, micro_contacts=4)
     blind: StudySFT = adapted_sft(1_500, micro_contacts=16)
     decoder: SFTConfig = adapted_sft(1_000, batch_size=16, questions=4, micro_contacts=4)

@@ -35,7 +35,6 @@ NEVER = (
     "touchr1_jax/text/plain_questions.py",
     "touchr1_jax/training/description_tuning.py",
     "touchr1_jax/training/exploration.py",
-    "touchr1_jax/training/fine_tuning.py",
     "touchr1_jax/training/kernel_probe.py",
     "sensors_io/commands/",
     "sensors_io/viewer/",

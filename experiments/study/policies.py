@@ -9,7 +9,7 @@ from experiments.core.text import bounds, number
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import ClipConfig
 from sensors_io.schema import Flag
-from touchr1_jax.asking import HUB, SHIPPED, AskablePolicy, load_policy
+from touchr1_jax.asking import HUB, AskablePolicy, load_policy, shipped
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
@@ -97,11 +97,6 @@ def is_policy(name: str, runs_dir: Path) -> bool:
     except PolicyError:
         return True
     return found or name.startswith(HUB) or name in shipped() or (Path(name) / CONFIG_FILE).is_file()
-
-
-def shipped() -> list[str]:
-    """Names of the policies that come with the package."""
-    return sorted(folder.name for folder in SHIPPED.glob("*/"))
 
 
 def run_policy(name: str, runs_dir: Path) -> Path | None:

@@ -127,7 +127,7 @@ def calibrate(
     report = CalibrationReport(
         kept=tuple(names[i] for i in remaining),
         left_out=tuple(UnusedPress(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
-        touches=Touches.of(equations.touches.stacked()[np.argsort(kept.canonical_order())]),
+        touches=Touches.of(equations.touches.stacked()[equations.given]),
         misfit=circles.misfit,
         choice=choice,
         errors=errors,

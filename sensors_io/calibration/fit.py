@@ -96,11 +96,15 @@ class Gram:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PressEquations:
-    """Presses in canonical order, their touches with centres as the map sees them, and their normal equations."""
+    """Presses in canonical order, their touches with centres as the map sees them, and their normal equations.
+
+    `given` [P] are the places in it of the presses in the order in which they were given.
+    """
 
     presses: BallPresses
     touches: Touches
     grams: list[Gram]
+    given: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,23 +116,15 @@ class ColourMapSettings:
     error_range: tuple[float, float]
 
 
-def fit_map(
-    presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5
-) -> tuple[ColourMap, Touches, ColourMapSettings]:
+def fit_map(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5) -> ColourMap:
     """Fit the map, move each centre to where the map sees it, fit again; the order of the presses changes no bit.
 
     Args:
       presses, touches: where each press is.
       seed: of the folds.
       folds: of the cross-validation that chooses the prior.
-
-    Returns:
-      The map, the moved touches, and what was chosen.
     """
-    equations = prepare(presses, touches, seed=seed, folds=folds)
-    colours, chosen = solve_map(equations.grams, seed=seed, folds=folds)
-    back = np.argsort(presses.canonical_order())
-    return colours, Touches.of(equations.touches.stacked()[back]), chosen
+    return solve_map(prepare(presses, touches, seed=seed, folds=folds).grams, seed=seed, folds=folds)[0]
 
 
 def prepare(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5) -> PressEquations:
@@ -137,7 +133,8 @@ def prepare(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int
     presses, touches = presses.chosen(order), Touches.of(touches.stacked()[order])
     first, _ = solve_map(_grams(presses, touches, None), seed=seed, folds=folds)
     touches = recentre(presses, touches, first)
-    return PressEquations(presses=presses, touches=touches, grams=_grams(presses, touches, first))
+    grams = _grams(presses, touches, first)
+    return PressEquations(presses=presses, touches=touches, grams=grams, given=np.argsort(order))
 
 
 def solve_map(

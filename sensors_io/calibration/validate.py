@@ -151,5 +151,5 @@ def cross_validate(
             errors = score_presses(made, ordered.chosen(out), touches[out])
             found[:, repeat, out] = errors.depth_um, errors.radius_share, errors.tip_mm
             progress(repeat * folds + k + 1)
-    depth_um, radius_share, tip_mm = found[..., np.argsort(presses.canonical_order())]
+    depth_um, radius_share, tip_mm = found[..., equations.given]
     return BallErrors(depth_um=depth_um, radius_share=radius_share, tip_mm=tip_mm)

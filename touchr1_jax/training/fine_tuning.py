@@ -6,7 +6,7 @@ The head starts at zero, so that every encoder starts from the same answers.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -35,7 +35,7 @@ class FineTuned:
 
 @struct.dataclass
 class FineTuneState:
-    """State of training; `params` holds "encoder" and "head" [feature, A·K]."""
+    """State of training; `params` holds the encoder, or a policy's encoders, and the "head"."""
 
     params: Params
     opt_state: optax.OptState
@@ -82,8 +82,12 @@ def level_log_probs(
 ) -> Float[Array, "P A K"]:
     """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
     features = _features(config, params["encoder"], batch, encode)
-    logits = (features @ params["head"]).reshape(len(features), len(config.levels), -1)
-    exists: Bool[np.ndarray, "A K"] = np.arange(max(config.levels)) < np.array(config.levels)[:, None]
+    return normalised_levels((features @ params["head"]).reshape(len(features), len(config.levels), -1), config.levels)
+
+
+def normalised_levels(logits: Float[Array, "P A K"], levels: Sequence[int]) -> Float[Array, "P A K"]:
+    """Log-softmax over the levels that each attribute has; −∞ for those that it lacks."""
+    exists: Bool[np.ndarray, "A K"] = np.arange(logits.shape[-1]) < np.array(levels)[:, None]
     return jax.nn.log_softmax(jnp.where(exists, logits, -jnp.inf))
 
 

@@ -17,14 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.training.feeds import FULL_SHARE, ONE_AT_A_TIME
+from touchr1_jax.training.fine_tuning import FineTuneState, label_loss, normalised_levels
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params, TouchBatch
@@ -45,15 +44,6 @@ class EncoderTrainingConfig:
         at_least(self, 1, "batch_size", "save_every")
 
 
-@struct.dataclass
-class LevelHeadState:
-    """State of training; `params` holds the "encoders" of a policy and the "head", a kernel [W, A, K] and a bias."""
-
-    params: Params
-    opt_state: optax.OptState
-    step: Int[Array, ""]
-
-
 def train_encoder(
     policy: TouchPolicy, params: Params, batches: Batches, config: EncoderTrainingConfig, hooks: Hooks = SILENT
 ) -> Params:
@@ -72,7 +62,7 @@ def train_encoder(
     levels = len(policy.levels), max(policy.levels)
     trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, *levels)), "bias": jnp.zeros(levels)}}
     optimizer, step = encoder_program(policy, config)
-    state = LevelHeadState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
+    state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, kept)
     state = fit(step, state, batches, LoopConfig(steps=config.steps, save_every=config.save_every), hooks)
     return kept | hooks.devices.gather(state.params)["encoders"]
@@ -81,33 +71,32 @@ def train_encoder(
 @functools.cache
 def encoder_program(
     policy: TouchPolicy, config: EncoderTrainingConfig
-) -> tuple[optax.GradientTransformation, Callable[..., tuple[LevelHeadState, dict[str, Array]]]]:
+) -> tuple[optax.GradientTransformation, Callable[..., tuple[FineTuneState, dict[str, Array]]]]:
     """Optimizer and compiled step, (state, batch, frozen towers) → (state, metrics), made once for all seeds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
 
-    def step(state: LevelHeadState, batch: TouchBatch, kept: Params) -> tuple[LevelHeadState, dict[str, Array]]:
+    def step(state: FineTuneState, batch: TouchBatch, kept: Params) -> tuple[FineTuneState, dict[str, Array]]:
         shown = some_streams(jax.random.key(state.step), batch.stream_mask)
 
         def loss(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
             features = policy.fns.encode(kept | params["encoders"], batch)
-            log_p = level_log_probs(policy.levels, params["head"], dataclasses.replace(features, stream_mask=shown))
+            log_p = head_log_probs(policy.levels, params["head"], dataclasses.replace(features, stream_mask=shown))
             right = masked.mean(log_p.argmax(-1) == batch.label, batch.label >= 0)
-            return -masked.mean(token_log_probs(log_p, jnp.maximum(batch.label, 0)), batch.label >= 0), right
+            return label_loss(log_p, batch.label), right
 
         (value, right), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics = {"loss": value, "accuracy": right, "grad_norm": optax.tree.norm(grads)}
-        return LevelHeadState(params=params, opt_state=opt_state, step=state.step + 1), metrics
+        return FineTuneState(params=params, opt_state=opt_state, step=state.step + 1), metrics
 
     return optimizer, jax.jit(step, donate_argnums=0)
 
 
-def level_log_probs(levels: Sequence[int], head: Params, features: Features) -> Float[Array, "P A K"]:
+def head_log_probs(levels: Sequence[int], head: Params, features: Features) -> Float[Array, "P A K"]:
     """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
     logits = jnp.einsum("pw,wak->pak", tokens_of(features), head["kernel"]) + head["bias"]
-    exists = np.arange(logits.shape[-1]) < np.array(levels)[:, None]
-    return jax.nn.log_softmax(jnp.where(exists, logits, -jnp.inf))
+    return normalised_levels(logits, levels)
 
 
 def tokens_of(features: Features) -> Float[Array, "P W"]:

@@ -19,12 +19,12 @@ from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
 from experiments.core.runs import ROOT
-from experiments.study.policies import find_policy, publish_policy, shipped
+from experiments.study.policies import find_policy, publish_policy
 from experiments.study.stages import encode_rows
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
 from tests.sensors_io.importers.films import film
-from touchr1_jax.asking import SHIPPED, TouchAnswer, TouchInput, compared, load_policy
+from touchr1_jax.asking import SHIPPED, TouchAnswer, TouchInput, compared, load_policy, shipped
 from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError
 from touchr1_jax.training.evaluation import answer_program, evaluate_policy

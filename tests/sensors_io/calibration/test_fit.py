@@ -21,7 +21,7 @@ def presses() -> BallPresses:
 
 @pytest.fixture(scope="module")
 def colours(presses: BallPresses) -> ColourMap:
-    return fit_map(presses, find_circles(presses).touches)[0]
+    return fit_map(presses, find_circles(presses).touches)
 
 
 def test_normals_of_an_unseen_press_come_out(presses: BallPresses, colours: ColourMap) -> None:

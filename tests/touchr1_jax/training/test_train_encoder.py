@@ -15,7 +15,7 @@ from touchr1_jax.training.encoding import touch_statistics
 from touchr1_jax.training.loop import Hooks
 from touchr1_jax.training.train_encoder import (
     EncoderTrainingConfig,
-    level_log_probs,
+    head_log_probs,
     some_streams,
     touch_rows,
     train_encoder,
@@ -74,7 +74,7 @@ def test_the_head_reads_what_is_there():
     head = {"kernel": jnp.asarray(rng.normal(size=(width, 4, 9)), jnp.float32), "bias": jnp.zeros((4, 9))}
     other = features.replace(touch=features.touch.at[:, 0].add(1.0))
     unseen = jnp.array([[False, True], [False, True]])
-    read = lambda x: np.asarray(level_log_probs((3, 3, 3, 9), head, x))
+    read = lambda x: np.asarray(head_log_probs((3, 3, 3, 9), head, x))
     assert not np.allclose(read(features)[:, 0], read(other)[:, 0])
     np.testing.assert_array_equal(read(features.replace(stream_mask=unseen)), read(other.replace(stream_mask=unseen)))
     assert np.isneginf(read(features)[:, :3, 3:]).all()
