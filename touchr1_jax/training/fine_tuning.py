@@ -74,7 +74,12 @@ def make_fine_tune_step(config: FineTuned, optimizer: optax.GradientTransformati
 
 def label_loss(log_p: Float[Array, "P A K"], label: Int[Array, "P A"]) -> Float[Array, ""]:
     """Mean −log p of the known labels; −1 marks an unknown one."""
-    return -masked.mean(token_log_probs(log_p, jnp.maximum(label, 0)), label >= 0)
+    return label_cost(log_p, label) / jnp.maximum(jnp.sum(label >= 0), 1)
+
+
+def label_cost(log_p: Float[Array, "P A K"], label: Int[Array, "P A"]) -> Float[Array, ""]:
+    """Sum of −log p over the known labels; −1 marks an unknown one."""
+    return -masked.total(token_log_probs(log_p, jnp.maximum(label, 0)), label >= 0)
 
 
 def level_log_probs(

@@ -21,6 +21,7 @@ from touchr1_jax import masked
 from touchr1_jax.models.chunked_logits import MAX_LOGITS, Rows, by_blocks
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.rl.gradient import batches_of
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.training.packing import PackedRows, Tokens, padded_tokens, row_of
 from touchr1_jax.types import Params, TouchBatch
@@ -124,8 +125,7 @@ def sft_gradient(
 
     zero = jnp.zeros(())
     start = (zero, zero), jax.tree.map(jnp.zeros_like, params)
-    cut = lambda x: x.reshape(micro, contacts // micro, *x.shape[1:]).swapaxes(0, 1)
-    return jax.lax.scan(body, start, jax.tree.map(cut, batch))[0]
+    return jax.lax.scan(body, start, batches_of(micro, batch))[0]
 
 
 def sft_loss(

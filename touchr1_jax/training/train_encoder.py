@@ -1,16 +1,19 @@
 """Supervised training of a policy's encoders by a linear head, before its decoder is trained on what they encode.
 
-    L = mean −log softmax(b + W h)_label over known labels,   h = the tokens that the decoder reads, side by side
+    L = mean −log softmax(b + W h)_label over known labels,   h = (Σ touch tokens / √n, Σ view tokens / √m)
 
 Every contact has one label of each attribute in each step, and no token has to be predicted that is not a level: per
-contact this teaches the encoders several times as much as the answers do.  The head reads each sensor and the view by
-weights of their own, and half of the contacts show a random part of their sensors, so that the tokens of each sensor
-alone tell the levels.
+contact this teaches the encoders several times as much as the answers do.  The head reads the n touch tokens of all
+sensors and time steps by the same weights, as attention can: what it reads, the decoder soon does.  A head with weights
+of its own for each token fits better, and teaches the decoder less.  Half of the contacts show a random part of their
+sensors, so that the tokens of each sensor alone tell the levels.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import grain
 import jax
@@ -22,8 +25,10 @@ from jaxtyping import Array, Bool, Float
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rl.gradient import batches_of
+from touchr1_jax.training.encoding import BATCH
 from touchr1_jax.training.feeds import FULL_SHARE, ONE_AT_A_TIME
-from touchr1_jax.training.fine_tuning import FineTuneState, label_loss, normalised_levels
+from touchr1_jax.training.fine_tuning import FineTuneState, label_cost, normalised_levels
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params, TouchBatch
@@ -58,7 +63,7 @@ def train_encoder(
     """
     kept = {name: tree for name, tree in params.items() if name in ("decoder", *policy.frozen)}
     encoders = jax.tree.map(jnp.copy, {name: tree for name, tree in params.items() if name not in kept})
-    width = jax.eval_shape(lambda p, b: tokens_of(policy.fns.encode(p, b)), params, peek(batches)).shape[-1]
+    width = jax.eval_shape(lambda p, b: read_tokens(policy.fns.encode(p, b)), params, peek(batches)).shape[-1]
     levels = len(policy.levels), max(policy.levels)
     trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, *levels)), "bias": jnp.zeros(levels)}}
     optimizer, step = encoder_program(policy, config)
@@ -77,14 +82,21 @@ def encoder_program(
 
     def step(state: FineTuneState, batch: TouchBatch, kept: Params) -> tuple[FineTuneState, dict[str, Array]]:
         shown = some_streams(jax.random.key(state.step), batch.stream_mask)
+        known = jnp.maximum(jnp.sum(batch.label >= 0), 1)
 
-        def loss(params: Params) -> tuple[Float[Array, ""], Float[Array, ""]]:
-            features = policy.fns.encode(kept | params["encoders"], batch)
-            log_p = head_log_probs(policy.levels, params["head"], dataclasses.replace(features, stream_mask=shown))
-            right = masked.mean(log_p.argmax(-1) == batch.label, batch.label >= 0)
-            return label_loss(log_p, batch.label), right
+        def share(params: Params, part: tuple[TouchBatch, Array]) -> tuple[Array, Array]:
+            contacts, streams = part
+            features = policy.fns.encode(kept | params["encoders"], contacts)
+            log_p = head_log_probs(policy.levels, params["head"], dataclasses.replace(features, stream_mask=streams))
+            right = masked.total(log_p.argmax(-1) == contacts.label, contacts.label >= 0)
+            return label_cost(log_p, contacts.label) / known, right / known
 
-        (value, right), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
+        def add(total: Any, part: tuple[TouchBatch, Array]) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, total, jax.value_and_grad(share, has_aux=True)(state.params, part)), None
+
+        zero = (jnp.zeros(()), jnp.zeros(())), jax.tree.map(jnp.zeros_like, state.params)
+        parts = batches_of(math.gcd(len(shown), BATCH), (batch, shown))
+        (value, right), grads = jax.lax.scan(add, zero, parts)[0]
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
         metrics = {"loss": value, "accuracy": right, "grad_norm": optax.tree.norm(grads)}
@@ -95,16 +107,24 @@ def encoder_program(
 
 def head_log_probs(levels: Sequence[int], head: Params, features: Features) -> Float[Array, "P A K"]:
     """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
-    logits = jnp.einsum("pw,wak->pak", tokens_of(features), head["kernel"]) + head["bias"]
+    logits = jnp.einsum("pw,wak->pak", read_tokens(features), head["kernel"]) + head["bias"]
     return normalised_levels(logits, levels)
 
 
-def tokens_of(features: Features) -> Float[Array, "P W"]:
-    """All tokens of each contact side by side, 0 where there is no touch or no view."""
+def read_tokens(features: Features) -> Float[Array, "P W"]:
+    """What the head reads, h: the sums of the tokens of touch and of view over the roots of their numbers."""
     exists = features.stream_mask[..., None] & (features.touch_time >= 0)
-    touch = jnp.where(exists[..., None], features.touch, 0.0)
-    view = jnp.where(features.view_mask[:, None, None], features.view, 0.0)
-    return jnp.concatenate([x.reshape(len(x), -1).astype(jnp.float32) for x in (touch, view)], -1)
+    touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1]).astype(jnp.float32)
+    exists = jnp.broadcast_to(exists, features.touch.shape[:-1]).reshape(touch.shape[:-1])
+    view = features.view.astype(jnp.float32)
+    seen = jnp.broadcast_to(features.view_mask[:, None], view.shape[:-1])
+    return jnp.concatenate([_root_mean(x, mask) for x, mask in ((touch, exists), (view, seen))], -1)
+
+
+def _root_mean(x: Float[Array, "P n D"], mask: Bool[Array, "P n"]) -> Float[Array, "P D"]:
+    """Σ x / √n over the n that are selected, 0 where none is."""
+    number = jnp.maximum(mask.sum(-1, keepdims=True), 1)
+    return masked.total(x, mask[..., None], 1) / jnp.sqrt(number)
 
 
 def some_streams(key: Array, present: Bool[Array, "P S"]) -> Bool[Array, "P S"]:

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from tests.touchr1_jax import tiny
@@ -12,10 +13,13 @@ from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, build_policy
 from touchr1_jax.training.encoding import touch_statistics
+from touchr1_jax.training.fine_tuning import FineTuneState, label_loss
 from touchr1_jax.training.loop import Hooks
 from touchr1_jax.training.train_encoder import (
     EncoderTrainingConfig,
+    encoder_program,
     head_log_probs,
+    read_tokens,
     some_streams,
     touch_rows,
     train_encoder,
@@ -69,7 +73,7 @@ def test_statistics_that_were_computed_before_give_the_same_features():
 
 def test_the_head_reads_what_is_there():
     features = tiny.features(0, 2)
-    width = features.touch[0].size + features.view[0].size
+    width = read_tokens(features).shape[-1]
     rng = np.random.default_rng(0)
     head = {"kernel": jnp.asarray(rng.normal(size=(width, 4, 9)), jnp.float32), "bias": jnp.zeros((4, 9))}
     other = features.replace(touch=features.touch.at[:, 0].add(1.0))
@@ -79,6 +83,37 @@ def test_the_head_reads_what_is_there():
     np.testing.assert_array_equal(read(features.replace(stream_mask=unseen)), read(other.replace(stream_mask=unseen)))
     assert np.isneginf(read(features)[:, :3, 3:]).all()
     assert np.isfinite(read(features)[:, 3]).all()
+
+
+def test_tokens_of_touch_count_alike_and_the_more_the_surer():
+    ones = jax.tree.map(jnp.ones_like, tiny.features(0, 2))
+    (streams, tokens, width), view = ones.touch.shape[1:], ones.view.shape[1]
+    both, one = (np.asarray(read_tokens(ones.replace(stream_mask=jnp.array([[True, x]] * 2)))) for x in (True, False))
+    np.testing.assert_allclose(both[:, :width], np.sqrt(streams * tokens), rtol=1e-6)
+    np.testing.assert_allclose(one[:, :width], np.sqrt(tokens), rtol=1e-6)
+    np.testing.assert_allclose(both[:, width:], np.sqrt(view), rtol=1e-6)
+
+
+def test_the_gradient_of_micro_batches_is_that_of_the_batch():
+    touch = jax.device_put(touch_statistics(POLICY.model.tactile, [contacts()]))
+    params = POLICY.init(0, jax.tree.map(lambda x: x[:1], contacts()))
+    kept = {"decoder": params.pop("decoder")}
+    width = read_tokens(POLICY.fns.encode(kept | params, touch)).shape[-1]
+    rng = np.random.default_rng(0)
+    head = {"kernel": jnp.asarray(rng.normal(size=(width, 4, 9)), jnp.float32), "bias": jnp.zeros((4, 9))}
+    trained = {"encoders": params, "head": head}
+    optimizer, step = encoder_program(POLICY, CONFIG)
+    shown = some_streams(jax.random.key(0), touch.stream_mask)
+
+    def whole(trained):
+        features = POLICY.fns.encode(kept | trained["encoders"], touch).replace(stream_mask=shown)
+        return label_loss(head_log_probs(POLICY.levels, trained["head"], features), touch.label)
+
+    value, gradient = jax.value_and_grad(whole)(trained)
+    state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
+    metrics = step(jax.tree.map(jnp.copy, state), touch, kept)[1]
+    np.testing.assert_allclose(metrics["loss"], value, rtol=1e-5)
+    np.testing.assert_allclose(metrics["grad_norm"], optax.tree.norm(gradient), rtol=1e-5)
 
 
 def test_half_of_the_contacts_show_a_part_of_their_sensors():
