@@ -112,7 +112,7 @@ def head_log_probs(levels: Sequence[int], head: Params, features: Features) -> F
 
 
 def read_tokens(features: Features) -> Float[Array, "P W"]:
-    """What the head reads, h: the sums of the tokens of touch and of view over the roots of their numbers."""
+    """Input of the head, h: the sums of the tokens of touch and of view over the roots of their numbers."""
     exists = features.stream_mask[..., None] & (features.touch_time >= 0)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1]).astype(jnp.float32)
     exists = jnp.broadcast_to(exists, features.touch.shape[:-1]).reshape(touch.shape[:-1])
