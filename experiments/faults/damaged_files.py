@@ -1,18 +1,15 @@
-"""Files of an unfinished run, damaged in four ways and by single bits: the run ends the same or names the damage."""
+"""Files of an unfinished run, damaged in four ways: the run ends the same or names the damage."""
 
 import contextlib
 import dataclasses
-import functools
 import io
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-import numpy as np
-
 from experiments.core.context import Context
 from experiments.faults.digests import differences, digests
-from experiments.faults.fixtures import cut, emptied, flip_bit, flipped, newest_checkpoints, run_counting, run_directory
+from experiments.faults.fixtures import cut, emptied, flipped, newest_checkpoints, run_counting, run_directory
 
 DAMAGES: Mapping[str, Callable[[Path], None]] = {
     "a byte flipped": flipped,
@@ -20,8 +17,6 @@ DAMAGES: Mapping[str, Callable[[Path], None]] = {
     "emptied": emptied,
     "removed": Path.unlink,
 }
-
-BIT = "a random bit flipped"
 
 SAME, OLDER, NAMED, WRONG = "same end", "same end from an older checkpoint", "named error", "WRONG"
 OUTCOMES = (SAME, OLDER, NAMED, WRONG)
@@ -40,9 +35,7 @@ class Damage:
     message: str
 
 
-def damage_each(
-    unfinished: Path, scratch: Path, context: Context, most: int | None = None, flips: int = 0
-) -> Iterator[Damage]:
+def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
     """Damage a file in a copy of an unfinished run, continue it, and compare its end with an undamaged copy's.
 
     Args:
@@ -50,7 +43,6 @@ def damage_each(
       scratch: an empty folder.
       context: for progress.
       most: number of files that are damaged in every way; `None` for all.
-      flips: number of single bits that are flipped besides, each a random one of a random file.
     """
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
@@ -58,21 +50,16 @@ def damage_each(
     wanted = digests(run_directory(whole))
     files = [path for path in sorted(newest_checkpoints(unfinished)[0].rglob("*")) if path.is_file()]
     files += [run_directory(unfinished) / name for name in RUN_FILES]
-    full, rng = [path for path in files if path.stat().st_size], np.random.default_rng(0)
+    full = [path for path in files if path.stat().st_size]
     every = [(path, how) for path in files[:most] for how in DAMAGES.items() if path in full or how[0] == "removed"]
-    for _ in range(flips):
-        path = full[rng.integers(len(full))]
-        bit = int(rng.integers(8 * path.stat().st_size))
-        every.append((path, (BIT, functools.partial(flip_bit, bit=bit))))
     # the run's own output is captured
     for i, (path, (damage, apply)) in context.each("damaging files", enumerate(every), still=True):
         folder = scratch / str(i)
         shutil.copytree(unfinished, folder, symlinks=True)
         apply(folder / path.relative_to(unfinished))
         code, output = _continued(folder)
-        message = next((s for s in output.splitlines() if "Error" in s or "is kept as damaged" in s), "")
-        outcome = _outcome(folder, code, output, wanted)
-        yield Damage(file=_kind(path), damage=damage, outcome=outcome, message=message)
+        outcome = end_of_run(folder / "runs" / "counting", code, output, wanted)
+        yield Damage(file=_kind(path), damage=damage, outcome=outcome, message=telling_line(output))
         shutil.rmtree(folder)
 
 
@@ -84,10 +71,22 @@ def _continued(folder: Path) -> tuple[int, str]:
     return code, err.getvalue() + out.getvalue()
 
 
-def _outcome(folder: Path, code: int, output: str, wanted: Mapping[str, str]) -> str:
+def telling_line(output: str) -> str:
+    """The first line that a session printed about an error or damage."""
+    return next((line for line in output.splitlines() if "Error" in line or " damaged" in line), "")
+
+
+def end_of_run(runs: Path, code: int, output: str, wanted: Mapping[str, str]) -> str:
+    """The outcome of a run with damage.
+
+    Args:
+      runs: the folder of the run's experiment.
+      code, output: of the session that continued it.
+      wanted: digests of an undamaged run.
+    """
     if code:
-        return NAMED if "Error: " in output else WRONG
-    ends = [p.parent for p in (folder / "runs" / "counting").glob("*/results.json") if not p.parent.is_symlink()]
+        return NAMED if "Error: " in output and "Traceback" not in output else WRONG
+    ends = [path.parent for path in runs.glob("*/results.json") if not path.parent.is_symlink()]
     if len(ends) != 1 or differences(wanted, digests(ends[0])):
         return WRONG
     return OLDER if "is kept as damaged" in output else SAME

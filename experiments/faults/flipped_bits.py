@@ -1,8 +1,8 @@
 """Single bits flipped at random in the files of a run and of its cache: each is found where its file is read, or
 changes nothing.
 
-A file is read as a session reads it, by the function that does; whole sessions with a flipped bit are in
-`damaged_files`.
+A file is read as a session reads it, by the function that does.  Then the run goes on: once with all flips that change
+nothing, and once with each of some that were found.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import hashlib
 import re
 import shutil
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,15 @@ import numpy as np
 from experiments.core.artifacts import DamagedFileError, read_json
 from experiments.core.context import Context, MetricLog, read_metrics
 from experiments.core.runs import read_description
+from experiments.faults.damaged_files import Damage, end_of_run, telling_line
 from experiments.faults.fixtures import flip_bit
+from experiments.faults.kills import PRINTED, KillableTraining, Session
 from experiments.study.cache import read_policy
 from experiments.study.study import load_answers
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
+from touchr1_jax.models import saved_policy
+from touchr1_jax.models.load import WeightsError
 from touchr1_jax.training.checkpoint import CheckpointError, DamagedCheckpointError, changed_files
 
 FOUND, SAME, WRONG, RAW, UNREAD = "found", "read the same", "WRONG", "RAW ERROR", "never read back"
@@ -32,15 +36,16 @@ READINGS = (FOUND, SAME, UNREAD, WRONG, RAW)
 """What reading a file with a flipped bit may give: an error that names it, what was written, other content, an error
 that nobody handles; or nothing ever reads the file."""
 
-NAMED = (DamagedFileError, CheckpointError, UserError)
+NAMED = (DamagedFileError, CheckpointError, UserError, WeightsError)
 """Errors that a session answers by an older checkpoint, by doing the work again, or by their message."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Flip:
-    """One flipped bit: the kind of its file, its place, and what reading gave."""
+    """One flipped bit: the kind of its file, its path and place, and what reading gave."""
 
     file: str
+    path: str
     bit: int
     reading: str
 
@@ -57,8 +62,9 @@ def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int
     """
     copy = shutil.copytree(root, scratch / "flipped", symlinks=True)
     kinds: dict[str, list[Path]] = {}
+    whole: dict[Path, str] = {}
     for path in sorted(copy.rglob("*")):
-        if path.is_file() and not path.is_symlink() and path.stat().st_size:
+        if path.is_file() and not path.is_symlink() and path.stat().st_size and path.name != PRINTED:
             kinds.setdefault(kind(path.relative_to(copy)), []).append(path)
     rng, names = np.random.default_rng(seed), sorted(kinds)
     for _ in context.each("flipping bits", range(count), still=True):
@@ -66,15 +72,54 @@ def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int
         path = kinds[name][rng.integers(len(kinds[name]))]
         content = path.read_bytes()
         bit = int(rng.integers(8 * len(content)))
-        yield Flip(file=name, bit=bit, reading=_reading(path, content, bit))
+        yield Flip(file=name, path=str(path.relative_to(copy)), bit=bit, reading=_reading(path, content, bit, whole))
+    shutil.rmtree(copy)
 
 
-def _reading(path: Path, content: bytes, bit: int) -> str:
-    """Read a file with a flipped bit, which is then taken back."""
+def go_on_flipped(
+    unfinished: Path,
+    flips: Sequence[Flip],
+    wanted: Mapping[str, str],
+    training: KillableTraining,
+    programs: Path,
+    scratch: Path,
+    context: Context,
+    most: int,
+) -> Iterator[Damage]:
+    """Ends of copies of a run that go on with flipped bits.
+
+    Args:
+      unfinished: its home; where it is finished, the copies lack its results.
+      flips: those of `flip_bits`.
+      wanted: digests of an undisturbed run.
+      training, programs: of its sessions.
+      scratch: an empty folder.
+      context: for progress.
+      most: number of the flips that were found, of as many kinds of file as there are.
+    """
+    together = [one for one in flips if one.reading in (SAME, UNREAD)]
+    found = [one for one in flips if one.reading == FOUND]
+    first = {one.file: one for one in reversed(found)}
+    alone = [*first.values(), *(one for one in found if first[one.file] is not one)][:most]
+    tries = [(f"{len(together)} files that change nothing", together), *((one.file, [one]) for one in alone)]
+    for i, (name, group) in context.each("going on with flipped bits", enumerate(tries)):
+        home = shutil.copytree(unfinished, scratch / f"flipped-{i}", symlinks=True)
+        for one in group:
+            flip_bit(home / one.path, one.bit)
+        for path in (home / PRINTED, *home.rglob("results.json")):
+            path.unlink(missing_ok=True)
+        code, output = Session(training, home, programs).end()
+        outcome = end_of_run(home / training.name, code, output, wanted)
+        yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output))
+        shutil.rmtree(home)
+
+
+def _reading(path: Path, content: bytes, bit: int, whole: dict[Path, str]) -> str:
+    """Read a file with a flipped bit, which is then taken back; `whole` are the readings of undamaged files."""
     read = next((read for pattern, read in READERS if re.search(pattern, path.as_posix())), None)
     if read is None:
         return UNREAD
-    before = read(path)
+    before = whole[path] if path in whole else whole.setdefault(path, read(path))
     flip_bit(path, bit)
     try:
         return SAME if read(path) == before else WRONG
@@ -128,6 +173,11 @@ def _records(path: Path) -> str:
     return digest([dataclasses.asdict(store.meta), store.complete, cards, contacts])
 
 
+def _saved_policy(path: Path) -> str:
+    saved = saved_policy.read_policy(path.parent)
+    return digest([saved.params, dict(saved.notes), repr(saved.reads), repr(saved.policy.language)])
+
+
 def _program(path: Path) -> str:
     try:
         return digest(zlib.decompress(path.read_bytes()))
@@ -142,6 +192,7 @@ READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
     (r"/answers/[^/]*\.npz$", _answers),
     (r"/(sft|grpo)/[^/]*\.npz$", lambda path: digest(read_policy(path))),
     (r"/scenes-[^/]*/[^/]*\.(json|arrayrecord)$", _records),
+    (r"/policies/.*\.(json|safetensors)$", _saved_policy),
     (r"/config\.json$", lambda path: digest(read_description(path.parent))),
     (r"\.json$", lambda path: digest(read_json(path))),
     (r"-cache$", _program),

@@ -30,7 +30,11 @@ POLL_S = 0.005  # time between two looks at a session's files; a step takes long
 PATIENCE_S = 300.0  # a session that adds nothing to its run for so long hangs
 
 START, BETWEEN, CHECKPOINT = "start-up", "between stages", "writing a checkpoint"
+PRINTED = "printed.txt"
+"""What the sessions of a run printed, in its home."""
+
 STEPPING = {
+    "encoders": "encoders' steps",
     "sft": "SFT steps",
     "decoder": "decoder's SFT steps",
     "grpo": "GRPO steps",
@@ -116,7 +120,7 @@ class Session:
     """One session of a training, from its start."""
 
     def __init__(self, training: KillableTraining, home: Path, programs: Path) -> None:
-        self._runs, self._steps, self._printed = home / training.name, training.steps, home / "printed.txt"
+        self._runs, self._steps, self._printed = home / training.name, training.steps, home / PRINTED
         home.mkdir(parents=True, exist_ok=True)
         self._directory: Path | None = None
         self._least = self._size()
@@ -172,10 +176,14 @@ class Session:
         Raises:
           RuntimeError: its exit code is not 0.
         """
+        code, printed = self.end()
+        if code:
+            raise RuntimeError(f"a session ended with exit code {code}; it printed:\n{printed[-2000:]}")
+
+    def end(self) -> tuple[int, str]:
+        """Wait for its end; its exit code, and what the sessions of its run printed."""
         self._process.join()
-        if self._process.exitcode:
-            tail = self._printed.read_text(encoding="utf-8", errors="replace")[-2000:]
-            raise RuntimeError(f"a session ended with exit code {self._process.exitcode}; it printed:\n{tail}")
+        return self._process.exitcode or 0, self._printed.read_text(encoding="utf-8", errors="replace")
 
     def _worked(self) -> bool:
         """True if it added anything; lines that it first dropped and computes again do not count."""
@@ -267,12 +275,12 @@ class Campaign:
     """
 
     def __init__(self, home: Path, programs: Path, training: KillableTraining, config: KillConfig) -> None:
-        self._home, self._programs, self._training, self._config = home, programs, training, config
+        self.home, self.programs, self._training, self._config = home, programs, training, config
         self._startup_s = 1.0  # until one was measured
 
     def run_undisturbed(self) -> UndisturbedRun:
         """A run without kills, from its beginning; it makes the records and compiles."""
-        shutil.rmtree(self._home / UNDISTURBED, ignore_errors=True)  # an interrupted one gives no time
+        shutil.rmtree(self.home / UNDISTURBED, ignore_errors=True)  # an interrupted one gives no time
         session = self._session(UNDISTURBED)
         session.wait_for_work()
         began_s = session.age_s
@@ -294,7 +302,7 @@ class Campaign:
         `before` are the kills of an earlier session; `keep` is called after each kill with all that have struck.
         """
         struck, schedule = tuple(before), KillSchedule(undisturbed.work_s)
-        home = self._home / str(number) / self._training.name
+        home = self.home / str(number) / self._training.name
         while not any((directory / "results.json").exists() for directory in runs.started(home)):
             session = self._session(str(number))
             left = kills - len(struck)
@@ -308,18 +316,27 @@ class Campaign:
                 keep(struck)
         return struck
 
+    def run_part(self, name: str, undisturbed: UndisturbedRun, share: float) -> Path:
+        """The home of a run that was killed once it had logged a share of the undisturbed one's lines."""
+        shutil.rmtree(self.home / name, ignore_errors=True)
+        session = self._session(name)
+        while session.log_state().lines < share * undisturbed.lines and session.sleep_until(session.age_s + POLL_S):
+            pass
+        session.kill(undisturbed.lines)
+        return self.home / name
+
     def directory(self, name: str) -> Path:
         """The one run directory of that name."""
-        (found,) = runs.started(self._home / name / self._training.name)
+        (found,) = runs.started(self.home / name / self._training.name)
         return found
 
     def _session(self, name: str) -> Session:
-        own = self._home / name / "cache"
+        own = self.home / name / "cache"
         if not own.exists():
             own.mkdir(parents=True)
-            for records in sorted((self._home / UNDISTURBED / "cache").glob("scenes-*")):
+            for records in sorted((self.home / UNDISTURBED / "cache").glob("scenes-*")):
                 shutil.copytree(records, own / records.name)
-        return Session(self._training, self._home / name, self._programs)
+        return Session(self._training, self.home / name, self.programs)
 
     def _wait(
         self, session: Session, lines: int, number: int, left: int, schedule: KillSchedule, reached: float

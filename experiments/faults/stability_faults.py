@@ -6,7 +6,8 @@ Four parts. Kills: training is ended by `kill -9` at random moments, a quarter o
 spread over the whole run, and continued until it is done; logs, answers and the final state of every stage are compared
 bit by bit with those of an undisturbed run. Two trainings are killed, with networks so small that the loop around a
 step takes most of its time: a study's GRPO, whose session starts in seconds, 200 times, and a whole study of supervised
-fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of an unfinished run, in four ways. Bad
+fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of an unfinished run, in four ways, and
+single bits of all files of an unfinished and of a finished study and their caches, which are read and then go on. Bad
 input: some forty kinds through the public command lines. Waiting: the share of a step that waits for data, at the sizes
 of the studies, on a CPU.
 
@@ -34,7 +35,7 @@ from experiments.faults.bad_inputs import cases, provoke
 from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import unfinished_run
-from experiments.faults.flipped_bits import RAW, READINGS, Flip, flip_bits
+from experiments.faults.flipped_bits import RAW, READINGS, Flip, flip_bits, go_on_flipped
 from experiments.faults.flipped_bits import WRONG as WRONG_READING
 from experiments.faults.kills import (
     PHASES,
@@ -59,6 +60,7 @@ from touchr1_jax.training.pretraining import PretrainConfig
 MOST_WAITING = 0.02  # share of a step that may wait for data
 KILLS = 200  # kills that training must survive
 GRPO = "GRPO run"  # name of the training that must survive them
+UNFINISHED = 0.7  # share of its log that a study has when bits of its files are flipped
 CELL = 110  # characters of a message in a table
 BLIND = 4  # steps without touch for each with it: they take a quarter of the time
 InputRow = Mapping[str, Any]  # row of a bad input: input, kind, exit code, answer, faults (empty if there are none)
@@ -84,9 +86,9 @@ class FaultsConfig:
     study_scale: str = "default"
     damaged_files: int | None = None
     flips: int = 1000
-    """Bits flipped in the files of a finished study and its cache, of which each is read."""
-    resumed_flips: int = 60
-    """Bits flipped in the files of an unfinished run, which then goes on."""
+    """Bits flipped in the files of an unfinished and a finished study and their caches, of which each is read."""
+    resumed_flips: int = 40
+    """Of those that are found, the number of those with which the study goes on, each alone."""
     bad_inputs: int | None = None
     waiting: WaitingConfig = WaitingConfig()
 
@@ -103,7 +105,8 @@ class KilledRuns:
 def run(config: FaultsConfig, context: Context) -> Results:
     """Kill, damage, feed nonsense, time."""
     study = SMALL_STUDY.configs()[config.study_scale]
-    steps = {phase: getattr(study, phase).steps for phase in ("sft", "decoder", "blind")} | {"grpo": study.grpo_steps}
+    steps = {phase: getattr(study, phase).steps for phase in ("encoders", "sft", "decoder", "blind")}
+    steps |= {"grpo": study.grpo_steps}
     grpo_options = ("--steps", str(config.grpo_steps))
     grpo = KillableTraining(name=SMALL_GRPO.name, options=grpo_options, steps={"grpo": config.grpo_steps})
     whole = KillableTraining(name=SMALL_STUDY.name, options=("--scale", config.study_scale), steps=steps)
@@ -112,8 +115,9 @@ def run(config: FaultsConfig, context: Context) -> Results:
         "study": kill_training("study", whole, config.study, context),
     }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
-        damage = damage_files(config, context, Path(scratch))
-        flips = flip_files(config.flips, context, Path(scratch))
+        damage = damage_files(config.damaged_files, context, Path(scratch))
+        flips, ends = flip_files(config, whole, context, Path(scratch))
+        damage += ends
         inputs = try_inputs(config.bad_inputs, context, Path(scratch))
     waited = waits(config.waiting, context)
     return Results(
@@ -134,10 +138,7 @@ def run(config: FaultsConfig, context: Context) -> Results:
 def kill_training(name: str, training: KillableTraining, config: KillConfig, context: Context) -> KilledRuns:
     """Runs of a training until all kills have struck; every run and every kill of an earlier session counts."""
     stage = f"kill/{training.name}"
-    campaign = Campaign(context.directory / "killed" / training.name, context.cache_dir / "programs", training, config)
-    if not context.done(f"{stage}/{UNDISTURBED}"):
-        context.save_stage(f"{stage}/{UNDISTURBED}", campaign.run_undisturbed()._asdict())
-    undisturbed = UndisturbedRun(**context.load_stage(f"{stage}/{UNDISTURBED}"))
+    campaign, undisturbed = start_campaign(training, config, context)
     kills: list[Kill] = []
     differs: list[str] = []
     number = 0
@@ -154,6 +155,14 @@ def kill_training(name: str, training: KillableTraining, config: KillConfig, con
     return KilledRuns(kills=tuple(kills), runs=number, differs=tuple(differs))
 
 
+def start_campaign(training: KillableTraining, config: KillConfig, context: Context) -> tuple[Campaign, UndisturbedRun]:
+    """The runs of a training, with the one that nobody kills."""
+    home, programs = context.directory / "killed" / training.name, context.cache_dir / "programs"
+    campaign = Campaign(home, programs, training, config)
+    alone = context.once(f"kill/{training.name}/{UNDISTURBED}", lambda: campaign.run_undisturbed()._asdict())
+    return campaign, UndisturbedRun(**alone)
+
+
 def _strike(
     stage: str, title: str, campaign: Campaign, number: int, kills: int, undisturbed: UndisturbedRun, context: Context
 ) -> tuple[Kill, ...]:
@@ -168,24 +177,37 @@ def _strike(
         return campaign.run_killed(number, kills, undisturbed, before=before, keep=keep)
 
 
-def flip_files(count: int, context: Context, scratch: Path) -> list[Flip]:
-    """Every flipped bit of the study that nobody killed, and of its cache."""
-    if not context.done("flips"):
-        whole = context.directory / "killed" / SMALL_STUDY.name / UNDISTURBED
-        context.save_stage("flips", list(flip_bits(whole, scratch, context, count)))
-    return [Flip(**one) for one in context.load_stage("flips")]
+def flip_files(
+    config: FaultsConfig, training: KillableTraining, context: Context, scratch: Path
+) -> tuple[list[Flip], list[Damage]]:
+    """Every flipped bit of an unfinished and a finished study and their caches, and the ends of those that go on."""
+    campaign, undisturbed = start_campaign(training, config.study, context)
+    flips: list[Flip] = []
+    ends: list[Damage] = []
+    for seed, state in enumerate(("unfinished", "finished")):
+        home = campaign.home / (UNDISTURBED if state == "finished" else state)
+        if not context.done(f"flips/{state}"):
+            if state == "unfinished":
+                campaign.run_part(state, undisturbed, UNFINISHED)
+            each = list(flip_bits(home, scratch, context, config.flips // 2, seed))
+            context.save_stage(f"flips/{state}", each)
+        found = [Flip(**one) for one in context.load_stage(f"flips/{state}")]
+        if not context.done(f"flips/{state}-ends"):
+            order = (undisturbed.digests, training, campaign.programs, scratch, context, config.resumed_flips // 2)
+            context.save_stage(f"flips/{state}-ends", list(go_on_flipped(home, found, *order)))
+        flips += found
+        ends += [Damage(**one) for one in context.load_stage(f"flips/{state}-ends")]
+    return flips, ends
 
 
-def damage_files(config: FaultsConfig, context: Context, scratch: Path) -> list[Damage]:
+def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
     """Every damaged file and the end of its run."""
     if not context.done("damage"):
         unfinished, damaged = scratch / "unfinished", scratch / "damaged"
         unfinished.mkdir()
         damaged.mkdir()
         unfinished_run(unfinished)
-        context.save_stage(
-            "damage", list(damage_each(unfinished, damaged, context, config.damaged_files, config.resumed_flips))
-        )
+        context.save_stage("damage", list(damage_each(unfinished, damaged, context, most)))
     return [Damage(**one) for one in context.load_stage("damage")]
 
 
@@ -310,7 +332,7 @@ def flip_table(flips: Sequence[Flip]) -> Table:
         by_kind.setdefault(one.file, []).append(one)
     count = lambda same: {name: sum(one.reading == name for one in same) for name in READINGS}
     return named_table(
-        "Flipped bits of a study and its cache",
+        "Flipped bits of an unfinished and a finished study and their caches",
         [{"file": name, **count(same)} for name, same in by_kind.items()],
         note="One random bit of a random file of a random kind; the file is read as a session reads it.",
     )

@@ -114,6 +114,10 @@ def test_curves_are_sorted_by_phase_arm_and_seed():
     assert list(found["sft"]["loss"]) == [("", "0")]
 
 
+def test_running_mean_is_over_a_twentieth_of_the_points():
+    assert running_mean(np.eye(100)[50])[47:54].tolist() == pytest.approx([0, 0.2, 0.2, 0.2, 0.2, 0.2, 0])
+
+
 def test_running_mean_keeps_lines_and_short_series():
     line = np.arange(100.0)
     assert running_mean(line)[10:90] == pytest.approx(line[10:90])

@@ -19,7 +19,7 @@ STRUCK = Kill(phase=STEPPING["sft"], after_s=2.0, done=0.5, torn=True)
 AT_START = dataclasses.replace(STRUCK, phase=START, torn=False)
 KILLED = KilledRuns(kills=(STRUCK,) * 150 + (AT_START,) * 50, runs=1, differs=())
 DAMAGE = Damage(file="config.json", damage="removed", outcome=SAME, message="")
-FLIP = Flip(file="a/config.json", bit=3, reading=FOUND)
+FLIP = Flip(file="a/config.json", path="a/config.json", bit=3, reading=FOUND)
 ANSWERED = [{"input": f"{i}", "kind": "run", "exit code": 1, "answer": "Error", "faults": ""} for i in range(25)]
 
 

@@ -49,6 +49,16 @@ def test_a_block_is_predicted_without_itself_and_without_the_gap_behind_it(frame
     assert np.array_equal(first, second) == same
 
 
+def test_the_penalty_is_chosen_without_the_gap_around_a_block():
+    """Noise whose three frames on either side of a border are the same: only those inside the gap can be predicted."""
+    rng = np.random.default_rng(2)
+    fields, force = rng.normal(0, 0.1, (50, 200)), rng.normal(0, 1, (50, 3))
+    for border in (10, 20, 30, 40):
+        for x in (fields, force):
+            x[border : border + 3] = x[border - 3 : border][::-1]
+    assert fit(fields, force).penalty > 0.03 > 0.01 > fit(fields, force, gap_frames=0).penalty
+
+
 def test_what_cannot_be_fitted_is_refused():
     refused(ForceFitError, "one per frame", fit, FIELDS, FORCE[:10], blocks=5)
     refused(ForceFitError, "blocks is 2", fit, FIELDS, FORCE, blocks=2)
