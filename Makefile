@@ -19,7 +19,7 @@ setup: $(READY)  ## make the environment (.venv) with the pinned packages
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"touchr1-jax needs Python >= 3.11, PYTHON={sys.executable} is {v[0]}.{v[1]}: set PYTHON=python3.11 or newer")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade-strategy only-if-needed -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --upgrade-strategy only-if-needed -c constraints.txt -e '.[dev]'
 	@touch $@
 
 experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."

@@ -146,11 +146,11 @@ class DemoCommand(Places):
         """Serve until Ctrl-C and return the exit status."""
         policy = find_policy(self.policy, self.runs_dir)
         with demo_server(policy, self.port) as address:
-            print_lines("compiling, up to half a minute the first time")
-            ask_policy(policy, [read_touch("generated:0", policy.saved)])  # the first answer of the page comes at once
-            print_lines(f"{address}, Ctrl-C ends")
+            print_lines(f"{address}, Ctrl-C ends", "compiling, up to half a minute the first time")
             if self.open:
                 webbrowser.open(address)
+            ask_policy(policy, [read_touch("generated:0", policy.saved)])  # later answers of the page come at once
+            print_lines("ready")
             with contextlib.suppress(KeyboardInterrupt):
                 threading.Event().wait()
         return 0

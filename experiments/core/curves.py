@@ -12,6 +12,21 @@ from experiments.core.look import MARKERS, SHARED, colours
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
+MOST_POINTS = 160
+"""Of a drawn line: a panel is as many points wide."""
+
+WORDS = {
+    "degenerate_share": "share of groups whose rewards are all equal",
+    "entropy": "entropy (nat a token)",
+    "grounding": "KL to the answers without a stream (nat)",
+    "kl": "KL to the reference (nat a token)",
+    "length": "length (tokens)",
+    "loss": "loss (nat a token)",
+    "middle_rate": "share of middle levels",
+    "parse_rate": "share of readable answers",
+}
+"""Scalar → its name in a chart, where that of the log says too little."""
+
 Curve = tuple[np.ndarray, np.ndarray]
 """Steps and values of one logged scalar of one stage."""
 
@@ -72,7 +87,11 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
     """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm."""
     columns = min(3, len(scalars))
     panels = [
-        Panel(_seeds_and_means(series, colour), title=name, x_label="step" if i >= len(scalars) - columns else "")
+        Panel(
+            _seeds_and_means(series, colour),
+            title=WORDS.get(name, name),
+            x_label="step" if i >= len(scalars) - columns else "",
+        )
         for i, (name, series) in enumerate(scalars.items())
     ]
     return draw(panels, size=(3.35 * columns, 0.35 + 2.15 * math.ceil(len(scalars) / columns)))
@@ -84,12 +103,22 @@ def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[st
     for arm in dict.fromkeys(arm for arm, _ in series):
         curves = [curve for (a, _), curve in series.items() if a == arm]
         look: dict[str, Any] = {"colour": colour.get(arm, SHARED), "marker": ""}
-        seeds += [Series(x=steps, y=values, width=0.6, alpha=0.25, **look) for steps, values in curves]
-        common = sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves)))
-        if common:
+        seeds += [Series(x=thin(x), y=thin(y), width=0.6, alpha=0.25, **look) for x, y in curves]
+        common = np.array(sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves))))
+        if len(common):
             mean = running_mean(np.mean([values[np.isin(steps, common)] for steps, values in curves], axis=0))
-            means.append(Series(arm, x=common, y=mean, width=1.8, **look | {"marker": "o" if len(common) == 1 else ""}))
+            means.append(
+                Series(
+                    arm, x=thin(common), y=thin(mean), width=1.8, **look | {"marker": "o" if len(common) == 1 else ""}
+                )
+            )
     return seeds + means
+
+
+def thin(values: np.ndarray) -> np.ndarray:
+    """At most `MOST_POINTS` of the values [n], evenly spaced and the last among them, so that a chart stays small."""
+    stride = -(-len(values) // MOST_POINTS)
+    return values[::-1][:: max(stride, 1)][::-1]
 
 
 def accuracy_against_middle(

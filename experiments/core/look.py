@@ -7,11 +7,17 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's colours, which colour-blind readers can tell apart (Wong, Nature Methods 8, 441, 2011)."""
+PALETTE = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#332288", "#882255", "#999933", "#44aa99"),
+)
+"""Okabe and Ito's six colours (Wong, Nature Methods 2011), four of Tol's; colour-blind readers can tell them apart."""
 
 SHARED = "#4d5560"
 """Colour of whatever belongs to no single series."""
+
+CONTROLS = {"sft": "#1d2126", "sft_continued": "#8c564b", "tactile_blind": SHARED}
+"""Colours of the policies that every study trains beside its arms; in curves they have stages of their own."""
 
 MARKERS = "osD^vXph"
 
@@ -30,8 +36,9 @@ LOOK: dict[Any, Any] = {
 
 
 def colours(names: Iterable[str]) -> dict[str, str]:
-    """The colour of every name, the same in every chart and table."""
-    return dict(zip(names, itertools.cycle(PALETTE), strict=False))
+    """The colour of every name: that of a control, or the next of the palette, so that charts and tables agree."""
+    free = itertools.cycle(PALETTE)
+    return {name: CONTROLS.get(name) or next(free) for name in names}
 
 
 def svg(figure: Figure) -> bytes:

@@ -5,8 +5,8 @@
 
 `experiments/recorded/table.md` holds the rows.  A figure of a row is `{KEY > KEY > … | FORMAT}`: the path of a value in
 `experiments/recorded/EXPERIMENT.json` and the format of its number.  A key names an entry of an object; of a list, the
-entry with that `name` or `title`; of a table, the row that begins with it, then the column.  A test compares the README
-with what `fill` would write.
+entry with that `name` or `title`; of a table, the row that begins with it, then the column; `NEW or OLD` is the first
+that exists, for names that changed.  A test compares the README with what `fill` would write.
 """
 
 import argparse
@@ -90,6 +90,7 @@ def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
     value: Any = read_json(file)
     for key in map(str.strip, path.split(">")):
         entries = _entries(value)
+        key = next((choice for choice in (key, *key.split(" or ")) if choice in entries), key)
         if key not in entries:
             known = ", ".join(map(str, entries)) or repr(value)
             raise FigureError(f"figure {path!r}: {key!r} must be one of {known}; correct it")

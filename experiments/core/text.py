@@ -6,6 +6,9 @@ from typing import Protocol
 ABSENT = "–"
 """Stands for a number that was not measured."""
 
+SMOKE, MEANINGLESS = "smoke", "smoke: the figures mean nothing"
+"""The scale that only shows that an experiment runs, and what stands in place of its verdict."""
+
 MINUTE, HOUR = 60, 3600
 
 

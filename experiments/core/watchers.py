@@ -1,9 +1,11 @@
 """Watchers of a run in progress: the page that a browser reloads, and TensorBoard's event files."""
 
+import contextlib
 import importlib
 import importlib.util
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,8 @@ from experiments.core.text import duration
 PAGE_EVERY_S = 10
 """Least seconds between two pages, and between two reloads by a browser."""
 
-PAGE_SHARE = 0.01
-"""Share of the run's time for pages: after one that took a second, the next follows after 100 s."""
+CURVES_SHARE = 0.01
+"""Share of the run's time for curves: after some that took a second to draw, the next follow after 100 s."""
 
 MOST_PANELS = 9
 """Panels of a phase whose scalars the experiment does not choose."""
@@ -59,30 +61,55 @@ class LivePage(Watcher):
         self._wanted, self._usual_s, self._clock = curves, usual_s, clock
         self._loops: Sequence[Loop] = ()
         self._drawn: dict[str, tuple[int, dict[str, PhaseCurves]]] = {}
-        self._began = self._due = clock()
-        self._write_if_due()
+        self._writing = threading.Lock()
+        self._began = self._due = self._due_curves = clock()
+        self.write_if_due()
 
     def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
         """Write the page again if it is time."""
-        self._write_if_due()
+        self.write_if_due()
 
     def looping(self, loops: Sequence[Loop]) -> None:
         """Write the page again if it is time."""
         self._loops = loops
-        self._write_if_due()
+        self.write_if_due()
 
     def end(self, error: BaseException) -> None:
         """Write the last page of a session that an error or a signal ended: the cause, and how to continue."""
         why = f"{type(error).__name__}: {error}".rstrip(": ")
         command = continuing(self._description["command"])
+        self._draw()
         self._write(f"Ended on {_now()} by {why}. To continue: {command}", reload_s=None)
 
-    def _write_if_due(self) -> None:
-        began = self._clock()
-        if began >= self._due:
+    def write_if_due(self, *, curves: bool = True) -> None:
+        """Write the page if it is time; its curves, which may take long, are drawn again only if asked for."""
+        with self._writing:
+            if self._clock() < self._due:
+                return
+            began = self._clock()
+            if curves and began >= self._due_curves:
+                self._draw()
+                self._due_curves = self._clock() + (self._clock() - began) / CURVES_SHARE
             self._write(f"Running: this page is of {_now()} and reloads itself.", reload_s=PAGE_EVERY_S)
-            now = self._clock()
-            self._due = now + max(PAGE_EVERY_S, (now - began) / PAGE_SHARE)
+            self._due = self._clock() + PAGE_EVERY_S
+
+    @contextlib.contextmanager
+    def kept_fresh(self, every_s: float = PAGE_EVERY_S) -> Iterator[None]:
+        """Write the page from a thread also while the block is silent, as in a compilation: it is never 30 s old."""
+        ended = threading.Event()
+
+        def watch() -> None:
+            while not ended.wait(every_s):
+                with contextlib.suppress(OSError):  # a full disk ends the run elsewhere
+                    self.write_if_due(curves=False)
+
+        thread = threading.Thread(target=watch, name="live page", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
     def _write(self, state: str, reload_s: int | None) -> None:
         times = self._directory / "timing.json"
@@ -98,21 +125,20 @@ class LivePage(Watcher):
             timing=timing,
             verdict=(state, f"{spent}; {usual}."),
             data_title="Time so far",
-            loops=self._loops,
-            curves=self._draw(),
+            loops=tuple(self._loops),
+            curves={name: drawn for _, phase in self._drawn.values() for name, drawn in phase.items()},
             reload_s=reload_s,
         )
         write_text(self._directory / "report.html", page)
 
-    def _draw(self) -> dict[str, PhaseCurves]:
-        """The curves of each phase; a phase without new lines is not drawn again."""
+    def _draw(self) -> None:
+        """Draw the curves of each phase; a phase without new lines is not drawn again."""
         rows: dict[str, list[Mapping[str, Any]]] = {}
         for line in read_metrics(self._directory):
             rows.setdefault(line["stage"].partition("/")[0], []).append(line)
         for phase, lines in rows.items():
             if self._drawn.get(phase, (0,))[0] != len(lines):
                 self._drawn[phase] = len(lines), draw_phases(lines, self._wanted, most=MOST_PANELS)
-        return {name: drawn for phase in rows for name, drawn in self._drawn[phase][1].items()}
 
 
 def _now() -> str:

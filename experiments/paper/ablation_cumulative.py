@@ -6,7 +6,8 @@ The arms of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)
 0/1 credit, ordinal credit, the consistency reward, the format reward, tactile grounding; and above them the credit for
 the use of touch that only the abstract has.  All arms of GRPO start from the SFT checkpoint of their seed and see the
 same questions in the same order.  Each step is compared with the paper's: its sign, intervals over seeds and objects,
-p-values corrected over the table, and where the sign does not come out the known failures that the run shows.
+a p-value over both, corrected for the three primary claims, and where the sign does not come out the known failures
+that the run shows.
 
 Cost: some 25 minutes of one core with five seeds after `main_table`, whose policies it shares, 60 without; `--scale
 smoke` under two.
@@ -71,8 +72,8 @@ ABLATION = Ablation(
 TITLE = "Change by each component of the ladder"
 
 NOTE = (
-    "Each arm minus the one below it. With five seeds p is .0625 or more before correction: over seeds judge by the "
-    "interval, over objects by p. OMAE should fall, CSC and Avg rise."
+    "Each arm minus the one below it. Three hypotheses are primary: SFT raises Avg, ordinal credit lowers OMAE, the "
+    "consistency reward raises CSC; their p-values are corrected for three, the others are exploratory."
 )
 
 ROWS: tuple[tuple[str, str | None, str], ...] = (

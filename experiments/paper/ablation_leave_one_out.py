@@ -21,7 +21,7 @@ from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.paper import presets
 from experiments.paper.bench_scores import pooled_table
-from experiments.paper.component_effects import FOUR, ComponentComparison, ComponentStep, run_components
+from experiments.paper.component_effects import FOUR, LEVEL, ComponentComparison, ComponentStep, run_components
 from experiments.paper.components import (
     COMPONENTS,
     FULL,
@@ -96,10 +96,11 @@ def verdict(found: ComponentComparison) -> tuple[str, ...]:
     if not found.effects:
         return ("One seed: no effect can be distinguished from chance; train two seeds at least.",)
     effects = [e for e in found.effects if e.metric.metric == FOUR]
-    missed = [f"{e.step.component} is missed: {e}." for e in effects if e.seeds.low > 0]
-    better = [f"Without {e.step.component} answers are better: {e}." for e in effects if e.seeds.high < 0]
-    rest = ", ".join(e.step.component for e in effects if e.seeds.low <= 0 <= e.seeds.high)
-    return (*missed, *better, *([f"No difference in accuracy beyond seeds: {rest}."] if rest else []))
+    clear = [e for e in effects if e.p_value < LEVEL]
+    missed = [f"{e.step.component} is missed: {e}." for e in clear if e.seeds.mean > 0]
+    better = [f"Without {e.step.component} answers are better: {e}." for e in clear if e.seeds.mean < 0]
+    rest = ", ".join(e.step.component for e in effects if e not in clear)
+    return (*missed, *better, *([f"No difference in accuracy beyond chance: {rest}."] if rest else []))
 
 
 EXPERIMENT = presets.paper_experiment("ablation_leave_one_out", presets.BENCH, presets.SCALES, run)

@@ -14,21 +14,26 @@ from experiments.core.text import bounds, interval, number
 from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.baselines import baselines
-from experiments.study.estimates import RESAMPLES, estimate, pooled
+from experiments.study.estimates import RESAMPLES, estimate
 from experiments.study.scores import Scored, score
 from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
 from touchr1_jax.bench.statistics import (
     Interval,
     clustered_bootstrap,
-    clustered_sign_flip_test,
+    crossed_test,
     holm,
-    sign_flip_test,
     student_interval,
 )
 
 FOUR = "four_acc"
 """Mean accuracy over hardness, roughness, protrusion and material: what the paper's ladder prints as Avg."""
+
+PRIMARY = {("SFT", FOUR), ("ordinal credit", "omae"), ("consistency", "csc")}
+"""Component and metric of the three claims that the paper rests on; all other effects are exploratory."""
+
+LEVEL = 0.05
+"""p-value below which a sign counts."""
 
 SignVerdict = Literal["reproduced", "opposite", "undecided", "not in the paper"]
 
@@ -74,17 +79,21 @@ class ComponentStep:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComponentEffect:
-    """A step in one metric: the difference with intervals over training seeds and over objects, and their p-values.
+    """A step in one metric: the difference with intervals over training seeds and over objects.
 
-    The p-values are of sign-flip tests, corrected over all steps and metrics of a table by Holm's method.
+    `p_value` is that of `crossed_test` over seeds and objects at once; Holm's method corrects those of `PRIMARY`.
     """
 
     step: ComponentStep
     metric: LadderMetric
     seeds: Interval
     objects: Interval
-    p_seeds: float
-    p_objects: float
+    p_value: float
+
+    @property
+    def primary(self) -> bool:
+        """True for one of the claims in `PRIMARY`."""
+        return (self.step.component, self.metric.metric) in PRIMARY
 
     @property
     def published(self) -> float | None:
@@ -93,10 +102,10 @@ class ComponentEffect:
 
     @property
     def sign(self) -> SignVerdict:
-        """Agreement with the paper's sign: beyond chance over seeds, against it, or neither."""
+        """Agreement with the paper's sign: beyond chance over seeds and objects, against it, or neither."""
         if self.published is None or self.published == 0:
             return "not in the paper"
-        if not self.seeds.excludes_zero:
+        if self.p_value >= LEVEL:
             return "undecided"
         return "reproduced" if np.sign(self.seeds.mean) == np.sign(self.published) else "opposite"
 
@@ -105,7 +114,7 @@ class ComponentEffect:
         published = "" if self.published is None else f"; paper {number(self.published, spec)}"
         return (
             f"{self.metric.title} {number(self.seeds.mean, spec)} {bounds(self.seeds.low, self.seeds.high, spec)}, "
-            f"p = {self.p_seeds:.2f} over seeds and {self.p_objects:.3f} over objects{published} ({self.sign})"
+            f"p = {self.p_value:.2g} over seeds and objects{published} ({self.sign})"
         )
 
 
@@ -128,11 +137,8 @@ def component_effects(
         for metric in LADDER_METRICS
         if all(metric.metric in rows[name][0] for name in (step.arm, step.against))
     ]
-    over_seeds, over_objects = (holm(np.array([getattr(e, p) for e in found])) for p in ("p_seeds", "p_objects"))
-    return tuple(
-        dataclasses.replace(effect, p_seeds=float(a), p_objects=float(b))
-        for effect, a, b in zip(found, over_seeds, over_objects, strict=True)
-    )
+    corrected = iter(holm(np.array([e.p_value for e in found if e.primary])).tolist())
+    return tuple(dataclasses.replace(e, p_value=next(corrected)) if e.primary else e for e in found)
 
 
 def _paired(step: ComponentStep, metric: str, rows: Mapping[str, SeedScores]) -> tuple[list[Scores], list[Scores]]:
@@ -150,15 +156,14 @@ def _effect(
     step: ComponentStep, metric: LadderMetric, a: list[Scores], b: list[Scores], objects: np.ndarray
 ) -> ComponentEffect:
     per_seed = np.array([x.mean() - y.mean() for x, y in zip(a, b, strict=True)])
-    difference = pooled(a).values - pooled(b).values
+    differences = np.stack([x.values - y.values for x, y in zip(a, b, strict=True)])
     where = {"clusters": objects[a[0].items], "strata": a[0].strata}
     return ComponentEffect(
         step=step,
         metric=metric,
         seeds=student_interval(per_seed),
-        objects=clustered_bootstrap(difference, **where, resamples=RESAMPLES),
-        p_seeds=sign_flip_test(per_seed),
-        p_objects=clustered_sign_flip_test(difference, **where),
+        objects=clustered_bootstrap(differences.mean(axis=0), **where, resamples=RESAMPLES),
+        p_value=crossed_test(differences, **where),
     )
 
 
@@ -250,23 +255,23 @@ def effects_table(found: ComponentComparison, title: str, note: str) -> Table:
                 "component and metric": f"{e.step.component}: {e.metric.title}",
                 "change": number(e.seeds.mean, e.metric.format),
                 "95 % over seeds": bounds(e.seeds.low, e.seeds.high, e.metric.format),
-                "p": e.p_seeds,
                 "95 % over objects": bounds(e.objects.low, e.objects.high, e.metric.format),
-                "p over objects": e.p_objects,
+                "p": e.p_value,
+                "hypothesis": "primary" if e.primary else "exploratory",
                 "paper": number(e.published, e.metric.format),
                 "sign": e.sign,
                 "failures": "; ".join(found.failures.get(e, ())),
             }
             for e in found.effects
         ],
-        formats={"p": ".3f", "p over objects": ".3f"},
+        formats={"p": ".2g"},
         meanings={
             "95 % over seeds": "Student's t over paired seeds",
-            "p": "of sign flips over seeds, corrected over the table (Holm)",
             "95 % over objects": "whole objects resampled, seeds pooled",
-            "p over objects": "of sign flips of whole objects, corrected likewise",
+            "p": "of Student's t over seeds and objects at once; those of the primary hypotheses are corrected (Holm)",
+            "hypothesis": "primary: named before the run, the claims that the paper rests on; exploratory: uncorrected",
             "paper": "difference of the rows of its ladder",
-            "sign": "reproduced or opposite where the interval over seeds excludes 0, else undecided",
+            "sign": f"reproduced or opposite where p < {LEVEL:g}, else undecided",
             "failures": "known failures that the run shows",
         },
         note=note,

@@ -63,7 +63,7 @@ GAP, GAIN = 40.0, 10.0
 
 DIFFERENCES = (
     ("conflict", "advertised, never measured", "deceptive pictures of generated objects"),
-    ("vision-only", "–", "the same policy, trained without touch end to end alone"),
+    (BLIND, "–", "the same policy, trained without touch end to end alone"),
 )
 
 
@@ -205,7 +205,7 @@ def requirements(contrasts: Contrasts, gain: TouchGain | None) -> tuple[Requirem
         lead = contrasts[DECEPTIVE]
         span = bounds(lead.seeds.low, lead.seeds.high, ".1f")
         note = f"95 % over seeds {span}; {lead.questions:.0f} questions a seed"
-        name = "full model over vision-only, deceptive questions"
+        name = f"{FULL} over {BLIND}, deceptive questions"
         found.append(at_least(name, lead.seeds.mean, GAP, "points", note))
     if gain is not None:
         least = gain.least.gain
@@ -220,9 +220,9 @@ def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain 
     if DECEPTIVE in contrasts:
         lead = contrasts[DECEPTIVE]
         sentences.append(
-            f"On deceptive questions the accuracy of the full model is {lead.ours:.1f} %, of vision-only "
-            f"{lead.theirs:.1f}: {interval(lead.seeds, '+.1f')} points. The full model differs from the picture's "
-            f"suggestion in {revised[FULL]:.0f} % of them, vision-only in {revised[BLIND]:.0f}."
+            f"On deceptive questions the accuracy of {FULL} is {lead.ours:.1f} %, of {BLIND} "
+            f"{lead.theirs:.1f}: {interval(lead.seeds, '+.1f')} points. {FULL} differs from the picture's "
+            f"suggestion in {revised[FULL]:.0f} % of them, {BLIND} in {revised[BLIND]:.0f}."
         )
     if ORDINAL_ONLY in contrasts:
         sentences.append(
@@ -242,16 +242,16 @@ def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain 
 
 def contrast_table(full: Contrasts, sft: Contrasts) -> Table:
     """Accuracy of the policy without touch, SFT and the full model on every group, and the lead of the full model."""
-    shares = ("vision-only", "SFT", "full model")
+    shares = (BLIND, SFT, FULL)
     return named_table(
         "Accuracy where the picture helps and where it deceives",
         [
             {
                 "questions": group,
                 "number": c.questions,
-                "vision-only": c.theirs,
-                "SFT": sft[group].ours,
-                "full model": c.ours,
+                BLIND: c.theirs,
+                SFT: sft[group].ours,
+                FULL: c.ours,
                 "lead": interval(c.seeds, "+.1f"),
                 "over objects": bounds(c.objects.low, c.objects.high, ".1f"),
             }
@@ -261,8 +261,8 @@ def contrast_table(full: Contrasts, sft: Contrasts) -> Table:
         units={**dict.fromkeys(shares, "%"), "lead": "points"},
         meanings={
             "number": "mean over seeds",
-            "vision-only": "the policy without touch",
-            "lead": "full model minus vision-only, with its 95 % interval over seeds",
+            BLIND: "SFT without touch",
+            "lead": f"{FULL} minus {BLIND}, with its 95 % interval over seeds",
             "over objects": "95 % interval of the lead when whole objects are resampled",
         },
         note="All four attributes. Deceptive: the object looks like another one, and most policies without touch of "
@@ -274,8 +274,8 @@ def conflict_chart(contrasts: Contrasts, gain: TouchGain | None) -> bytes:
     """Left: accuracy of two policies on groups of questions; right: the points lost under each control of touch."""
     found = list(contrasts.values())
     low, high = ([c.theirs + getattr(c.objects, end) for c in found] for end in ("low", "high"))
-    ours = Series("full model", x=[c.ours for c in found], low=low, high=high, bar=True, colour=PALETTE[0])
-    theirs = Series("without touch", x=[c.theirs for c in found], bar=True, colour=PALETTE[1])
+    ours = Series(FULL, x=[c.ours for c in found], low=low, high=high, bar=True, colour=PALETTE[0])
+    theirs = Series(BLIND, x=[c.theirs for c in found], bar=True, colour=SHARED)
     panels = [Panel([theirs, ours], rows=list(contrasts), x_label="accuracy (%)")]
     if gain is not None:
         points = [estimates("", list(gain.over.values()), marker="o", width=2.4)]

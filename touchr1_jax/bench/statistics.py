@@ -217,35 +217,42 @@ def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: in
     return hits / len(signs) if exact else (1 + hits) / (1 + resamples)
 
 
-def clustered_sign_flip_test(
-    differences: np.ndarray,
-    clusters: np.ndarray,
-    *,
-    strata: np.ndarray | None = None,
-    resamples: int = 20_000,
-    seed: int = 0,
-) -> float:
-    """Two-sided p-value of "no object favours either policy" where the answers about one object are not independent.
+def crossed_test(differences: np.ndarray, clusters: np.ndarray, *, strata: np.ndarray | None = None) -> float:
+    """Two-sided p-value of "no difference" for other training runs and other objects at once: five seeds can reject it.
 
-    The sign-flip test of the objects' shares in the mean difference, s_c = Σ_{i ∈ c} d_i / (S · n_stratum(i)), whose
-    sum is the mean over S strata; all answers about an object change sides together.
+    Student's t of the mean over S strata, V = max(V_seeds + V_objects − V_both, V_seeds, V_objects), with one degree of
+    freedom fewer than seeds; each V sums the squares of the shares of its clusters, V_both those of one object in
+    one seed.
 
     Args:
-      differences: float [M], paired by answer.
+      differences: float [seeds, M], paired by answer.
       clusters: [M], the object of each answer.
       strata: int [M], as for `clustered_bootstrap`.
 
     Raises:
-      ValueError: as `clustered_bootstrap`.
+      ValueError: as `clustered_bootstrap`, or fewer than two seeds.
 
-    Source: Fisher (1935), §21, with the object as the unit that is flipped.
+    Source: Cameron, Gelbach and Miller, Robust inference with multiway clustering (2011), eq. 2.8 and §2.3; the maximum
+    keeps V from falling below either of its parts.
     """
-    strata = np.zeros(len(differences), int) if strata is None else strata
-    _check_values(differences, clusters, strata)
+    seeds = len(differences)
+    if seeds < 2:
+        raise ValueError(f"differences holds {seeds} seeds: a test over seeds needs two at least; train more seeds")
+    strata = np.zeros(differences.shape[1], int) if strata is None else strata
+    _check_values(differences.mean(axis=0), clusters, strata)
     _, stratum, counts = np.unique(strata, return_inverse=True, return_counts=True)
     _, cluster = np.unique(clusters, return_inverse=True)
-    share = np.bincount(cluster, weights=differences / (len(counts) * counts[stratum]))
-    return sign_flip_test(share, resamples=resamples, seed=seed)
+    weight = 1 / (len(counts) * counts[stratum] * seeds)
+    means = np.bincount(stratum, weights=differences.mean(axis=0)) / counts
+    mean = float(means.mean())
+    shares = np.array([np.bincount(cluster, weights=row) for row in weight * (differences - means[stratum])])
+    of_seeds, of_objects, of_both = (
+        float(np.sum(s**2)) * s.size / (s.size - 1) for s in (shares.sum(axis=1), shares.sum(axis=0), shares)
+    )
+    deviation = math.sqrt(max(of_seeds + of_objects - of_both, of_seeds, of_objects))
+    if deviation == 0:
+        return float(mean == 0)
+    return 2 * float(special.stdtr(min(shares.shape) - 1, -abs(mean) / deviation))
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
-from experiments.core.report import is_best, pieces, png, strip, write_report
+from experiments.core.report import is_best, jpeg, pieces, png, strip, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
+from experiments.core.text import MEANINGLESS, SMOKE
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
@@ -35,7 +36,7 @@ SVG = b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>'
 HOSTILE = '<script>alert("x")</script>&"\''
 DESCRIPTION = {
     "experiment": "coin",
-    "scale": "smoke",
+    "scale": "default",
     "config": {"steps": 3},
     "git": {"commit": "a" * 40, "dirty": True},
 }
@@ -135,6 +136,42 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert write(tmp_path / "again", results) == page
 
 
+def test_a_smoke_page_says_that_its_figures_mean_nothing(tmp_path, results):
+    text = read(write(tmp_path, results, description={**DESCRIPTION, "scale": SMOKE})).text
+    assert MEANINGLESS in text
+    assert "Being paid helps." not in text
+    assert "Requirements" not in text
+    assert MEANINGLESS not in read(write(tmp_path, results)).text
+
+
+def test_unknown_forces_are_left_out_and_none_is_minus_zero(tmp_path, results):
+    def forces(force_n: np.ndarray) -> list[str]:
+        example = dataclasses.replace(coin.example(), force_n={"xense": force_n})
+        return re.findall(r"<span>([^<]* N)</span>", write(tmp_path, dataclasses.replace(results, examples=(example,))))
+
+    assert forces(np.zeros((3, 3))) == []
+    assert forces(np.array([[0, 0, 0.0], [0, 0, 0.01], [0, 0, -2.0]])) == ["0.0 N", "0.0 N", "2.0 N"]
+
+
+def test_a_page_of_a_long_run_stays_small(tmp_path, results):
+    rng = np.random.default_rng(0)
+    stages = [f"grpo/{arm}/{seed}" for arm in ("paid", "unpaid", "a", "b") for seed in range(5)]
+    scalars = [f"scalar{i}" for i in range(8)]
+    lines = [
+        f'{{"stage": "{stage}", "step": {t}, ' + ", ".join(f'"{s}": {rng.normal():.4f}' for s in scalars) + "}\n"
+        for stage in stages
+        for t in range(900)
+    ]
+    noisy = np.linspace(60, 180, 64)[:, None] + rng.normal(0, 3, (8, 48, 64, 3))
+    frames = dict.fromkeys("abcd", noisy.astype(np.uint8))
+    examples = (dataclasses.replace(coin.example(), frames=frames),) * 12
+    write_text(tmp_path / "metrics.jsonl", "".join(lines))
+    page = write_report(
+        tmp_path, dataclasses.replace(results, examples=examples), about="Does it?", description=DESCRIPTION
+    )
+    assert page.stat().st_size < 3_000_000
+
+
 def test_hostile_text_stays_text(tmp_path, results):
     example = dataclasses.replace(
         coin.example(),
@@ -184,14 +221,18 @@ def test_a_text_is_cut_at_its_segments():
     ]  # fmt: skip
 
 
-def test_a_strip_holds_every_frame_in_its_true_colours(tmp_path, results):
-    frames = np.random.default_rng(0).integers(0, 255, (3, 5, 4, 3), dtype=np.uint8)
-    shown = cv2.imdecode(np.frombuffer(png(strip(frames)), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    assert shown.shape == (5, 3 * 6, 3)
-    for f in range(3):
-        np.testing.assert_array_equal(shown[:, 6 * f + 1 : 6 * f + 5], frames[f])
-    embedded = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", write(tmp_path, results))
-    assert base64.b64decode(embedded[1]) == png(strip(coin.example().frames["xense"]))
+def test_a_strip_holds_every_frame_in_its_colours(tmp_path, results):
+    frames = (
+        np.zeros((3, 8, 8, 3), np.uint8) + np.array([200, 40, 90], np.uint8) // np.arange(1, 4)[:, None, None, None]
+    )
+    frames = frames.astype(np.uint8)
+    for encode, error in ((png, 0), (jpeg, 6)):
+        shown = cv2.imdecode(np.frombuffer(encode(strip(frames)), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        assert shown.shape == (8, 3 * 10, 3)
+        for f in range(3):
+            assert np.abs(shown[2:6, 10 * f + 3 : 10 * f + 7].astype(int) - frames[f, 2:6, 2:6]).max() <= error
+    embedded = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", write(tmp_path, results))
+    assert base64.b64decode(embedded[0]) == jpeg(strip(coin.example().frames["xense"]))
 
 
 def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):

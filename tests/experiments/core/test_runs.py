@@ -54,7 +54,7 @@ def make_run(home, stamp, *, results=None, total=None):
     directory = home / "coin" / stamp
     description = {
         "experiment": "coin",
-        "scale": "smoke",
+        "scale": "default",
         "config": {"steps": 9},
         "git": {"commit": "0123456789", "dirty": True},
         "versions": {"python": "3.11"},
@@ -74,7 +74,7 @@ def test_the_list_shows_the_newest_run_its_cost_and_its_result(tmp_path, capsys)
     make_run(tmp_path, "20260102-000000", results=FINISHED, total=1170)
     assert main(["list", "--runs-dir", str(tmp_path)], package=FAKES) == 0
     out = capsys.readouterr().out
-    assert "20260102-000000  smoke, code 0123456+: finished, 19 min 30 s (and 1 more)  1 of 2 requirements met." in out
+    assert "20260102-000000  default, code 0123456+: finished, 19 min 30 s (and 1 more)  1 of 2 requirements met." in out
     assert "20260101" not in out
 
 
@@ -108,7 +108,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
     for arguments in (["list"], ["list", "coin"]):
         assert main([*arguments, "--runs-dir", str(tmp_path)], package=FAKES) == 0
         out = capsys.readouterr().out
-        assert "20260101-000000  smoke, code 0123456+: finished, 2 s" in out
+        assert "20260101-000000  default, code 0123456+: finished, 2 s" in out
         assert "20260102-000000/config.json is damaged" in out
         assert "20260103-000000/config.json is not that of a run" in out
 

@@ -1,15 +1,17 @@
 """The page of a run in progress is whole, up to date and cheap; event files hold what `metrics.jsonl` holds."""
 
 import itertools
+import re
 import struct
 import sys
+import time
 
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from experiments.core.context import Context, MetricLog
 from experiments.core.runner import main
-from experiments.core.watchers import MOST_PANELS, PAGE_EVERY_S, PAGE_SHARE, TENSORBOARD, Events, LivePage
+from experiments.core.watchers import CURVES_SHARE, MOST_PANELS, PAGE_EVERY_S, TENSORBOARD, Events, LivePage
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, read
 
 FAKES = "tests.experiments.fakes"
@@ -73,14 +75,30 @@ def test_without_a_choice_the_first_scalars_are_drawn(tmp_path, console):
     context.close()
 
 
-def test_pages_take_their_share_of_the_time_and_no_more(tmp_path, console):
-    """Every look at the clock takes a second: two for each page, one for each line."""
-    _, context = watched(tmp_path, console, itertools.count().__next__)
-    pages = [shown(context)]
+def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, console):
+    """Every look at the clock takes a second, so that curves take one and pages follow after ten."""
+    page, context = watched(tmp_path, console, itertools.count().__next__)
+    pages, curves = [shown(context)], set()
     for step in range(700):
         context.log("grpo/paid/0", step, reward=0.5)
         pages += [shown(context)] * (shown(context) != pages[-1])
-    assert len(pages) == 1 + 700 // (2 / PAGE_SHARE)
+        curves |= set(re.findall(r"base64,([^\"]*)", pages[-1]))
+    assert 700 // (PAGE_EVERY_S + 5) <= len(pages) <= 2 + 700 // PAGE_EVERY_S
+    assert 1 <= len(curves) <= 1 + 700 * CURVES_SHARE
+    page.end(RuntimeError("over"))
+    assert set(re.findall(r"base64,([^\"]*)", shown(context))) - curves  # the last page has all lines
+    context.close()
+
+
+def test_the_page_is_written_while_nothing_happens(tmp_path, console):
+    clock = Clock()
+    page, context = watched(tmp_path, console, clock)
+    before = shown(context)
+    with page.kept_fresh(every_s=0.001):
+        clock.now += PAGE_EVERY_S
+        while shown(context) == before:
+            time.sleep(0.001)
+    assert "10 s so far" in shown(context)
     context.close()
 
 

@@ -63,10 +63,15 @@ def test_signs_need_an_interval_without_zero(after, signs):
     assert [e.sign for e in effects(before, after, bare)] == ["not in the paper"] * 3
 
 
-def test_p_values_are_corrected_over_the_table():
-    found = effects([1.0, 2.0, 3.0], [1.1, 2.1, 3.2])
-    assert [e.p_seeds for e in found] == [0.75] * 3  # .25 is the least of three seeds; three metrics
-    assert all(e.p_objects < 0.01 for e in found)
+def test_p_values_of_the_primary_hypotheses_are_corrected_and_can_reject_with_five_seeds():
+    before, after = np.zeros(5), [-0.02, -0.03, -0.02, -0.01, -0.02]
+    plain = {e.metric.metric: e.p_value for e in effects(before, after)}
+    assert plain["omae"] == pytest.approx(0.0032, abs=1e-4)  # Student's t of five seeds
+    steps = [dataclasses.replace(STEP, component=name) for name in ("ordinal credit", "consistency")]
+    found = component_effects(steps, rows(before, after), OBJECTS)
+    primary = {e.step.component: e.p_value for e in found if e.primary}
+    assert primary == pytest.approx({"ordinal credit": 2 * plain["omae"], "consistency": 2 * plain["omae"]})
+    assert {e.p_value for e in found if not e.primary} == {plain["omae"]}
 
 
 def test_a_baseline_of_one_seed_is_compared_with_every_seed():

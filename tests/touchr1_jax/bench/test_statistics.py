@@ -155,29 +155,36 @@ def test_sign_flip_p_value_is_symmetric_and_bounded(differences):
     assert p == statistics.sign_flip_test(-d)
 
 
-def test_objects_flip_as_a_whole():
-    ones, objects = np.ones(10), np.repeat(np.arange(5), 2)
-    assert statistics.clustered_sign_flip_test(ones, objects) == 2 / 32  # five objects, not ten answers
-    assert statistics.clustered_sign_flip_test(ones, np.arange(10)) == 2 / 1024
-    assert statistics.clustered_sign_flip_test(np.array([1.0, -1.0, 2.0]), np.array(["a", "a", "b"])) == 1.0
-
-
-def test_flipped_objects_weigh_the_strata_alike():
-    # Stratum 0 holds one answer, stratum 1 four: shares of the mean are ½ and ⅛ each; objects sum to ½ + ⅛, ⅛, ¼.
-    values, strata = np.ones(5), np.array([0, 1, 1, 1, 1])
-    objects = np.array(["a", "a", "b", "c", "c"])
-    p = statistics.clustered_sign_flip_test(values, objects, strata=strata)
-    assert p == statistics.sign_flip_test(np.array([0.625, 0.125, 0.25]))
-    with pytest.raises(ValueError, match="lengths"):
-        statistics.clustered_sign_flip_test(values, objects[:3])
-
-
-def test_flipping_objects_keeps_its_level_where_answers_are_not_independent():
+def test_a_crossed_test_of_answers_that_are_alike_is_a_t_test_over_seeds_or_over_objects():
     rng = np.random.default_rng(0)
-    objects = np.repeat(np.arange(9), 6)
-    effects = rng.normal(size=(300, 9))[:, objects]
-    p = [statistics.clustered_sign_flip_test(d, objects) for d in effects + 0.2 * rng.normal(size=(300, 54))]
-    assert 0.02 <= np.mean(np.array(p) <= 0.05) <= 0.09
+    objects = np.repeat(np.arange(30), 2)
+    seeds = rng.normal(0.5, 1, 5)
+    found = statistics.crossed_test(np.repeat(seeds[:, None], 60, axis=1), objects)
+    assert found == pytest.approx(stats.ttest_1samp(seeds, 0).pvalue)
+    shares = rng.normal(0.5, 1, 30)
+    t = stats.ttest_1samp(shares, 0).statistic
+    assert statistics.crossed_test(np.tile(shares[objects], (5, 1)), objects) == pytest.approx(2 * stats.t.sf(t, 4))
+    assert statistics.crossed_test(np.ones((5, 60)), objects) == 0.0
+    assert statistics.crossed_test(np.zeros((5, 60)), objects) == 1.0
+    with pytest.raises(ValueError, match="two at least"):
+        statistics.crossed_test(np.ones((1, 60)), objects)
+
+
+def test_a_crossed_test_weighs_the_strata_alike():
+    # Means of the strata are 2 and 0; the stratum of one answer counts as much as that of four.
+    values = np.array([[2.0, 1.0, -1.0, 1.0, -1.0], [2.2, 1.0, -1.0, 1.0, -1.0]])
+    strata, objects = np.array([0, 1, 1, 1, 1]), np.arange(5)
+    one, two = (statistics.crossed_test(values, objects, strata=s) for s in (strata, np.zeros(5, int)))
+    assert one < two
+
+
+@pytest.mark.parametrize(("of_seeds", "of_objects"), [(1.0, 1.0), (1.0, 0.0), (0.0, 1.0), (0.1, 0.5)])
+def test_a_crossed_test_keeps_its_level_with_five_seeds(of_seeds, of_objects):
+    rng = np.random.default_rng(0)
+    objects = np.repeat(np.arange(40), 3)
+    effects = 0.3 * of_seeds * rng.normal(size=(400, 5, 1)) + (of_objects * rng.normal(size=(400, 1, 40)))[..., objects]
+    p = [statistics.crossed_test(d, objects) for d in effects + rng.normal(size=(400, 5, 120))]
+    assert np.mean(np.array(p) <= 0.05) <= 0.075
 
 
 def test_holm_by_hand():
