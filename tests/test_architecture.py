@@ -241,7 +241,17 @@ def test_every_folder_serves_several_modules():
     assert not {folder: by for folder, by in importers.items() if len(by) == 1 and not by[0].endswith("__main__")}
 
 
-NO_CODE = {"README.md", "LOG.md", "TUTORIAL.md", "recorded", "figures", "py.typed", "__init__.py", "__pycache__"}
+NO_CODE = {
+    "README.md",
+    "LOG.md",
+    "REPRODUCTION.md",
+    "TUTORIAL.md",
+    "recorded",
+    "figures",
+    "py.typed",
+    "__init__.py",
+    "__pycache__",
+}
 
 
 def users(folder: str) -> list[str]:

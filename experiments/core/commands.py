@@ -20,6 +20,7 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
        {PROG} list [NAME]            experiments, their runs, cost and results
        {PROG} new NAME [--reward]    a template that runs
        {PROG} compare RUN_A RUN_B    two runs, figure by figure
+       {PROG} show NAME              the recorded result of an experiment as its report
        {PROG} ask [POLICY] INPUT     ask a trained policy about a touch
        {PROG} export POLICY FOLDER   a trained policy as a folder for others
        {PROG} demo [POLICY]          ask in the browser
@@ -28,7 +29,7 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
 ASKING = ("ask", "export", "demo")
 """Commands on trained policies, which `experiments.ask` defines."""
 
-COMMANDS = ("list", "new", "compare", *ASKING)
+COMMANDS = ("list", "new", "compare", "show", *ASKING)
 """Names that no experiment can have."""
 
 
@@ -147,10 +148,37 @@ class CompareCommand:
         return 0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ShowCommand:
+    """Render the recorded result of an experiment as its report, in RUNS/NAME/recorded/report.html."""
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """An experiment with a run in experiments/recorded."""
+    runs_dir: Path = Path("runs")
+    """Folder of all runs."""
+
+    def run(self, package: str) -> int:
+        """Write the report, print its path and its verdict, and return the exit status."""
+        from experiments.core.recorded import FigureError, show_recorded  # charts, which no other command needs
+
+        entries = find(package)
+        if self.name not in entries:
+            print_error(_unknown_name(self.name, entries))
+            return 2
+        try:
+            lines = show_recorded(self.name, entries[self.name].module, self.runs_dir)
+        except FigureError as error:
+            print_error(f"{type(error).__name__}: {error}")
+            return 1
+        print_lines(*lines)
+        return 0
+
+
 Command = (
     Annotated[ListCommand, tyro.conf.subcommand("list")]
     | Annotated[NewCommand, tyro.conf.subcommand("new")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
+    | Annotated[ShowCommand, tyro.conf.subcommand("show")]
 )
 
 

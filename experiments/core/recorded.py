@@ -10,6 +10,7 @@ that exists, for names that changed.  A test compares the README with what `fill
 """
 
 import argparse
+import ast
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.core.artifacts import read_json, write_json, write_text
+from experiments.core.report import write_report
+from experiments.core.results import from_json
 from experiments.core.runs import ROOT
 from experiments.core.text import number
 
@@ -60,6 +63,32 @@ def _placeless(value: Any) -> Any:
     return Path(value).name if isinstance(value, str) and _ABSOLUTE.fullmatch(value) else value
 
 
+def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
+    """Write the recorded results of an experiment, which a module defines, as its report; the lines to print.
+
+    Raises:
+      FigureError: no run of it is recorded.
+    """
+    found, folder = _read(name, ROOT), runs_dir / name / "recorded"
+    source = ROOT / Path(*module.split(".")).with_suffix(".py")
+    about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
+    commit, _, dirty = found["git"].partition("-")
+    description = {"experiment": name, "scale": found["scale"], "git": {"commit": commit, "dirty": bool(dirty)}}
+    results = from_json(found)
+    report = write_report(folder, results, about=about, description=description | {"config": found["config"]})
+    return (f"report: {report}", *results.verdict)
+
+
+def _read(name: str, root: Path) -> Mapping[str, Any]:
+    file = root / RECORDED / f"{name}.json"
+    if not file.exists():
+        known = ", ".join(sorted(path.stem for path in (root / RECORDED).glob("*.json")))
+        raise FigureError(
+            f"name is {name!r}: no run of it is recorded in {RECORDED}; choose from {known}, or record one"
+        )
+    return read_json(file)
+
+
 def filled(text: str, root: Path = ROOT) -> str:
     """A document with the table between `BEGIN` and `END` as the runs recorded in a checkout have it.
 
@@ -84,10 +113,20 @@ def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
     Raises:
       FigureError: an unknown run or key, or a value that has no such format.
     """
-    file = root / RECORDED / f"{name}.json"
-    if not file.exists():
-        raise FigureError(f"figure {path!r}: no run of {name!r} is recorded in {RECORDED}; record one")
-    value: Any = read_json(file)
+    value = value_at(_read(name, root), path)
+    try:
+        return number(value, spec)
+    except (TypeError, ValueError) as error:
+        raise FigureError(f"figure {path!r}: {value!r} has no format {spec!r}: {error}; correct either") from error
+
+
+def value_at(run: Mapping[str, Any], path: str) -> Any:
+    """The value at a path in the results of a run.
+
+    Raises:
+      FigureError: an unknown key.
+    """
+    value: Any = run
     for key in map(str.strip, path.split(">")):
         entries = _entries(value)
         key = next((choice for choice in (key, *key.split(" or ")) if choice in entries), key)
@@ -95,10 +134,7 @@ def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
             known = ", ".join(map(str, entries)) or repr(value)
             raise FigureError(f"figure {path!r}: {key!r} must be one of {known}; correct it")
         value = entries[key]
-    try:
-        return number(value, spec)
-    except (TypeError, ValueError) as error:
-        raise FigureError(f"figure {path!r}: {value!r} has no format {spec!r}: {error}; correct either") from error
+    return value
 
 
 def _entries(value: Any) -> Mapping[str, Any]:

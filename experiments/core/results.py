@@ -301,6 +301,35 @@ class Results:
         }
 
 
+def from_json(found: Mapping[str, Any]) -> Results:
+    """The results in a `results.json`, without what it does not hold: pictures, curves, examples and former metrics."""
+    table = lambda t: Table(
+        title=t["title"],
+        columns=tuple(Column(**column) for column in t["columns"]),
+        rows=tuple(map(tuple, t["rows"])),
+        note=t["note"],
+    )
+    interval = lambda one: {**one, "ci95": tuple(one["ci95"])}
+    estimate = lambda one: Estimate(**interval(one) | {"per_seed": tuple(one["per_seed"])})
+    rows = lambda part: {
+        name: {metric: estimate(one) for metric, one in row.items() if metric in REPORTED}
+        for name, row in found.get(part, {}).items()
+    }
+    return Results(
+        verdict=tuple(found["verdict"]),
+        requirements=tuple(
+            Requirement(**{k: v for k, v in r.items() if k != "met"}) for r in found.get("requirements", ())
+        ),
+        tables=tuple(map(table, found["tables"])),
+        settings=found["settings"],
+        data=found["data"],
+        timing=found["timing"],
+        comparisons=tuple(Comparison(**interval(c)) for c in found.get("comparisons", ()) if c["metric"] in REPORTED),
+        arms=rows("arms"),
+        baselines=rows("baselines"),
+    )
+
+
 def _check_row(name: str, row: Mapping[str, Estimate]) -> None:
     require(bool(row), name, dict(row), "must hold one metric at least", "add the metrics")
     for metric, value in row.items():

@@ -5,6 +5,7 @@ import re
 import pytest
 
 from experiments.core.artifacts import read_json, write_json
+from experiments.core.commands import run_command
 from experiments.core.recorded import BEGIN, END, RECORDED, TABLE, FigureError, figure, filled, main, record
 from experiments.core.runs import ROOT
 
@@ -42,7 +43,7 @@ def test_rows_are_filled_with_their_figures(root):
 @pytest.mark.parametrize(
     ("name", "path", "spec", "message"),
     [
-        ("dice", "arms", "d", "no run of 'dice'"),
+        ("dice", "arms", "d", "'dice': no run of it is recorded"),
         ("coin", "arms > unpaid", ".0f", "'unpaid' must be one of paid"),
         ("coin", "arms > paid", ".0f", "has no format '.0f'"),
         ("coin", "tables > Tosses > silver > heads", "d", "'silver' must be one of gold"),
@@ -64,6 +65,17 @@ def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp
     assert recorded == RESULTS | {"config": {"data_dir": "x", "paths": ["b.npz", "1/2", "/"]}}
     assert main(["record", str(tmp_path)]) == 1
     assert "finish it first" in capsys.readouterr().err
+
+
+def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys):
+    assert run_command(["show", "conflict", "--runs-dir", str(tmp_path)], "experiments") == 0
+    page = (tmp_path / "conflict" / "recorded" / "report.html").read_text(encoding="utf-8")
+    assert "When picture and touch of an object disagree" in page
+    assert "Scores on unseen objects" in page
+    assert run_command(["show", "conflcit", "--runs-dir", str(tmp_path)], "experiments") == 2
+    assert "Did you mean conflict?" in capsys.readouterr().err
+    assert run_command(["show", "few_labels", "--runs-dir", str(tmp_path)], "experiments") == 1
+    assert "choose from ablation_cumulative" in capsys.readouterr().err
 
 
 def test_the_readme_shows_what_was_recorded():

@@ -74,7 +74,9 @@ def test_the_list_shows_the_newest_run_its_cost_and_its_result(tmp_path, capsys)
     make_run(tmp_path, "20260102-000000", results=FINISHED, total=1170)
     assert main(["list", "--runs-dir", str(tmp_path)], package=FAKES) == 0
     out = capsys.readouterr().out
-    assert "20260102-000000  default, code 0123456+: finished, 19 min 30 s (and 1 more)  1 of 2 requirements met." in out
+    assert (
+        "20260102-000000  default, code 0123456+: finished, 19 min 30 s (and 1 more)  1 of 2 requirements met." in out
+    )
     assert "20260101" not in out
 
 
