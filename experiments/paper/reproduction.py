@@ -172,7 +172,7 @@ def write(root: Path = ROOT) -> Path:
     description = {
         "experiment": "reproduction",
         "scale": "recorded",
-        "git": {"commit": "those of the recorded runs, below", "dirty": False},
+        "git": {"commit": "see below", "dirty": False},
         "recorded": runs,
     }
     about = "What of Touch-R1 (arXiv 2605.27154) holds?"
