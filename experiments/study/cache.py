@@ -51,7 +51,7 @@ LATER = (
 )
 """Source that runs only after SFT, or never."""
 
-USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/losses.py")
+USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/gradient.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
 
 DAMAGED = (ValueError, KeyError)
