@@ -24,6 +24,8 @@ import dataclasses
 import functools
 from collections.abc import Mapping
 
+import numpy as np
+
 from experiments.active.arms import (
     EVERY_TOUCH,
     Arm,
@@ -84,6 +86,9 @@ class ActiveTouchConfig:
             raise ConfigurationError(
                 f"seeds, full_seeds, contacts are {given}: must be at least 1, 1 and 2; raise them"
             )
+        for name in ("second_price", "second_prices", "harm_price"):
+            if not (np.isfinite(getattr(self, name)) & (np.asarray(getattr(self, name)) >= 0)).all():
+                raise ConfigurationError(f"{name} is {getattr(self, name)}: must be finite and at least 0; correct it")
 
     def arms(self, seed: int) -> dict[str, Arm]:
         """The reinforced policies of a seed."""
@@ -166,7 +171,7 @@ SMOKE = ActiveTouchConfig(
         contacts=ContactsConfig(
             objects=40, motions=("press", "slide_x", "hold"), forces_n=(2.0,), sensors=("tac3d",), picture_px=24
         ),
-        encoder=ContactEncoderConfig(width=24, layers=1, heads=1, steps=40, batch_size=32),
+        encoder=ContactEncoderConfig(width=24, steps=40, batch_size=32),
     ),
     learner=LearnerConfig(
         warm=SFTConfig(steps=20, batch_size=32, questions=1, micro_contacts=32),

@@ -24,6 +24,7 @@ from experiments.active.plans import (
 from experiments.active.policies import answerer, explore, imitate, part_of, reinforce, single_beliefs, warm_up
 from experiments.active.world import TouchWorld
 from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
@@ -88,6 +89,10 @@ class LearnerConfig:
     kept: int = 12
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.dropout < 1:
+            raise ConfigurationError(f"dropout is {self.dropout}: must lie in 0 ≤ dropout < 1; lower it")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SeedPolicy:
@@ -110,7 +115,7 @@ def warm_start(
 ) -> SeedPolicy:
     """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
     bank = world.bank
-    learned = part_of(bank, np.concatenate([world.parts["encoder"], world.parts["warm"]]))
+    learned = part_of(bank, world.parts["warm"])
     params = warm_up(policy, learned, contacts, config.warm, context, f"warm/{seed}", seed)
     answer = answerer(policy, params, bank)
     val = beliefs_of(world, answer, "val")

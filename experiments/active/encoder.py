@@ -1,7 +1,7 @@
-"""A small encoder, trained on single contacts with questions about all five properties, and the tokens that it makes.
+"""Beliefs about single contacts by a network that reads fixed statistics of patches, and tokens made of beliefs.
 
-It reads fixed features of each kept frame, not pixels, so that training it takes seconds, and never the measured force,
-in which friction could simply be read.
+The network learns all five properties from every contact at once.  It never sees the measured force, in which friction
+could simply be read.
 """
 
 import dataclasses
@@ -14,74 +14,59 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt8
 
-from experiments.active.contacts import LEVELS, PROPERTIES, ContactsConfig
+from experiments.active.contacts import LEVELS, PROPERTIES, ContactBank
 from experiments.active.feed import DrawnFeed
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
-from touchr1_jax.models.tactile_vit import EncoderLayer, QueryPool
+from touchr1_jax.models.frame_statistics import scaled_statistics
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params
 
+FAR = 5.0
+"""Standard deviations beyond which statistics are cut off."""
+
+_CONSTANT = 1e-4  # spread below which a statistic of a choice says nothing
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactEncoderConfig:
-    """Sizes and training of the encoder.
+    """Sizes and training of the encoders.
 
     Args:
-      width, layers, heads: of the transformer over the frames of a contact.
-      tokens: N, to which a contact is pooled; they are what a policy observes.
+      width, layers: of the network.
       dropout: share of the entries that training sets to 0, against learning objects by heart.
       steps, batch_size: of training, contacts drawn at random.
       optimizer: of training.
     """
 
-    width: int = 96
+    width: int = 192
     layers: int = 2
-    heads: int = 3
-    tokens: int = 4
-    dropout: float = 0.2
-    steps: int = 3000
-    batch_size: int = 128
+    dropout: float = 0.3
+    steps: int = 1500
+    batch_size: int = 256
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, weight_decay=0.1)
 
 
 class SingleContact(nn.Module):
-    """Scores of the levels of every property from the features of one contact."""
+    """Scores of the levels of every property from the statistics of one contact and the choice that made it."""
 
     config: ContactEncoderConfig
-    sensors: int
     choices: int
 
-    def setup(self) -> None:
-        c = self.config
-        self.enter, self.of_sensor = nn.Dense(c.width), nn.Embed(self.sensors, c.width)
-        self.layers = [EncoderLayer(c.width, c.heads, 2) for _ in range(c.layers)]
-        self.pool = QueryPool(c.tokens)
-        self.of_choice = nn.Embed(self.choices, 2 * c.width)
-        self.hidden, self.out = nn.Dense(2 * c.width), nn.Dense(len(PROPERTIES) * LEVELS)
-        self.drop = nn.Dropout(c.dropout)
-
     @nn.compact
-    def tokens(
-        self, features: Float[Array, "n F D"], sensor: Int[Array, "n"], train: bool = False
-    ) -> Float[Array, "n N W"]:
-        """Tokens of contacts."""
-        frames = features.shape[1]
-        place = self.param("place", nn.initializers.normal(0.5), (frames, self.config.width))
-        x = self.enter(self.drop(features, deterministic=not train)) + self.of_sensor(sensor)[:, None] + place
-        for layer in self.layers:
-            x = layer(x, jnp.ones(x.shape[:2], bool))
-        return self.pool(x)
-
     def __call__(
-        self, features: Float[Array, "n F D"], sensor: Int[Array, "n"], choice: Int[Array, "n"], train: bool = False
+        self, statistics: Float[Array, "n D"], choice: Int[Array, "n"], train: bool = False
     ) -> Float[Array, "n A K"]:
-        x = self.drop(self.tokens(features, sensor, train), deterministic=not train)
-        x = nn.gelu(self.hidden(x.reshape(len(x), -1)) + self.of_choice(choice))
-        return self.out(self.drop(x, deterministic=not train)).reshape(-1, len(PROPERTIES), LEVELS)
+        c = self.config
+        drop = nn.Dropout(c.dropout, deterministic=not train)
+        of_choice = lambda: nn.Embed(self.choices, c.width)(choice)
+        x = nn.gelu(nn.Dense(c.width)(drop(statistics)) + of_choice())
+        for _ in range(c.layers - 1):
+            x = x + nn.gelu(nn.Dense(c.width)(drop(x)) + of_choice())
+        return nn.Dense(len(PROPERTIES) * LEVELS)(drop(x)).reshape(-1, len(PROPERTIES), LEVELS)
 
 
 @struct.dataclass
@@ -97,65 +82,91 @@ class EncoderState:
 class ContactBatch:
     """Contacts that a step learns from."""
 
-    features: Float[Array, "n F D"]
-    sensor: Int[Array, "n"]
+    statistics: Float[Array, "n D"]
     choice: Int[Array, "n"]
     label: Int[Array, "n A"]
 
 
-def encode_contacts(
+@jax.jit
+def patch_statistics(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C D"]:
+    """Statistics of the four quarters of every picture and the two halves of the fields below it."""
+    edge = frames.shape[3]
+    parts = [scaled_statistics(x, edge // 2) for x in (frames[..., :edge, :, :], frames[..., edge:, :, :])]
+    of_patch = parts[0].shape[-1] // 2
+    split = [(x[..., :of_patch], x[..., :1, of_patch:]) for x in parts]  # those of the whole are the same for all
+    return jnp.concatenate([x.reshape(len(frames), -1) for pair in split for x in pair], -1)
+
+
+def contact_statistics(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C D"]:
+    """`patch_statistics` of all contacts."""
+    return np.stack([np.asarray(patch_statistics(x)) for x in context.each("statistics of contacts", bank.frames)])
+
+
+def belief_tokens(log_probs: Float[np.ndarray, "O C A K"]) -> Float[np.ndarray, "O C A W"]:
+    """One token for each property, W = A + K: which one it is, and its log-probabilities less their mean."""
+    centred = log_probs - log_probs.mean(-1, keepdims=True)
+    names = np.broadcast_to(np.eye(log_probs.shape[-2]), (*log_probs.shape[:-1], log_probs.shape[-2]))
+    return np.concatenate([names, centred / centred.std()], -1).astype(np.float32)
+
+
+def encoder_beliefs(
     config: ContactEncoderConfig,
-    contacts: ContactsConfig,
-    features: Float[np.ndarray, "O C F D"],
+    statistics: Float[np.ndarray, "O C D"],
     label: Int[np.ndarray, "O A"],
     objects: Int[np.ndarray, "n"],
     context: Context,
-    *,
-    seed: int = 0,
-) -> tuple[Float[np.ndarray, "O C N W"], Float[np.ndarray, "O C A K"]]:
-    """Train the encoder on all contacts of some objects, then encode those of all.
+    seed: int,
+) -> Float[np.ndarray, "O C A K"]:
+    """Log-probabilities of every level from every contact, by a network of some objects.
 
-    Returns:
-      The tokens of every contact at unit scale, and the log-probabilities of the encoder's own head.
+    Args:
+      config: of the network.
+      statistics: of all contacts.
+      label: level of each property.
+      objects: those that it learns from.
+      context: of the run.
+      seed: of parameters and draws, and the number of its stage.
     """
-    sensor = np.array([contacts.sensors.index(name) for name, _, _ in contacts.choices], np.int32)
-    centre, spread = features[objects].mean((0, 1)), features[objects].std((0, 1))
-    features = np.where(spread > 1e-6, (features - centre) / np.maximum(spread, 1e-6), 0.0).astype(np.float32)
-    module = SingleContact(config, len(contacts.sensors), len(contacts.choices))
-    choice = np.arange(len(sensor), dtype=np.int32)
+    centre, spread = statistics[objects].mean(0), statistics[objects].std(0)
+    scaled = (statistics - centre) / np.maximum(spread, _CONSTANT) * (spread > _CONSTANT)
+    scaled = np.clip(scaled, -FAR, FAR).astype(np.float32)
+    choice = np.arange(statistics.shape[1], dtype=np.int32)
+    module = SingleContact(config, len(choice))
 
     def draw(rng: np.random.Generator) -> ContactBatch:
         which, chosen = rng.choice(objects, config.batch_size), rng.choice(choice, config.batch_size)
-        drawn: Any = (features[which, chosen], sensor[chosen], chosen, label[which])
+        drawn: Any = (scaled[which, chosen], chosen, label[which])
         return ContactBatch(*drawn)
 
-    params = module.init(jax.random.key(seed), features[0], sensor, choice)["params"]
-    optimizer = make_optimizer(config.optimizer, config.steps)
+    params = module.init(jax.random.key(seed), scaled[0], choice)["params"]
+    optimizer, step = _program(module)
     state = EncoderState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
-    step = jax.jit(functools.partial(_update, module, optimizer, jax.random.key(seed)), donate_argnums=0)
     loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
     params = run_loop(step, state, DrawnFeed(draw, seed), loop, context, f"encoder/{seed}").params
 
     @jax.jit
-    def read(of_object: Float[Array, "C F D"]) -> tuple[Array, Array]:
-        tokens: Any = module.apply({"params": params}, of_object, sensor, method=SingleContact.tokens)
-        scores: Any = module.apply({"params": params}, of_object, sensor, choice)
-        return tokens, jax.nn.log_softmax(scores)
+    def read(of_object: Float[Array, "C D"]) -> Float[Array, "C A K"]:
+        scores: Any = module.apply({"params": params}, of_object, choice)
+        return jax.nn.log_softmax(scores)
 
-    found = [jax.device_get(read(x)) for x in features]
-    tokens = np.stack([tokens for tokens, _ in found])
-    return tokens / tokens.std(), np.stack([scores for _, scores in found])
+    return np.stack([np.asarray(read(x)) for x in scaled])
+
+
+@functools.cache
+def _program(module: SingleContact) -> tuple[optax.GradientTransformation, Any]:
+    """Optimizer and compiled step, made once for all folds."""
+    optimizer = make_optimizer(module.config.optimizer, module.config.steps)
+    return optimizer, jax.jit(functools.partial(_update, module, optimizer), donate_argnums=0)
 
 
 def _update(
-    module: SingleContact, optimizer: optax.GradientTransformation, key: Array, state: EncoderState, batch: ContactBatch
+    module: SingleContact, optimizer: optax.GradientTransformation, state: EncoderState, batch: ContactBatch
 ) -> tuple[EncoderState, dict[str, Array]]:
     """One step of gradient descent on the mean cross-entropy of all properties."""
-    noise = {"dropout": jax.random.fold_in(key, state.step)}
+    noise = {"dropout": jax.random.key(state.step)}
 
     def loss(params: Params) -> tuple[Array, Array]:
-        inputs = batch.features, batch.sensor, batch.choice
-        scores: Any = module.apply({"params": params}, *inputs, train=True, rngs=noise)
+        scores: Any = module.apply({"params": params}, batch.statistics, batch.choice, train=True, rngs=noise)
         cost = optax.softmax_cross_entropy_with_integer_labels(scores, batch.label).mean()
         return cost, 100 * (scores.argmax(-1) == batch.label).mean()
 

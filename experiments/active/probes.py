@@ -1,4 +1,6 @@
-"""Fixed features of every contact, and linear probes on them: what a touch shows without any trained encoder."""
+"""Fixed features of every contact, linear probes on them, and beliefs about objects that no reader learned from."""
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -7,9 +9,9 @@ from jaxtyping import Array, Float, Int, UInt8
 
 from experiments.active.contacts import LEVELS, PROPERTIES, ContactBank
 from experiments.core.context import Context
-from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs, stream_features
+from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_log_probs, stream_features
 
-PROBE = ProbeConfig()
+PROBE = ProbeConfig(folds=3, penalty=0.2)
 
 
 @jax.jit
@@ -49,3 +51,24 @@ def probe_beliefs(
         for a in range(len(PROPERTIES)):
             found[:, choice, a] = probe_log_probs(of_choice, label[:, a], weights, LEVELS, PROBE)[0]
     return found
+
+
+def crossed(
+    read: Callable[[Int[np.ndarray, "m"], int], Float[np.ndarray, "O C A K"]], objects: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "O C A K"]:
+    """Beliefs about all contacts by readers of which none learned from the object that it reads.
+
+    What a policy observes of the objects that it learns from is then as fallible as of unseen ones.
+
+    Args:
+      read: (objects to learn from, number of the reader) → its log-probabilities for all contacts.
+      objects: dealt to folds; each is read by the reader of the other folds, all others by the mean of all readers.
+
+    Raises:
+      ValueError: fewer objects than folds.
+    """
+    fold = group_folds(objects, PROBE)
+    found = np.stack([read(objects[fold != k], k) for k in range(PROBE.folds)])
+    mixed = np.array(jax.nn.log_softmax(found.mean(0)))
+    mixed[objects] = found[fold, objects]
+    return mixed

@@ -51,8 +51,11 @@ def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outc
       outcome: of every action in the n prompts (`environment.check_environment`).
 
     Raises:
-      RewardError: a reward that is no dictionary of float scalars, or that is not finite.
+      RewardError: a price below 0 or not finite, a reward that is no dictionary of float scalars or is not finite.
     """
+    for name, price in prices._asdict().items():
+        if not 0 <= float(price) < np.inf:
+            raise RewardError(f"prices.{name} is {float(price)}: must be finite and ≥ 0; correct it")
     for action in range(-1, outcome.seconds.shape[1]):
         for level in range(-1, int(np.max(target.levels))):
             _earned(reward, prices, target, np.full(target.label.shape, level, np.int32), _after(outcome, action))

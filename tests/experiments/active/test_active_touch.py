@@ -49,6 +49,15 @@ def test_too_few_seeds_or_contacts_are_refused(field):
         ActiveTouchConfig(**{field: 0})
 
 
+@pytest.mark.parametrize("price", [float("nan"), float("inf"), -0.1])
+@pytest.mark.parametrize("field", ["second_price", "harm_price"])
+def test_prices_that_no_reward_can_have_are_refused_before_contacts_are_made(field, price):
+    with pytest.raises(ConfigurationError, match=field):
+        ActiveTouchConfig(**{field: price})
+    with pytest.raises(ConfigurationError, match="second_prices"):
+        ActiveTouchConfig(second_prices=(0.01, price))
+
+
 def test_a_seed_trains_the_priced_arms_only_where_it_is_asked_for():
     config = ActiveTouchConfig(second_prices=(0.0,), harm_price=0.7)
     assert config.arms(1).keys() == {"chosen", "chosen_3"}

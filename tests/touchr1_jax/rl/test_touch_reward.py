@@ -57,6 +57,13 @@ def test_a_reward_that_is_no_number_is_named(outcome, names):
         check_touch_reward(FAULTS[names], FREE, EVERY.target, outcome)
 
 
+@pytest.mark.parametrize("price", [-1.0, jnp.nan, jnp.inf])
+@pytest.mark.parametrize("name", Prices._fields)
+def test_prices_that_are_no_price_are_named(outcome, name, price):
+    with pytest.raises(RewardError, match=f"prices.{name}"):
+        check_touch_reward(priced_answer, FREE._replace(**{name: jnp.float32(price)}), EVERY.target, outcome)
+
+
 @pytest.mark.parametrize("prices", [Prices(jnp.float32(1), jnp.float32(0)), Prices(jnp.float32(2), jnp.float32(9))])
 def test_prices_at_which_touching_never_pays_are_named(outcome, prices):
     with pytest.raises(RewardError, match="never pays"):
